@@ -23,12 +23,12 @@ from benchmarks.merge_work import BATCH, Batches, batches, samples_of, seconds_o
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import warm_up
 from mapserver.fleet.correction import UNCORRECTED
-from mapserver.follower.jobs import Audit, ChangeSearch
 from mapserver.ingest.backlog import GROUP_BATCHES
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Auditor
+from mapserver.upkeep.jobs import Audit, ChangeSearch
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch

@@ -15,7 +15,6 @@ import zenoh
 from mapserver.claim import WriterClaim
 from mapserver.config import ServerConfig
 from mapserver.evidence import grid
-from mapserver.follower.follower import Follower
 from mapserver.ingest import batches
 from mapserver.ingest.admission import Verify
 from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
@@ -25,6 +24,7 @@ from mapserver.journal import records
 from mapserver.past.past import Past
 from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.answering import Answers
+from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import ConfigError, QueryError, Refusal
 from protocol.queries.answer_codec import encode_change, encode_error
 from protocol.queries.answers import GroundChange
@@ -77,8 +77,8 @@ class Server:
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
         past = Past.of_store(folder, site.cell_m, config.fold)
-        self._follower = Follower(self._writer, self._publish, past)
-        self.answers = Answers(self._writer, self._follower, past)
+        self._upkeep = Upkeep(self._writer, self._publish, past)
+        self.answers = Answers(self._writer, self._upkeep, past)
         self._now = AnswerPool("query", config.query_threads, ANSWER_BYTES)
         # Others: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
         self._past = AnswerPool("past", 1, MOST_PAST)
@@ -105,7 +105,7 @@ class Server:
             queryable.undeclare()  # type: ignore[no-untyped-call]
         for pool in (self._now, self._past, self._commands):
             pool.close()
-        self._follower.close()
+        self._upkeep.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()
         self._claim.close()  # the last: another server may use the store now

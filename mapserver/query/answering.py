@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.follower.follower import Follower
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.rows import Selection
@@ -21,6 +20,7 @@ from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
 from mapserver.query.why import reasons
+from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
@@ -48,8 +48,8 @@ WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 class Answers:
     """Answers the queries of one map, from any thread."""
 
-    def __init__(self, writer: Writer, follower: Follower, past: Past) -> None:
-        self._writer, self._follower = writer, follower
+    def __init__(self, writer: Writer, upkeep: Upkeep, past: Past) -> None:
+        self._writer, self._upkeep = writer, upkeep
         self._site, self._config = writer.site, writer.config
         self._open = OpenRegions()
         self._tiles = Tiles(writer)
@@ -99,11 +99,11 @@ class Answers:
             case requests.AliveQuery():
                 return codec.encode_alive(self._writer.alive())
             case requests.MachinesQuery():
-                return codec.encode_machines(self._follower.machines(), self._version())
+                return codec.encode_machines(self._upkeep.machines(), self._version())
             case requests.CalibrationQuery():
-                return encode_calibration(self._follower.calibration())
+                return encode_calibration(self._upkeep.calibration())
             case requests.ChangesQuery():
-                changes = self._follower.changes(query.after)[: codec.MAX_CHANGES]
+                changes = self._upkeep.changes(query.after)[: codec.MAX_CHANGES]
                 return codec.encode_changes(changes, self._version())
         return codec.encode_info(self.info())
 
@@ -137,7 +137,7 @@ class Answers:
     def history(self, query: HistoryQuery) -> HistoryAnswer:
         """Layers of the cell that a position lies in, span by span."""
         names = _of_cells(query.layers)
-        now_ns, facts = self._writer.run(lambda store: store.newest_ns), self._follower.facts()
+        now_ns, facts = self._writer.run(lambda store: store.newest_ns), self._upkeep.facts()
         span_s = query.span_s or self._config.fold.bucket_s
         from_ns, to_ns = _time_of(query, now_ns, span_s)
         cell = self._cell(query.x_m, query.y_m)
@@ -169,24 +169,24 @@ class Answers:
         """Everything that is known of the cell that a position lies in."""
         window = self._cell(query.x_m, query.y_m)
         view = self._view(window, query.as_of_ns)
-        excluded = self._follower.facts().excluded
+        excluded = self._upkeep.facts().excluded
         names = self._writer.run(lambda store: [name for name in store.machines() if name not in excluded])
         version = MapVersion(self._writer.store_id, view.merged, view.fact)
         return reasons(view, version, (window.column, window.row), names, self._site.cell_m, self._config)
 
     def trust(self, command: TrustCommand) -> dict[str, Any]:
         """What is known of the machine once the command counts, and the version of the map that it counts in."""
-        row = self._follower.trust(command.machine, command.trusted, command.reason, command.wait_s)
+        row = self._upkeep.trust(command.machine, command.trusted, command.reason, command.wait_s)
         version = self._version()
         return {**row, "store": version.store, "merged": version.row, "fact": version.fact}
 
     def calibrate(self, command: CalibrateCommand) -> CalibrationAnswer:
         """What is known of all machines once the command counts."""
         if command.machine:
-            self._follower.correct(command)
+            self._upkeep.correct(command)
         else:
-            self._follower.calibrate(command.wait_s)
-        return self._follower.calibration()
+            self._upkeep.calibrate(command.wait_s)
+        return self._upkeep.calibration()
 
     def _version(self) -> MapVersion:
         return self._writer.run(lambda store: store.version)
@@ -233,7 +233,7 @@ class Answers:
     def _view(self, window: CellWindow, as_of_ns: int | None) -> View:
         if as_of_ns is None:
             return self._writer.run(lambda store: view_now(store, window))
-        return self._past.view(window, as_of_ns, self._follower.facts())
+        return self._past.view(window, as_of_ns, self._upkeep.facts())
 
     def _spans(self, past: CellHistory, names: tuple[str, ...]) -> tuple[HistorySpan, ...]:
         values = cell_layers.read(past.evidence, names, self._config.read, past.last_ns[:, None])

@@ -23,7 +23,7 @@ REPLACED = {
     "ladder": "timeline",
     "rung": "tier",
     "hot": "open",
-    "keeper": "follower",
+    "keeper": "upkeep",
     "sheet": "frame",
     "bank": "sensor group",
     "told": "stated, stamped",

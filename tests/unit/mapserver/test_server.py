@@ -282,7 +282,7 @@ def test_no_batch_is_taken_while_another_server_may_be_the_writer(served):
     assert deliver(client, batch(samples(5))).watermark == 5
 
 
-def test_a_command_reaches_the_follower_with_its_reason(served):
+def test_a_command_reaches_the_upkeep_with_its_reason(served):
     _, client = served
     deliver(client, batch(samples(5)))
     command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")

@@ -45,7 +45,7 @@ from tests.unit.mapserver.data import (
     send,
     wait_for,
 )
-from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
+from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered
 
 
 @pytest.fixture
@@ -575,7 +575,7 @@ QUERIES = [
 def test_a_refused_query_says_why(start, reason, name, parameters):
     writer = start()
     with pytest.raises(QueryError) as caught:
-        answered(Answers(writer, FakeFollower(), past_of(writer)), name, parameters)
+        answered(Answers(writer, FakeUpkeep(), past_of(writer)), name, parameters)
     assert caught.value.reason == reason
 
 

@@ -26,7 +26,7 @@ from tests.unit.mapserver.data import (
     samples,
     send,
 )
-from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
+from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered
 
 # One sample in each cell of two diagonals, the value tells the cell.
 STEPS = np.arange(-40, 40)
@@ -37,7 +37,7 @@ def diagonal() -> np.ndarray:
 
 
 def asked(writer: Writer) -> Answers:
-    return Answers(writer, FakeFollower(), past_of(writer))
+    return Answers(writer, FakeUpkeep(), past_of(writer))
 
 
 @pytest.fixture

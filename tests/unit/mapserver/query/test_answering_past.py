@@ -13,7 +13,7 @@ from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.requests import MAX_SPANS, Freshness, HistoryQuery, PointQuery, RegionQuery, When, reads_past
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, past_of, random_samples, samples, send
-from tests.unit.mapserver.query.fake_follower import FakeFollower, answered
+from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered
 
 S, HOUR_NS = 10**9, 3600 * 10**9
 BOX = Bounds(-40, -40, 40, 40)
@@ -28,14 +28,14 @@ def served(tmp_path_factory):
     """Function that starts a writer with the samples of each machine in two rows, in a folder of its own."""
     opened = []
 
-    def start(rows=None, follower=None) -> Answers:
+    def start(rows=None, upkeep=None) -> Answers:
         writer = open_writer(tmp_path_factory.mktemp("store"))
         opened.append(writer)
         for machine, table in (ROWS if rows is None else rows).items():
             half = len(table) // 2
             send(writer, [incoming(part, machine=machine) for part in (table[:half],) if len(part)])
             send(writer, [incoming(table[half:], 1 + half, machine)])
-        return Answers(writer, follower or FakeFollower(), past_of(writer))
+        return Answers(writer, upkeep or FakeUpkeep(), past_of(writer))
 
     yield start
     for writer in opened:
@@ -110,7 +110,7 @@ def test_what_changed_later_has_not_changed_yet(served):
 
 
 def test_excluded_machines_are_excluded_from_the_past(answers, served):
-    without = served(follower=FakeFollower("b"))
+    without = served(upkeep=FakeUpkeep("b"))
     only_a = served({"a": ROWS["a"]})
     when = When(as_of_ns=NEWEST_NS)
     here, there = (asked.region(RegionQuery(BOX, ("resistance",), when=when)) for asked in (without, only_a))
@@ -218,7 +218,7 @@ def test_without_a_first_time_the_newest_spans_are_answered(served):
 
 def test_a_history_leaves_out_machines_and_filled_layers(served):
     rows = hours(0.02, 0.05)
-    assert served(rows, FakeFollower("a")).history(HistoryQuery(8.5, 8.5)).spans == ()
+    assert served(rows, FakeUpkeep("a")).history(HistoryQuery(8.5, 8.5)).spans == ()
     with pytest.raises(QueryError, match="`resistance_filled` is made from a cell's neighbours") as caught:
         served(rows).history(HistoryQuery(8.5, 8.5, ("visits", "resistance_filled")))
     assert caught.value.reason == Refusal.UNKNOWN_LAYER
@@ -239,7 +239,7 @@ def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
     with closing(open_writer(tmp_path)) as writer:
         writer.folder = tmp_path / "elsewhere"
         with pytest.raises(QueryError, match="no usable journal") as caught:
-            getattr(Answers(writer, FakeFollower(), past_of(writer)), query.name)(query)
+            getattr(Answers(writer, FakeUpkeep(), past_of(writer)), query.name)(query)
     assert caught.value.reason == Refusal.STORE
 
 
@@ -272,9 +272,9 @@ def test_answers_about_the_past_travel_as_bytes(answers):
 # --- machines, changes, commands -------------------------------------------------------------------------------------
 
 
-def test_the_follower_is_asked(served):
-    follower = FakeFollower()
-    answers = served(follower=follower)
+def test_the_upkeep_is_asked(served):
+    upkeep = FakeUpkeep()
+    answers = served(upkeep=upkeep)
     machines = codec.decode_machines(answered(answers, "machines", {"after": "1"})).machines
     assert [(machine.name, machine.trusted) for machine in machines] == [("a", True), ("b", False)]
     changes = codec.decode_changes(answered(answers, "changes", {"after": "41"})).changes
@@ -282,7 +282,7 @@ def test_the_follower_is_asked(served):
     row = codec.decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
     assert (row.name, row.trusted, row.merged) == ("b", False, 4)
     answers.obey("trust", {"machine": "b", "trusted": "auto"})
-    assert follower.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
+    assert upkeep.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
     with pytest.raises(QueryError, match="`c` is not known") as caught:
         answers.obey("trust", {"machine": "c", "trusted": "yes"})
     assert caught.value.reason == Refusal.UNKNOWN_MACHINE

@@ -10,13 +10,13 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence.grid import Grid
-from mapserver.follower import checkpointing
-from mapserver.follower.checkpointing import RESERVE_BYTES, Checkpointing
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalReader
 from mapserver.past.plan import HOUR_NS
+from mapserver.upkeep import checkpointing
+from mapserver.upkeep.checkpointing import RESERVE_BYTES, Checkpointing
 from protocol.arrays import Table
 from tests.unit.mapserver.data import (
     NOW_NS,

@@ -1,4 +1,4 @@
-"""The follower: a thread beside the writer that runs four jobs in turn, one that calibrates, one that folds again."""
+"""The upkeep: a thread beside the writer that runs four jobs in turn, one that calibrates, one that folds again."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 
 from mapserver.fleet.correction import Corrections
 from mapserver.fleet.machine_state import MachineState, state_of
-from mapserver.follower.calibrating import Calibrating
-from mapserver.follower.calibration_state import calibration_of, decided_by_person
-from mapserver.follower.checkpointing import Checkpointing
-from mapserver.follower.jobs import Archiving, Audit, ChangeSearch, Job, Publish
-from mapserver.follower.refolding import Refolding
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
 from mapserver.journal.reader import JournalReader
 from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
+from mapserver.upkeep.calibrating import Calibrating
+from mapserver.upkeep.calibration_state import calibration_of, decided_by_person
+from mapserver.upkeep.checkpointing import Checkpointing
+from mapserver.upkeep.jobs import Archiving, Audit, ChangeSearch, Job, Publish
+from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal, SitegridError, StoreError
 from protocol.queries.answers import GroundChange
 from protocol.queries.calibration import CalibrationAnswer
@@ -31,10 +31,10 @@ from protocol.queries.commands import CalibrateCommand
 TURN_S, LATEST_S = 1.0, 5.0
 SHARE = 0.2
 END_S = 5.0  # a solve may take so long in the end
-log = logging.getLogger("mapserver.follower.follower")
+log = logging.getLogger("mapserver.upkeep.upkeep")
 
 
-class Follower:
+class Upkeep:
     """Machines and changes of one site. All but the thread itself is for any thread.
 
     publish: is given each change when it is new or grows.
@@ -53,7 +53,7 @@ class Follower:
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
         archiving = Archiving(writer, reader, self._ending)
         jobs = {
-            "follower": (self._audit, self._changes, archiving, self._checkpointing),
+            "upkeep": (self._audit, self._changes, archiving, self._checkpointing),
             "calibration": (self._calibrating,),  # which may take seconds at a time
         }
         self._threads = [
@@ -185,9 +185,9 @@ class Follower:
                 try:
                     job.run()
                 except (SitegridError, OSError) as error:  # the map goes on without; the next turn tries again
-                    log.error("follower failed job=%s error=%r", job.name, str(error))
+                    log.error("upkeep failed job=%s error=%r", job.name, str(error))
                 except Exception:  # a bug here must not end the server, nor pass unseen
-                    log.exception("follower failed job=%s", job.name)
+                    log.exception("upkeep failed job=%s", job.name)
             self._ending.wait(pause_s(time.thread_time() - began_s))
 
 

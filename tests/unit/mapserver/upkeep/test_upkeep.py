@@ -1,4 +1,4 @@
-"""The follower and its jobs on a real writer and store: machines are excluded, changes published, old rows archived."""
+"""The upkeep and its jobs on a real writer and store: machines are excluded, changes published, old rows archived."""
 
 import shutil
 import threading
@@ -15,9 +15,6 @@ from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.fleet.machine_state import MachineState
-from mapserver.follower import follower, refolding
-from mapserver.follower.follower import Follower
-from mapserver.follower.jobs import Archiving, Audit
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
@@ -25,6 +22,9 @@ from mapserver.journal import reader as journal_reader
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.judgement import Reason
+from mapserver.upkeep import refolding, upkeep
+from mapserver.upkeep.jobs import Archiving, Audit
+from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import QueryError, StoreError
 from protocol.queries.answers import GroundChange
 from protocol.site.ground_classes import ZONES
@@ -49,29 +49,29 @@ HOUR_NS = 3600 * 10**9
 
 
 class Site:
-    """A writer with its follower over a folder, and what was published."""
+    """A writer with its upkeep over a folder, and what was published."""
 
     def __init__(self, folder: Path, judge_s: float = 60.0, *, exclude: bool = True) -> None:
         self.published: list[GroundChange] = []
         self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0), trust=TrustConfig(judge_s, exclude))
         self.writer = open_writer(folder, self.config)
-        self.follower = Follower(self.writer, self.published.append, past_of(self.writer))
+        self.upkeep = Upkeep(self.writer, self.published.append, past_of(self.writer))
 
     @property
     def grid(self) -> Grid:
         return self.writer.run(grid_copy)
 
     def machine(self, name: str) -> dict[str, Any]:
-        return next(row for row in self.follower.machines() if row["name"] == name)
+        return next(row for row in self.upkeep.machines() if row["name"] == name)
 
     def close(self) -> None:
-        self.follower.close()
+        self.upkeep.close()
         self.writer.close()
 
 
 @pytest.fixture
 def opened(tmp_path, monkeypatch):
-    monkeypatch.setattr(follower, "TURN_S", 0.01)
+    monkeypatch.setattr(upkeep, "TURN_S", 0.01)
     monkeypatch.setattr(refolding, "RETRY_S", 0.01)
 
     @contextmanager
@@ -84,7 +84,7 @@ def opened(tmp_path, monkeypatch):
 
 @pytest.fixture
 def store(tmp_path):
-    """A writer without a follower, and a reader of its journal."""
+    """A writer without a upkeep, and a reader of its journal."""
     folder = tmp_path / "store"
     with closing(open_writer(folder)) as writer, JournalReader(folder / JOURNAL_FILE) as reader:
         yield writer, reader
@@ -128,18 +128,18 @@ def fold_of(sent: dict[str, list[Any]], config: ServerConfig, without: str = "")
 
 @pytest.mark.parametrize(("worked_s", "pause_s"), [(0.0, 1.0), (0.2, 1.0), (0.5, 2.0), (1.0, 4.0), (60.0, 5.0)])
 def test_turns_of_a_large_fleet_leave_most_of_the_time_to_others(worked_s, pause_s):
-    assert follower.pause_s(worked_s) == pytest.approx(pause_s)
+    assert upkeep.pause_s(worked_s) == pytest.approx(pause_s)
 
 
 def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
     sent = fleet({}, size=16)
     with opened() as site:
         deliver(site, sent)
-        row = site.follower.trust("b", False, "its scale is broken", 20.0)
+        row = site.upkeep.trust("b", False, "its scale is broken", 20.0)
         assert (row["trusted"], row["by"], row["reason"]) == (False, "person", "its scale is broken")
         assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert site.follower.facts().excluded == {"b"}
-        assert site.follower.trust("b", True, "repaired", 20.0)["trusted"]
+        assert site.upkeep.facts().excluded == {"b"}
+        assert site.upkeep.trust("b", True, "repaired", 20.0)["trusted"]
         assert same(site.grid, fold_of(sent, site.config))
 
 
@@ -148,12 +148,12 @@ def test_rows_of_an_excluded_machine_are_kept_and_stay_out(opened):
     with opened() as site:
         for name in sent:
             send(site.writer, [incoming(sent[name][0], 1, name)])
-        site.follower.trust("b", False, "", 20.0)
+        site.upkeep.trust("b", False, "", 20.0)
         for name in sent:
             send(site.writer, [incoming(sent[name][1], 1 + len(sent[name][0]), name)])
         assert same(site.grid, fold_of(sent, site.config, without="b"))
         assert site.machine("b")["samples"] == sum(map(len, sent["b"]))
-        site.follower.trust("b", True, "", 20.0)
+        site.upkeep.trust("b", True, "", 20.0)
         assert same(site.grid, fold_of(sent, site.config))
 
 
@@ -162,7 +162,7 @@ def test_a_decision_outlives_the_server(opened, tmp_path, snapshot):
     sent = fleet({}, size=16)
     with opened() as site:
         deliver(site, sent)
-        site.follower.trust("b", False, "why", 20.0)
+        site.upkeep.trust("b", False, "why", 20.0)
     if not snapshot:
         for path in (tmp_path / "store").glob("snapshot-*"):
             path.unlink()
@@ -175,7 +175,7 @@ def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
     with opened(judge_s=JUDGE_S) as site:
         deliver(site, sent)
-        wait_for(lambda: site.follower.facts().excluded == {"c"})
+        wait_for(lambda: site.upkeep.facts().excluded == {"c"})
         row = site.machine("c")
         assert (row["trusted"], row["by"]) == (False, "audit")
         assert "gain" in row["reason"]
@@ -191,7 +191,7 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
         never = threading.Event()
         for _ in range(4):  # turns in which it could be excluded
             never.wait(JUDGE_S)
-        assert site.follower.facts().excluded == frozenset()
+        assert site.upkeep.facts().excluded == frozenset()
         assert site.machine("c")["trusted"]
         assert site.machine("c")["reasons"]
 
@@ -199,18 +199,18 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
 def test_a_person_overrules_the_audit_and_hands_back(opened):
     with opened(judge_s=JUDGE_S) as site:
         deliver(site, fleet({"c": 1.6}))
-        wait_for(lambda: site.follower.facts().excluded == {"c"})
-        assert site.follower.trust("c", True, "I know better", 20.0)["by"] == "person"
-        assert site.follower.facts().excluded == frozenset()
-        assert not site.follower.trust("c", None, "", 20.0)["trusted"]
-        assert site.follower.facts().excluded == {"c"}
+        wait_for(lambda: site.upkeep.facts().excluded == {"c"})
+        assert site.upkeep.trust("c", True, "I know better", 20.0)["by"] == "person"
+        assert site.upkeep.facts().excluded == frozenset()
+        assert not site.upkeep.trust("c", None, "", 20.0)["trusted"]
+        assert site.upkeep.facts().excluded == {"c"}
 
 
 def test_a_machine_that_sent_nothing_is_refused_by_name(opened):
     with opened() as site:
         send(site.writer, [incoming(samples(3), machine="a")])
         with pytest.raises(QueryError, match="`nobody` has sent nothing; known: a"):
-            site.follower.trust("nobody", False, "", 1.0)
+            site.upkeep.trust("nobody", False, "", 1.0)
 
 
 def repaved(site: Site) -> None:
@@ -228,15 +228,15 @@ def test_a_change_is_published_listed_and_kept(opened):
     with opened() as site:
         repaved(site)
         wait_for(lambda: site.published)
-        wait_for(lambda: site.follower.changes() and site.follower.changes()[0].cells > 1000)
-        (change,) = site.follower.changes()
+        wait_for(lambda: site.upkeep.changes() and site.upkeep.changes()[0].cells > 1000)
+        (change,) = site.upkeep.changes()
         assert site.published[-1] == change
         assert change.resistance_after == pytest.approx(0.02, rel=0.05)
     with opened() as site:
-        assert site.follower.changes() == [change]
+        assert site.upkeep.changes() == [change]
         wait_for(lambda: not site.writer.run(lambda store: store.grid.take_touched(1)))
         assert site.published == []
-        assert site.follower.changes(after=change.id) == []
+        assert site.upkeep.changes(after=change.id) == []
 
 
 # --- archiving -------------------------------------------------------------------------------------------------------
@@ -302,7 +302,7 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
         (path,) = (tmp_path / "store" / FOLDER).glob("*.parquet")
         path.write_bytes(path.read_bytes()[:-50])
         with pytest.raises(QueryError, match=f"the decision is kept, but the map is not folded again .*{path.name}"):
-            site.follower.trust("a", False, "", 0.5)
+            site.upkeep.trust("a", False, "", 0.5)
         assert path.name in caplog.text
         wait_for(lambda: caplog.text.count("job=refolding") > 1)  # it is tried again
         assert len(reader.events("trust")) == 1

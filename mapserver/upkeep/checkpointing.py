@@ -24,7 +24,7 @@ LATE_ROWS = 5000  # so many that came in late are read for a map of the past, in
 RESERVE_BYTES = 2**30  # of the disk: what machines send goes before
 LATER_S = 60.0  # after damage, or without room
 MINUTE_NS = 60 * 10**9
-log = logging.getLogger("mapserver.follower.checkpointing")
+log = logging.getLogger("mapserver.upkeep.checkpointing")
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Checkpointing:
             return
         try:
             self._turn()
-        except Exception:  # for the follower to log; whatever it is, it is not tried again at once
+        except Exception:  # for the upkeep to log; whatever it is, it is not tried again at once
             self.close()
             self._due_s = time.monotonic() + LATER_S
             raise

@@ -1,4 +1,4 @@
-"""A follower with an answer to everything, and no thread; queries answered as the server does."""
+"""A upkeep with an answer to everything, and no thread; queries answered as the server does."""
 
 from concurrent.futures import Future
 from dataclasses import asdict
@@ -13,8 +13,8 @@ from tests.unit.mapserver.data import WAIT_S
 from tests.unit.records import machine_state
 
 
-class FakeFollower:
-    """Stands for a Follower that knows the machines a and b; notes what it is asked."""
+class FakeUpkeep:
+    """Stands for a Upkeep that knows the machines a and b; notes what it is asked."""
 
     def __init__(self, *excluded: str) -> None:
         self.asked: list[object] = []

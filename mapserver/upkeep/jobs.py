@@ -1,4 +1,4 @@
-"""Jobs of the follower that look again and again: audit of machines, search for changes, archiving of old rows.
+"""Jobs of the upkeep that look again and again: audit of machines, search for changes, archiving of old rows.
 
 Each has a name for the log, and a `run` that does what is due and returns soon.
 """
@@ -37,7 +37,7 @@ KEEP_S = 3600.0  # between two looks for decisions, where no file is new
 Report = Callable[[Mapping[str, Verdict], int], None]
 Known = Callable[[], tuple[Corrections, Mapping[str, MachineState]]]
 Publish = Callable[[GroundChange], None]
-log = logging.getLogger("mapserver.follower.jobs")
+log = logging.getLogger("mapserver.upkeep.jobs")
 
 
 class Job(Protocol):

@@ -1,4 +1,4 @@
-"""A fleet with one broken machine at a real server's follower: samples in, calibration, trust and map out."""
+"""A fleet with one broken machine at a real server's upkeep: samples in, calibration, trust and map out."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
-from mapserver.follower import follower
-from mapserver.follower.follower import Follower
 from mapserver.ingest.writer import Writer
+from mapserver.upkeep import upkeep
+from mapserver.upkeep.upkeep import Upkeep
 from protocol.arrays import Table
 from tests.unit.mapserver.data import incoming, open_writer, past_of, send, wait_for
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
@@ -35,16 +35,16 @@ def deliver(writer: Writer, sent: dict[str, Table], batch: int = 100) -> None:
                 send(writer, [incoming(part, first + 1, name)])
 
 
-def seen(site: Follower) -> dict[str, Any]:
+def seen(site: Upkeep) -> dict[str, Any]:
     """What the server says of the broken machine."""
     return next(each for each in site.machines() if each["name"] == "bad")
 
 
 @pytest.mark.slow
 def test_a_broken_machine_is_named_left_out_and_let_in_by_a_person(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(follower, "TURN_S", 0.01)
+    monkeypatch.setattr(upkeep, "TURN_S", 0.01)
     writer = open_writer(tmp_path / "store", CONFIG)
-    with closing(writer), closing(Follower(writer, lambda _: None, past_of(writer))) as site:
+    with closing(writer), closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
         deliver(writer, SENT)
         wait_for(lambda: site.facts().excluded == {"bad"})
         row = seen(site)
@@ -68,6 +68,6 @@ def test_a_broken_machine_is_named_left_out_and_let_in_by_a_person(tmp_path: Pat
         true = drive(RAMP, Errors(), seed=99)
         assert abs(np.median(right["c_rr"] - true["c_rr"])) < 0.003
     again = open_writer(tmp_path / "store", CONFIG)
-    with closing(again), closing(Follower(again, lambda _: None, past_of(again))) as site:
+    with closing(again), closing(Upkeep(again, lambda _: None, past_of(again))) as site:
         wait_for(lambda: seen(site)["reasons"] == ["beyond_data_sheet"])  # before it has solved anything
         assert seen(site)["evidence"]["torque_gain"] == pytest.approx(1 + GAIN, abs=0.05)

@@ -17,14 +17,14 @@ from mapserver.fleet import calibration
 from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import corrected
 from mapserver.fleet.ledger import Ledger
-from mapserver.follower import calibrating as calibrating_module
-from mapserver.follower import follower
-from mapserver.follower.calibrating import EVERY_NS, Calibrating
-from mapserver.follower.follower import Follower
 from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.reader import JournalReader
+from mapserver.upkeep import calibrating as calibrating_module
+from mapserver.upkeep import upkeep
+from mapserver.upkeep.calibrating import EVERY_NS, Calibrating
+from mapserver.upkeep.upkeep import Upkeep
 from protocol.arrays import Table
 from protocol.errors import QueryError, Refusal
 from protocol.queries.commands import CalibrateCommand
@@ -99,7 +99,7 @@ def test_followed_live_made_at_a_start_or_from_the_archive_ledgers_are_the_same(
         next(archive(tmp_path / FOLDER, reader, SITE, 2**62, lambda until: max(forget(until), until)))
         assert reader.archived_row == half
     assert solved(writer) == result
-    monkeypatch.setattr("mapserver.follower.calibrating.TURN_SAMPLES", 10)
+    monkeypatch.setattr("mapserver.upkeep.calibrating.TURN_SAMPLES", 10)
     assert solved(writer) == result
 
 
@@ -129,7 +129,7 @@ def test_it_solves_in_site_time(tmp_path):
     assert EVERY_NS == 60 * S
 
 
-def folded(follower: Follower, writer: Writer) -> Grid:
+def folded(upkeep: Upkeep, writer: Writer) -> Grid:
     """The fold of all samples with the corrections that count."""
     each = writer.run(lambda store: store.facts.corrections).each
     grid = Grid(SITE.cell_m, writer.config.fold)
@@ -141,7 +141,7 @@ def folded(follower: Follower, writer: Writer) -> Grid:
 def test_asked_for_the_map_has_what_is_known_at_once(writer):
     deliver(writer)
     before = writer.run(grid_copy)
-    with closing(Follower(writer, lambda _: None, past_of(writer))) as site:
+    with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
         assert site.calibration().machines[0].spans == ()
         site.calibrate(WAIT_S)
         answer = site.calibration()
@@ -162,7 +162,7 @@ def test_asked_for_the_map_has_what_is_known_at_once(writer):
 
 def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
     deliver(writer)
-    with closing(Follower(writer, lambda _: None, past_of(writer))) as site:
+    with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
         site.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=WAIT_S))
         state = site.calibration().machines[0]
         assert (state.by, state.reason, state.spans[0].zero, state.spans[0].from_ns) == (
@@ -189,7 +189,7 @@ def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
 def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, machines):
     config = ServerConfig(store=StoreConfig(archive_after_h=0.0), calibration=CalibrationConfig(automatic))
     with closing(open_writer(tmp_path, config)) as writer:
-        site = Follower(writer, lambda _: None, past_of(writer))
+        site = Upkeep(writer, lambda _: None, past_of(writer))
         with closing(site):
             for share in range(4):
                 deliver(writer, share / 4, (share + 1) / 4)
@@ -203,7 +203,7 @@ def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, 
 
 def test_what_a_person_takes_off_is_no_measured_fault(writer, monkeypatch):
     deliver(writer)
-    with closing(Follower(writer, lambda _: None, past_of(writer))) as site:
+    with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
         monkeypatch.setattr(site._calibrating, "states", dict)  # nothing is solved yet
         site.correct(CalibrateCommand("a", zero=0.03, scale=0.4, reason="known to read too much", wait_s=WAIT_S))
         corrections, known = site._known()
@@ -215,7 +215,7 @@ def test_what_a_person_takes_off_is_no_measured_fault(writer, monkeypatch):
 
 def test_the_end_does_not_wait_for_a_solve_that_a_person_asked_for(writer, monkeypatch):
     deliver(writer, last=0.1)
-    monkeypatch.setattr(follower, "END_S", 0.1)
+    monkeypatch.setattr(upkeep, "END_S", 0.1)
     solving, may_end = threading.Event(), threading.Event()
 
     def slow(*_: object) -> Calibration:
@@ -223,7 +223,7 @@ def test_the_end_does_not_wait_for_a_solve_that_a_person_asked_for(writer, monke
         assert may_end.wait(WAIT_S)
         return calibrate({})
 
-    site = Follower(writer, lambda _: None, past_of(writer))
+    site = Upkeep(writer, lambda _: None, past_of(writer))
     monkeypatch.setattr(calibrating_module, "calibrate", slow)
     problems: list[str] = []
 

@@ -34,7 +34,7 @@ REST = 50.0  # times as long as a solve took: 2 % of a core, also where a log is
 TURN_SAMPLES = 200_000  # read in one turn, in about 0.2 s
 Decide = Callable[[Calibration, int], object]
 Group = tuple[str, ...]
-log = logging.getLogger("mapserver.follower.calibrating")
+log = logging.getLogger("mapserver.upkeep.calibrating")
 
 
 class Calibrating:

@@ -15,14 +15,14 @@ from mapserver.fleet.calibration import Calibration
 from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.fleet.decisions import EVERY_NS
 from mapserver.fleet.observability import CommonScale
-from mapserver.follower import refolding
-from mapserver.follower.refolding import Refolding
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.reader import JournalReader
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import DISTRUST_AFTER, KIND, PERSON, TrustDecision
 from mapserver.trust.judgement import Reason
+from mapserver.upkeep import refolding
+from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal
 from tests.unit.mapserver.data import (
     CONFIG,

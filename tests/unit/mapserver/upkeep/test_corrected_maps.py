@@ -18,7 +18,6 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, Corrections
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
-from mapserver.follower.refolding import Refolding
 from mapserver.ingest.store import JOURNAL_FILE, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
@@ -29,6 +28,7 @@ from mapserver.past.making import make
 from mapserver.past.past import Past
 from mapserver.past.plan import HOUR_NS
 from mapserver.trust.decisions import TrustDecision
+from mapserver.upkeep.refolding import Refolding
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from tests.reference.correction import in_numpy

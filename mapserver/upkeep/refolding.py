@@ -36,7 +36,7 @@ FEW_ROWS = 8  # may be left to the writer's thread: some ms
 MOST_ROUNDS = 20  # where batches come in as fast as they are folded, the writer has to make them wait
 RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after rows that could not be read; doubled, as a fold up to them may take minutes
 T = TypeVar("T")
-log = logging.getLogger("mapserver.follower.refolding")
+log = logging.getLogger("mapserver.upkeep.refolding")
 
 
 class Refolding:
@@ -192,10 +192,10 @@ class Refolding:
         try:
             return self._follow(facts), ""
         except (SitegridError, OSError) as error:
-            log.error("follower failed job=refolding error=%r", str(error))
+            log.error("upkeep failed job=refolding error=%r", str(error))
             return False, str(error)
         except Exception:  # a bug here must not end the server, nor pass unseen
-            log.exception("follower failed job=refolding")
+            log.exception("upkeep failed job=refolding")
             return False, "the server failed; see its log"
 
     def _follow(self, facts: Facts) -> bool:
