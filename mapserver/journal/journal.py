@@ -19,7 +19,15 @@ from typing import Any
 from mapserver.journal.progress import Progress
 from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
 from mapserver.journal.records import extent_of, record
-from mapserver.journal.rows import Admission, JournalRow, MachineTotals, Watermark, checksum, extent_checksum
+from mapserver.journal.rows import (
+    Admission,
+    JournalRow,
+    MachineTotals,
+    SpoolKey,
+    Watermark,
+    checksum,
+    extent_checksum,
+)
 from mapserver.journal.shortfall import EVENT, ROW, Shortfall, compare, marked, spool_name
 from mapserver.journal.shortfall import KIND as SHORTFALL
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
@@ -145,6 +153,15 @@ class Journal(JournalQueries):
                 self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
                 self._changed[EVENT] = number
             return self._number(_LAST_EVENT)
+
+    def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
+        """Have a new journal go on after an archive: its rows reach up to `row`, its spools up to these watermarks."""
+        with self._transaction():
+            self._db.execute("INSERT INTO sqlite_sequence VALUES ('journal', ?)", (row,))
+            self._db.execute("REPLACE INTO meta VALUES ('archived_row', ?)", (str(row),))
+            for spool, watermark in watermarks.items():
+                self.put_watermark(*spool, watermark)
+            self.last_row = row
 
     def note_shortfall(self, shortfall: Shortfall) -> None:
         """Keep what is missing as an event; no file that proves it is needed from then on."""
