@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 from protocol.errors import SitegridError
 
@@ -65,7 +65,7 @@ class Here:
     """One task after the other, in the process that asks; a single one folds all, and nothing has to be merged."""
 
     threads: int
-    task_samples: int = sys.maxsize
+    task_samples: ClassVar[int] = sys.maxsize
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
         """See Engine."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from mapserver.journal.rows import Selection, SpoolKey, Watermark
 from protocol.arrays import Table
-from protocol.errors import StoreError
+from protocol.errors import ConfigError, StoreError
 from protocol.machine.samples import RAW_SAMPLE
 from sitegrid.refold.contents import Contents, Interval, Look, by_spool, look
 from sitegrid.refold.engine import Engine
@@ -74,6 +74,7 @@ class Comparison:
 def plan(parts: Sequence[Part], selection: Selection, engine: Engine) -> Plan:
     """Look through all parts; StoreError where a sample is in two of them with different contents."""
     contents = engine.each(look, [Look(part, selection) for part in parts])
+    _require_one_site(contents)
     contents.sort(key=lambda each: (each.first_ns, each.origin.machines, each.origin.identity, str(each.part)))
     overlaps = list(_overlaps(contents))
     engine.each(compare, list(_comparisons(contents, overlaps)))
@@ -85,6 +86,15 @@ def plan(parts: Sequence[Part], selection: Selection, engine: Engine) -> Plan:
     for at, each in zip(again, looked, strict=True):
         contents[at] = each
     return Plan(tuple(contents), tuple(taken), selection)
+
+
+def _require_one_site(contents: Sequence[Contents]) -> None:
+    first = contents[0]
+    for each in contents:
+        if (each.origin.name, each.origin.frame) != (first.origin.name, first.origin.frame):
+            problem = f"is of site {each.origin.name!r}, frame {each.origin.frame}, but {first.part} of "
+            problem += f"{first.origin.name!r}, {first.origin.frame}; fold them apart"
+            raise ConfigError(each.part, problem)
 
 
 def compare(task: Comparison) -> None:

@@ -83,11 +83,6 @@ def _site_of(store: Path) -> SiteConfig | None:
 def chosen_site(sources: Sequence[Source], contents: Sequence[Contents], arguments: Namespace) -> SiteConfig:
     """The one site of all parts, with what the options change."""
     first = contents[0]
-    for each in contents[1:]:
-        if (each.origin.name, each.origin.frame) != (first.origin.name, first.origin.frame):
-            problem = f"is of site {each.origin.name!r}, frame {each.origin.frame}, but {first.part} of "
-            problem += f"{first.origin.name!r}, {first.origin.frame}; fold them apart"
-            raise ConfigError(each.part, problem)
     given = load_site(arguments.site_file) if arguments.site_file else None
     known = [*(source.site for source in sources), *(each.origin.site for each in contents)]
     site = given or next((site for site in known if site), None)

@@ -32,8 +32,9 @@ from protocol.site.site_config import KnownGround, SiteConfig, site_toml
 from protocol.site.site_file import load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
-from sitegrid import refold as fold
 from sitegrid.cli import main
+from sitegrid.refold import command
+from sitegrid.refold.engine import Here
 from tests.unit.mapserver.data import same_evidence
 
 pytest.importorskip("pyarrow.parquet")
@@ -374,8 +375,9 @@ def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tm
         assert run(*order, "--out", tmp_path / f"new{i}") == 0
     made = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
     assert made[0] == made[1] == made[2]
-    received = [row[3] for row in made[0]]
-    assert received == sorted(received)
+    parts = [path.name for path in sorted((tmp_path / "new0" / FOLDER).glob("*.parquet"))]
+    assert parts == [path.name for path in sorted((tmp_path / "new2" / FOLDER).glob("*.parquet"))]
+    assert parts == sorted(parts, key=lambda name: name.partition("_")[2]), "hours of reception, as rows go on"
 
 
 def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Path, capsys):
@@ -412,18 +414,17 @@ def test_a_place_that_is_taken_is_refused(store: Path, tmp_path: Path, capsys):
     assert "something is no folder" in refused(capsys, store, "--out", tmp_path / "full" / "something")
     (tmp_path / "empty").mkdir()
     assert run(store, "--out", tmp_path / "empty") == 0
-    (tmp_path / "new.part").mkdir()
-    assert "is left from a fold that was killed" in refused(capsys, store, "--out", tmp_path / "new")
-    assert (tmp_path / "new.part").exists()
 
 
 def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys):
     moved = make_store(tmp_path / "moved", "a", site=replace(SITE, origin_lat_deg=48.1), archived=1)
     named = make_store(tmp_path / "named", "a", site=replace(SITE, name="quarry"))
     out = ("--out", tmp_path / "new")
-    assert f"{moved}: is of site 'pit', frame" in refused(capsys, store, moved, *out)
+    error = refused(capsys, store, moved, *out)
+    assert f"{moved / FOLDER}" in error
+    assert "is of site 'pit', frame" in error
     assert "fold them apart" in refused(capsys, store / FOLDER, moved / FOLDER, *out)
-    assert f"{named}: is of site 'quarry'" in refused(capsys, store, named, *out)
+    assert f"{named / JOURNAL_FILE}, rows 1 to 6: is of site 'quarry'" in refused(capsys, store, named, *out)
     error = refused(capsys, store, "--site-file", moved / "site.toml", *out)
     assert f"{moved}/site.toml: is site 'pit', frame" in error
     assert not (tmp_path / "new").exists()
@@ -491,11 +492,11 @@ def test_progress_is_shown_on_a_terminal(
     store: Path, tmp_path: Path, monkeypatch, *, terminal: bool, as_json: bool, shown: bool
 ):
     seen = []
-    monkeypatch.setattr(fold, "COMMIT_ROWS", 6)
-    monkeypatch.setattr(fold.sys.stderr, "isatty", lambda: terminal)
-    monkeypatch.setattr(fold.Display, "show", lambda _, *what: seen.append(what[:2]))
+    monkeypatch.setattr(Here, "task_samples", 100)
+    monkeypatch.setattr(command.sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.setattr(command.Display, "show", lambda _, *what: seen.append(what[:2]))
     assert run(store, "--out", tmp_path / "new", *(["--json"] if as_json else [])) == 0
-    assert seen == ([(120, 360), (240, 360), (360, 360)] if shown else [])
+    assert seen == ([(60, 360), (120, 360), (360, 360)] if shown else [])
 
 
 def test_every_column_is_carried(store: Path, tmp_path: Path):

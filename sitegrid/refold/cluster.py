@@ -1,0 +1,117 @@
+"""A cluster that does the tasks of a fold: workers of a Dask scheduler (dask.distributed).
+
+Dask finds out that a worker is gone and has its tasks done by others. What it does not find out is time-limited here.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib import import_module
+from typing import Any, Self, TypeVar
+from uuid import uuid4
+
+from protocol.errors import ConfigError
+from sitegrid.refold.engine import PATIENCE_S, TASK_SAMPLES, TRIES, EngineError, attempt, opened
+
+T = TypeVar("T")
+R = TypeVar("R")
+SCHEME = "dask://"
+CONNECT_S = 20.0  # for a scheduler to answer, and for its first worker
+LOST = ("cancelled", "lost")
+
+
+class Cluster:
+    """Workers of one scheduler; use it as a context. address: dask://HOST:PORT."""
+
+    threads, task_samples = 1, TASK_SAMPLES
+
+    def __init__(self, address: str) -> None:
+        if not address.startswith(SCHEME):
+            raise ConfigError("--engine", f"{address!r} is no {SCHEME}HOST:PORT of a Dask scheduler")
+        try:
+            self._dask: Any = import_module("distributed")
+        except ModuleNotFoundError:
+            raise ConfigError("--engine", "dask.distributed is not installed: pip install '.[cluster]'") from None
+        self._address = address
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its lines are about its own threads
+        self._client: Any = None
+
+    def __enter__(self) -> Self:
+        place = self._address.removeprefix(SCHEME)
+        host, _, port = place.rpartition(":")
+        try:
+            socket.create_connection(
+                (host, int(port)), CONNECT_S
+            ).close()  # a client would wait long, and again in the end
+            # One that never came to be connected would wait for that once more, when Python lets go of it.
+            client = type("Client", (self._dask.Client,), {"__del__": lambda _: None})
+            self._client = client(f"tcp://{place}", timeout=CONNECT_S)
+        except (OSError, ValueError, OverflowError):
+            problem = f"no Dask scheduler answers at {self._address}; start one with `dask scheduler`"
+            raise ConfigError("--engine", problem) from None
+        try:
+            self._client.wait_for_workers(1, timeout=CONNECT_S)
+        except TimeoutError:
+            self.__exit__()
+            problem = f"the scheduler at {self._address} has no workers; start some with `dask worker`"
+            raise ConfigError("--engine", problem) from None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(Exception):  # of a scheduler that is gone
+            self._client.close(timeout=CONNECT_S)
+
+    def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
+        """See Engine."""
+        results: dict[int, R] = {}
+        failures = 0
+        while left := [number for number in range(len(tasks)) if number not in results]:
+            before = len(results)
+            try:
+                self._do(work, {number: tasks[number] for number in left}, results, done)
+            except TimeoutError:
+                failures = failures + 1 if len(results) == before else 1
+                if failures >= TRIES:
+                    problem = f"the workers of {self._address} did nothing for {PATIENCE_S:g} s, {failures} times"
+                    raise EngineError(f"{problem}; look at the logs of scheduler and workers") from None
+        return [results[number] for number in range(len(tasks))]
+
+    def _do(
+        self, work: Callable[[T], R], tasks: dict[int, T], results: dict[int, R], done: Callable[[int], None]
+    ) -> None:
+        """Do tasks until all are done; TimeoutError where none is done for a while."""
+        run = uuid4().hex[:8]  # a task that hangs is given to others under another name
+        waiting: dict[Any, int] = {}
+        for number, task in tasks.items():
+            key = f"{work.__name__}-{run}-{number}"
+            future = self._client.submit(attempt, work, task, key=key, pure=False, retries=TRIES)
+            waiting[future] = number
+        try:
+            while waiting:
+                finished = self._dask.wait(list(waiting), timeout=PATIENCE_S, return_when="FIRST_COMPLETED").done
+                for future in finished:
+                    number = waiting.pop(future)
+                    results[number] = opened(self._result(future))
+                    done(number)
+        except self._dask.client.FuturesCancelledError:
+            raise self._gone() from None
+        finally:
+            with suppress(Exception):  # of a scheduler that is gone
+                self._client.cancel(list(waiting), force=True)
+
+    def _result(self, future: Any) -> Any:
+        if future.status in LOST:
+            raise self._gone()
+        if future.status == "finished":
+            return future.result(timeout=CONNECT_S)
+        error = future.exception(timeout=CONNECT_S)
+        if isinstance(error, self._dask.scheduler.KilledWorker):
+            problem = f"a task of the fold ended {TRIES + 1} workers of {self._address}"
+            raise EngineError(f"{problem}; if that is for want of memory, give them more")
+        raise EngineError(f"a worker of {self._address} failed: {type(error).__name__}: {error}")
+
+    def _gone(self) -> EngineError:
+        return EngineError(f"the Dask scheduler at {self._address} is gone")
