@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import socket
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -43,13 +44,9 @@ class Cluster:
         place = self._address.removeprefix(SCHEME)
         host, _, port = place.rpartition(":")
         try:
-            socket.create_connection(
-                (host, int(port)), CONNECT_S
-            ).close()  # a client would wait long, and again in the end
-            # One that never came to be connected would wait for that once more, when Python lets go of it.
-            client = type("Client", (self._dask.Client,), {"__del__": lambda _: None})
-            self._client = client(f"tcp://{place}", timeout=CONNECT_S)
-        except (OSError, ValueError, OverflowError):
+            socket.create_connection((host, int(port)), CONNECT_S).close()
+            self._client = _within(CONNECT_S, lambda: self._dask.Client(f"tcp://{place}", timeout=CONNECT_S))
+        except (OSError, ValueError, OverflowError):  # TimeoutError is an OSError
             problem = f"no Dask scheduler answers at {self._address}; start one with `dask scheduler`"
             raise ConfigError("--engine", problem) from None
         try:
@@ -115,3 +112,23 @@ class Cluster:
 
     def _gone(self) -> EngineError:
         return EngineError(f"the Dask scheduler at {self._address} is gone")
+
+
+def _within(seconds: float, work: Callable[[], T]) -> T:
+    """What comes of work; TimeoutError in the end: to a port that says nothing a client connects for ever."""
+    results: list[T | Exception] = []
+
+    def do() -> None:
+        try:
+            results.append(work())
+        except Exception as error:  # whatever it is, it is raised where it is waited for
+            results.append(error)
+
+    thread = threading.Thread(target=do, name="connect", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if not results:
+        raise TimeoutError
+    if isinstance(results[0], Exception):
+        raise results[0]
+    return results[0]

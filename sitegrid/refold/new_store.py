@@ -15,11 +15,11 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid_state import GridState
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import plain
-from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.store import Store
 from mapserver.ingest.store_folder import hold, is_in_use
 from mapserver.journal.archive import FOLDER, file_name
 from mapserver.journal.facts import Facts
-from mapserver.journal.journal import Journal
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import SpoolKey, Watermark
 from protocol.errors import ConfigError, SitegridError, StoreError
 from protocol.files import sync_folder, write_whole
@@ -58,7 +58,7 @@ class NewStore:
 
     def fill_journal(self, watermarks: Mapping[SpoolKey, Watermark], decisions: Sequence[CalibrationDecision]) -> None:
         """Have the journal go on after the archive, with the decisions about the samples in it."""
-        with closing(Journal(self.folder / JOURNAL_FILE, self.site.name, self.site.frame)) as journal:
+        with closing(JournalLocation(self.folder).open(self.site.name, self.site.frame)) as journal:
             if not journal.last_row:
                 journal.follow_archive(self.rows, watermarks)
             if not journal.events():
@@ -70,7 +70,7 @@ class NewStore:
         """Open the store as a server does, and put it in its place; texts: further files. Returns its `info`."""
         for name, text in texts.items():
             write_whole(self.folder / name, text.encode())
-        with closing(Store(self.folder, self.site, config, time.time_ns)) as store:
+        with closing(Store(JournalLocation(self.folder), self.site, config, time.time_ns)) as store:
             info = store.info()
         shutil.rmtree(self.work)
         self.folder.replace(out)
@@ -100,7 +100,7 @@ def making(folder: Path, site: SiteConfig, descends: tuple[str, ...]) -> Iterato
 def _identity(folder: Path, site: SiteConfig, descends: tuple[str, ...]) -> str:
     """Id of the new store: that of an empty journal, which is made now or was made by the fold that was killed."""
     try:
-        with closing(Journal(folder / JOURNAL_FILE, site.name, site.frame, descends)) as journal:
+        with closing(JournalLocation(folder).open(site.name, site.frame, descends)) as journal:
             identity = journal.identity()
     except StoreError:
         if not _is_useful(folder):

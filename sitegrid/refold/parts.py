@@ -13,8 +13,9 @@ from pathlib import Path
 
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.history import History, read_history
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.places import Place
-from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRows
 from protocol.errors import StoreError
 from protocol.machine.samples import COLUMNS
@@ -64,7 +65,7 @@ class JournalPart:
     host: that wrote it. SQLite's files are no good to others while a server writes to them.
     """
 
-    path: Path
+    location: JournalLocation
     after: int
     until: int
     host: str
@@ -74,7 +75,7 @@ class JournalPart:
         with self._reader() as journal:
             store = journal.identity()
             crc32 = 0
-            for rows in read_history(History.beside(journal), self.after, self.until):
+            for rows in read_history(History(journal, self.location.archive), self.after, self.until):
                 crc32 = zlib.crc32(rows.samples.tobytes(), crc32)
             machines = tuple(sorted({machine for machine, _ in journal.watermarks()}))
             identity = f"{crc32:08x}-{store.id}-{self.after}-{self.until}"
@@ -83,18 +84,18 @@ class JournalPart:
     def read(self, columns: Sequence[str] = COLUMNS) -> Iterator[JournalRows]:  # noqa: ARG002 # rows are whole records
         """Its rows; StoreError where they are damaged."""
         with self._reader() as journal:
-            yield from read_history(History.beside(journal), self.after, self.until)
+            yield from read_history(History(journal, self.location.archive), self.after, self.until)
 
     def __str__(self) -> str:
-        return f"{self.path}, rows {self.after + 1} to {self.until}"
+        return f"{self.location}, rows {self.after + 1} to {self.until}"
 
     def _reader(self) -> JournalReader:
         if (here := socket.gethostname()) != self.host:
             advice = "fold its archive alone, or fold on that host with --jobs"
             raise StoreError(
-                self.path, f"is a journal that {self.host} alone can read, and a worker runs on {here}; {advice}"
+                self.location, f"is a journal that {self.host} alone can read, and a worker runs on {here}; {advice}"
             )
-        return JournalReader(self.path)
+        return self.location.reader()
 
 
 Part = FilePart | JournalPart

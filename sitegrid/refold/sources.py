@@ -13,12 +13,11 @@ from mapserver.config import ServerConfig
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.losses import lacking
-from mapserver.ingest.store import ACCEPTED, JOURNAL_FILE
+from mapserver.ingest.store import ACCEPTED
 from mapserver.journal import archived_decisions
-from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.archive_file import ArchiveFile
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.places import Place
-from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import SpoolKey, Watermark
 from protocol.config import from_table
 from protocol.errors import ConfigError, StoreError
@@ -46,7 +45,7 @@ class Source:
 def source(path: Path | Place) -> Source:
     """What a Parquet file, a folder of them or a store holds; nothing of its samples is read yet."""
     path = path.absolute() if isinstance(path, Path) else path
-    if isinstance(path, Path) and (path / JOURNAL_FILE).exists():
+    if isinstance(path, Path) and JournalLocation(path).exists():
         return _store(path)
     if not path.exists():
         raise ConfigError(path, "no such file or folder")
@@ -57,15 +56,16 @@ def source(path: Path | Place) -> Source:
 
 
 def _store(path: Path) -> Source:
-    if shortfall := lacking(path / JOURNAL_FILE):
+    location = JournalLocation(path)
+    if shortfall := lacking(location):
         advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
-        raise StoreError(path / JOURNAL_FILE, f"{shortfall}; {advice}")
-    with JournalReader(path / JOURNAL_FILE) as journal:
+        raise StoreError(location, f"{shortfall}; {advice}")
+    with location.reader() as journal:
         last, archived = journal.last_row, journal.archived_row
-        files = Archive(path / FOLDER).cover(archived)
+        files = location.archive.cover(archived)
         slices = range(archived, last, SLICE_ROWS)
         host, cut = socket.gethostname(), [(after, min(after + SLICE_ROWS, last)) for after in slices]
-        rest = (JournalPart(path / JOURNAL_FILE, after, until, host) for after, until in cut)
+        rest = (JournalPart(location, after, until, host) for after, until in cut)
         identity, accepted = journal.identity(), (event.body["store"] for event in journal.events(ACCEPTED))
         stores = (identity.id, *identity.descends, *accepted)
         parts = (*map(FilePart, files), *rest)
@@ -76,7 +76,7 @@ def _site_of(store: Path) -> SiteConfig | None:
     """The site as a store knows it: a file of its own, or the header of its newest archive."""
     if (store / SITE_FILE).exists():
         return load_site(store / SITE_FILE)
-    paths = Archive(store / FOLDER).paths()
+    paths = JournalLocation(store).archive.paths()
     return ArchiveFile(paths[-1]).header.site if paths else None
 
 
