@@ -1,6 +1,7 @@
 """A cluster that does the tasks of a fold: workers of a Dask scheduler (dask.distributed).
 
-Dask finds out that a worker is gone and has its tasks done by others. What it does not find out is time-limited here.
+Dask finds out that a worker is gone and has its tasks done by others. What it does not find out is time-limited here:
+a worker that ends in order, say by `sys.exit`, takes its nanny along, and none comes in its place.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -21,6 +23,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 SCHEME = "dask://"
 CONNECT_S = 20.0  # for a scheduler to answer, and for its first worker
+LOOK_S = 2.0  # between two looks whether somebody is there at all: Dask waits for ever for a worker
 LOST = ("cancelled", "lost")
 
 
@@ -37,7 +40,8 @@ class Cluster:
         except ModuleNotFoundError:
             raise ConfigError("--engine", "dask.distributed is not installed: pip install '.[cluster]'") from None
         self._address = address
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its lines are about its own threads
+        for name in (name for name in logging.root.manager.loggerDict if name.startswith("distributed")):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say at length is one line here
         self._client: Any = None
 
     def __enter__(self) -> Self:
@@ -88,8 +92,7 @@ class Cluster:
             waiting[future] = number
         try:
             while waiting:
-                finished = self._dask.wait(list(waiting), timeout=PATIENCE_S, return_when="FIRST_COMPLETED").done
-                for future in finished:
+                for future in self._finished(list(waiting)):
                     number = waiting.pop(future)
                     results[number] = opened(self._result(future))
                     done(number)
@@ -98,6 +101,22 @@ class Cluster:
         finally:
             with suppress(Exception):  # of a scheduler that is gone
                 self._client.cancel(list(waiting), force=True)
+
+    def _finished(self, futures: list[Any]) -> list[Any]:
+        """Some that are finished; TimeoutError where there are none for long, EngineError where nobody does them."""
+        began_s = alone_s = time.monotonic()
+        while True:
+            with suppress(TimeoutError):
+                return list(self._dask.wait(futures, timeout=LOOK_S, return_when="FIRST_COMPLETED").done)
+            now_s = time.monotonic()
+            if self._client.status != "running":
+                raise self._gone()
+            if self._client.scheduler_info()["workers"]:
+                alone_s = now_s
+            if now_s - alone_s > CONNECT_S:
+                raise EngineError(f"the workers of {self._address} are gone, and no other comes; start some")
+            if now_s - began_s > PATIENCE_S:
+                raise TimeoutError
 
     def _result(self, future: Any) -> Any:
         if future.status in LOST:

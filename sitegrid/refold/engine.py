@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from protocol.errors import SitegridError
 
@@ -35,8 +35,15 @@ class EngineError(SitegridError):
 class Engine(Protocol):
     """Does tasks."""
 
-    threads: int  # that one task may use
-    task_samples: int  # that one task folds, about
+    @property
+    def threads(self) -> int:
+        """How many threads one task may use."""
+        ...
+
+    @property
+    def task_samples(self) -> int:
+        """How many samples one task folds, about."""
+        ...
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
         """Results of all tasks, in their order; done: is told the number of each that is done, here.
@@ -60,12 +67,13 @@ class Success(Generic[R]):
     value: R
 
 
-@dataclass(frozen=True)
 class Here:
     """One task after the other, in the process that asks; a single one folds all, and nothing has to be merged."""
 
-    threads: int
-    task_samples: ClassVar[int] = sys.maxsize
+    task_samples = sys.maxsize
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
         """See Engine."""

@@ -49,7 +49,9 @@ def source(path: Path | Place) -> Source:
         return _store(path)
     if not path.exists():
         raise ConfigError(path, "no such file or folder")
-    files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
+    files: list[Path | Place] = [path]
+    if path.is_dir():
+        files = sorted(path.glob("*.parquet"), key=str)
     if not files:
         raise ConfigError(path, f"holds neither Parquet files nor a {JOURNAL_FILE}")
     return Source(path, tuple(map(FilePart, files)), archived_decisions.load(files[0].parent))
@@ -68,7 +70,7 @@ def _store(path: Path) -> Source:
         rest = (JournalPart(location, after, until, host) for after, until in cut)
         identity, accepted = journal.identity(), (event.body["store"] for event in journal.events(ACCEPTED))
         stores = (identity.id, *identity.descends, *accepted)
-        parts = (*map(FilePart, files), *rest)
+        parts: tuple[Part, ...] = (*map(FilePart, files), *rest)
         return Source(path, parts, calibrations(journal), stores, _site_of(path), journal.watermarks())
 
 

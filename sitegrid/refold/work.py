@@ -25,6 +25,7 @@ import protocol
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridState
+from mapserver.evidence.pages import CompactPages
 from mapserver.fleet.correction import Corrections
 from mapserver.journal.archive import READABLE, ArchiveWriter
 from mapserver.journal.archive_file import seal
@@ -40,6 +41,7 @@ from sitegrid.refold.contents import Interval, chosen
 from sitegrid.refold.parts import Part
 
 TILES = 64  # at most: that many processes can merge
+LEAST_TILE = 8  # blocks: 128 cells
 MERGED_AT_ONCE = 8  # evidence of so many tasks waits for the next sum: it is five times as large meanwhile
 STORE_FILE = "store-id"  # in OUT.part/work: which store its files are for
 
@@ -158,7 +160,7 @@ def merge_tile(task: TileTask) -> None:
 def tiles(fold: Fold, evidence: Sequence[Path]) -> Iterator[TileTask]:
     """Tiles that cover all evidence, TILES at most; their edges depend on nothing but where that lies."""
     x, y = _places(evidence)
-    edge = 8
+    edge = LEAST_TILE
     while len(corners := {(a // edge, b // edge) for a, b in set(zip(x.tolist(), y.tolist(), strict=True))}) > TILES:
         edge *= 2
     for column, row in sorted(corners):
@@ -171,7 +173,7 @@ def merged_state(evidence: Sequence[Path], parts: Sequence[Path]) -> GridState:
     for path in evidence:
         with opened(path) as checkpoint:
             headers.append(checkpoint.header)
-    blocks: list[tuple[int, int, object]] = []
+    blocks: list[tuple[int, int, CompactPages]] = []
     for path in parts:
         with opened(path) as checkpoint:
             blocks += checkpoint.blocks(checkpoint.numbers_in(None))
