@@ -96,7 +96,9 @@ class Cluster:
                     number = waiting.pop(future)
                     results[number] = opened(self._result(future))
                     done(number)
-        except self._dask.client.FuturesCancelledError:
+        except TimeoutError:
+            raise
+        except (OSError, self._dask.client.FuturesCancelledError):  # its connection is closed, or it was another's
             raise self._gone() from None
         finally:
             with suppress(Exception):  # of a scheduler that is gone

@@ -28,7 +28,7 @@ pytest.importorskip("pyarrow.parquet")
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.processes
 FILES, WAIT_S = 12, 120.0
-MOST_FOLDS = 5  # until a worker dies in one
+MOST_FOLDS = 8  # until a worker dies in one
 # The command with smaller tasks, so that there are many of them.
 FOLD = (
     "import sys; from sitegrid.refold.engine import Processes as P; P.task_samples = 1; from sitegrid.cli import main; "
@@ -191,7 +191,7 @@ def test_a_cluster_whose_workers_die_makes_the_same_store(
     deaths = Deaths()
     dask.scheduler.add_plugin(deaths)
     with distributed.Client(dask) as client:
-        client.register_plugin(KillWorker(2.0, mode))  # less, and they die before they are there, which ends a nanny
+        client.register_plugin(KillWorker(4.0, mode))  # less, and they die while they start, which ends a nanny
         for number in range(MOST_FOLDS):
             out, before = tmp_path / str(number), deaths.count
             assert main(["fold", str(archive), "--out", str(out), "--engine", address(dask), "--json"]) == 0
