@@ -22,8 +22,8 @@ from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.postgres.connection import connect, line
 from protocol.errors import StoreError
 
-HANGS_S = 2.0  # a holder that says nothing for so long has lost the lock
-AWAKE_S = 0.4  # between two signs of life
+HANGS_S = 1.5  # a holder that says nothing for so long has lost the lock
+AWAKE_S = 0.3  # between two signs of life
 LOOK_TURNS = 10  # signs of life between two looks for replicas
 LOCK = 0x517E62D1  # of journals; advisory locks are those of one database
 FENCED = "SG001"  # SQLSTATE of `advance`
