@@ -113,7 +113,7 @@ class Cluster:
             now_s = time.monotonic()
             if self._client.status != "running":
                 raise self._gone()
-            if self._client.scheduler_info()["workers"]:
+            if self._client.nthreads():  # by worker
                 alone_s = now_s
             if now_s - alone_s > CONNECT_S:
                 raise EngineError(f"the workers of {self._address} are gone, and no other comes; start some")
