@@ -8,8 +8,9 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import archive, fleet, fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
+from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
 from benchmarks.agents import filter as filters
+from benchmarks.folds import archive
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 from benchmarks.web import pages as web

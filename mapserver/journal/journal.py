@@ -209,9 +209,6 @@ class Journal(JournalQueries, Protocol):
         The number is 0 where there never was an event.
         """
 
-    def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
-        """Have a new journal go on after an archive: its rows reach up to `row`, its spools up to these watermarks."""
-
     def note_shortfall(self, shortfall: Shortfall) -> None:
         """Keep what is missing as an event; no file that proves it is needed from then on."""
 

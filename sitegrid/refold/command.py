@@ -88,7 +88,8 @@ def _build(
     decided.add(decisions, len(decisions))
     reached = ((spool, mark.seq) for each in sources for spool, mark in each.watermarks.items())
     out = arguments.out.absolute()
-    with making(out.with_name(f"{out.name}.part"), site, tuple(descent(sources, planned.contents))) as store:
+    part, rows = out.with_name(f"{out.name}.part"), sum(each.rows for each in planned.contents)
+    with making(part, site, tuple(descent(sources, planned.contents)), rows) as store:
         corrections, selection = decided.facts.corrections, planned.selection
         fold = Fold(store.work, store.id, site, config.fold, selection, corrections, code_digest())
         tasks = list(_tasks(fold, planned, engine))
@@ -97,9 +98,9 @@ def _build(
         evidence = [task.evidence for task in tasks]
         merged = list(tiles(fold, evidence)) if len(evidence) > 1 else []
         engine.each(merge_tile, merged)
-        store.take_samples((part, task.samples(part)) for task in tasks for part in task.parts)
         store.save_map(merged_state(evidence, [tile.path for tile in merged] or evidence), config, decided.facts)
         store.fill_journal(planned.watermarks(reached), decisions)
+        store.take_samples((part, task.samples(part)) for task in tasks for part in task.parts)
         info = store.finish(out, {SITE_FILE: site_toml(site), CONFIG_FILE: text}, config)
     machines: Counter[str] = Counter()
     for (machine, _), samples in planned.kept.items():

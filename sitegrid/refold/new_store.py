@@ -29,14 +29,14 @@ from sitegrid.refold.work import STORE_FILE, PartWork
 WORK = "work"  # folder in that of the store, as long as it is in the making: see work.py
 
 
-@dataclass
+@dataclass(frozen=True)
 class NewStore:
     """A store in the making. id: its own; rows: the last one of its archive."""
 
     folder: Path
     id: str
     site: SiteConfig
-    rows: int = 0
+    rows: int
 
     @property
     def work(self) -> Path:
@@ -48,8 +48,7 @@ class NewStore:
         archive = self.folder / FOLDER
         archive.mkdir(exist_ok=True)
         for part, path in files:
-            self.rows = part.row + part.rows - 1
-            path.rename(archive / file_name(part.first_ns, part.row, self.rows))
+            path.rename(archive / file_name(part.first_ns, part.row, part.row + part.rows - 1))
         sync_folder(archive)
 
     def save_map(self, state: GridState, config: ServerConfig, facts: Facts) -> None:
@@ -58,7 +57,7 @@ class NewStore:
 
     def fill_journal(self, watermarks: Mapping[SpoolKey, Watermark], decisions: Sequence[CalibrationDecision]) -> None:
         """Have the journal go on after the archive, with the decisions about the samples in it."""
-        with closing(JournalLocation(self.folder).open(self.site.name, self.site.frame)) as journal:
+        with closing(JournalLocation(self.folder).open_file(self.site.name, self.site.frame)) as journal:
             if not journal.last_row:
                 journal.follow_archive(self.rows, watermarks)
             if not journal.events():
@@ -79,19 +78,20 @@ class NewStore:
 
 
 @contextmanager
-def making(folder: Path, site: SiteConfig, descends: tuple[str, ...]) -> Iterator[NewStore]:
+def making(folder: Path, site: SiteConfig, descends: tuple[str, ...], rows: int) -> Iterator[NewStore]:
     """Make a store in a folder, or go on with it; after an error nothing is left, or what the same command can use."""
     if is_in_use(folder / WORK):
         raise ConfigError(folder, "another fold is at work there; wait for it, or choose another --out")
     try:
         with hold(folder / WORK):
-            yield NewStore(folder, _identity(folder, site, descends), site)
-    except SitegridError as error:
+            yield NewStore(folder, _identity(folder, site, descends), site, rows)
+    except (SitegridError, OSError) as error:
+        problem = str(error)
+        if isinstance(error, OSError):
+            problem = f"{folder}: cannot be written: {error.strerror or error}"
         if _is_useful(folder):
-            raise SitegridError(f"{error}; what is done is kept in {folder}, and the same command goes on") from None
-        raise
-    except OSError as error:
-        raise StoreError(folder, f"cannot be written: {error.strerror or error}") from None
+            problem = f"{problem}; what is done is kept in {folder}, and the same command goes on"
+        raise SitegridError(problem) from None
     finally:
         if folder.exists() and not _is_useful(folder):
             shutil.rmtree(folder)
@@ -100,7 +100,7 @@ def making(folder: Path, site: SiteConfig, descends: tuple[str, ...]) -> Iterato
 def _identity(folder: Path, site: SiteConfig, descends: tuple[str, ...]) -> str:
     """Id of the new store: that of an empty journal, which is made now or was made by the fold that was killed."""
     try:
-        with closing(JournalLocation(folder).open(site.name, site.frame, descends)) as journal:
+        with closing(JournalLocation(folder).open_file(site.name, site.frame, descends)) as journal:
             identity = journal.identity()
     except StoreError:
         if not _is_useful(folder):

@@ -117,16 +117,16 @@ def compare(task: Comparison) -> None:
 
 def _samples(part: Part, wanted: dict[SpoolKey, list[Interval]]) -> dict[tuple[str, int, int], Table]:
     """Samples of intervals, as bytes, in the order of their numbers; by spool and first number."""
-    found: dict[tuple[str, int, int], list[tuple[int, Table]]] = defaultdict(list)
+    tables_of: dict[tuple[str, int, int], list[tuple[int, Table]]] = defaultdict(list)
     for rows in part.read():
         raw = rows.samples.view(RAW_SAMPLE)
         for spool, seqs, of_spool in by_spool(rows):
             for first, last in wanted.get(spool, ()):
                 if len(inside := of_spool[(seqs >= first) & (seqs <= last)]):
-                    found[(*spool, first)].append((int(seqs[(seqs >= first) & (seqs <= last)][0]), raw[inside]))
+                    tables_of[(*spool, first)].append((int(seqs[(seqs >= first) & (seqs <= last)][0]), raw[inside]))
     return {
         key: np.concatenate([table for _, table in sorted(tables, key=lambda pair: pair[0])])
-        for key, tables in found.items()
+        for key, tables in tables_of.items()
     }
 
 

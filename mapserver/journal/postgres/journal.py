@@ -9,7 +9,7 @@ waits for a commit that is still under way, and the journal says.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -144,17 +144,6 @@ class PostgresJournal(TableWriter, PostgresQueries):
             self._newest = number
             self._mark.write({EVENT: number})
         return self._newest
-
-    def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
-        """See `Journal`."""
-        self.begin()
-        puts = [watermark_line(*spool, watermark) for spool, watermark in watermarks.items()]
-        archived = f"UPDATE head SET archived_row = {row}"  # noqa: S608 # a number
-        self._run(self._advance(row, self._newest), archived, insert("watermark", puts, _PUT))
-        self._row = self._committed = row
-        for spool, watermark in watermarks.items():
-            self._progress.put(*spool, watermark)
-        self._mark.write({ROW: row, **{spool_name(*spool): mark.seq for spool, mark in watermarks.items()}})
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
         """See `Journal`."""

@@ -110,7 +110,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
             return self._last_event()
 
     def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
-        """Have a new journal go on after an archive: its rows reach up to `row`, its spools up to these watermarks."""
+        """Have a new journal go on after an archive with rows up to `row`, and spools up to these watermarks."""
         with self._transaction():
             self._write("INSERT INTO sqlite_sequence VALUES ('journal', ?)", (row,))
             self._write("REPLACE INTO meta VALUES ('archived_row', ?)", (str(row),))

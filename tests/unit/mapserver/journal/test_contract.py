@@ -191,16 +191,6 @@ def test_archived_rows_are_forgotten_in_pieces(journal, reader):
     journal.shrink()
 
 
-def test_a_new_journal_goes_on_after_an_archive(place, journal, reader):
-    marks = {("a", 7): Watermark(50, 3, 40), ("b", 2**64 - 1): Watermark(9, 0, 60)}
-    journal.follow_archive(20, marks)
-    assert (reader.last_row, reader.archived_row, reader.watermarks()) == (20, 20, marks)
-    assert journal.samples == 56
-    write(journal, admission(first_seq=51))
-    assert (reader.last_row, journal.samples) == (21, 59)
-    reader.check()
-
-
 def test_the_checksum_of_a_row_tells_it_from_another(place, journal, reader):
     write(journal, admission(), admission(2, 4))
     first, second = reader.row_checksum(1), reader.row_checksum(2)

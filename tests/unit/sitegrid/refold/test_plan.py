@@ -92,10 +92,10 @@ def test_a_file_that_is_named_twice_is_not_compared(tmp_path: Path, monkeypatch)
 
 def numbered(rows: JournalRows) -> dict[tuple[object, int], bytes]:
     """Bytes of samples by their identity."""
-    found = ((spool, seqs, at) for spool, seqs, at in by_spool(rows))
+    spools = ((spool, seqs, at) for spool, seqs, at in by_spool(rows))
     return {
         (spool, seq): rows.samples[i].tobytes()
-        for spool, seqs, at in found
+        for spool, seqs, at in spools
         for seq, i in zip(seqs.tolist(), at, strict=True)
     }
 

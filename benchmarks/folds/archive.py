@@ -1,7 +1,7 @@
 """How long `sitegrid fold` takes for an archive: one thread, two threads, processes, a Dask cluster, one with deaths.
 
-Each variant is the whole command, in turn, started by `python -m benchmarks.archive VARIANT ARCHIVE STORE`; the archive
-was just written, so that its files are in the system's cache. Hashes of the snapshots are compared.
+Each variant is the whole command, in turn, started by `python -m benchmarks.folds.archive VARIANT ARCHIVE STORE`; the
+archive was just written, so that its files are in the system's cache. Hashes of the snapshots are compared.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def run(samples: int, runs: int) -> Report:
             for name, reports in taken.items():
                 _say(f"it is folded: {name}, run {number + 1} of {runs}")
                 out = folder / f"{name}-{number}"
-                reports.append(in_child("benchmarks.archive", name, str(folder / "archive"), str(out)))
+                reports.append(in_child("benchmarks.folds.archive", name, str(folder / "archive"), str(out)))
     one_s = statistics.median(report["wall_s"] for report in taken["thread"])
     rows = [_row(name, reports, one_s) for name, reports in taken.items()]
     if len({row["hash"] for row in rows}) != 1:
@@ -104,7 +104,7 @@ def fold_timed(variant: str, archive: Path, out: Path) -> Report:
     with _words(variant, deaths) as words:
         command = [sys.executable, "-m", "sitegrid.cli", "fold", str(archive), "--out", str(out), "--json", *words]
         start_s = time.perf_counter()
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=Path(__file__).parent.parent)  # noqa: S603
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=Path(__file__).parents[2])  # noqa: S603
         wall_s = time.perf_counter() - start_s
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     (snapshot,) = out.glob("snapshot-*.npz")
