@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from distributed import Client, LocalCluster
 from distributed.chaos import KillWorker
@@ -117,7 +117,7 @@ def fold_timed(variant: str, archive: Path, out: Path) -> Report:
     }
 
 
-class Deaths(SchedulerPlugin):  # type: ignore[misc] # dask.distributed has no types
+class Deaths(SchedulerPlugin):
     """Counts workers that leave a scheduler, but for those that are asked to in the end."""
 
     def __init__(self) -> None:
@@ -136,12 +136,13 @@ def _words(variant: str, deaths: Deaths) -> Iterator[list[str]]:
     elif variant == "jobs":
         yield ["--jobs", str(WORKERS)]
     else:
+        clusters, clients, killers = cast("tuple[Any, Any, Any]", (LocalCluster, Client, KillWorker))  # without types
         options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
-        with LocalCluster(n_workers=WORKERS, threads_per_worker=1, **options) as cluster:
+        with clusters(n_workers=WORKERS, threads_per_worker=1, **options) as cluster:
             cluster.scheduler.add_plugin(deaths)
             if variant != "dask":
-                with Client(cluster) as client:
-                    client.register_plugin(KillWorker(KILL_S, variant))
+                with clients(cluster) as client:
+                    client.register_plugin(killers(KILL_S, variant))
             yield ["--engine", cluster.scheduler_address.replace("tcp://", "dask://")]
             deaths.ended = True
 
