@@ -43,6 +43,7 @@ class Cluster:
         for name in (name for name in logging.root.manager.loggerDict if name.startswith("distributed")):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say at length is one line here
         self._client: Any = None
+        self._killed: type[Exception] = self._dask.scheduler.KilledWorker
 
     def __enter__(self) -> Self:
         place = self._address.removeprefix(SCHEME)
@@ -73,11 +74,12 @@ class Cluster:
             before = len(results)
             try:
                 self._do(work, {number: tasks[number] for number in left}, results, done)
-            except TimeoutError:
+            except (TimeoutError, self._killed) as error:
                 failures = failures + 1 if len(results) == before else 1
                 if failures >= TRIES:
-                    problem = f"the workers of {self._address} did nothing for {PATIENCE_S:g} s, {failures} times"
-                    raise EngineError(f"{problem}; look at the logs of scheduler and workers") from None
+                    why = f"did nothing for {PATIENCE_S:g} s" if isinstance(error, TimeoutError) else "died of one task"
+                    problem = f"the workers of {self._address} {why}, {failures} times in a row"
+                    raise EngineError(f"{problem}; if that is for want of memory, give them more") from None
         return [results[number] for number in range(len(tasks))]
 
     def _do(
@@ -126,9 +128,8 @@ class Cluster:
         if future.status == "finished":
             return future.result(timeout=CONNECT_S)
         error = future.exception(timeout=CONNECT_S)
-        if isinstance(error, self._dask.scheduler.KilledWorker):
-            problem = f"a task of the fold ended {TRIES + 1} workers of {self._address}"
-            raise EngineError(f"{problem}; if that is for want of memory, give them more")
+        if isinstance(error, self._killed):  # several workers died while they did this task
+            raise error
         raise EngineError(f"a worker of {self._address} failed: {type(error).__name__}: {error}")
 
     def _gone(self) -> EngineError:
