@@ -23,6 +23,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 SCHEME = "dask://"
 CONNECT_S = 20.0  # for a scheduler to answer, and for its first worker
+ALONE_S = 60.0  # without any worker: one that is asked to end finishes its task first, and then another one starts
 LOOK_S = 2.0  # between two looks whether somebody is there at all: Dask waits for ever for a worker
 LOST = ("cancelled", "lost")
 
@@ -117,7 +118,7 @@ class Cluster:
                 raise self._gone()
             if self._client.nthreads():  # by worker
                 alone_s = now_s
-            if now_s - alone_s > CONNECT_S:
+            if now_s - alone_s > ALONE_S:
                 raise EngineError(f"the workers of {self._address} are gone, and no other comes; start some")
             if now_s - began_s > PATIENCE_S:
                 raise TimeoutError

@@ -208,7 +208,7 @@ def test_a_cluster_that_loses_all_its_workers_is_named(
     """By `sys.exit` a worker takes its nanny along, and none comes in its place."""
     from distributed.chaos import KillWorker
 
-    monkeypatch.setattr(clusters, "CONNECT_S", 3.0)
+    monkeypatch.setattr(clusters, "ALONE_S", 3.0)
     with distributed.Client(dask) as client:
         client.register_plugin(KillWorker(0.4, "sys.exit"))
         assert main(["fold", str(archive), "--out", str(tmp_path / "out"), "--engine", address(dask)]) == 1
