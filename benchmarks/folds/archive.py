@@ -35,7 +35,7 @@ from mapserver.journal.rows import JournalRow
 
 STORE = "0123456789abcdef"
 WORKERS = 2
-KILL_S = 15.0  # mean life of a worker, where workers die
+KILL_S = 20.0  # mean life of a worker, where workers die: a task takes five to ten
 GOAL = 1.6  # times as fast as one thread, with two processes
 VARIANTS = ("thread", "threads", "jobs", "dask", "graceful", "segfault")
 
@@ -140,6 +140,7 @@ def _words(variant: str, deaths: Deaths) -> Iterator[list[str]]:
         options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
         with clusters(n_workers=WORKERS, threads_per_worker=1, **options) as cluster:
             cluster.scheduler.add_plugin(deaths)
+            cluster.adapt(minimum=WORKERS, maximum=WORKERS, interval="1 s")  # a nanny may end with its worker
             if variant != "dask":
                 with clients(cluster) as client:
                     client.register_plugin(killers(KILL_S, variant))
