@@ -71,6 +71,10 @@ class JournalLocation:
         """Read it; StoreError where that cannot be done."""
         return _postgres().reader.PostgresReader(self.url) if self.url else SqliteReader(self._file)
 
+    def file_reader(self) -> SqliteReader:
+        """As `reader`, of a file in the folder, which can be copied."""
+        return SqliteReader(self._file)
+
     def store_id(self) -> str:
         """Id of the store; empty where there is none yet. StoreError where it cannot be read."""
         if not self.exists():

@@ -19,6 +19,7 @@ COMMANDS = (
     *(
         "accept",
         "agent",
+        "backup",
         "demo",
         "distrust",
         "doctor",
@@ -27,11 +28,13 @@ COMMANDS = (
         "keys",
         "plot",
         "query",
+        "restore",
         "router",
         "server",
         "sim",
     ),
     "trust",
+    "verify",
 )
 
 
