@@ -22,7 +22,7 @@ def state_of(store: Store) -> dict[str, Any]:
         "descends": list(store.identity.descends),
         "accepted": sorted(store.accepted),
         "epoch": store.journal.epoch,
-        "journal": {"where": store.journal.where, "replica": store.journal.replica},
+        "replica": store.journal.replica,
         "fact": store.fact,
         "decided": store.decided,
         "corrections": len(store.facts.corrections),
