@@ -41,6 +41,7 @@ def test_a_standby_takes_over_and_nothing_is_lost_double_or_acknowledged_under_a
     assert epochs == sorted(set(epochs)), "each round has a new writer"
     assert site.exit_codes[str(FENCED)] >= 1, "the stopped one, once it went on"
     assert site.exit_codes["-9"] == 1
+    assert set(site.exit_codes) <= {str(FENCED), "-9"}, "none ends for another reason"
     assert info.epoch >= epochs[-1]
     assert {ack.store for ack in site.acknowledged()} == {info.store}
 

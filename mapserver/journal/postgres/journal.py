@@ -3,13 +3,14 @@
 A commit is one message: what it writes is gathered in memory until then. It names the epoch and the last row that this
 writer knows, and fails where the journal has others: a writer that has lost its lock without a word acknowledges
 nothing. Where its answer is lost it is not known whether it happened; then the lock and a new epoch are taken, which
-waits for a commit that is still under way, and the journal says. One module because a transaction, and what to do when
-its answer is lost, are about the same few values.
+waits for a commit that is still under way, and the journal says. It is one module because a transaction, and what
+to do when its answer is lost, are about the same few values.
 """
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -22,7 +23,7 @@ from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
 from mapserver.journal.postgres.connection import Connection, connect
 from mapserver.journal.postgres.mark import CHECKSUM, EPOCH, STORE, traces_of, trusted_by
 from mapserver.journal.postgres.reader import CHANNEL, SCHEMA, TABLES, PostgresQueries
-from mapserver.journal.postgres.session import WriterSession
+from mapserver.journal.postgres.session import HANGS_S, WriterSession
 from mapserver.journal.postgres.statements import insert
 from mapserver.journal.progress import Progress
 from mapserver.journal.records import checksum_of
@@ -188,19 +189,22 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._rows, self._extents, self._puts, self._before = [], [], {}, {}
 
     def _take_lock(self, waiting: Callable[[float], None] | None) -> bool:
-        """Wait until no other session has the lock, also while the database is away; whether that took any time."""
-        waited = False
+        """Wait until no other session has the lock, also while the database is away; whether that took any time.
+
+        Who may not wait waits for as long as the database needs to notice that the last holder is gone.
+        """
+        waited, end_s = False, time.monotonic() + 2 * HANGS_S
         while True:
             with suppress(UnwrittenError):
                 if self._session.lost:
                     self._session = WriterSession(self._url, self.where, self._on_loss)
                 if self._session.take_lock():
                     return waited
-            if waiting is None:
+            if waiting is None and time.monotonic() > end_s:
                 problem = self._session.lost or "another server is writing this journal; stop it first"
                 raise StoreError(self.where, problem)
-            waiting(LOOK_S)
-            waited = True
+            (waiting or time.sleep)(LOOK_S)
+            waited = waiting is not None
 
     def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
         """Make the tables where there are none; nobody else does so meanwhile, since the lock is taken."""
