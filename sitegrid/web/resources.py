@@ -103,6 +103,11 @@ async def machines(feed: SiteFeed, _: Parameters) -> Response:
     return _json({"machines": await feed.ask(feed.client.machines)})
 
 
+async def calibration(feed: SiteFeed, _: Parameters) -> Response:
+    """What is taken off the samples of each machine, and what is known of its calibration."""
+    return _json(await feed.ask(feed.client.calibration))
+
+
 async def changes(feed: SiteFeed, parameters: Parameters) -> Response:
     """Changes of the ground."""
     after = values.number(parameters, "after", 0.0)
@@ -174,6 +179,7 @@ RESOURCES: dict[str, Resource] = {
         follows_now=True,
     ),
     "machines": Resource(machines, "What is known of each machine", {}, follows_now=True),
+    "calibration": Resource(calibration, "How machines are calibrated and corrected", {}, follows_now=True),
     "changes": Resource(changes, "Changes of the ground", {"after": "with a number beyond this one"}, follows_now=True),
     "tiles": Resource(
         tiles,

@@ -22,6 +22,7 @@ from websockets.sync.client import connect as open_socket
 from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
 from sitegrid.process.children import Children, wait_until
+from sitegrid.web import values
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, READY_S, Frame, WebSite
 from tests.soak import SITE_TOML
@@ -88,6 +89,10 @@ def test_why_history_machines_changes_are_the_clients(web: WebSite):
     ours = web.client.history(x_m, y_m, ["resistance"])
     assert [span["first_ns"] for span in spans] == [span.first_ns for span in ours]
     assert [m["name"] for m in web.get("machines").json["machines"]] == ["machine-0", "machine-1", "machine-2"]
+    calibration, ours = web.get("calibration").json, web.client.calibration()
+    assert (calibration["store"], calibration["fact"]) == (ours.store, ours.fact)
+    assert [m["name"] for m in calibration["machines"]] == [m.name for m in ours.machines]
+    assert calibration["machines"][0]["spans"] == [values.plain(span) for span in ours.machines[0].spans]
     assert web.get("changes").json == {"changes": []}
     info = web.get("info").json
     assert info["samples_merged"] == web.client.info().samples_merged
