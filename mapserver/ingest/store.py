@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-import os
-import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,7 @@ from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.decisions import Decision, Decisions, plain
 from mapserver.ingest.losses import by_machine, name_shortfalls
+from mapserver.ingest.map_info import map_info
 from mapserver.ingest.store_folder import hold
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import History, read_history
@@ -34,7 +33,6 @@ from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
-from protocol.version import package_version
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
@@ -110,6 +108,11 @@ class Store:
     def newest_ns(self) -> int:
         """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
         return self._newest_but("")
+
+    @property
+    def names(self) -> Collection[str]:
+        """All machines that have sent anything."""
+        return self._newest.keys()
 
     @property
     def version(self) -> MapVersion:
@@ -200,29 +203,14 @@ class Store:
 
     def info(self) -> dict[str, Any]:
         """State of the store in plain values, from counters."""
-        counts = self.grid.counts()
-        return {
-            "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
-            "store": self.identity.id,
+        info = map_info(self.site, self.grid, self.facts, self.version, self.newest_ns, self.now_ns())
+        return info | {
             "descends": list(self.identity.descends),
             "accepted": sorted(self.accepted),
-            "fact": self.fact,
             "decided": self._decisions.facts.number,
-            "corrections": len(self.facts.corrections),
             "journalled": self.journalled,
-            "merged": self.merged,
             "snapshot": self.snapshot_row,
-            "samples_merged": counts.folded,
-            "samples_too_unsure": counts.skipped,
-            "cells": counts.cells,
-            "bounds": counts.bounds,
-            "first_ns": self.grid.oldest_ns,
-            "stamp_ns": self.newest_ns,
-            "wall_ns": self.now_ns(),
-            "version": package_version(),
-            "server": {"host": socket.gethostname(), "pid": os.getpid()},
             "machines": self.machines(),
-            "distrusted": sorted(self.facts.excluded),
             "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
             "counters": dict(self.counters),
         }

@@ -125,7 +125,7 @@ def followers_alive_all(site: str) -> str:
 
 def follower_owner(site: str, follower: str) -> str:
     """Which process has the name of a follower: a query that followers of one name ask each other."""
-    return f"{_follower(site, follower)}/owner"
+    return _follower(site, follower)
 
 
 def follower_of(key: str) -> str:

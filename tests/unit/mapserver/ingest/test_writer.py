@@ -21,7 +21,6 @@ from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
 from mapserver.journal.journal import UnwrittenError
 from mapserver.journal.sqlite.journal import SqliteJournal
-from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import ServerAlive
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
@@ -38,14 +37,13 @@ from tests.unit.mapserver.data import (
     held,
     incoming,
     open_writer,
-    past_of,
     random_samples,
     same,
     samples,
     send,
     wait_for,
 )
-from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered
+from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
 
 
 @pytest.fixture
@@ -575,7 +573,7 @@ QUERIES = [
 def test_a_refused_query_says_why(start, reason, name, parameters):
     writer = start()
     with pytest.raises(QueryError) as caught:
-        answered(Answers(writer, FakeUpkeep(), past_of(writer)), name, parameters)
+        answered(answers_of(writer), name, parameters)
     assert caught.value.reason == reason
 
 
