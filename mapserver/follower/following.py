@@ -168,10 +168,7 @@ class Following:
         self._complete_s, self._anew, self._checksum = float("-inf"), None, None
         self.past = Past.of_store(self.location.folder, self.site.cell_m, self.config.fold)  # its index is of rows
         self.waits.advance(0)
-        newest_ns: dict[str, int] = {}
-        for (machine, _), watermark in reader.watermarks().items():
-            newest_ns[machine] = max(newest_ns.get(machine, 0), watermark.newest_ns)
-        replica = Replica(self.site, self.config, reader.identity().id, newest_ns)
+        replica = Replica(self.site, self.config, reader.identity().id)
         _hear(replica, reader)
         facts, site, fold = replica.wanted, self.site, self.config.fold
         row, grid = snapshot.load_newest(self.location.folder, state.row, site.cell_m, fold, facts.of_evidence())
@@ -180,16 +177,19 @@ class Following:
             if folded is None:
                 return None
             row, grid = folded.row, folded.grid
-        last = reader.last_row  # at least all that the watermarks are of
+        last = reader.last_row
         history, selection = History(reader, self.past.archive), Selection.by(facts)
         if not fold_history(grid, history, row, last, selection, self._ending.is_set):
             return None
         release_memory()
         replica.adopt(grid, last, facts)
-        self._checksum = reader.row_checksum(last)
+        # The site's now is that of the rows in the map: watermarks are of these, and of some that are folded next.
+        replica.reach((machine, mark.newest_ns) for (machine, _), mark in reader.watermarks().items())
+        self._fold(reader, replica, reader.last_row)
+        self._checksum = reader.row_checksum(replica.merged)
         with self._lock:
             self._replica = replica
-        log.info("map folded row=%d fact=%d", last, facts.number)
+        log.info("map folded row=%d fact=%d", replica.merged, facts.number)
         return replica
 
     def _fold(self, reader: JournalReader, replica: Replica, until: int) -> None:
@@ -198,7 +198,8 @@ class Following:
         for rows in read_history(History(reader, self.past.archive), replica.merged, until):
             with self._lock:
                 replica.fold(rows)
-            self.waits.advance(replica.merged)
+            if replica is self._replica:
+                self.waits.advance(replica.merged)
             if self._ending.is_set():
                 return
         self._checksum = reader.row_checksum(replica.merged)

@@ -5,7 +5,7 @@ No clock, thread or file: what was read is handed in. On equal rows and facts it
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 
 import numpy as np
 
@@ -25,14 +25,13 @@ class Replica:
     changes: of the ground, by number.
     """
 
-    def __init__(self, site: SiteConfig, config: ServerConfig, store: str, newest_ns: Mapping[str, int]) -> None:
-        """newest_ns: stamp of the newest sample of each machine, as watermarks have it."""
+    def __init__(self, site: SiteConfig, config: ServerConfig, store: str) -> None:
         self.site, self.config, self.store = site, config, store
         self.grid, self.facts = Grid(site.cell_m, config.fold), Facts()
         self.merged = self.event = 0
         self.changes: dict[int, GroundChange] = {}
         self._decisions = Decisions()
-        self._newest_ns = dict(newest_ns)
+        self._newest_ns: dict[str, int] = {}
 
     @property
     def version(self) -> MapVersion:
@@ -72,10 +71,14 @@ class Replica:
         self.grid.fold_all(*rows.without(self.facts.excluded).selected(Selection.by(self.facts)))
         stamps, ends = rows.samples["stamp_ns"], np.cumsum(rows.lengths)
         newest_ns = np.maximum.reduceat(stamps, ends - rows.lengths)
-        for machine, stamp_ns in zip(rows.machine.tolist(), newest_ns.tolist(), strict=True):
-            name = rows.machines[machine]
-            self._newest_ns[name] = max(self._newest_ns.get(name, 0), stamp_ns)
+        names = (rows.machines[machine] for machine in rows.machine.tolist())
+        self.reach(zip(names, newest_ns.tolist(), strict=True))
         self.merged = int(rows.numbers[-1])
+
+    def reach(self, newest_ns: Iterable[tuple[str, int]]) -> None:
+        """Know stamps of machines that are in the map, or would be if these were not excluded."""
+        for name, stamp_ns in newest_ns:
+            self._newest_ns[name] = max(self._newest_ns.get(name, 0), stamp_ns)
 
     def adopt(self, grid: Grid, row: int, facts: Facts) -> None:
         """Go on with a grid that has these facts and all rows up to this one."""
