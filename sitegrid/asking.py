@@ -13,12 +13,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
+from typing import Any
 
 import zenoh
 
 from protocol.errors import ConfigError, LinkError, QueryError, Refusal
 from protocol.queries import requests
-from protocol.queries.answer_codec import decode_error
+from protocol.queries.answer_codec import decode_alive, decode_error
+from protocol.queries.answers import FollowerState, ServerAlive
 from protocol.queries.origin import SERVER, Origin, decode_origin
 from protocol.queries.parameters import selector_of, text_of
 from protocol.wire import keys
@@ -115,6 +117,14 @@ class Asker:
             return self._of_follower(query, at.follower)
         return self._get(query, wait_s)
 
+    def followers(self) -> list[FollowerState]:
+        """All followers that answer, by name; also those that clients are not offered, since they are far behind."""
+        every: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+        replies = self._session.get(keys.followers_alive_all(self._site), timeout=self._timeout_s / 2, **every)
+        answers = [reply.ok for reply in replies if reply.ok is not None]
+        states = [_state(decode_alive(one.payload.to_bytes()), _origin(one.attachment)) for one in answers]
+        return sorted(states, key=lambda state: state.name)
+
     def command(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
         """Have the server carry out a command."""
         return self._until_answered(lambda: iter((_Attempt(key, parameters),)), wait_s).data
@@ -203,6 +213,11 @@ class Asker:
 
 def _origin(attachment: zenoh.ZBytes | None) -> Origin:
     return decode_origin(attachment.to_bytes()) if attachment else SERVER
+
+
+def _state(alive: ServerAlive, origin: Origin) -> FollowerState:
+    lag = (origin.behind_rows, origin.behind_s)
+    return FollowerState(origin.follower, alive.store, alive.journalled, alive.merged, *lag)
 
 
 def _name(key: str) -> str:

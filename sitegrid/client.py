@@ -11,6 +11,7 @@ import zenoh
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec, requests
 from protocol.queries.answers import (
+    FollowerState,
     GroundChange,
     HistorySpan,
     MachineState,
@@ -139,6 +140,10 @@ class Client:
     def alive(self) -> ServerAlive:
         """Whether the server takes batches: for probes, since it waits for nothing."""
         return answer_codec.decode_alive(self._ask(requests.AliveQuery()))
+
+    def followers(self) -> list[FollowerState]:
+        """Followers that answer, and how far behind the journal each is."""
+        return self._asker.followers()
 
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""

@@ -34,7 +34,7 @@ class FollowerSource:
         self.name, self._following, self._now_ns = name, following, now_ns
         self.site, self.config, self.location = following.site, following.config, following.location
         self.waits = following.waits
-        self._refusals: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self._lock = threading.Lock()
 
     @property
@@ -77,7 +77,7 @@ class FollowerSource:
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None
         with self._lock:
-            counters = dict(self._refusals)
+            counters = dict(self._counts)
         return info | {
             "descends": list(identity.descends),
             "accepted": sorted(accepted),
@@ -105,10 +105,10 @@ class FollowerSource:
             raise QueryError(Refusal.NOT_HERE, "this follower has no map yet; ask the map server")
         return Origin(self.name, rows, round(seconds, 3))
 
-    def count_refusal(self, reason: str) -> None:
-        """Count a refused query."""
+    def count(self, what: str) -> None:
+        """Count what became of a query."""
         with self._lock:
-            self._refusals[f"refused_query_{reason}"] += 1
+            self._counts[what] += 1
 
 
 def _only_at_the_server(what: str) -> NoReturn:

@@ -23,6 +23,7 @@ from protocol.wire import keys
 ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 pieces, or 2000 points
 MOST_PAST = 16  # that wait or are in work
 MAX_QUESTION = 4096  # bytes of a query's parameters
+ANSWERED = "queries_answered"  # a counter of `info`
 log = logging.getLogger("mapserver.query.queryable")
 
 
@@ -41,7 +42,7 @@ class Replies:
 
     def refuse(self, asked: zenoh.Query, error: QueryError) -> None:
         """Say why a query is not answered."""
-        self._source.count_refusal(error.reason)
+        self._source.count(f"refused_query_{error.reason}")
         with asked:
             _send(asked, lambda: asked.reply_err(encode_error(error)))
 
@@ -55,6 +56,7 @@ class Replies:
             log.exception("query failed query=%s", asked.key_expr)
             self.refuse(asked, QueryError("internal", f"the server failed: {error}"))
         else:
+            self._source.count(ANSWERED)
             with asked:
                 _send(asked, lambda: asked.reply(asked.key_expr, data, attachment=origin))
 

@@ -53,9 +53,9 @@ class ServerSource:
         """The server: a batch is in its map before it is acknowledged."""
         return SERVER
 
-    def count_refusal(self, reason: str) -> None:
+    def count(self, what: str) -> None:
         """See `Writer`."""
-        self._writer.count_refusal(reason)
+        self._writer.count(what)
 
 
 class Commands:

@@ -87,5 +87,5 @@ class MapSource(Protocol):
     def origin(self) -> Origin:
         """Who answers, and how far behind the journal."""
 
-    def count_refusal(self, reason: str) -> None:
-        """Count a refused query."""
+    def count(self, what: str) -> None:
+        """Count what became of a query, for `info`."""

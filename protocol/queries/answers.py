@@ -218,6 +218,21 @@ class ServerAlive:
 
 
 @dataclass(frozen=True)
+class FollowerState:
+    """A follower that answers. store, merged: see MapVersion; journalled: the last row of the journal, as it knows.
+
+    behind_rows: rows that its map lacks. behind_s: its map had all that was in the journal so long ago, or later.
+    """
+
+    name: str
+    store: str
+    journalled: int
+    merged: int
+    behind_rows: int
+    behind_s: float
+
+
+@dataclass(frozen=True)
 class MachineState:
     """What the map server knows of one machine.
 

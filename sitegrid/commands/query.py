@@ -7,6 +7,7 @@ import re
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,7 @@ def add_options(parser: ArgumentParser) -> None:
     changes = _add_query(queries, _changes, "list of ground changes: place and time")
     changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
     _add_query(queries, _info, "state of the map and its server")
+    _add_query(queries, _followers, "followers that answer, and how far behind they are")
     _add_query(queries, _alive, "whether the map server takes batches: for probes")
 
 
@@ -247,6 +249,15 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
         ),
         *(f"  {name}: {count}" for name, count in sorted(info.counters.items())),
     ]
+
+
+def _followers(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:
+    states = client.followers()
+    lines = [
+        f"{state.name:24} journal row {state.merged}, {state.behind_rows} rows and {state.behind_s:.1f} s behind"
+        for state in states
+    ]
+    return [asdict(state) for state in states], lines or ["no follower answers"]
 
 
 def _alive(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:

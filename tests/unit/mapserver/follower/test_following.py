@@ -6,7 +6,6 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,9 +13,6 @@ from hypothesis import strategies as st
 from mapserver.follower.following import Following
 from mapserver.ingest.writer import Writer
 from mapserver.journal.location import JournalLocation
-from mapserver.past.past import Past
-from mapserver.query.answering import Answers
-from mapserver.query.server_source import ServerSource
 from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal
@@ -216,11 +212,13 @@ def test_it_begins_with_the_snapshot_of_the_server(tmp_path, monkeypatch):
         deliver(writer, 5)
         from mapserver.follower import following as module
 
-        folded: list[int] = []
-        fold_history = module.fold_history
-        monkeypatch.setattr(
-            module, "fold_history", lambda grid, history, after, *more: folded.append(after) or fold_history(grid, history, after, *more)
-        )
+        folded, fold_history = list[int](), module.fold_history
+
+        def noted(grid, history, after, *more) -> bool:
+            folded.append(after)
+            return fold_history(grid, history, after, *more)
+
+        monkeypatch.setattr(module, "fold_history", noted)
         with following(tmp_path) as one:
             catches_up(one, writer)
         assert folded == [4]

@@ -588,7 +588,7 @@ def test_every_reason_to_refuse_is_provoked_here():
 def test_refused_queries_are_counted_by_reason(start):
     writer = start()
     for _ in range(2):
-        writer.count_refusal(Refusal.UNKNOWN_LAYER)
-    writer.count_refusal(Refusal.TOO_LARGE)
+        writer.count("refused_query_unknown_layer")
+    writer.count("refused_query_too_large")
     counters = writer.info()["counters"]
     assert (counters["refused_query_unknown_layer"], counters["refused_query_too_large"]) == (2, 1)
