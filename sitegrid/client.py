@@ -142,8 +142,10 @@ class Client:
         return answer_codec.decode_alive(self._ask(requests.AliveQuery()))
 
     def followers(self) -> list[FollowerState]:
-        """Followers that answer, and how far behind the journal each is."""
-        return self._asker.followers()
+        """Followers that answer, and how far behind the journal each is; LinkError where there is no server either."""
+        if not (followers := self._asker.followers()):
+            self.alive()
+        return followers
 
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""

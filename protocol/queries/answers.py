@@ -231,6 +231,9 @@ class FollowerState:
     behind_rows: int
     behind_s: float
 
+    def __str__(self) -> str:
+        return f"{self.name}: journal row {self.merged}, {self.behind_rows} rows and {self.behind_s:.1f} s behind"
+
 
 @dataclass(frozen=True)
 class MachineState:

@@ -7,7 +7,6 @@ import re
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -252,12 +251,8 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
 
 
 def _followers(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:
-    states = client.followers()
-    lines = [
-        f"{state.name:24} journal row {state.merged}, {state.behind_rows} rows and {state.behind_s:.1f} s behind"
-        for state in states
-    ]
-    return [asdict(state) for state in states], lines or ["no follower answers"]
+    followers = client.followers()
+    return followers, [*map(str, followers)] or ["no follower answers"]
 
 
 def _alive(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:

@@ -79,7 +79,7 @@ def grant(role: str, site: str, name: str) -> Grant:
         ),
         "follower": Grant(
             query=(keys.journal(site), keys.follower_owner(site, name)),
-            answer=(keys.follower_queries(site, name),),
+            answer=(keys.follower_queries(site, name), keys.follower_owner(site, name)),
             alive=(keys.follower_alive(site, name),),
         ),
         "sim": Grant(publish=(_sensors_all(site),)),

@@ -37,6 +37,7 @@ from protocol.queries.calibration import (
     encode_calibration,
 )
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
+from protocol.queries.origin import Origin, decode_origin, encode_origin
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
 from protocol.wire import codec, correction_codec
 from protocol.wire.messages import (
@@ -266,6 +267,8 @@ GOLDEN: dict[str, Golden] = {
         answers.decode_changes,
     ),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
+    "origin.bin": Golden(Origin("reader-1", 3, 0.25), encode_origin, decode_origin),
+    "origin_server.bin": Golden(Origin(), encode_origin, decode_origin),
     "alive.bin": Golden(records.ServerAlive(STORE, 18, 17, 0.25), answers.encode_alive, answers.decode_alive),
     "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, answers.encode_info, decode_info_table),
     "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),
