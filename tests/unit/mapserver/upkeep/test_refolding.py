@@ -23,7 +23,6 @@ from mapserver.past import anew
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import DISTRUST_AFTER, KIND, PERSON, TrustDecision
 from mapserver.trust.judgement import Reason
-from mapserver.upkeep import refolding
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal
 from tests.unit.mapserver.data import (
@@ -128,7 +127,7 @@ def test_a_few_rows_are_left_to_the_writer(writer, fold):
 
 
 def test_where_batches_never_end_the_writer_has_them_wait(writer, monkeypatch):
-    monkeypatch.setattr(refolding, "FEW_ROWS", -1)
+    monkeypatch.setattr(anew, "FEW_ROWS", -1)
     with closing(Refolding(writer, past_of(writer))) as refolds:
         refolds.wait(refolds.decide(decision("b")), WAIT_S)
     assert same(writer.run(grid_copy), map_without("b", 5))
