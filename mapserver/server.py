@@ -16,6 +16,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import grid
 from mapserver.ingest import batches
 from mapserver.ingest.admission import Verify
+from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records
@@ -55,19 +56,31 @@ class Server:
         *,
         sign: SignReply | None = None,
         take_over: bool = False,
+        standing_by: Callable[[], None] = lambda: None,
     ) -> None:
         """ingest: for batches alone, since an answer that nobody takes holds up its whole link. readers: for all else.
 
         verify: of signed batches, see Store; without it signatures are not asked for. sign: makes the
         signature that goes beside the reply to a signed batch. take_over: have another server of
-        the site end, where there is one; otherwise a LinkError says so.
+        the site end, where there is one; otherwise a LinkError says so. standing_by: is called again and again while
+        another server writes a journal that is shared; what it raises ends the wait.
         """
         self._sign = sign
         with ExitStack() as opened:
-            self._claim = WriterClaim(ingest, site.name, location.store_id())
+            self._claim = claim = WriterClaim(ingest, site.name, location.store_id(), shared=location.is_shared)
             opened.callback(self._claim.close)
             self._claim.acquire(take_over=take_over)
-            self._writer = Writer(Store(location, site, config, now_ns, verify))
+
+            def check() -> None:
+                standing_by()
+                claim.require()
+
+            standby = Standby(location, site, config, check) if location.is_shared else None
+            if standby:
+                opened.callback(standby.close)
+            self._writer = Writer(Store(location, site, config, now_ns, verify, standby))
+            if standby:
+                standby.close()
             self._claim.store = self._writer.store_id
             opened.pop_all()
         self._changed = readers.declare_publisher(
@@ -94,6 +107,11 @@ class Server:
     def ended(self) -> str:
         """Why another server is the site's writer now, empty while none is; the process should end."""
         return self._claim.ended
+
+    @property
+    def fenced(self) -> str:
+        """Why this server may not write any more, since another one took over; the process should end."""
+        return self._writer.fenced
 
     def close(self) -> None:
         """Stop listening, finish what has come in, commit, snapshot."""

@@ -66,6 +66,19 @@ class SqliteQueries(TableQueries):
         """See `JournalQueries`; also where all rows are archived."""
         return self._number("SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'")
 
+    @property
+    def archived_row(self) -> int:
+        """See `JournalQueries`."""
+        return self._number("SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = 'archived_row'")
+
+    def state(self) -> JournalState:
+        """See `JournalQueries`."""
+        epoch = self._number("SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = 'epoch'")
+        return JournalState(epoch, self.last_row, self._last_event())
+
+    def _last_event(self) -> int:
+        return self._number("SELECT COALESCE(MAX(id), 0) FROM events")
+
     @contextmanager
     def _one_state(self) -> Iterator[None]:
         self._query("BEGIN")
