@@ -70,6 +70,7 @@ class FollowerSource:
         info, decided, facts = self.run(described)
         try:
             with self.location.reader() as reader:
+                journal = {"epoch": reader.state().epoch, "journal": {"where": reader.where, "replica": ""}}
                 identity, progress = reader.identity(), Progress(reader.watermarks())
                 accepted = {event.body["store"] for event in reader.events(ACCEPTED)}
                 past.checkpoints.look(past.depends_on(reader, facts), reader.last_row)
@@ -78,16 +79,20 @@ class FollowerSource:
             raise QueryError(Refusal.STORE, str(error)) from None
         with self._lock:
             counters = dict(self._counts)
-        return info | {
-            "descends": list(identity.descends),
-            "accepted": sorted(accepted),
-            "decided": decided,
-            "journalled": self._following.journalled,
-            "snapshot": max(rows_on_disk(self.location.folder), default=0),
-            "machines": by_machine(progress, shortfalls),
-            "shortfalls": [str(each) for each in shortfalls],
-            "counters": counters,
-        }
+        return (
+            info
+            | journal
+            | {
+                "descends": list(identity.descends),
+                "accepted": sorted(accepted),
+                "decided": decided,
+                "journalled": self._following.journalled,
+                "snapshot": max(rows_on_disk(self.location.folder), default=0),
+                "machines": by_machine(progress, shortfalls),
+                "shortfalls": [str(each) for each in shortfalls],
+                "counters": counters,
+            }
+        )
 
     def alive(self) -> ServerAlive:
         """Whether the journal is looked at; QueryError where it has not been for long."""

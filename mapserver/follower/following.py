@@ -33,6 +33,7 @@ from protocol.site.site_config import SiteConfig
 ASK_S = 1.0  # a notification may be lost: the journal is asked so often all the same
 OPEN_S = 2.0  # a connection lasts so long: another file may have taken the place of the one that it reads
 RETRY_S = 1.0
+Known = Callable[[], tuple[int, float]]
 T = TypeVar("T")
 log = logging.getLogger("mapserver.follower.following")
 
@@ -48,11 +49,15 @@ class Following:
     goes on; the process should end.
     """
 
-    def __init__(self, location: JournalLocation, site: SiteConfig, config: ServerConfig) -> None:
+    def __init__(
+        self, location: JournalLocation, site: SiteConfig, config: ServerConfig, known: Known | None = None
+    ) -> None:
+        """known: of the journal that this one is a copy of: its last row, and when that was asked for [s]."""
         self.location, self.site, self.config = location, site, config
         self.waits = MergeWaits(0)
         self.past = Past.of_store(location.folder, site.cell_m, config.fold)
         self.ended = ""
+        self._known = known
         self._lock = threading.Lock()  # of the replica: held while pages are taken from it, or rows are folded
         self._replica: Replica | None = None
         self._checksum: int | None = None  # of the last row that was folded, where that is known
@@ -133,7 +138,8 @@ class Following:
     def _look(self, reader: JournalReader, state: JournalState) -> None:
         """Read what is new."""
         began_s, replica = time.monotonic(), self._replica
-        self._journalled = state.row
+        last_row, as_of_s = self._known() if self._known else (state.row, began_s)
+        self._journalled = max(state.row, last_row)
         if replica is None or self._is_gone(reader, state, replica):
             replica = self._begin(reader, state)
         if replica is None:
@@ -142,8 +148,8 @@ class Following:
             _hear(replica, reader)
         self._fold(reader, replica, state.row)
         self._correct(reader, replica)
-        if replica.merged >= state.row:
-            self._complete_s = began_s
+        if replica.merged >= last_row:
+            self._complete_s = as_of_s
         self.waits.advance(replica.merged)
 
     def _is_gone(self, reader: JournalReader, state: JournalState, replica: Replica) -> bool:
@@ -171,7 +177,8 @@ class Following:
         replica = Replica(self.site, self.config, reader.identity().id)
         _hear(replica, reader)
         facts, site, fold = replica.wanted, self.site, self.config.fold
-        row, grid = snapshot.load_newest(self.location.folder, state.row, site.cell_m, fold, facts.of_evidence())
+        trusted_row = min(state.row, self.location.trusted_row(reader))
+        row, grid = snapshot.load_newest(self.location.folder, trusted_row, site.cell_m, fold, facts.of_evidence())
         if not row:
             folded = fold_anew(self.past, reader, facts, self._ending.is_set)
             if folded is None:

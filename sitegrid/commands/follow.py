@@ -16,6 +16,7 @@ from protocol.site.site_file import load_site
 from protocol.wire.keys import check_name
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
+from sitegrid.options.outputs import FOLDER
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
 from sitegrid.security.join import join
 
@@ -29,7 +30,9 @@ def add_options(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add_network(parser)
     add("--site-file", type=Path, required=True, help="site file of the server: name, origin, cells")
-    add("--store", type=Path, required=True, help="the server's store on this host, which is only read")
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--store", type=Path, help="the server's store on this host, which is only read")
+    where.add_argument("--copy", type=FOLDER, help="folder for a copy of the journal, where the server is elsewhere")
     add("--config", type=Path, help="the server's file with options (config/server.toml)")
     add("--name", help="name of this follower, another one for each (default the name of this host)")
 
@@ -37,6 +40,7 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Follow until stopped."""
     from mapserver.config import ServerConfig
+    from mapserver.follower.copying import Copying
     from mapserver.follower.follower import Follower
     from mapserver.journal.location import JournalLocation
     from mapserver.server import warm_up
@@ -52,8 +56,8 @@ def run(arguments: Namespace) -> int:
         warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="follower", name=name, site=site.name)
         session = opened.enter_context(closing(open_session(joined)))
-        location = JournalLocation(arguments.store)
-        follower = opened.enter_context(closing(Follower(session, name, location, site, config, time.time_ns)))
+        journal = JournalLocation(arguments.store) if arguments.store else Copying(session, site, arguments.copy)
+        follower = opened.enter_context(closing(Follower(session, name, journal, site, config, time.time_ns)))
         is_ready = False
         while not stop.wait(TEND_S):
             if follower.ended:
@@ -61,7 +65,8 @@ def run(arguments: Namespace) -> int:
             follower.tend()
             if follower.is_shown and not is_ready:
                 is_ready = True
-                say({"ready": "follow", "site": site.name, "name": name, "store": str(arguments.store)})
+                folder = str(arguments.store or arguments.copy)
+                say({"ready": "follow", "site": site.name, "name": name, "store": folder})
     return 0
 
 

@@ -113,7 +113,8 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
     server = run.serve()
     for machine in "abcabc":
         sender.send(machine)
-    followers = [run.start_follower(name) for name in ("near", "far")]
+    near, far = run.start_follower("near"), run.start_follower("far", "--copy", run.folder / "copy")  # of the journal
+    followers = [near, far]
     pids = f"server pid {server.pid}, followers pids {[one.pid for one in followers]}"
     with run.connect() as client:
 
