@@ -31,7 +31,7 @@ from protocol.queries.reasons import CellReasons, decode_why
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
-from sitegrid.asking import Asker
+from sitegrid.asking import Answered, Asker
 from sitegrid.listener import Listener
 from sitegrid.security.join import join
 
@@ -230,18 +230,22 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _ask(self, query: requests.MapQuery, *, at: Origin | None = None) -> bytes:
+    def _ask(self, query: requests.MapQuery) -> bytes:
+        return self._answered(query).data
+
+    def _answered(self, query: requests.MapQuery, *, at: Origin | None = None) -> Answered:
         answered = self._asker.ask(query, at=at)
-        self.origin = answered.origin
-        return answered.data
+        self.origin = answered.origin  # of the last answer of any thread: nothing here goes on with it
+        return answered
 
     def _pieces(self, query: requests.RegionQuery) -> Iterator[Region]:
         """The region, or piece after piece of it, all from whom has the first one."""
-        yield (first := answer_codec.decode_region(self._ask(query)))
+        answered = self._answered(query)
+        yield (first := answer_codec.decode_region(answered.data))
         if first.piece:
-            at = self.origin
             for number in range(1, first.piece.count):
-                yield answer_codec.decode_region(self._ask(requests.PieceQuery(first.piece.cursor, number), at=at))
+                piece = requests.PieceQuery(first.piece.cursor, number)
+                yield answer_codec.decode_region(self._answered(piece, at=answered.origin).data)
 
     def _command(self, command: TrustCommand) -> TrustAnswer:
         key = keys.admin(self.site, command.name)

@@ -57,6 +57,10 @@ class Copying:
         """Copy from now on."""
         self._thread.start()
 
+    def stop(self) -> None:
+        """Have the thread end soon."""
+        self._ending.set()
+
     def close(self) -> None:
         """End the thread, and close the copy."""
         self._ending.set()

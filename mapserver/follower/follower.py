@@ -16,11 +16,11 @@ from mapserver.journal.location import JournalLocation
 from mapserver.query.answering import Answers
 from mapserver.query.queryable import MapQueryable
 from protocol.errors import LinkError
+from protocol.queries.origin import SHOWN_S
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.owners import ANSWER_S, EVERY_OTHER, Owner, encode_owner, owner_of, this_process
 
-SHOWN_S = 10.0  # behind: a follower that is more is not offered to clients, until it has caught up
 LOOK_S = 2.0  # between two looks for another follower of the same name
 
 
@@ -90,6 +90,9 @@ class Follower:
         """Take no more queries, and end what is in work."""
         self._hide()
         self._queries.stop()
+        self.following.stop()
+        if self._copying:
+            self._copying.stop()
         self._queries.close()
         self._identity.undeclare()  # type: ignore[no-untyped-call]
         self.following.close()

@@ -90,6 +90,10 @@ class Following:
         """The last row of the journal, as of the last look."""
         return self._journalled
 
+    def stop(self) -> None:
+        """Have the thread end soon."""
+        self._ending.set()
+
     def close(self) -> None:
         """End the thread."""
         self._ending.set()

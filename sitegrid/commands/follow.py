@@ -10,7 +10,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 from protocol.config import from_table
-from protocol.errors import LinkError
+from protocol.errors import ConfigError, LinkError
 from protocol.files import load_toml
 from protocol.site.site_file import load_site
 from protocol.wire.keys import check_name
@@ -33,6 +33,7 @@ def add_options(parser: ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--store", type=Path, help="the server's store on this host, which is only read")
     where.add_argument("--copy", type=FOLDER, help="folder for a copy of the journal, where the server is elsewhere")
+    add("--journal", metavar="URL", default="", help="the server's database, postgresql://..., beside its --store")
     add("--config", type=Path, help="the server's file with options (config/server.toml)")
     add("--name", help="name of this follower, another one for each (default the name of this host)")
 
@@ -45,6 +46,10 @@ def run(arguments: Namespace) -> int:
     from mapserver.journal.location import JournalLocation
     from mapserver.server import warm_up
 
+    if arguments.copy and arguments.journal:
+        raise ConfigError(
+            "--journal", "a copy is made of the server's journal, wherever that is: leave one of both out"
+        )
     stop = stop_flag()
     use_many_threads()
     return_large_blocks()
@@ -56,7 +61,10 @@ def run(arguments: Namespace) -> int:
         warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="follower", name=name, site=site.name)
         session = opened.enter_context(closing(open_session(joined)))
-        journal = JournalLocation(arguments.store) if arguments.store else Copying(session, site, arguments.copy)
+        if arguments.copy:
+            journal: JournalLocation | Copying = Copying(session, site, arguments.copy)
+        else:
+            journal = JournalLocation(arguments.store, arguments.journal)
         follower = opened.enter_context(closing(Follower(session, name, journal, site, config, time.time_ns)))
         is_ready = False
         while not stop.wait(TEND_S):

@@ -66,8 +66,15 @@ class Sender:
         self._spool += 1
         rows = random_samples(n, self._spool)
         batch = encode_batch(SampleBatch(machine, self._spool, 1, rows, self._site.frame))
-        (reply,) = self.session.get(keys.ingest(self._site.name, machine), payload=batch, timeout=20.0)
-        ack = decode_reply(reply.ok.payload.to_bytes())
+        replies: list[zenoh.Reply] = []
+        key = keys.ingest(self._site.name, machine)
+
+        def is_answered() -> bool:  # nobody may be known to a router yet that has just been joined
+            replies[:] = self.session.get(key, payload=batch, timeout=20.0)
+            return bool(replies)
+
+        wait_until(is_answered, 10.0, "the server takes batches")
+        ack = decode_reply(replies[0].ok.payload.to_bytes())
         assert isinstance(ack, Ack)
         return ack.row
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.follower.following import Following
+from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.location import JournalLocation
 from mapserver.trust.decisions import PERSON, TrustDecision
@@ -23,6 +24,7 @@ from tests.unit.mapserver.data import (
     SITE,
     WAIT_S,
     incoming,
+    now_ns,
     open_writer,
     past_of,
     random_samples,
@@ -38,6 +40,25 @@ def following(folder: Path, site=SITE, config=CONFIG) -> Iterator[Following]:
     one.start()
     with closing(one):
         yield one
+
+
+@pytest.mark.parametrize("folder", ["store", "elsewhere"])
+def test_a_follower_of_a_journal_in_postgresql_is_told_of_rows(tmp_path, database, folder):
+    location = JournalLocation(tmp_path / "store", database.url)
+    with closing(Writer(Store(location, SITE, CONFIG, now_ns))) as writer:
+        deliver(writer, 1)
+        writer.run(lambda store: store.save_snapshot())
+        deliver(writer, 2)
+        one = Following(JournalLocation(tmp_path / folder, database.url), SITE, CONFIG)
+        one.start()
+        with closing(one):
+            catches_up(one, writer)
+            for seed in (3, 4, 5):
+                deliver(writer, seed, machine="b")
+                catches_up(one, writer)
+            decided = writer.run(lambda store: store.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)))
+            wait_for(lambda: version(one).fact == decided.number)
+            assert one.run(lambda replica: replica.facts.excluded) == {"b"}
 
 
 def version(one: Following) -> MapVersion | None:
