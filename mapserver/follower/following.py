@@ -229,7 +229,7 @@ class Following:
         if folded and folded.row > replica.merged:
             return  # the rows of this one come first
         self._anew = None
-        if folded is None:
+        if folded is None or facts.number <= replica.facts.number:  # a decision was taken back meanwhile
             return
         history, selection = History(reader, self.past.archive), Selection.by(facts)
         if fold_history(folded.grid, history, folded.row, replica.merged, selection, self._ending.is_set, 1):

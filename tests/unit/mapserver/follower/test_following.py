@@ -1,23 +1,28 @@
 """A follower of a real journal: equal to the server bit for bit, whatever happens to the journal."""
 
 import shutil
+import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapserver.change import change_log
+from mapserver.follower import following as module
 from mapserver.follower.following import Following
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal.archive import archive
 from mapserver.journal.location import JournalLocation
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal
-from protocol.queries.answers import MapVersion
+from protocol.queries.answers import GroundChange, MapVersion
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
@@ -136,6 +141,31 @@ def test_decisions_and_corrections_in_mid_run_make_the_same_map(tmp_path):
             catches_up(one, writer)
 
 
+def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_path, monkeypatch):
+    may_go_on, folds, fold_anew = threading.Event(), list[int](), module.fold_anew
+
+    def held(past, reader, facts, stopped):
+        folds.append(facts.number)
+        if facts.number == 1:
+            assert may_go_on.wait(WAIT_S)
+        return fold_anew(past, reader, facts, stopped)
+
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1, machine="b")
+        catches_up(one, writer)
+        monkeypatch.setattr(module, "fold_anew", held)
+        for trusted in (False, True):
+            writer.run(lambda store, t=trusted: store.decide(TrustDecision("b", t, PERSON, "drawn", NOW_NS)))
+            wait_for(lambda n=1 + trusted: one.run(lambda replica: replica.event) == n)
+            wait_for(lambda: folds == [1])
+        assert version(one).fact == 2  # the map has what decisions come to
+        may_go_on.set()
+        wait_for(lambda: one._anew is None)
+        assert version(one).fact == 2
+        assert one.run(lambda replica: replica.facts.excluded) == frozenset()
+        catches_up(one, writer)
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 60), st.booleans()), min_size=1, max_size=12),
@@ -198,8 +228,6 @@ def test_other_rows_under_the_same_numbers_are_noticed_by_a_checksum(tmp_path, c
 
 
 def test_rows_that_are_forgotten_below_the_follower_or_above_it_are_read_from_the_archive(tmp_path):
-    from mapserver.journal.archive import archive
-
     with closing(open_writer(tmp_path)) as writer:
         for seed in range(6):
             deliver(writer, seed)
@@ -231,8 +259,6 @@ def test_it_begins_with_the_snapshot_of_the_server(tmp_path, monkeypatch):
             deliver(writer, seed)
         writer.run(lambda store: store.save_snapshot())
         deliver(writer, 5)
-        from mapserver.follower import following as module
-
         folded, fold_history = list[int](), module.fold_history
 
         def noted(grid, history, after, *more) -> bool:
@@ -284,8 +310,6 @@ def test_a_damaged_row_is_named_and_the_map_says_how_far_behind_it_is(tmp_path, 
 
 
 def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):
-    from mapserver.journal.sqlite.reader import SqliteReader
-
     def lost(self, known, timeout_s):  # the notification; the time-out is not
         wait_for(lambda: True)
         return self.state()
@@ -299,11 +323,6 @@ def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch
 
 
 def test_changes_of_the_ground_come_with_the_events(tmp_path):
-    from dataclasses import asdict
-
-    from mapserver.change import change_log
-    from protocol.queries.answers import GroundChange
-
     change = GroundChange(1, 1, 2, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, 0.5)
     with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
         for cells in (4, 9):
