@@ -8,8 +8,9 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import fleet, fold, follow, ingest, live, merge, merge_memory, merge_restart, past, query, sim
+from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
 from benchmarks.agents import filter as filters
+from benchmarks.fleets import fleet, follow
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 from benchmarks.web import pages as web

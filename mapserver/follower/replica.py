@@ -44,9 +44,8 @@ class Replica:
         shown = (stamp for name, stamp in self._newest_ns.items() if name not in self.facts.excluded)
         return max(shown, default=0)
 
-    @property
-    def names(self) -> Collection[str]:
-        """All machines that have sent anything."""
+    def machines(self) -> Collection[str]:
+        """Names of all machines that have sent anything."""
         return self._newest_ns.keys()
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -115,11 +115,6 @@ class Store:
     def newest_ns(self) -> int:
         """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
         return self._newest_but("")
-
-    @property
-    def names(self) -> Collection[str]:
-        """All machines that have sent anything."""
-        return self._newest.keys()
 
     @property
     def version(self) -> MapVersion:

@@ -154,7 +154,7 @@ class Answers:
         """Everything that is known of the cell that a position lies in."""
         window = self._cell(query.x_m, query.y_m)
         view = self._view(window, query.as_of_ns)
-        names = self._source.run(lambda state: [name for name in state.names if name not in state.facts.excluded])
+        names = self._source.run(lambda state: [name for name in state.machines() if name not in state.facts.excluded])
         return reasons(view, (window.column, window.row), names, self._site.cell_m, self._config)
 
     def _version(self) -> MapVersion:

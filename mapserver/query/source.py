@@ -46,9 +46,8 @@ class MapState(Protocol):
     def newest_ns(self) -> int:
         """The site's now: the newest stamp of the machines that are in it, 0 for none."""
 
-    @property
-    def names(self) -> Collection[str]:
-        """All machines that have sent anything."""
+    def machines(self) -> Collection[str]:
+        """Names of all machines that have sent anything."""
 
 
 class MapSource(Protocol):

@@ -80,7 +80,7 @@ def catches_up(one: Following, writer: Writer) -> None:
     assert one.run(lambda replica: writer.run(lambda store: same(replica.grid, store.grid)))
     assert ours is not theirs
     assert one.run(lambda replica: replica.newest_ns) == writer.run(lambda store: store.newest_ns)
-    assert set(one.run(lambda replica: replica.names)) == set(writer.run(lambda store: store.names))
+    assert set(one.run(lambda replica: replica.machines())) == set(writer.run(lambda store: store.machines()))
 
 
 def deliver(writer: Writer, seed: int, n: int = 40, machine: str = "a", first_seq: int = 1) -> None:

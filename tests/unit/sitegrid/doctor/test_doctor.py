@@ -549,7 +549,7 @@ def test_a_running_agent_is_heard(site: Site, capsys):
 def test_people_read_one_line_each(capsys):
     assert main(["doctor", "--endpoint", free_endpoint()]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"-" * 10]
+    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"-" * 11]
     assert lines[1].startswith("FAIL  router        nothing listens at tcp/127.0.0.1:")
 
 

@@ -1,7 +1,8 @@
 """Followers beside a map server: how soon they show what it has acknowledged, and what readers cost the machines.
 
 Router, server, followers and readers are processes of their own, on this host, the machines send from here. Readers are
-this module, `python -m benchmarks.follow ENDPOINT SECONDS`: it prints how often they were answered, and how soon.
+this module, `python -m benchmarks.fleets.follow ENDPOINT SECONDS [FOLLOWER...]`: it prints how often they were answered,
+and how soon. Each asks one follower, as clients do, or the server where there is none.
 """
 
 from __future__ import annotations
@@ -20,23 +21,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zenoh
 
-from benchmarks.fleet import Machine, samples, send
+from benchmarks.fleets.fleet import Machine, samples, send
 from benchmarks.measure import Report, machine
 from benchmarks.merge_restart import SITE, build
 from benchmarks.merge_work import BATCH, samples_of
-from benchmarks.processes import OPTIONS, ask, process, processor_s, served, session, settle
+from benchmarks.processes import ANSWER_S, OPTIONS, ask, process, processor_s, served, session, settle
 from protocol.queries.answer_codec import decode_region
+from protocol.queries.origin import decode_origin
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
-from sitegrid import connect
 
 READERS = 50
 EVERY_S = 1.0  # a reader asks for a point and a region so often, as a page that shows the surroundings of a machine
 LAYERS = ("resistance", "grade", "visits")
 HALF_M = 32.0
-PROBE_S = 0.1
+PROBE_S, RETRY_S = 0.1, 0.5
 QUIET = "[trust]\nexclude = false\n[calibration]\nautomatic = false\n"  # these machines drive past each other at random
 FOLLOWERS = ("reader-1", "reader-2")
 WHOLE = "bounds=-128,-128,128,128;layers=resistance,visits,age_s"
@@ -61,7 +63,7 @@ def run(machines: int, seconds: float, hours: float, runs: int) -> Report:
         for number in range(runs):
             for name in VARIANTS[number % 3 :] + VARIANTS[: number % 3]:
                 measured[name].append(_measured(name, endpoint, Path(path), server, fleet, seconds))
-    rows = [{"variant": name, **_medians(each)} for name, each in measured.items()]
+    rows: list[dict[str, Any]] = [{"variant": name, **_medians(each)} for name, each in measured.items()]
     losses = {
         f"{load}_loss": [round(1 - row[f"{load}_per_s"] / rows[0][f"{load}_per_s"], 3) for row in rows]
         for load in ("paced", "saturated")
@@ -84,10 +86,12 @@ def _measured(
 ) -> dict[str, float]:
     """One variant: paced, then saturated."""
     with ExitStack() as opened:
-        pids = [opened.enter_context(_follower(endpoint, folder, one)) for one in FOLLOWERS] if "foll" in name else []
+        pids = (
+            [opened.enter_context(_follower(endpoint, folder, one)) for one in FOLLOWERS] if name == VARIANTS[2] else []
+        )
         answers: list[dict[str, float]] = []
         if name != VARIANTS[0]:
-            opened.enter_context(_readers(endpoint, 2 * seconds, answers))
+            opened.enter_context(_readers(endpoint, 2 * seconds, FOLLOWERS if pids else (), answers))
         with _probe(endpoint, bool(pids)) as probe:
             paced = _loaded([server, *pids], fleet, seconds, 1.0)
         saturated = _loaded([server, *pids], fleet, seconds, 0.0)
@@ -115,10 +119,10 @@ def _follower(endpoint: str, folder: Path, name: str) -> Any:
 
 
 @contextmanager
-def _readers(endpoint: str, seconds: float, answers: list[dict[str, float]]) -> Any:
+def _readers(endpoint: str, seconds: float, followers: Sequence[str], answers: list[dict[str, float]]) -> Any:
     """Readers of the map in a process of their own, until they have printed what they got."""
-    words = [sys.executable, "-m", "benchmarks.follow", endpoint, str(seconds)]
-    root = Path(__file__).parent.parent
+    words = [sys.executable, "-m", "benchmarks.fleets.follow", endpoint, str(seconds), *followers]
+    root = Path(__file__).parent.parent.parent
     with subprocess.Popen(words, stdout=subprocess.PIPE, cwd=root, text=True) as child:  # noqa: S603
         try:
             if child.stdout is None or "ready" not in child.stdout.readline():
@@ -175,23 +179,26 @@ def _medians(each: Sequence[dict[str, float]]) -> dict[str, float]:
     return {key: statistics.median(one[key] for one in each) for key in each[0]}
 
 
-def read(endpoint: str, seconds: float) -> dict[str, Any]:
+def read(endpoint: str, seconds: float, followers: Sequence[str]) -> dict[str, Any]:
     """Have READERS ask for so long, each over a session of its own; how many answers, how soon [ms], from whom."""
     ms: list[float] = []
     origins: Counter[str] = Counter()
     with ExitStack() as opened:
-        clients = [opened.enter_context(connect(endpoint, SITE.name)) for _ in range(READERS)]
+        links = [opened.enter_context(session(endpoint)) for _ in range(READERS)]
         end_s = time.monotonic() + seconds
 
         def reader(number: int) -> None:
-            draw, client = np.random.default_rng(number), clients[number]
+            draw = np.random.default_rng(number)
             time.sleep(EVERY_S * number / READERS)
             while (began_s := time.monotonic()) < end_s:
                 x, y = draw.uniform(-200, 200, 2)
-                client.point(x, y, LAYERS)
-                client.region((x - HALF_M, y - HALF_M, x + HALF_M, y + HALF_M), LAYERS)
+                box = f"{x - HALF_M:.3f},{y - HALF_M:.3f},{x + HALF_M:.3f},{y + HALF_M:.3f}"
+                for query, where in (("point", f"x={x:.3f};y={y:.3f}"), ("region", f"bounds={box}")):
+                    key = keys.map_query(SITE.name, query)
+                    if followers:
+                        key = keys.follower_query(SITE.name, followers[number % len(followers)], query)
+                    origins[_answered(links[number], f"{key}?{where};layers={','.join(LAYERS)}")] += 1
                 ms.append((time.monotonic() - began_s) * 1e3)
-                origins[client.origin.follower] += 1
                 time.sleep(max(0.0, EVERY_S - (time.monotonic() - began_s)))
 
         threads = [threading.Thread(target=reader, args=(number,)) for number in range(READERS)]
@@ -201,14 +208,22 @@ def read(endpoint: str, seconds: float) -> dict[str, Any]:
         for thread in threads:
             thread.join()
     p50, p99 = np.percentile(ms, (50, 99))
-    share = 1 - origins[""] / max(1, sum(origins.values()))
     return {
-        "answers_per_s": round(2 * len(ms) / seconds, 1),
+        "answers_per_s": round(sum(origins.values()) / seconds, 1),
         "answer_ms_p50": round(float(p50), 1),
         "answer_ms_p99": round(float(p99), 1),
-        "by_followers": round(share, 3),
+        "by_followers": round(1 - origins[""] / sum(origins.values()), 3),
     }
 
 
+def _answered(link: zenoh.Session, selector: str) -> str:
+    """Ask until there is an answer; the follower that gave it, empty for the server."""
+    while True:
+        for reply in link.get(selector, timeout=ANSWER_S):
+            if reply.ok is not None and reply.ok.attachment is not None:
+                return decode_origin(reply.ok.attachment.to_bytes()).follower
+        time.sleep(RETRY_S)
+
+
 if __name__ == "__main__":
-    print(json.dumps(read(sys.argv[1], float(sys.argv[2]))))
+    print(json.dumps(read(sys.argv[1], float(sys.argv[2]), sys.argv[3:])))

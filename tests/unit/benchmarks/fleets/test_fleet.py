@@ -5,8 +5,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from benchmarks import fleet
 from benchmarks.__main__ import main
+from benchmarks.fleets import fleet
 from protocol.errors import Refusal
 from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused
