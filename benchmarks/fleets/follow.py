@@ -1,8 +1,8 @@
 """Followers beside a map server: how soon they show what it has acknowledged, and what readers cost the machines.
 
 Router, server, followers and readers are processes of their own, on this host, the machines send from here. Readers are
-this module, `python -m benchmarks.fleets.follow ENDPOINT SECONDS [FOLLOWER...]`: it prints how often they were answered,
-and how soon. Each asks one follower, as clients do, or the server where there is none.
+this module, `python -m benchmarks.fleets.follow ENDPOINT SECONDS [FOLLOWER...]`: it prints how often they were
+answered, and how soon. Each asks one follower, as clients do, or the server where there is none.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def run(machines: int, seconds: float, hours: float, runs: int) -> Report:
         "runs": runs,
         **machine(),
         "goals": GOALS,
-        "rows": [row | {name: each[i] for name, each in losses.items()} for i, row in enumerate(rows)],
+        "rows": [_complete(row | {name: each[i] for name, each in losses.items()}, rows) for i, row in enumerate(rows)],
     }
 
 
@@ -86,12 +86,11 @@ def _measured(
 ) -> dict[str, float]:
     """One variant: paced, then saturated."""
     with ExitStack() as opened:
-        pids = (
-            [opened.enter_context(_follower(endpoint, folder, one)) for one in FOLLOWERS] if name == VARIANTS[2] else []
-        )
+        followers = FOLLOWERS if name == VARIANTS[2] else ()
+        pids = [opened.enter_context(_follower(endpoint, folder, one)) for one in followers]
         answers: list[dict[str, float]] = []
         if name != VARIANTS[0]:
-            opened.enter_context(_readers(endpoint, 2 * seconds, FOLLOWERS if pids else (), answers))
+            opened.enter_context(_readers(endpoint, 2 * seconds, followers, answers))
         with _probe(endpoint, bool(pids)) as probe:
             paced = _loaded([server, *pids], fleet, seconds, 1.0)
         saturated = _loaded([server, *pids], fleet, seconds, 0.0)
@@ -173,6 +172,11 @@ def _equal(endpoint: str) -> bool:
         row = decode_region(whole).merged
         others = [keys.follower_query(SITE.name, name, "region") for name in FOLLOWERS]
         return all(ask(link, f"{key}?{WHOLE};after={row};wait=30") == [whole] for key in others)
+
+
+def _complete(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """A row with all columns that any has."""
+    return {key: "-" for one in rows for key in one} | row
 
 
 def _medians(each: Sequence[dict[str, float]]) -> dict[str, float]:
