@@ -70,7 +70,7 @@ class FollowerSource:
         info, decided, facts = self.run(described)
         try:
             with self.location.reader() as reader:
-                journal = {"epoch": reader.state().epoch, "journal": {"where": reader.where, "replica": ""}}
+                epoch = reader.state().epoch
                 identity, progress = reader.identity(), Progress(reader.watermarks())
                 accepted = {event.body["store"] for event in reader.events(ACCEPTED)}
                 past.checkpoints.look(past.depends_on(reader, facts), reader.last_row)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -191,9 +191,9 @@ class Store:
         self._count_decisions()
         return self._decisions.facts
 
-    def confirm(self, machines: Iterable[str], now_ns: int) -> None:
-        """Date what is offered to machines: the solver says the same of them now [site's]."""
-        self._decisions.calibration.confirm(machines, now_ns)
+    def confirm(self, confirmed: Mapping[str, int]) -> None:
+        """Date what is offered to machines: the solver says the same of them, as of when [ns]."""
+        self._decisions.calibration.confirm(confirmed)
 
     def accept(self, store: str, reason: str) -> None:
         """Take the place of another store for good, since a person says so: its runs are taken on here."""

@@ -17,7 +17,7 @@ def state_of(store: Store) -> dict[str, Any]:
         "descends": list(store.identity.descends),
         "accepted": sorted(store.accepted),
         "epoch": store.journal.epoch,
-        "journal": {"where": store.journal.where, "replica": store.journal.replica},
+        "replica": store.journal.replica,
         "decided": store.decided,
         "journalled": store.journalled,
         "snapshot": store.snapshot_row,

@@ -77,6 +77,17 @@ class JournalQueries(Protocol):
     def archived_row(self) -> int:
         """The last row that has moved to the archive."""
 
+    @property
+    def schema(self) -> int:
+        """Number of its tables' form."""
+
+    @property
+    def replica(self) -> str:
+        """What stands behind the disk: "synchronous" where a commit waits for another machine's disk too.
+
+        "asynchronous" where another one follows without that, else "none".
+        """
+
     def identity(self) -> StoreIdentity:
         """Which store this is; StoreError where that is damaged."""
 
@@ -157,13 +168,6 @@ class Journal(JournalQueries, Protocol):
     @property
     def fenced(self) -> str:
         """Why it may not write any more since another server does, empty while it may; for any thread."""
-
-    @property
-    def replica(self) -> str:
-        """What stands behind the disk: "synchronous" where a commit waits for another machine's disk too.
-
-        "asynchronous" where another one follows without that, else "none".
-        """
 
     @property
     def trusted_row(self) -> int:

@@ -12,12 +12,11 @@ from mapserver.journal.journal import Journal, JournalQueries, JournalReader
 from mapserver.journal.postgres import MARK_FILE
 from mapserver.journal.rows import StoreIdentity
 from mapserver.journal.sqlite.journal import SqliteJournal
-from mapserver.journal.sqlite.reader import SCHEMA, SqliteReader
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.disk.traces import Traces, look_beside
 from protocol.disk.write_ahead_log import LogScan
 from protocol.errors import ConfigError, one_line
 
-__all__ = ["JOURNAL_FILE", "SCHEMA", "JournalLocation"]
 JOURNAL_FILE = "journal.db"
 
 

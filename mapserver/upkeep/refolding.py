@@ -73,6 +73,11 @@ class Refolding:
         with self._changed:
             return self._decisions.calibration.of_solver()
 
+    def shown(self) -> list[Correction]:
+        """The last of each machine whose scale evidence showed."""
+        with self._changed:
+            return self._decisions.calibration.shown()
+
     def calibration(self, machine: str) -> CalibrationDecision | None:
         """The newest decision about the calibration of a machine that counts."""
         with self._changed:
@@ -89,7 +94,7 @@ class Refolding:
     def calibrate(self, solved: Calibration, stamp_ns: int, *, asked: bool = False) -> int:
         """Decide what the solver may decide, or all that it would where a person asks; returns a number to wait for.
 
-        While the map does not follow what is decided, the solver waits: folds of a large site take longer than it.
+        While the map does not follow what is decided, what the solver wants waits: folds of a large site take longer.
         Raises QueryError as `decide` does; the solver then decides the same the next time.
         """
         return self._write(lambda store: self._calibrate(store, solved, stamp_ns, asked=asked))
@@ -139,7 +144,7 @@ class Refolding:
         with self._changed:
             decisions = self._decisions.calibration.judge(solved, stamp_ns, asked=asked)
             waits = not asked and self._folded < self._decided
-            store.confirm(self._decisions.calibration.confirmed, stamp_ns)
+            store.confirm(self._decisions.calibration.confirmed)
         return self._keep(store, () if waits else decisions)
 
     def _keep(self, store: Store, decisions: Sequence[Decision]) -> int:

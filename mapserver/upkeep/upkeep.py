@@ -43,8 +43,8 @@ class Upkeep:
         self._ending = threading.Event()
         self._refolding = Refolding(writer, past)
         refolding = self._refolding
-        earlier = refolding.solver_corrections
-        self._calibrating = Calibrating(writer, past, refolding.calibrate, self._doubtful, earlier, self._ending)
+        decide, shown = refolding.calibrate, refolding.shown
+        self._calibrating = Calibrating(writer, past, decide, self._doubtful, shown, self._ending)
         self._audit = Audit(writer, reader, self._refolding.judge, self._known, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)

@@ -44,7 +44,7 @@ def examine(arguments: Namespace) -> list[Finding]:
     """Check what the options name."""
     findings, subject = _keys(arguments)
     findings += _network(subject) if subject else [skipped("router", "these keys cannot be used")]
-    return findings + _store(arguments.store, subject.site_file if subject else None)
+    return findings + _store(arguments.store, arguments.journal, subject.site_file if subject else None)
 
 
 def _subject(arguments: Namespace, identity: Identity | None) -> Subject:
@@ -157,11 +157,11 @@ def _spool_itself(subject: Subject, path: Path, session: zenoh.Session | None) -
         return [Finding(Level.FAIL, "spool", str(error))]
 
 
-def _store(folder: Path | None, site: SiteConfig | None) -> list[Finding]:
+def _store(folder: Path | None, journal: str, site: SiteConfig | None) -> list[Finding]:
     if folder is None:
         return [skipped("store", "give --store FOLDER, where the map server runs")]
     try:
-        store = disk.check_store(disk.read_store(folder, time.time()), site)
+        store = disk.check_store(disk.read_store(folder, time.time(), journal), site)
     except SitegridError as error:
         store = Finding(Level.FAIL, "store", str(error))
     return [store, disk.check_disk("store", disk.free_bytes(folder))]

@@ -248,6 +248,7 @@ GOLDEN: dict[str, Golden] = {
     "batch_lost.bin": Golden(LOST, codec.encode_batch, decode_batch),
     "batch_empty.bin": Golden(ASK, codec.encode_batch, decode_batch),
     "ack.bin": Golden(Ack(43, 17, 2, STORE), codec.encode_reply, codec.decode_reply),
+    "ack_epoch.bin": Golden(Ack(43, 17, 2, STORE, epoch=7), codec.encode_reply, codec.decode_reply),
     "ack_replaces.bin": Golden(Ack(43, 17, 2, STORE, "fedcba9876543210"), codec.encode_reply, codec.decode_reply),
     "ack_offer.bin": Golden(Ack(43, 17, 0, STORE, offer=encode_offer(OFFER)), codec.encode_reply, codec.decode_reply),
     "refused.bin": Golden(Refused("gap", "first_seq: 41: 12 is expected", 12), codec.encode_reply, codec.decode_reply),

@@ -234,7 +234,7 @@ def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path:
     covariance = ((4e-7, 0.0, 0.0), (0.0, 2e-5, 0.0), (0.0, 0.0, 1e-6))
     with closing(SqliteJournal(path, config.name, config.frame)) as journal:
         for name in (one, other):
-            offered = Correction(name, 0, LAST_NS, 0.004, 0.03, 0.0, covariance)
+            offered = Correction(name, START_NS, LAST_NS, 0.004, 0.03, 0.0, covariance)
             decision = CalibrationDecision(name, SOLVER, "", START_NS, (offered,))
             journal.append_event("calibration", START_NS, decision.body())
     server = serve(site)

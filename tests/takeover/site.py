@@ -15,12 +15,12 @@ from typing import Any
 
 import psycopg
 
+from benchmarks.postgres.server import Database
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig, site_toml
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.process.children import Child, Children, wait_until
 from tests.chaos.tcp_proxy import FAIR, Proxy, Weather
-from tests.postgres import Database
 from tests.takeover.senders import Acknowledged, Sender
 
 READY_S = 120.0
@@ -134,7 +134,8 @@ class TakeOverSite:
             machine = record[_HEAD.size : _HEAD.size + name_bytes].decode()
             samples = (len(record) - _HEAD.size - name_bytes - 4) // SAMPLE_DTYPE.itemsize
             there.update((machine, first_seq + k) for k in range(samples))
-        acks = [Acknowledged(**json.loads(line)) for path in self.folder.glob("*.audit") for line in path.open()]
+        lines = [line for path in self.folder.glob("*.audit") for line in path.read_text().splitlines()]
+        acks = [Acknowledged(**json.loads(line)) for line in lines]
         acks.sort(key=lambda ack: ack.at_s)
         reached = {
             name: max((ack.watermark for ack in acks if ack.machine == name), default=0) for name in self.machines

@@ -14,6 +14,8 @@ from protocol.errors import ConfigError, StoreError
 Connection = psycopg.Connection[tuple[Any, ...]]
 SCHEMA = "sitegrid"  # the database's schema with the tables
 MISSING = ("3D000", "3F000", "42P01")  # SQLSTATEs: no such database, schema, table
+REPLICAS = """SELECT current_setting('synchronous_standby_names') <> '',
+(SELECT count(*) FROM pg_stat_replication)"""
 # A server that is gone is noticed after three to four seconds, whatever it was doing then.
 DEFAULTS = {
     "connect_timeout": "3",
@@ -44,6 +46,11 @@ def connect(url: str, role: str, **more: str) -> Connection:
     db = psycopg.connect("", autocommit=True, prepare_threshold=None, **settings)  # type: ignore[arg-type]
     db.execute(f"SET search_path = {SCHEMA}; SET standard_conforming_strings = on")
     return db
+
+
+def replica_of(*, synchronous: bool, replicas: int) -> str:
+    """What stands behind a database's disk, by what REPLICAS answers."""
+    return "synchronous" if synchronous else "asynchronous" if replicas else "none"
 
 
 def line(error: psycopg.Error) -> str:

@@ -32,6 +32,7 @@ from protocol.disk.high_water_mark import HighWaterMark
 from protocol.errors import StoreError
 from protocol.files import make_private
 
+LACKING = "it is another journal than before, or lacks rows that were acknowledged; start this server again"
 LOOK_S = 0.1  # between two looks whether the lock is free
 _PUT = (
     "ON CONFLICT (machine, spool_id) DO UPDATE SET"
@@ -234,13 +235,15 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._return_to_disk()
         gone = self._row < row or (row and self.row_checksum(row) not in (checksum, None))
         if gone or int(self.identity().id, 16) != store:
-            self._fence("it is another journal than before, or lacks rows that were acknowledged")
+            self._fence(LACKING)
         if self._newest != event:
             self._fence("a decision was committed whose answer was lost")
         self._note_mark()
 
     def _require_epoch(self, rows: list[tuple[int]]) -> None:
-        if rows[0][0] != self.epoch:
+        if rows[0][0] < self.epoch:
+            self._fence(LACKING)
+        if rows[0][0] > self.epoch:
             self._fence(f"another server has taken over the journal, with epoch {rows[0][0]} after {self.epoch}")
 
     def _fence(self, why: str) -> None:
@@ -251,12 +254,9 @@ class PostgresJournal(TableWriter, PostgresQueries):
     def _on_loss(self) -> None:
         """Look whether another server has taken over, on a connection of its own: the writer may have nothing to do."""
         with suppress(psycopg.Error), connect(self._url, "lost", target_session_attrs="read-write") as db:
-            self._look(db)
-
-    def _look(self, db: Connection) -> None:
-        ((epoch,),) = db.execute("SELECT epoch FROM head").fetchall()
-        if epoch > self.epoch and self._session.lost:
-            self.fenced = f"another server has taken over the journal, with epoch {epoch} after {self.epoch}"
+            ((epoch,),) = db.execute("SELECT epoch FROM head").fetchall()
+            if epoch > self.epoch and self._session.lost:
+                self.fenced = f"another server has taken over the journal, with epoch {epoch} after {self.epoch}"
 
     def _return_to_disk(self) -> None:
         self._progress = Progress(self._load_watermarks())

@@ -13,7 +13,7 @@ import psycopg
 
 from mapserver.journal.journal import ROWS_AT_ONCE, JournalState
 from mapserver.journal.postgres import connection
-from mapserver.journal.postgres.connection import Connection, connect, readable, shown
+from mapserver.journal.postgres.connection import REPLICAS, Connection, connect, readable, replica_of, shown
 from mapserver.journal.queries import BYTES_AT_ONCE, TableQueries, size_of
 from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
@@ -86,6 +86,12 @@ class PostgresQueries(TableQueries):
     def archived_row(self) -> int:
         """See `JournalQueries`."""
         return self._number("SELECT archived_row FROM head")
+
+    @property
+    def replica(self) -> str:
+        """See `JournalQueries`."""
+        ((synchronous, replicas),) = self._query(REPLICAS)
+        return replica_of(synchronous=synchronous, replicas=replicas)
 
     def state(self) -> JournalState:
         """See `JournalQueries`."""
@@ -162,9 +168,9 @@ class PostgresReader(PostgresQueries):
         """See `JournalReader`: waits for a notification, and looks by itself once a second."""
         end_s = time.monotonic() + timeout_s
         with readable(self._where):
-            is_told = self._listen()
+            notified = self._listen()
             while (state := self.state()) == known and (left_s := end_s - time.monotonic()) > 0:
-                if is_told:
+                if notified:
                     list(self._connected().notifies(timeout=min(left_s, _LOOK_S), stop_after=1))
                 else:
                     time.sleep(min(left_s, _LOOK_AGAIN_S))

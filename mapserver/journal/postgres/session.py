@@ -19,7 +19,7 @@ from typing import Any
 import psycopg
 
 from mapserver.journal.journal import FencedError, UnwrittenError
-from mapserver.journal.postgres.connection import connect, line
+from mapserver.journal.postgres.connection import REPLICAS, connect, line, replica_of
 from protocol.errors import StoreError
 
 HANGS_S = 1.5  # a holder that says nothing for so long has lost the lock
@@ -38,21 +38,18 @@ _SETTINGS = """SELECT current_setting('server_version_num')::int, current_settin
 current_setting('full_page_writes'), set_config('synchronous_commit',
     CASE current_setting('synchronous_commit') WHEN 'remote_apply' THEN 'remote_apply' ELSE 'on' END, false),
 pg_backend_pid()"""
-_REPLICAS = """SELECT current_setting('synchronous_standby_names') <> '',
-(SELECT count(*) FROM pg_stat_replication), current_setting('server_version')"""
 log = logging.getLogger("mapserver.journal.postgres.session")
 
 
 class WriterSession:
     """A session for the lock and for writes; for any thread, one at a time.
 
-    lost: why it cannot be used any more, empty while it can. replica: what stands behind the database's disk:
-    "synchronous", "asynchronous" or "none"; version: of the database.
+    lost: why it cannot be used any more, empty while it can. replica: see `JournalQueries`.
     """
 
     def __init__(self, url: str, where: str, lost: Callable[[], None] = lambda: None) -> None:
         """lost: is called, on a thread of its own, again and again once the session is lost."""
-        self.lost, self.replica, self.version = "", "none", ""
+        self.lost, self.replica = "", "none"
         self._where, self._on_loss = where, lost
         self._turn, self._ending = threading.Lock(), threading.Event()
         self._warning = ""
@@ -128,8 +125,8 @@ class WriterSession:
         return int(pid)
 
     def _look_for_replicas(self) -> None:
-        ((synchronous, replicas, self.version),) = self._db.execute(_REPLICAS).fetchall()
-        self.replica = "synchronous" if synchronous else "asynchronous" if replicas else "none"
+        ((synchronous, replicas),) = self._db.execute(REPLICAS).fetchall()
+        self.replica = replica_of(synchronous=synchronous, replicas=replicas)
 
     def _stay_awake(self) -> None:
         turns = 0

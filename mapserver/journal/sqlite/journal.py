@@ -31,7 +31,7 @@ SPARE = 0.25  # share of free pages above which a file is made smaller
 class SqliteJournal(TableWriter, SqliteQueries):
     """See `Journal`. StoreError where anything in it is damaged (`check`)."""
 
-    fenced, replica = "", "none"
+    fenced = ""
 
     def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = (), store: str = "") -> None:
         """descends: ids of the stores that a new one is made from. store: id of the one that a new one is a copy of."""

@@ -52,7 +52,7 @@ _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "n
 class SqliteQueries(TableQueries):
     """What can be read of a journal, on its owner's connection as on a reader's; see `JournalQueries`."""
 
-    schema = SCHEMA
+    schema, replica = SCHEMA, "none"
     path: Path
     _db: sqlite3.Connection
 

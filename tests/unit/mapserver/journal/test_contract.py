@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.postgres.server import Database
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import Store
 from mapserver.journal.history import history_rows
@@ -23,7 +24,6 @@ from mapserver.journal.sqlite.journal import SqliteJournal
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
 from protocol.wire.messages import Ack, Refused
-from tests.postgres import Database
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, incoming, now_ns, random_samples, same, samples
 
 

@@ -1,4 +1,4 @@
-"""Real PostgreSQL servers in temporary folders, for tests: Debian's binaries, run as another user than root."""
+"""Real PostgreSQL servers in temporary folders: Debian's binaries, run as another user than root."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Database:
         """End the session that has a journal's lock, if there is one."""
         held = "SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted"
         here = "database = (SELECT oid FROM pg_database WHERE datname = current_database())"
-        self.sql(f"SELECT pg_terminate_backend(pid) FROM ({held} AND {here}) AS holder")
+        self.sql(f"SELECT pg_terminate_backend(pid) FROM ({held} AND {here}) AS holder")  # noqa: S608 # constants
 
 
 class Cluster:
@@ -98,7 +98,7 @@ class Cluster:
         words = [str(self._bin / "postgres"), "-D", str(self.data)]
         words += [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
         log = (self.folder / "log").open("ab")
-        self._process = subprocess.Popen(words, stdout=log, stderr=log, cwd=self.folder, **_as_user())
+        self._process = subprocess.Popen(words, stdout=log, stderr=log, cwd=self.folder, **_as_user())  # noqa: S603
         log.close()
         end_s = time.monotonic() + START_S
         while True:
@@ -145,7 +145,8 @@ class Cluster:
 
     def _run(self, name: str, *words: object) -> None:
         command = [str(self._bin / name), *map(str, words)]
-        done = subprocess.run(command, capture_output=True, cwd=self.folder, check=False, text=True, **_as_user())
+        as_user = _as_user()
+        done = subprocess.run(command, capture_output=True, cwd=self.folder, check=False, text=True, **as_user)  # noqa: S603
         if done.returncode:
             raise RuntimeError(f"{name}: {done.stderr[-2000:]}")
 
@@ -157,6 +158,19 @@ def cluster(**settings: str) -> Iterator[Cluster]:
         made = Cluster(folder)
         made.initialise()
         made.start(**settings)
+        try:
+            yield made
+        finally:
+            made.stop(signal.SIGQUIT)
+
+
+@contextmanager
+def replica(primary: Cluster, name: str) -> Iterator[Cluster]:
+    """A new replica of a server, which streams under this name; it goes away with its data."""
+    with cluster_folder() as folder:
+        made = Cluster(folder)
+        made.copy_of(primary, name)
+        made.start()
         try:
             yield made
         finally:
