@@ -79,20 +79,18 @@ class FollowerSource:
             raise QueryError(Refusal.STORE, str(error)) from None
         with self._lock:
             counters = dict(self._counts)
-        return (
-            info
-            | journal
-            | {
-                "descends": list(identity.descends),
-                "accepted": sorted(accepted),
-                "decided": decided,
-                "journalled": self._following.journalled,
-                "snapshot": max(rows_on_disk(self.location.folder), default=0),
-                "machines": by_machine(progress, shortfalls),
-                "shortfalls": [str(each) for each in shortfalls],
-                "counters": counters,
-            }
-        )
+        return info | {
+            "epoch": epoch,
+            "replica": "unknown",  # the server knows
+            "descends": list(identity.descends),
+            "accepted": sorted(accepted),
+            "decided": decided,
+            "journalled": self._following.journalled,
+            "snapshot": max(rows_on_disk(self.location.folder), default=0),
+            "machines": by_machine(progress, shortfalls),
+            "shortfalls": [str(each) for each in shortfalls],
+            "counters": counters,
+        }
 
     def alive(self) -> ServerAlive:
         """Whether the journal is looked at; QueryError where it has not been for long."""
