@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Any
 
 import zenoh
 
@@ -83,10 +82,13 @@ class Followers:
         """Names, the first to be asked first."""
         now_s = time.monotonic()
         if now_s >= self._look_s:
-            replies = self._session.liveliness().get(keys.followers_alive_all(self._site), timeout=LOOK_WAIT_S)
-            names = {name for reply in replies if reply.ok is not None and (name := _name(str(reply.ok.key_expr)))}
-            self._names, self._look_s = preferred(self._client, names), time.monotonic() + LOOK_S
+            self._names, self._look_s = preferred(self._client, self.look()), time.monotonic() + LOOK_S
         return [name for name in self._names if self._avoided.get(name, 0.0) <= now_s]
+
+    def look(self) -> set[str]:
+        """Names of those whose tokens are there."""
+        replies = self._session.liveliness().get(keys.followers_alive_all(self._site), timeout=LOOK_WAIT_S)
+        return {name for reply in replies if reply.ok is not None and (name := _name(str(reply.ok.key_expr)))}
 
     def avoid(self, name: str) -> None:
         """Ask others for a while, and look again who is there."""
@@ -118,12 +120,14 @@ class Asker:
         return self._get(query, wait_s)
 
     def followers(self) -> list[FollowerState]:
-        """All followers that answer, by name; also those that clients are not offered, since they are far behind."""
-        every: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
-        replies = self._session.get(keys.followers_alive_all(self._site), timeout=self._timeout_s / 2, **every)
-        answers = [reply.ok for reply in replies if reply.ok is not None]
-        states = [_state(decode_alive(one.payload.to_bytes()), _origin(one.attachment)) for one in answers]
-        return sorted(states, key=lambda state: state.name)
+        """Followers whose tokens are there and that answer, by name."""
+        states = []
+        for name in sorted(self._followers.look()):  # one by one: routers let no wildcard pass to a name
+            key = keys.follower_query(self._site, name, requests.AliveQuery.name)
+            answered = self._once(_Attempt(key, {}, name), self._timeout_s / 2)
+            if isinstance(answered, Answered):
+                states.append(_state(decode_alive(answered.data), answered.origin))
+        return states
 
     def command(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
         """Have the server carry out a command."""
