@@ -225,7 +225,7 @@ def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: 
 
 
 def _decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
-    """Those of all sources, each history once; of those that begin alike, as of a store and its archive, what goes on.
+    """Those of all sources, each history once: of one that another holds, as of a store and its archive, what goes on.
 
     A decision that was made twice counts twice: who corrects, takes that back, and corrects again, has corrected.
     """
@@ -233,10 +233,16 @@ def _decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[Calib
     taken: list[Sequence[CalibrationDecision]] = []
     for history in histories:
         if history not in taken:
-            same = takewhile(lambda pair: pair[0] == pair[1], zip(out, history, strict=False))
-            out += history[sum(1 for _ in same) :]
+            out += history[max((_held(history, other) for other in taken), default=0) :]
             taken.append(history)
     return out
+
+
+def _held(history: Sequence[CalibrationDecision], other: Sequence[CalibrationDecision]) -> int:
+    """How much of a history another one holds, from its beginning on; in that of a fold of both it comes later."""
+    starts = (i for i, decision in enumerate(other) if history and history[0] == decision)
+    runs = (takewhile(lambda pair: pair[0] == pair[1], zip(history, other[i:], strict=False)) for i in starts)
+    return max((sum(1 for _ in run) for run in runs), default=0)
 
 
 def _lines(summary: Mapping[str, Any]) -> list[str]:
