@@ -123,7 +123,7 @@ def test_a_scale_that_is_remembered_does_not_wear_out() -> None:
 
 
 def test_a_scale_that_is_found_late_leaves_no_step_in_the_map() -> None:
-    """Paved ramps show nothing, until the machine drives one both ways; what it drove long before is right then, too."""
+    """Paved ramps show nothing, until the machine drives one both ways; what it drove before is right then, too."""
     ledger, decisions, driven = Ledger(), CalibrationDecisions(), []
     ledger.epochs = 2
     for turn in range(6):

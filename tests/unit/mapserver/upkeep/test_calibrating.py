@@ -14,7 +14,7 @@ import pytest
 
 from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet import calibration, ledger
+from mapserver.fleet import calibration
 from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import corrected
 from mapserver.fleet.ledger import Ledger
@@ -358,9 +358,9 @@ def test_one_clock_that_was_ahead_does_not_stop_the_calibration_of_the_site(tmp_
 
 
 def test_what_a_clock_stamped_that_was_ahead_has_no_part_in_a_solve(tmp_path, monkeypatch):
-    """A machine drives with a clock that is 20 h ahead, and then with one that is right; in both for an epoch or two."""
+    """A machine drives with a clock that is 20 h ahead, and then with one that is right, in both for some epochs."""
     monkeypatch.setattr(calibration, "MOST_EPOCHS", 1)
-    monkeypatch.setattr(ledger, "_PENDING_ROWS", 10)
+    monkeypatch.setattr("mapserver.fleet.ledger._PENDING_ROWS", 10)
     with closing(open_writer(tmp_path)) as writer:
         job, _ = calibrating(writer)
         with closing(job):
