@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
 from benchmarks.agents import filter as filters
+from benchmarks.folds import archive
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 from benchmarks.web import pages as web
@@ -49,6 +50,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         fold.run,
         "journals that are folded again, and a decision about a machine",
         {"hours": HOURS, "samples": 20_000_000, "runs": 1},
+    ),
+    "archive": (
+        archive.run,
+        "an archive that is folded by threads, processes and a cluster",
+        {"samples": 50_000_000, "runs": 1},
     ),
     "live": (
         live.run,

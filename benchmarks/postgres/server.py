@@ -67,6 +67,11 @@ class Database:
         """Run one statement as the superuser."""
         return self.cluster.sql(statement, self.name)
 
+    def end_all(self) -> None:
+        """End all other sessions."""
+        others = "datname = current_database() AND pid <> pg_backend_pid()"
+        self.sql(f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE {others}")  # noqa: S608 # a constant
+
     def end_writer(self) -> None:
         """End the session that has a journal's lock, if there is one."""
         held = "SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted"

@@ -61,6 +61,10 @@ class JournalLocation:
             words = (self.url, self.folder, site, frame, descends, waiting)
             journal: Journal = _postgres().journal.PostgresJournal(*words)
             return journal
+        return self.open_file(site, frame, descends)
+
+    def open_file(self, site: str, frame: str, descends: Iterable[str] = ()) -> SqliteJournal:
+        """As `open`, of a file in the folder, which can be made to go on after an archive."""
         return SqliteJournal(self._file, site, frame, descends)
 
     def reader(self) -> JournalReader:

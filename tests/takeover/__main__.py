@@ -19,9 +19,12 @@ def main() -> int:
     """Run; 1 where anything is wrong."""
     parser = argparse.ArgumentParser(prog="tests.takeover", description=__doc__)
     parser.add_argument("--count", type=int, default=len(FAULTS), help="how many take-overs")
-    count = parser.parse_args().count
+    parser.add_argument("--samples", type=int, default=0, help="so many are in the journal before")
+    arguments = parser.parse_args()
+    count = arguments.count
     with cluster() as server, tempfile.TemporaryDirectory() as name, Children(Path(name)) as children:
         site = TakeOverSite(Path(name), children, server.new_database())
+        site.fill(arguments.samples)
         site.start()
         rounds = []
         for number in range(count):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
+from protocol.arrays import Table
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
@@ -53,7 +54,8 @@ class Sender(threading.Thread):
     def run(self) -> None:
         with self._audit.open("a") as audit:
             while not self._ending.is_set():
-                batch = SampleBatch(self.machine, SPOOL, self.reached + 1, self._rows(), self._site.frame)
+                rows = rows_of(self.reached + 1, BATCH)
+                batch = SampleBatch(self.machine, SPOOL, self.reached + 1, rows, self._site.frame)
                 if ack := self._ask(encode_batch(batch)):
                     self.reached = ack.watermark
                     seen = Acknowledged(self.machine, ack.watermark, ack.row, ack.epoch, ack.store, time.time())
@@ -75,12 +77,13 @@ class Sender(threading.Thread):
             self.refused.append(str(error))
         return None
 
-    def _rows(self) -> np.ndarray:
-        seqs = self.reached + 1 + np.arange(BATCH)
-        rows = empty(BATCH)
-        usual = {"distance_m": 1.0, "c_rr": 0.04, "grade_e": 0.1, "grade_n": -0.05}
-        usual |= {"cov_xx_m2": 0.01, "cov_yy_m2": 0.01}
-        placed = {"stamp_ns": BEGIN_NS + seqs * 100_000_000, "x_m": seqs % 100 + 0.5, "y_m": (seqs // 100) % 100 + 0.5}
-        for name, values in (usual | placed).items():
-            rows[name] = values
-        return rows
+
+def rows_of(first_seq: int, count: int) -> Table:
+    """Samples of a drive, each by its number: twice the same where they are sent twice."""
+    seqs = first_seq + np.arange(count)
+    rows = empty(count)
+    usual = {"distance_m": 1.0, "c_rr": 0.04, "grade_e": 0.1, "grade_n": -0.05, "cov_xx_m2": 0.01, "cov_yy_m2": 0.01}
+    placed = {"stamp_ns": BEGIN_NS + seqs * 100_000_000, "x_m": seqs % 400 + 0.5, "y_m": (seqs // 400) % 400 + 0.5}
+    for name, values in (usual | placed).items():
+        rows[name] = values
+    return rows

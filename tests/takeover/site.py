@@ -9,23 +9,28 @@ import time
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import psycopg
 
-from benchmarks.postgres.server import Database
+from benchmarks.postgres.server import Cluster, Database
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.rows import Admission
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig, site_toml
+from protocol.wire.messages import SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.process.children import Child, Children, wait_until
 from tests.chaos.tcp_proxy import FAIR, Proxy, Weather
-from tests.takeover.senders import Acknowledged, Sender
+from tests.takeover.senders import BEGIN_NS, Acknowledged, Sender, rows_of
 
 READY_S = 120.0
 ACK_S = 60.0  # for the first acknowledgement after a fault
 FENCED = 3
+ROWS, FILL_BATCH = 100, 100  # of a commit, and samples of a row, of what was there before
 SITE = SiteConfig("pit", 48.0, 11.0)
 _HEAD = struct.Struct("<qqQqB")  # of a record, as docs/design.md has it; nothing of the product is used to look at rows
 
@@ -66,7 +71,11 @@ class Verdict:
 class TakeOverSite:
     """Started by `start`; every process is one of `children`."""
 
-    def __init__(self, folder: Path, children: Children, database: Database, machines: int = 3) -> None:
+    def __init__(
+        self, folder: Path, children: Children, database: Database, machines: int = 3, hosts: Sequence[Cluster] = ()
+    ) -> None:
+        """hosts: where the database is or may be later, without a proxy; none for where it is, behind proxies."""
+        self._hosts = hosts
         self.folder, self.database, self._children = folder, database, children
         self.endpoint = free_endpoint()
         self.exit_codes: Counter[str] = Counter()
@@ -75,6 +84,17 @@ class TakeOverSite:
         self.machines = [f"loader-{n}" for n in range(machines)]
         self.senders: list[Sender] = []
         self.standby: Server | None = None
+
+    def fill(self, samples: int) -> None:
+        """Have so many samples of an earlier machine in the journal, before any server starts."""
+        journal = JournalLocation(self.folder / "fill", self.database.url).open(SITE.name, SITE.frame)
+        with closing(journal):
+            for first in range(1, samples, ROWS * FILL_BATCH):
+                journal.begin()
+                for seq in range(first, first + ROWS * FILL_BATCH, FILL_BATCH):
+                    batch = SampleBatch("earlier", 1, seq, rows_of(seq, FILL_BATCH), SITE.frame)
+                    journal.append(Admission(batch, trimmed=0, lost=0), BEGIN_NS)
+                journal.commit()
 
     def start(self, pause_s: float = 0.02) -> None:
         self._children.start("router", "router", "--listen", self.endpoint).expect("ready", READY_S)
@@ -132,6 +152,8 @@ class TakeOverSite:
             row, _, _, first_seq, name_bytes = _HEAD.unpack_from(record)
             assert row == number
             machine = record[_HEAD.size : _HEAD.size + name_bytes].decode()
+            if machine not in self.machines:
+                continue
             samples = (len(record) - _HEAD.size - name_bytes - 4) // SAMPLE_DTYPE.itemsize
             there.update((machine, first_seq + k) for k in range(samples))
         lines = [line for path in self.folder.glob("*.audit") for line in path.read_text().splitlines()]
@@ -155,7 +177,9 @@ class TakeOverSite:
         self._made += 1
         name = f"server-{self._made}"
         proxy = self._children.enter_context(Proxy(self.database.cluster.port))
-        url = self.database.url.replace(f":{self.database.cluster.port}/", f":{proxy.endpoint.rpartition(':')[2]}/")
+        ports = [cluster.port for cluster in self._hosts] or [proxy.endpoint.rpartition(":")[2]]
+        hosts = ",".join(f"127.0.0.1:{port}" for port in ports)
+        url = f"postgresql://postgres@{hosts}/{self.database.name}?target_session_attrs=read-write"
         words = ("--endpoint", self.endpoint, "--site-file", self.folder / "site.toml")
         words += ("--store", self.folder / name, "--journal", url)
         return Server(name, proxy, self._children.start(name, "server", *words))

@@ -3,12 +3,14 @@
 A commit is one message: what it writes is gathered in memory until then. It names the epoch and the last row that this
 writer knows, and fails where the journal has others: a writer that has lost its lock without a word acknowledges
 nothing. Where its answer is lost it is not known whether it happened; then the lock and a new epoch are taken, which
-waits for a commit that is still under way, and the journal says.
+waits for a commit that is still under way, and the journal says. It is one module because a transaction, and what
+to do when its answer is lost, are about the same few values.
 """
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -21,7 +23,7 @@ from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
 from mapserver.journal.postgres.connection import Connection, connect
 from mapserver.journal.postgres.mark import CHECKSUM, EPOCH, STORE, traces_of, trusted_by
 from mapserver.journal.postgres.reader import CHANNEL, SCHEMA, TABLES, PostgresQueries
-from mapserver.journal.postgres.session import WriterSession
+from mapserver.journal.postgres.session import HANGS_S, WriterSession
 from mapserver.journal.postgres.statements import insert
 from mapserver.journal.progress import Progress
 from mapserver.journal.records import checksum_of
@@ -32,7 +34,6 @@ from protocol.disk.high_water_mark import HighWaterMark
 from protocol.errors import StoreError
 from protocol.files import make_private
 
-LACKING = "it is another journal than before, or lacks rows that were acknowledged; start this server again"
 LOOK_S = 0.1  # between two looks whether the lock is free
 _PUT = (
     "ON CONFLICT (machine, spool_id) DO UPDATE SET"
@@ -91,7 +92,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
 
     @property
     def replica(self) -> str:
-        """See `Journal`."""
+        """See `Journal`: as of some seconds ago."""
         return self._session.replica
 
     def begin(self) -> None:
@@ -188,19 +189,22 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._rows, self._extents, self._puts, self._before = [], [], {}, {}
 
     def _take_lock(self, waiting: Callable[[float], None] | None) -> bool:
-        """Wait until no other session has the lock, also while the database is away; whether that took any time."""
-        waited = False
+        """Wait until no other session has the lock, also while the database is away; whether that took any time.
+
+        Who may not wait waits for as long as the database needs to notice that the last holder is gone.
+        """
+        waited, end_s = False, time.monotonic() + 2 * HANGS_S
         while True:
             with suppress(UnwrittenError):
                 if self._session.lost:
                     self._session = WriterSession(self._url, self.where, self._on_loss)
                 if self._session.take_lock():
                     return waited
-            if waiting is None:
+            if waiting is None and time.monotonic() > end_s:
                 problem = self._session.lost or "another server is writing this journal; stop it first"
                 raise StoreError(self.where, problem)
-            waiting(LOOK_S)
-            waited = True
+            (waiting or time.sleep)(LOOK_S)
+            waited = waiting is not None
 
     def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
         """Make the tables where there are none; nobody else does so meanwhile, since the lock is taken."""
@@ -221,30 +225,41 @@ class PostgresJournal(TableWriter, PostgresQueries):
         log.info("journal taken epoch=%d", self.epoch)
 
     def _open_again(self) -> None:
-        """Go on after the session was lost, if no other server has written meanwhile."""
-        known, row, event = self.epoch, self._committed, self._newest
-        checksum, store = self._mark.values.get(CHECKSUM), self._mark.values.get(STORE)
-        self._session.close()
-        self._session = WriterSession(self._url, self.where, self._on_loss)
-        if not self._session.take_lock():
-            self._require_epoch(self._session.run("SELECT epoch FROM head"))
+        """Go on after the session was lost, if no other server has written meanwhile; else it is tried again later."""
+        self._close_sessions()
+        try:
+            self._session = WriterSession(self._url, self.where, self._on_loss)
+            self._take_again()
+        except FencedError:
+            raise
+        except StoreError as error:
             self._session.close()
-            raise UnwrittenError(self.where, "the last session still has the journal's lock")
-        self._require_epoch(self._session.run("SELECT epoch FROM head"))
-        self._take_epoch(known)
-        self._return_to_disk()
-        gone = self._row < row or (row and self.row_checksum(row) not in (checksum, None))
-        if gone or int(self.identity().id, 16) != store:
-            self._fence(LACKING)
-        if self._newest != event:
+            log.warning("journal not open yet problem=%r", str(error))
+            raise UnwrittenError(self.where, "the journal's database is away, or its lock is not free yet") from None
+
+    def _take_again(self) -> None:
+        is_free = self._session.take_lock()
+        ((epoch,),) = self._session.run("SELECT epoch FROM head")
+        if epoch > self.epoch:
+            self._fence(self._taken_over(epoch))
+        if not is_free:
+            raise StoreError(self.where, "the last session still has its lock")
+        known = self._mark.values
+        if epoch == self.epoch and int(self.identity().id, 16) == known.get(STORE):
+            self._take_epoch(epoch)
+        state, checksum = super().state(), self.row_checksum(self._committed)
+        same = state.row >= self._committed and checksum in (known.get(CHECKSUM) if self._committed else None, None)
+        if state.epoch != self.epoch or not same:
+            self._fence(
+                "it is another journal than before, or lacks rows that were acknowledged; start this server again"
+            )
+        if state.event != self._newest:
             self._fence("a decision was committed whose answer was lost")
+        self._return_to_disk()
         self._note_mark()
 
-    def _require_epoch(self, rows: list[tuple[int]]) -> None:
-        if rows[0][0] < self.epoch:
-            self._fence(LACKING)
-        if rows[0][0] > self.epoch:
-            self._fence(f"another server has taken over the journal, with epoch {rows[0][0]} after {self.epoch}")
+    def _taken_over(self, epoch: int) -> str:
+        return f"another server has taken over the journal, with epoch {epoch} after {self.epoch}"
 
     def _fence(self, why: str) -> None:
         self.fenced = why
@@ -252,11 +267,11 @@ class PostgresJournal(TableWriter, PostgresQueries):
         raise FencedError(self.where, why)
 
     def _on_loss(self) -> None:
-        """Look whether another server has taken over, on a connection of its own: the writer may have nothing to do."""
+        """Look whether another server has taken over: the writer itself may have nothing to do."""
         with suppress(psycopg.Error), connect(self._url, "lost", target_session_attrs="read-write") as db:
             ((epoch,),) = db.execute("SELECT epoch FROM head").fetchall()
             if epoch > self.epoch and self._session.lost:
-                self.fenced = f"another server has taken over the journal, with epoch {epoch} after {self.epoch}"
+                self.fenced = self._taken_over(epoch)
 
     def _return_to_disk(self) -> None:
         self._progress = Progress(self._load_watermarks())
@@ -284,10 +299,9 @@ class PostgresJournal(TableWriter, PostgresQueries):
 
     def _note_mark(self) -> None:
         present = marked(self._row, self._newest, self.watermarks())
-        own = {STORE: int(self.identity().id, 16), EPOCH: self.epoch}
-        own |= {CHECKSUM: self.row_checksum(self._row) or 0}
+        store, checksum = int(self.identity().id, 16), self.row_checksum(self._row) or 0
         with suppress(OSError):  # it stays behind, which is no alarm, or is compared again
-            self._mark.replace({**present, **own})
+            self._mark.replace({**present, STORE: store, EPOCH: self.epoch, CHECKSUM: checksum})
 
     def _close_sessions(self) -> None:
         self._session.close()

@@ -106,6 +106,8 @@ class WriterSession:
         """Let go of the lock."""
         self._ending.set()  # its thread ends by itself, unless it waits for a database that does not answer
         with self._turn:
+            with suppress(psycopg.Error):
+                self._db.execute("SELECT pg_advisory_unlock_all()")  # now, not once the database sees that it is closed
             self._lose("it is closed")
 
     def _require_settings(self) -> int:

@@ -8,14 +8,14 @@ decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulate
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from mapserver.journal.journal import ROWS_AT_ONCE, UnwrittenError
 from mapserver.journal.progress import Progress
-from mapserver.journal.rows import JournalRow, Watermark
+from mapserver.journal.rows import JournalRow, SpoolKey, Watermark
 from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
 from mapserver.journal.sqlite.reader import SCHEMA, TABLES, SqliteQueries
 from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, new_meta, watermark_line
@@ -108,6 +108,15 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 self._write("INSERT INTO events VALUES (?, ?, ?, ?, ?)", line)
                 self._changed[EVENT] = line[0]
             return self._last_event()
+
+    def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
+        """Have a new journal go on after an archive with rows up to `row`, and spools up to these watermarks."""
+        with self._transaction():
+            self._write("INSERT INTO sqlite_sequence VALUES ('journal', ?)", (row,))
+            self._write("REPLACE INTO meta VALUES ('archived_row', ?)", (str(row),))
+            self._row = row
+            for spool, watermark in watermarks.items():
+                self.put_watermark(*spool, watermark)
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
         """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.

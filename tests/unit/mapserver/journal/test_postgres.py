@@ -222,10 +222,11 @@ def test_a_writer_without_its_lock_cannot_commit(tmp_path, database):
         assert database.sql("SELECT count(*) FROM sitegrid.journal") == [(0,)]
 
 
-def test_a_server_goes_on_after_its_session_was_ended(tmp_path, database):
+@pytest.mark.parametrize("end", [Database.end_writer, Database.end_all])
+def test_a_server_goes_on_after_its_sessions_were_ended(tmp_path, database, end):
     with closing(open_store(tmp_path, database)) as store:
         assert send(store, 1).epoch == 1
-        database.end_writer()
+        end(database)
         answers = [send(store, 6), send(store, 6)]
         assert isinstance(answers[0], Refused)
         assert (answers[1].epoch, answers[1].watermark) == (2, 10)
@@ -354,6 +355,8 @@ def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_ac
     first = Store(JournalLocation(tmp_path / "one", database.url), SITE, CONFIG, now_ns)
     assert first.info()["replica"] == "synchronous"
     acknowledged = [send(first, k).watermark for k in (1, 6, 11)]
+    known = f"SELECT 1 FROM pg_database WHERE datname = '{database.name}'"
+    wait_for(lambda: replica.sql(known) and JournalLocation(tmp_path, replica.url(database.name)).exists())
     with JournalLocation(tmp_path / "two", replica.url(database.name)).reader() as follower:
         wait_for(lambda: follower.last_row == 3)
         assert follower.follow(follower.state(), 0.1).row == 3, "a replica has no notifications"
