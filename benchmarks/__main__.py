@@ -8,8 +8,9 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
+from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
 from benchmarks.agents import filter as filters
+from benchmarks.fleets import fleet, follow
 from benchmarks.folds import archive
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
@@ -68,6 +69,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         fleet.run,
         "a fleet at a real server: acknowledgements, and what they cost",
         {"machines": 500, "seconds": 70.0, "hours": HOURS},
+    ),
+    "follow": (
+        follow.run,
+        "followers: how soon they show a sample, what readers cost the machines with them and without",
+        {"machines": 100, "seconds": 15.0, "hours": 1.0, "runs": 3},
     ),
     "web": (
         web.run,
