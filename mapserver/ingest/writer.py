@@ -55,7 +55,7 @@ class Writer:
         self._group: list[_Batch] = []  # of this turn, as far as nobody has an answer
         self._works: deque[_Work] = deque()
         self._pace = Pace()
-        self._refusals: Counter[str] = Counter()  # of what never comes to the store
+        self._counts: Counter[str] = Counter()  # of what never comes to the store
         self._is_closing = False
         self._ended = ""  # why nothing is taken any more
         self._busy_since_s: float | None = None
@@ -77,7 +77,7 @@ class Writer:
         with self._turn:
             ended = self._ended
             gone = [] if ended else self._backlog.add(incoming.machine, size_of(incoming.payload), (incoming, reply))
-            self._refusals[f"refused_{Refusal.OVERLOADED}"] += len(gone)
+            self._counts[f"refused_{Refusal.OVERLOADED}"] += len(gone)
             retry_after_s = self._pace.retry_after_s(self._backlog.size)
             self._turn.notify()
         if ended:
@@ -96,10 +96,10 @@ class Writer:
             self._turn.notify()
         return result.result(timeout_s)
 
-    def count_refusal(self, reason: str) -> None:
-        """Count a refused query."""
+    def count(self, what: str) -> None:
+        """Count something that never comes to the store: what became of a query."""
         with self._turn:
-            self._refusals[f"refused_query_{reason}"] += 1
+            self._counts[what] += 1
 
     def alive(self) -> ServerAlive:
         """Whether batches are taken, without waiting for the owner; QueryError where it has ended, or hangs."""
@@ -119,7 +119,7 @@ class Writer:
         waiting = {"waiting": len(self._backlog), "waiting_bytes": self._backlog.size}
         info["writer"] = {**waiting, "commits": commits, "commit_s": commit_s}
         with self._turn:
-            info["counters"] |= +self._refusals
+            info["counters"] |= +self._counts
         return info
 
     def close(self) -> None:

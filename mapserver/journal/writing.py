@@ -104,9 +104,9 @@ class TableWriter(TableQueries):
                 raise StoreError(self.where, problem)
 
 
-def new_meta(schema: int, site: str, frame: str, descends: Iterable[str]) -> dict[str, str]:
-    """What a new journal says of itself. descends: ids of the stores that it is made from."""
-    words = (secrets.token_hex(8), *descends)
+def new_meta(schema: int, site: str, frame: str, descends: Iterable[str], store: str = "") -> dict[str, str]:
+    """What a new journal says of itself. descends: ids of the stores that it is made from. store: of a copy, its id."""
+    words = (store or secrets.token_hex(8), *descends)
     store = " ".join((*words, f"{checksum(*words):08x}"))
     return {"schema": str(schema), "site": site, "frame": frame, "store": store}
 

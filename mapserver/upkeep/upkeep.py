@@ -11,7 +11,6 @@ from typing import Any
 from mapserver.fleet.correction import Corrections
 from mapserver.fleet.machine_state import MachineState, state_of
 from mapserver.ingest.writer import Writer
-from mapserver.journal.facts import Facts
 from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from mapserver.upkeep.calibrating import Calibrating
@@ -59,10 +58,6 @@ class Upkeep:
         ]
         for thread in self._threads:
             thread.start()
-
-    def facts(self) -> Facts:
-        """What the map is folded with."""
-        return self._refolding.facts()
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with a number beyond `after`."""

@@ -221,6 +221,24 @@ class ServerAlive:
 
 
 @dataclass(frozen=True)
+class FollowerState:
+    """A follower that answers. store, merged: see MapVersion; journalled: the last row of the journal, as it knows.
+
+    behind_rows: rows that its map lacks. behind_s: its map had all that was in the journal so long ago, or later.
+    """
+
+    name: str
+    store: str
+    journalled: int
+    merged: int
+    behind_rows: int
+    behind_s: float
+
+    def __str__(self) -> str:
+        return f"{self.name}: journal row {self.merged}, {self.behind_rows} rows and {self.behind_s:.1f} s behind"
+
+
+@dataclass(frozen=True)
 class MachineState:
     """What the map server knows of one machine.
 

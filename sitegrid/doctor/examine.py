@@ -17,6 +17,7 @@ from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials
+from sitegrid.asking import Asker
 from sitegrid.doctor import Finding, Level, base, disk, network, skipped
 from sitegrid.doctor.keys import check_certificate, read_certificate
 from sitegrid.doctor.positions import check_positions
@@ -24,7 +25,8 @@ from sitegrid.security.join import join
 
 ANYBODY = "doctor"  # where there are no keys, every name is as good
 ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
-OF_SERVER = ("server", "losses", "clock", "time", "writer", "version", "permission")  # checks that need the map server
+# Checks that need the map server:
+OF_SERVER = ("server", "losses", "clock", "time", "writer", "followers", "version", "permission")
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
             network.check_clock(*network.offset_of(info, asked_ns), site),
             network.check_time(info),
             network.check_writers(network.ask_writers(session, subject.site)),
+            network.check_followers(Asker(session, "", subject.site, network.ANSWER_S).followers(), info),
             network.check_version(package_version(), info.version),
         ]
     return [*findings, _permission(subject, session, info)]

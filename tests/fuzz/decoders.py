@@ -101,6 +101,8 @@ _SINGLE = (
     "tiles",
     "why",
     "alive",
+    "origin",
+    "journal",
     *PLAIN[1:],
     "error",
 )

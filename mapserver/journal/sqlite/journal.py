@@ -8,14 +8,14 @@ decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulate
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from mapserver.journal.journal import ROWS_AT_ONCE, UnwrittenError
 from mapserver.journal.progress import Progress
-from mapserver.journal.rows import JournalRow, Watermark
+from mapserver.journal.rows import JournalRow, SpoolKey, Watermark
 from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
 from mapserver.journal.sqlite.reader import SCHEMA, TABLES, SqliteQueries
 from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, new_meta, watermark_line
@@ -33,8 +33,8 @@ class SqliteJournal(TableWriter, SqliteQueries):
 
     fenced = ""
 
-    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
-        """descends: ids of the stores that a new one is made from."""
+    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = (), store: str = "") -> None:
+        """descends: ids of the stores that a new one is made from. store: id of the one that a new one is a copy of."""
         self.path, self._row = path, 0
         self._changed: dict[str, int] = {}  # by the open transaction, for the mark
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
-                self._create_or_check(site, frame, descends)
+                self._create_or_check(site, frame, descends, store)
                 self._row = super().last_row
                 self.check()
                 self.epoch = self.state().epoch + 1
@@ -109,6 +109,15 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 self._changed[EVENT] = line[0]
             return self._last_event()
 
+    def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
+        """Have a new journal go on after an archive with rows up to `row`, and spools up to these watermarks."""
+        with self._transaction():
+            self._write("INSERT INTO sqlite_sequence VALUES ('journal', ?)", (row,))
+            self._write("REPLACE INTO meta VALUES ('archived_row', ?)", (str(row),))
+            self._row = row
+            for spool, watermark in watermarks.items():
+                self.put_watermark(*spool, watermark)
+
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
         """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.
 
@@ -159,10 +168,10 @@ class SqliteJournal(TableWriter, SqliteQueries):
             self.rollback()
             raise
 
-    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
+    def _create_or_check(self, site: str, frame: str, descends: Iterable[str], store: str) -> None:
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
             self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
-            meta = new_meta(SCHEMA, site, frame, descends)
+            meta = new_meta(SCHEMA, site, frame, descends, store)
             self._db.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
             self._db.execute("COMMIT")
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # no damage of a log takes the store's id away

@@ -49,7 +49,7 @@ def test_each_command_has_help_and_a_module(command: str, capsys):
         cli.main([command, "--help"])
     assert end.value.code == 0
     assert "--json" in capsys.readouterr().out
-    assert (Path(cli.__file__).parent / "commands" / f"{command}.py").exists()
+    assert list((Path(cli.__file__).parent / "commands").rglob(f"{command}.py"))
 
 
 @pytest.mark.parametrize(("set_to", "is_then"), [(None, "1"), ("3", "3")])
