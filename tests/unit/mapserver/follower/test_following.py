@@ -38,7 +38,6 @@ from tests.unit.mapserver.data import (
     wait_for,
 )
 
-
 pytestmark = pytest.mark.slow  # a writer and a follower each, and waits of theirs
 
 
