@@ -57,14 +57,15 @@ class Server:
         *,
         sign: SignReply | None = None,
         take_over: bool = False,
-        standing_by: Callable[[], None] = lambda: None,
+        standing_by: Callable[[bool], None] = lambda _: None,
     ) -> None:
         """ingest: for batches alone, since an answer that nobody takes holds up its whole link. readers: for all else.
 
         verify: of signed batches, see Store; without it signatures are not asked for. sign: makes the
         signature that goes beside the reply to a signed batch. take_over: have another server of
         the site end, where there is one; otherwise a LinkError says so. standing_by: is called again and again while
-        another server writes a journal that is shared; what it raises ends the wait.
+        another server writes a journal that is shared, with whether this one has folded all that there is; what it
+        raises ends the wait.
         """
         self._sign = sign
         with ExitStack() as opened:
@@ -72,8 +73,8 @@ class Server:
             opened.callback(self._claim.close)
             self._claim.acquire(take_over=take_over)
 
-            def check() -> None:
-                standing_by()
+            def check(warm: bool) -> None:  # noqa: FBT001
+                standing_by(warm)
                 claim.require()
 
             standby = Standby(location, site, config, check) if location.is_shared else None

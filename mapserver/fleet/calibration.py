@@ -132,8 +132,8 @@ def _common_ground(
         return pb, estimate(pb)
 
     all_of_them = solved(trusted)
-    nobody_is = all_of_them[1].edges and 2 * len(_odd(*all_of_them, FAULT_SIGMAS)) >= len(trusted)
-    others = all_of_them if nobody_is else _without_odd(trusted, all_of_them, FAULT_SIGMAS[1], solved)
+    most_seem = all_of_them[1].edges and 2 * len(_odd(*all_of_them, FAULT_SIGMAS)) >= len(trusted)
+    others = all_of_them if most_seem else _without_odd(trusted, all_of_them, FAULT_SIGMAS[1], solved)
     fewer = _without_odd(trusted, others, FAULTY_SIGMAS, solved) if others[1].edges else others
     return others if fewer[1].edges else fewer
 

@@ -27,9 +27,9 @@ class Standby:
     """The map of a journal that another server writes. row: the last one in the grid."""
 
     def __init__(
-        self, location: JournalLocation, site: SiteConfig, config: ServerConfig, check: Callable[[], object]
+        self, location: JournalLocation, site: SiteConfig, config: ServerConfig, check: Callable[[bool], object]
     ) -> None:
-        """check: is called before each wait; what it raises ends it."""
+        """check: is called before each wait, with whether the grid is warm; what it raises ends the wait."""
         self._location, self._site, self._config, self._check = location, site, config, check
         self._reader: JournalReader | None = None
         self._known = _NOTHING
@@ -39,7 +39,7 @@ class Standby:
     def follow(self, timeout_s: float) -> None:
         """Wait for more rows for so long at most, and have them in the grid."""
         began_s = time.monotonic()
-        self._check()
+        self._check(self._known != _NOTHING)
         try:
             reader = self._opened()
             state = reader.follow(self._known, timeout_s)

@@ -170,7 +170,7 @@ class Calibrating:
         for name, own in parts.items():
             first_ns = int(own["stamp_ns"].min())
             self._begins_ns[name] = min(first_ns, self._begins_ns.get(name, first_ns))
-            self._clock.add(name, first_ns, int(own["stamp_ns"].max()))
+            self._clock.add(name, first_ns, int(own["stamp_ns"][-1]))
         until_ns = self._clock.now_ns(self._doubtful()) + AHEAD_NS
         for name, own in parts.items():
             if name not in self._ledgers:

@@ -78,8 +78,8 @@ def run(arguments: Namespace) -> int:
         sign = key.sign_reply if key else None
         said: list[str] = []
 
-        def standing_by() -> None:
-            if not said:
+        def standing_by(warm: bool) -> None:  # noqa: FBT001
+            if warm and not said:
                 said.append("standby")
                 say({"standby": "server", "site": site.name, "store": str(arguments.store)})
             if stop.is_set():

@@ -109,7 +109,7 @@ def chosen_config(sources: Sequence[Source], arguments: Namespace) -> tuple[Serv
 
 
 def joined_decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
-    """Those of all sources, each history once; of those that begin alike, as of a store and its archive, what goes on.
+    """Those of all sources, each history once; of one that another holds, as of a store and its archive, what goes on.
 
     A decision that was made twice counts twice: who corrects, takes that back, and corrects again, has corrected.
     """
@@ -117,10 +117,16 @@ def joined_decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list
     taken: list[Sequence[CalibrationDecision]] = []
     for history in histories:
         if history not in taken:
-            same = takewhile(lambda pair: pair[0] == pair[1], zip(out, history, strict=False))
-            out += history[sum(1 for _ in same) :]
+            out += history[max((_held(history, other) for other in taken), default=0) :]
             taken.append(history)
     return out
+
+
+def _held(history: Sequence[CalibrationDecision], other: Sequence[CalibrationDecision]) -> int:
+    """How much of a history another one holds, from its beginning on; in that of a fold of both it comes later."""
+    starts = (i for i, decision in enumerate(other) if history and history[0] == decision)
+    runs = (takewhile(lambda pair: pair[0] == pair[1], zip(history, other[i:], strict=False)) for i in starts)
+    return max((sum(1 for _ in run) for run in runs), default=0)
 
 
 def descent(sources: Sequence[Source], contents: Sequence[Contents]) -> Iterator[str]:

@@ -102,7 +102,7 @@ _SINGLE = (
     "why",
     "alive",
     "origin",
-    "journal",
+    "journal_piece",
     *PLAIN[1:],
     "error",
 )

@@ -283,7 +283,7 @@ GOLDEN: dict[str, Golden] = {
         answers.decode_changes,
     ),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
-    "journal.bin": Golden(JOURNAL, encode_journal_piece, decode_journal_piece),
+    "journal_piece.bin": Golden(JOURNAL, encode_journal_piece, decode_journal_piece),
     "origin.bin": Golden(Origin("reader-1", 3, 0.25), encode_origin, decode_origin),
     "origin_server.bin": Golden(Origin(), encode_origin, decode_origin),
     "alive.bin": Golden(records.ServerAlive(STORE, 18, 17, 0.25), answers.encode_alive, answers.decode_alive),

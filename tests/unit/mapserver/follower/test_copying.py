@@ -31,6 +31,7 @@ from tests.unit.mapserver.data import (
     wait_for,
 )
 
+pytestmark = pytest.mark.slow  # servers, and waits of theirs
 MACHINES = "abc"
 
 

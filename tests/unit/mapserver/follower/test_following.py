@@ -38,6 +38,8 @@ from tests.unit.mapserver.data import (
     wait_for,
 )
 
+pytestmark = pytest.mark.slow  # a writer and a follower each, and waits of theirs
+
 
 @contextmanager
 def following(folder: Path, site=SITE, config=CONFIG) -> Iterator[Following]:
@@ -171,7 +173,6 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
     st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 60), st.booleans()), min_size=1, max_size=12),
     st.integers(0, 12),
 )
-@pytest.mark.slow
 def test_any_course_of_rows_and_decisions_makes_the_same_map(tmp_path_factory, course, begins):
     folder = tmp_path_factory.mktemp("store")
     with closing(open_writer(folder)) as writer, closing(Refolding(writer, past_of(writer))) as refolding:

@@ -170,7 +170,7 @@ def test_a_holder_that_says_nothing_loses_the_lock_by_itself(tmp_path, database)
         assert send(first, 1).epoch == 1
         hang(first)
         began_s = time.monotonic()
-        with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, int)) as standby:
+        with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
             second = open_store(tmp_path / "two", database, standby)
         assert time.monotonic() - began_s < session.HANGS_S + 5.0
         with closing(second):
@@ -239,7 +239,7 @@ def test_a_second_server_is_refused_where_it_may_not_wait(tmp_path, database):
 
 
 def test_a_standby_follows_rows_and_decisions(tmp_path, database):
-    standby = Standby(place(tmp_path / "two", database), SITE, CONFIG, int)
+    standby = Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)
     with closing(open_store(tmp_path / "one", database)) as store, closing(standby):
         for first in (1, 6):
             send(store, first)

@@ -8,6 +8,7 @@ import socket
 import time
 from contextlib import closing
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet import decisions
 from mapserver.fleet.correction import LAST_NS, Correction
-from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
+from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.store_folder import hold
 from mapserver.journal import archived_decisions
@@ -38,6 +39,7 @@ from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main
 from sitegrid.refold import cluster, command, new_store, work
 from sitegrid.refold.engine import Here
+from sitegrid.refold.sources import joined_decisions
 from tests.journals import history_beside
 from tests.unit.mapserver.data import same_evidence
 
@@ -193,6 +195,21 @@ def test_a_correction_that_was_taken_back_and_given_again_counts(tmp_path: Path)
         with closing(opened(out)) as new:
             assert same_evidence(new.grid, live) == (i < 2)
             assert new.fact == (3 if i < 2 else 2)
+
+
+@pytest.mark.parametrize("order", [*permutations(("one", "other", "stale", "both")), ("one", "stale", "other")])
+def test_a_copy_of_a_history_that_is_behind_brings_nothing_back(order: tuple[str, ...]):
+    """Of two stores, with the archive of the second as it was, and a store that was folded of both and went on."""
+
+    def decided(machine: str, zero: float) -> CalibrationDecision:
+        correction = Correction(machine, 0, LAST_NS, zero, 0.0, 0.0, ())
+        return CalibrationDecision(machine, PERSON, "", T0, (correction,))
+
+    one, other = [decided("a", 0.001)], [decided("b", 0.002), decided("b", 0.005)]
+    histories = {"one": one, "other": other, "stale": other[:1], "both": [*one, *other, decided("b", 0.009)]}
+    counts = CalibrationDecisions(joined_decisions(histories[name] for name in order)).corrections.each
+    newest = 0.009 if "both" in order else 0.005
+    assert [(each.machine, each.zero) for each in counts] == [("a", 0.001), ("b", newest)]
 
 
 def test_decisions_beside_an_archive_are_read_once(tmp_path: Path, monkeypatch):
