@@ -40,7 +40,7 @@ from protocol.site.site_config import SiteConfig
 from sitegrid.refold.contents import Interval, chosen
 from sitegrid.refold.parts import Part
 
-TILES = 64  # at most: that many processes can merge
+TILES = 64  # at most, and at least 4, as no tile lies across an axis: that many processes can merge
 LEAST_TILE = 8  # blocks: 128 cells
 MERGED_AT_ONCE = 8  # evidence of so many tasks waits for the next sum: it is five times as large meanwhile
 STORE_FILE = "store-id"  # in OUT.part/work: which store its files are for
