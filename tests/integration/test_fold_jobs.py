@@ -190,6 +190,7 @@ def test_a_cluster_whose_workers_die_makes_the_same_store(
 
     deaths = Deaths()
     dask.scheduler.add_plugin(deaths)
+    dask.adapt(minimum=2, maximum=2, interval="1 s")  # a nanny may end with its worker
     with distributed.Client(dask) as client:
         client.register_plugin(KillWorker(4.0, mode))  # less, and they die while they start, which ends a nanny
         for number in range(MOST_FOLDS):
