@@ -193,12 +193,12 @@ def test_a_cluster_whose_workers_die_makes_the_same_store(
     dask.adapt(minimum=2, maximum=2, interval="1 s")  # a nanny may end with its worker
     with distributed.Client(dask) as client:
         client.register_plugin(KillWorker(4.0, mode))  # less, and they die while they start, which ends a nanny
-        for number in range(MOST_FOLDS):
-            out, before = tmp_path / str(number), deaths.count
-            assert main(["fold", str(archive), "--out", str(out), "--engine", address(dask), "--json"]) == 0
-            assert contents(out) == expected
-            if died := deaths.count - before:
-                break
+    for number in range(MOST_FOLDS):
+        out, before = tmp_path / str(number), deaths.count
+        assert main(["fold", str(archive), "--out", str(out), "--engine", address(dask), "--json"]) == 0
+        assert contents(out) == expected
+        if died := deaths.count - before:
+            break
     assert died, "workers died during a fold"
 
 
@@ -212,7 +212,7 @@ def test_a_cluster_that_loses_all_its_workers_is_named(
     monkeypatch.setattr(clusters, "ALONE_S", 3.0)
     with distributed.Client(dask) as client:
         client.register_plugin(KillWorker(0.4, "sys.exit"))
-        assert main(["fold", str(archive), "--out", str(tmp_path / "out"), "--engine", address(dask)]) == 1
+    assert main(["fold", str(archive), "--out", str(tmp_path / "out"), "--engine", address(dask)]) == 1
     error = capsys.readouterr().err
     assert "workers" in error
     assert error.count("\n") == 1
