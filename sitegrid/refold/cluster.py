@@ -10,14 +10,23 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from typing import Any, Self, TypeVar
 from uuid import uuid4
 
 from protocol.errors import ConfigError
-from sitegrid.refold.engine import PATIENCE_S, TASK_SAMPLES, TRIES, EngineError, attempt, opened
+from sitegrid.refold.engine import (
+    PATIENCE_S,
+    TASK_SAMPLES,
+    TRIES,
+    EngineError,
+    StalledError,
+    attempt,
+    in_turns,
+    opened,
+)
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -25,7 +34,7 @@ SCHEME = "dask://"
 CONNECT_S = 20.0  # for a scheduler to answer, and for its first worker
 ALONE_S = 60.0  # without any worker: one that is asked to end finishes its task first, and then another one starts
 LOOK_S = 2.0  # between two looks whether somebody is there at all: Dask waits for ever for a worker
-LOST = ("cancelled", "lost")
+LOST = "lost"  # with the worker that had it, and done again by another
 
 
 class Cluster:
@@ -69,22 +78,19 @@ class Cluster:
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
         """See Engine."""
-        results: dict[int, R] = {}
-        failures = 0
-        while left := [number for number in range(len(tasks)) if number not in results]:
-            before = len(results)
+
+        def attempt_all(left: Mapping[int, T], results: dict[int, R]) -> None:
             try:
-                self._do(work, {number: tasks[number] for number in left}, results, done)
+                self._do(work, left, results, done)
             except (TimeoutError, self._killed) as error:
-                failures = failures + 1 if len(results) == before else 1
-                if failures >= TRIES:
-                    why = f"did nothing for {PATIENCE_S:g} s" if isinstance(error, TimeoutError) else "died of one task"
-                    problem = f"the workers of {self._address} {why}, {failures} times in a row"
-                    raise EngineError(f"{problem}; if that is for want of memory, give them more") from None
-        return [results[number] for number in range(len(tasks))]
+                why = f"did nothing for {PATIENCE_S:g} s" if isinstance(error, TimeoutError) else "died of one task"
+                advice = "if that is for want of memory, give them more"
+                raise StalledError(f"the workers of {self._address} {why}", advice) from None
+
+        return in_turns(tasks, attempt_all)
 
     def _do(
-        self, work: Callable[[T], R], tasks: dict[int, T], results: dict[int, R], done: Callable[[int], None]
+        self, work: Callable[[T], R], tasks: Mapping[int, T], results: dict[int, R], done: Callable[[int], None]
     ) -> None:
         """Do tasks until all are done; TimeoutError where none is done for a while."""
         run = uuid4().hex[:8]  # a task that hangs is given to others under another name
@@ -96,6 +102,8 @@ class Cluster:
         try:
             while waiting:
                 for future in self._finished(list(waiting)):
+                    if future.status == LOST:
+                        continue
                     number = waiting.pop(future)
                     results[number] = opened(self._result(future))
                     done(number)
@@ -124,7 +132,7 @@ class Cluster:
                 raise TimeoutError
 
     def _result(self, future: Any) -> Any:
-        if future.status in LOST:
+        if future.status == "cancelled":
             raise self._gone()
         if future.status == "finished":
             return future.result(timeout=CONNECT_S)

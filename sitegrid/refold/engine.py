@@ -32,6 +32,14 @@ class EngineError(SitegridError):
     """Those who do the work are gone, or do not do it."""
 
 
+class StalledError(Exception):
+    """The work did not go on, and may be tried again. why: what happened; advice: for who gives up."""
+
+    def __init__(self, why: str, advice: str) -> None:
+        super().__init__(why)
+        self.why, self.advice = why, advice
+
+
 class Engine(Protocol):
     """Does tasks."""
 
@@ -96,20 +104,17 @@ class Processes:
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
         """See Engine."""
-        results: dict[int, R] = {}
-        failures = 0
-        while left := [number for number in range(len(tasks)) if number not in results]:
-            before = len(results)
+
+        def attempt_all(left: Mapping[int, T], results: dict[int, R]) -> None:
             try:
-                self._do(work, {number: tasks[number] for number in left}, results, done)
+                self._do(work, left, results, done)
             except (BrokenProcessPool, TimeoutError) as error:
                 self._end()
-                failures = failures + 1 if len(results) == before else 1
-                if failures >= TRIES:
-                    why = "were killed" if isinstance(error, BrokenProcessPool) else f"did nothing for {PATIENCE_S:g} s"
-                    advice = "if that is for want of memory, give fewer --jobs"
-                    raise EngineError(f"processes of the fold {why}, {failures} times in a row; {advice}") from None
-        return [results[number] for number in range(len(tasks))]
+                why = "were killed" if isinstance(error, BrokenProcessPool) else f"did nothing for {PATIENCE_S:g} s"
+                advice = "if that is for want of memory, give fewer --jobs"
+                raise StalledError(f"processes of the fold {why}", advice) from None
+
+        return in_turns(tasks, attempt_all)
 
     def __enter__(self) -> Self:
         return self
@@ -153,6 +158,24 @@ class Processes:
                 child.kill()
                 child.join()
             self._pool = None
+
+
+def in_turns(tasks: Sequence[T], attempt_all: Callable[[Mapping[int, T], dict[int, R]], None]) -> list[R]:
+    """Results of tasks, in their order; EngineError after TRIES turns in a row in which none was done.
+
+    attempt_all: does what is left, by number, and enters each result; StalledError where that does not go on.
+    """
+    results: dict[int, R] = {}
+    failures = 0
+    while left := {number: task for number, task in enumerate(tasks) if number not in results}:
+        before = len(results)
+        try:
+            attempt_all(left, results)
+        except StalledError as error:
+            failures = failures + 1 if len(results) == before else 1
+            if failures >= TRIES:
+                raise EngineError(f"{error.why}, {failures} times in a row; {error.advice}") from None
+    return [results[number] for number in range(len(tasks))]
 
 
 def attempt(work: Callable[[T], R], task: T) -> Success[R] | Failure:

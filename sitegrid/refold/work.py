@@ -1,10 +1,11 @@
 """The two tasks of a fold: some parts into samples of the new store and their evidence, and a tile of all evidence.
 
-    OUT.part/work/TOKEN.parquet                samples of one part, as they go into the new store's archive
-    OUT.part/work/evidence-TOKEN.checkpoint    the evidence of the parts of one task, block by block
-    OUT.part/work/tile-TOKEN.checkpoint        the evidence of one tile, of all tasks
+    TOKEN.parquet                samples of one part, as they go into the new store's archive
+    evidence-TOKEN.checkpoint    the evidence of the parts of one task, block by block
+    tile-TOKEN.checkpoint        the evidence of one tile, of all tasks
 
-A token is a hash of all that a file depends on. So a file that is there is used as it is, whoever made it.
+They lie in the folder `work` of OUT.part. A token is a hash of all that a file depends on. So a file that is there is
+used as it is, whoever made it.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from sitegrid.refold.parts import Part
 TILES = 64  # at most, and at least 4, as no tile lies across an axis: that many processes can merge
 LEAST_TILE = 8  # blocks: 128 cells
 MERGED_AT_ONCE = 8  # evidence of so many tasks waits for the next sum: it is five times as large meanwhile
-STORE_FILE = "store-id"  # in OUT.part/work: which store its files are for
+STORE_FILE = "store-id"  # beside them: which store they are for
 
 
 @dataclass(frozen=True)
