@@ -195,9 +195,6 @@ class Journal(JournalQueries, Protocol):
     def declare_lost(self, admission: Admission) -> None:
         """Write a watermark alone into the open transaction: samples at a spool's end that will never come."""
 
-    def put_watermark(self, machine: str, spool_id: int, watermark: Watermark) -> None:
-        """Write a watermark into the open transaction."""
-
     def commit(self) -> None:
         """Commit to disk; only then may anything be acknowledged."""
 
