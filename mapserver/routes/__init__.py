@@ -1,0 +1,1 @@
+"""What a drive over the map costs, and which line between two points costs least."""

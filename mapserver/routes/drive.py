@@ -1,0 +1,128 @@
+"""What a drive along a line costs: speed, energy and time of a machine over ground of known resistance and slope.
+
+A machine is a point of mass on the line. It keeps below its own speed and below what curves allow, accelerates as far
+as its power goes, and brakes in time. Per step of length d,
+
+    drive force  F = m g (c + s) + m k a,    a = (v1^2 - v0^2) / 2 d,
+
+with the rolling resistance c, the slope s along the line, the acceleration a and the factor k >= 1 of what rotates with
+it. What F > 0 does is work of the engine, what F < 0 does is lost in brakes; nothing is stored but by speed and height.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+
+from protocol.arrays import Floats
+from protocol.queries.routing import RouteMachine
+from protocol.units import GRAVITY_MPS2
+
+CREEP_MPS = 0.3  # no machine is driven more slowly: what its power cannot do at this speed, it cannot do
+SMOOTH_M = 9.0  # force is smoothed over about the length of a machine, which stands on all of it at once
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive of n steps.
+
+    speed_mps (n + 1,): at their ends. energy_j, braked_j (n,): what the engine does, and what the brakes take.
+    time_s (n,). stalls: the first step that the machine's power cannot do, -1 if there is none.
+    """
+
+    speed_mps: Floats
+    energy_j: Floats
+    braked_j: Floats
+    time_s: Floats
+    stalls: int
+
+
+def smoothed(values: Floats, step_m: float) -> Floats:
+    """Values (n,) at steps, each the mean of those within half of SMOOTH_M; at the ends of what there is of them."""
+    half = min(round(SMOOTH_M / step_m) // 2, max(len(values) - 1, 0))
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    at = np.arange(len(values))
+    first, end = np.maximum(at - half, 0), np.minimum(at + half + 1, len(values))
+    mean: Floats = (sums[end] - sums[first]) / (end - first)
+    return mean
+
+
+def drive(step_m: Floats, resistance: Floats, slope: Floats, limit_mps: Floats, machine: RouteMachine) -> Drive:
+    """Drive n steps of step_m (n,) over resistance and slope along (n,), as fast as limits and machine allow.
+
+    limit_mps (n + 1,): at the ends of steps; where it is 0 the machine stands. Resistance and slope: already smoothed.
+    """
+    force_n = machine.mass_kg * GRAVITY_MPS2 * (resistance + slope)
+    limit = np.minimum(limit_mps, machine.speed_mps)
+    inertia_kg = machine.mass_kg * machine.rotating
+    limits = machine.power_w, machine.accelerate_mps2, machine.brake_mps2
+    speed, energy, braked, time = (np.zeros(len(step_m) + extra) for extra in (1, 0, 0, 0))
+    stalls = _drive(step_m, force_n, limit, inertia_kg, limits, speed, energy, braked, time)
+    return Drive(speed, energy, braked, time, stalls)
+
+
+@numba.njit(cache=True, nogil=True)
+def _drive(
+    step_m: Any,
+    force_n: Any,
+    limit: Any,
+    inertia_kg: float,
+    limits: Any,
+    speed: Any,
+    energy: Any,
+    braked: Any,
+    time: Any,
+) -> int:
+    power_w, accelerate, brake = limits
+    n = len(step_m)
+    # from the end back: no faster than brakes stop in time
+    speed[n] = limit[n]
+    for i in range(n - 1, -1, -1):
+        speed[i] = min(limit[i], math.sqrt(speed[i + 1] ** 2 + 2 * brake * step_m[i]))
+    # from the start on: no faster than the engine brings it to
+    stalls = -1
+    for i in range(n):
+        v, d = speed[i], step_m[i]
+        wanted = min(speed[i + 1], math.sqrt(v * v + 2 * accelerate * d))
+        reached = _reached(v, wanted, d, force_n[i], inertia_kg, power_w)
+        least = min(CREEP_MPS, limit[i + 1])
+        if reached < least:
+            if stalls < 0 and force_n[i] * max(CREEP_MPS, v) > power_w:
+                stalls = i
+            reached = least
+        speed[i + 1] = reached
+        work = force_n[i] * d + 0.5 * inertia_kg * (reached * reached - v * v)
+        energy[i], braked[i] = max(work, 0.0), max(-work, 0.0)
+        time[i] = 2 * d / max(v + reached, CREEP_MPS)
+    return stalls
+
+
+@numba.njit(cache=True, nogil=True)
+def _reached(v: float, wanted: float, d: float, force_n: float, inertia_kg: float, power_w: float) -> float:
+    """The speed at the end of a step that is wanted, or the highest that the power reaches.
+
+    There its work in the time of the step is the work that is done.
+    """
+    low, high = 0.0, wanted
+    if _spare(v, high, d, force_n, inertia_kg, power_w) >= 0.0:
+        return high
+    for _ in range(40):  # the spare work falls with the speed that is reached
+        middle = 0.5 * (low + high)
+        if _spare(v, middle, d, force_n, inertia_kg, power_w) >= 0.0:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@numba.njit(cache=True, nogil=True)
+def _spare(v: float, reached: float, d: float, force_n: float, inertia_kg: float, power_w: float) -> float:
+    """Work of the engine in the time of a step less the work that is done there, both [J]."""
+    mean = 0.5 * (v + reached)
+    if mean <= 0.0:
+        return math.inf
+    return power_w * d / mean - (force_n * d + 0.5 * inertia_kg * (reached * reached - v * v))

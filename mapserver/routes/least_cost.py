@@ -1,0 +1,271 @@
+"""The line between two cells that costs least.
+
+A line from one cell's centre to another's costs, in each cell that it crosses, its length there times the cost per
+metre in its direction, so that up and down differ. First all cells are searched, each with 16 neighbours: that finds
+the passage, but goes in 16 directions, up to 2.75 % too long. Then a band around that line is searched with 64, and
+pieces between places of what comes out, which run in any direction, replace what is dearer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise, product
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from protocol.arrays import Bools, Floats, Ints
+
+Cell = tuple[int, int]  # row and column in a window
+
+# Scipy takes negative costs and gives wrong distances for them: downhill a metre costs this, not less. As resistance.
+LEAST_COST = 0.002
+LOOK_AHEAD = 64  # places of a line that a straight piece may skip at a time; the next pass skips as many of the rest
+BAND = 8  # cells: lines that were found in a wider one cost the same
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """What lines cost over a window of cells.
+
+    resistance, grade_east, grade_north (rows, columns): known wherever is_open, and positive. cell_m: edge of a cell.
+    crawl: resistance and slope beyond which a machine goes slower than it may: its power over weight and highest speed,
+    for lines that cost time; inf for lines that cost energy, whose unit is metres of lift.
+    """
+
+    resistance: Floats
+    grade_east: Floats
+    grade_north: Floats
+    is_open: Bools
+    cell_m: float
+    crawl: float = math.inf
+
+
+def least_cost_line(terrain: Terrain, start: Cell, end: Cell) -> tuple[Ints, float] | None:
+    """Corners (n, 2), as rows and columns, of the cheapest line, and its cost; None where there is none.
+
+    Cost: metres of lift, or metres at the highest speed.
+    """
+    line = _search(terrain, start, end, moves(2))
+    if line is None:
+        return None
+    around = replace(terrain, is_open=terrain.is_open & _band(terrain.is_open.shape, line))
+    finer = _search(around, start, end, moves(4))
+    return straightened(terrain, line if finer is None else finer)
+
+
+def _search(terrain: Terrain, start: Cell, end: Cell, steps: Ints) -> Ints | None:
+    """Cells (n, 2) of the cheapest line in steps (k, 2)."""
+    columns = terrain.is_open.shape[1]
+    source, target = start[0] * columns + start[1], end[0] * columns + end[1]
+    distance, before = dijkstra(graph(terrain, steps), indices=source, return_predecessors=True)
+    if not math.isfinite(distance[target]):
+        return None
+    places = [target]
+    while places[-1] != source:
+        places.append(int(before[places[-1]]))
+    return np.stack(np.divmod(np.array(places[::-1]), columns), axis=1)
+
+
+def _band(shape: tuple[int, int], line: Ints) -> Bools:
+    """Cells within BAND of a line."""
+    drawn = np.zeros(shape, np.uint8)
+    cv2.polylines(drawn, [line[:, ::-1].astype(np.int32).reshape(-1, 1, 2)], isClosed=False, color=1)
+    band: Bools = cv2.dilate(drawn, np.ones((2 * BAND + 1, 2 * BAND + 1), np.uint8)) > 0
+    return band
+
+
+def reaches(terrain: Terrain, start: Cell, end: Cell) -> bool:
+    """Whether any line leads from one cell to the other."""
+    columns = terrain.is_open.shape[1]
+    source, target = start[0] * columns + start[1], end[0] * columns + end[1]
+    return math.isfinite(dijkstra(graph(terrain, moves(1)), indices=source, unweighted=True)[target])
+
+
+@lru_cache
+def moves(order: int) -> Ints:
+    """Steps (k, 2) to neighbours, in rows and columns: 8 of order 1, 16 of 2, 32 of 3, 64 of 4.
+
+    Each order puts between two neighbouring directions their sum (a Farey sequence).
+    """
+    quarter = [(0, 1), (1, 0)]
+    for _ in range(order):
+        sums = [(a[0] + b[0], a[1] + b[1]) for a, b in pairwise(quarter)]
+        quarter = [step for pair in zip(quarter, [*sums, None], strict=True) for step in pair if step]
+    turned = [(row, column) for row, column in quarter[:-1]]
+    whole = []
+    for _ in range(4):
+        whole += turned
+        turned = [(-column, row) for row, column in turned]
+    return np.array(whole)
+
+
+def graph(terrain: Terrain, steps: Ints) -> csr_matrix:
+    """Costs of all steps (k, 2) from all open cells to open ones over open ones."""
+    rows, columns = terrain.is_open.shape
+    starts = np.zeros(rows * columns + 1, np.int32)
+    edges = int(terrain.is_open.sum()) * len(steps)
+    targets, costs = np.empty(edges, np.int32), np.empty(edges)
+    used = _graph(*_arrays(terrain), steps, *_touched(steps), starts, targets, costs)
+    return csr_matrix((costs[:used], targets[:used], starts), shape=(rows * columns, rows * columns))
+
+
+def cost_of(terrain: Terrain, line: Ints) -> float:
+    """Cost of a line (n, 2) of cells; inf where it leaves the open ones."""
+    return float(sum(_piece(*_arrays(terrain), *a, *b) for a, b in pairwise(line)))
+
+
+def straightened(terrain: Terrain, line: Ints) -> tuple[Ints, float]:
+    """A line (n, 2) over some of the places of another one, where straight pieces cost less; and what it costs."""
+    while True:
+        kept = np.zeros(len(line), np.bool_)
+        cost = _straighten(*_arrays(terrain), line, kept)
+        if kept.all():
+            return line, cost
+        line = line[kept]
+
+
+def _arrays(terrain: Terrain) -> tuple[Floats, Floats, Floats, Bools, float, float]:
+    fields = (
+        np.ascontiguousarray(a, np.float64) for a in (terrain.resistance, terrain.grade_east, terrain.grade_north)
+    )
+    resistance, east, north = fields
+    return resistance, east, north, terrain.is_open, terrain.cell_m, terrain.crawl
+
+
+def _touched(steps: Ints) -> tuple[Ints, Floats]:
+    """Cells that each step (k, 2) touches, (k, m, 2) from its first one, and shares (k, m) of its length; -1: none."""
+    order = int(np.abs(steps).max())
+    cells, shares = np.zeros((len(steps), 4 * order, 2), np.int64), np.full((len(steps), 4 * order), -1.0)
+    for k, (down, right) in enumerate(steps.tolist()):
+        cuts = {0.0, 1.0, *((i + 0.5) / abs(n) for n in (down, right) if n for i in range(abs(n)))}
+        ends = sorted(cuts)
+        crossed = [((a + b) / 2, b - a) for a, b in pairwise(ends)]
+        touched = {(round(down * at), round(right * at)): share for at, share in crossed}
+        for at in ends[1:-1]:  # through a corner it touches the cells beside it
+            y, x = down * at, right * at
+            if abs(y % 1 - 0.5) < 1e-9 and abs(x % 1 - 0.5) < 1e-9:
+                for cell in product((math.floor(y), math.ceil(y)), (math.floor(x), math.ceil(x))):
+                    touched.setdefault(cell, 0.0)
+        cells[k, : len(touched)], shares[k, : len(touched)] = list(touched), list(touched.values())
+    return cells, shares
+
+
+@numba.njit(cache=True, nogil=True)
+def _graph(
+    resistance: Any,
+    east: Any,
+    north: Any,
+    is_open: Any,
+    cell_m: float,
+    crawl: float,
+    steps: Any,
+    cells: Any,
+    shares: Any,
+    starts: Any,
+    targets: Any,
+    costs: Any,
+) -> int:
+    rows, columns = is_open.shape
+    at = 0
+    norms = np.sqrt((steps * steps).sum(axis=1).astype(np.float64))
+    for row in range(rows):
+        for column in range(columns):
+            if is_open[row, column]:
+                for k in range(len(steps)):
+                    to_row, to_column = row + steps[k, 0], column + steps[k, 1]
+                    if not (0 <= to_row < rows and 0 <= to_column < columns):
+                        continue
+                    x, y, total = steps[k, 1] / norms[k], steps[k, 0] / norms[k], 0.0
+                    for i in range(shares.shape[1]):
+                        share = shares[k, i]
+                        if share < 0.0:
+                            break
+                        r, c = row + cells[k, i, 0], column + cells[k, i, 1]
+                        if not is_open[r, c]:
+                            total = math.inf
+                            break
+                        climbs = resistance[r, c] + east[r, c] * x + north[r, c] * y
+                        total += share * (max(climbs, LEAST_COST) if crawl == math.inf else max(climbs / crawl, 1.0))
+                    if total < math.inf:
+                        targets[at], costs[at] = to_row * columns + to_column, total * norms[k] * cell_m
+                        at += 1
+            starts[row * columns + column + 1] = at
+    return at
+
+
+@numba.njit(cache=True, nogil=True)
+def _straighten(
+    resistance: Any, east: Any, north: Any, is_open: Any, cell_m: float, crawl: float, line: Any, kept: Any
+) -> float:
+    """Keep the places between which straight pieces cost least; returns what they cost."""
+    n = len(line)
+    best, before = np.full(n, math.inf), np.full(n, -1, np.int64)
+    best[0] = 0.0
+    for j in range(1, n):
+        for i in range(max(j - LOOK_AHEAD, 0), j):
+            cost = best[i] + _piece(
+                resistance, east, north, is_open, cell_m, crawl, line[i, 0], line[i, 1], line[j, 0], line[j, 1]
+            )
+            if cost < best[j] * (1 - 1e-9):  # of two as dear the one with fewer places
+                best[j], before[j] = cost, i
+    at = n - 1
+    while at >= 0:
+        kept[at] = True
+        at = before[at]
+    return best[n - 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def _piece(
+    resistance: Any,
+    east: Any,
+    north: Any,
+    is_open: Any,
+    cell_m: float,
+    crawl: float,
+    row: int,
+    column: int,
+    to_row: int,
+    to_column: int,
+) -> float:
+    """Cost of a straight piece between the centres of two cells; inf where it touches one that is not open.
+
+    From cell to cell (Amanatides and Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987). Through a corner
+    it touches both cells beside it.
+    """
+    down, right = to_row - row, to_column - column
+    length_m = math.sqrt(down * down + right * right) * cell_m
+    if length_m == 0.0:
+        return 0.0
+    x, y = right * cell_m / length_m, down * cell_m / length_m
+    step_row, step_column = (1 if down > 0 else -1), (1 if right > 0 else -1)
+    # shares of the way at which the next row and column begin
+    per_row = 1.0 / abs(down) if down else math.inf
+    per_column = 1.0 / abs(right) if right else math.inf
+    next_row, next_column = 0.5 * per_row, 0.5 * per_column
+    at, total = 0.0, 0.0
+    while True:
+        if not is_open[row, column]:
+            return math.inf
+        end = min(next_row, next_column, 1.0)
+        climbs = resistance[row, column] + east[row, column] * x + north[row, column] * y
+        total += (end - at) * (max(climbs, LEAST_COST) if crawl == math.inf else max(climbs / crawl, 1.0))
+        if row == to_row and column == to_column:
+            return total * length_m
+        at = end
+        if abs(next_row - next_column) < 1e-9:
+            if not (is_open[row + step_row, column] and is_open[row, column + step_column]):
+                return math.inf
+            row, column = row + step_row, column + step_column
+            next_row, next_column = next_row + per_row, next_column + per_column
+        elif next_row < next_column:
+            row, next_row = row + step_row, next_row + per_row
+        else:
+            column, next_column = column + step_column, next_column + per_column

@@ -1,0 +1,111 @@
+"""Drives with known answers: energy is resistance, height and speed; power, curves and brakes bound the speed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mapserver.routes.drive import CREEP_MPS, Drive, drive, smoothed
+from protocol.arrays import Floats
+from protocol.queries.routing import RouteMachine
+from protocol.units import GRAVITY_MPS2
+
+MACHINE = RouteMachine(mass_kg=20_000.0, speed_mps=8.0, power_w=200_000.0)
+N = 1000
+
+
+def rolling(
+    resistance: float | Floats, slope: float | Floats, machine: RouteMachine = MACHINE, ends: float = 2.0
+) -> Drive:
+    """A drive of N steps of 1 m that begins and ends at a speed."""
+    limit = np.full(N + 1, np.inf)
+    limit[[0, -1]] = ends
+    return drive(np.ones(N), np.zeros(N) + resistance, np.zeros(N) + slope, limit, machine)
+
+
+def test_on_even_ground_energy_is_resistance_times_way_and_what_the_brakes_take() -> None:
+    done = rolling(0.03, 0.0)
+    assert done.energy_j.sum() - done.braked_j.sum() == pytest.approx(20_000 * GRAVITY_MPS2 * 0.03 * N)
+    assert done.stalls == -1
+
+
+def test_uphill_less_downhill_is_twice_the_height_where_nothing_is_braked() -> None:
+    """c > s, and so far to go that the machine rolls out."""
+    height_m = 0.01 * N
+    gentle = RouteMachine(mass_kg=20_000.0, speed_mps=2.0, power_w=200_000.0)
+    up, down = (rolling(0.03, slope, gentle) for slope in (0.01, -0.01))
+    assert up.braked_j.sum() == down.braked_j.sum() == 0.0
+    assert up.energy_j.sum() - down.energy_j.sum() == pytest.approx(2 * 20_000 * GRAVITY_MPS2 * height_m)
+
+
+def test_a_descent_steeper_than_the_resistance_costs_nothing_and_is_braked() -> None:
+    steady = RouteMachine(mass_kg=20_000.0, speed_mps=2.0, power_w=200_000.0)
+    done = rolling(0.02, -0.05, steady)
+    assert done.energy_j.sum() == 0.0
+    assert done.braked_j.sum() == pytest.approx(20_000 * GRAVITY_MPS2 * 0.03 * N)
+
+
+def test_power_bounds_the_speed_uphill() -> None:
+    done = rolling(0.03, 0.1)
+    top = 200_000 / (20_000 * GRAVITY_MPS2 * 0.13)
+    assert done.speed_mps[600:-200] == pytest.approx(np.full(N + 1 - 800, top), rel=1e-3)
+    assert done.energy_j[300:-200].sum() == pytest.approx(200_000 * done.time_s[300:-200].sum(), rel=1e-6)
+
+
+def test_a_machine_starts_and_stops_within_its_limits() -> None:
+    done = rolling(0.02, 0.0, ends=0.0)
+    change = np.diff(done.speed_mps**2) / 2
+    assert done.speed_mps[0] == done.speed_mps[-1] == 0.0
+    assert change.max() <= MACHINE.accelerate_mps2 + 1e-9
+    assert change.min() >= -MACHINE.brake_mps2 - 1e-9
+    assert done.speed_mps.max() == MACHINE.speed_mps
+    # the way of even acceleration, as in a textbook
+    start = int(np.argmax(done.speed_mps >= 4.0))
+    assert start == pytest.approx(4.0**2 / 2 / MACHINE.accelerate_mps2, abs=1.0)
+    assert done.time_s[:start].sum() == pytest.approx(4.0 / MACHINE.accelerate_mps2, rel=0.05)
+
+
+def test_a_stop_on_the_way_costs_the_energy_of_motion() -> None:
+    limit = np.full(N + 1, np.inf)
+    limit[[0, -1]] = 2.0
+    whole = drive(np.ones(N), np.full(N, 0.02), np.zeros(N), limit, MACHINE)
+    limit[500] = 0.0
+    stopped = drive(np.ones(N), np.full(N, 0.02), np.zeros(N), limit, MACHINE)
+    motion = 0.5 * MACHINE.mass_kg * MACHINE.rotating * MACHINE.speed_mps**2
+    rolled = 20_000 * GRAVITY_MPS2 * 0.02 * MACHINE.speed_mps**2 / 2 / MACHINE.brake_mps2  # resistance helps to brake
+    assert stopped.energy_j.sum() - whole.energy_j.sum() == pytest.approx(motion - rolled, rel=0.02)
+    assert stopped.time_s.sum() > whole.time_s.sum() + 5
+
+
+def test_what_the_power_cannot_do_is_said() -> None:
+    slope = np.zeros(N)
+    slope[400:] = 2.0
+    weak = RouteMachine(mass_kg=20_000.0, power_w=50_000.0)
+    assert 50_000 / (20_000 * GRAVITY_MPS2 * 2.03) < CREEP_MPS
+    done = rolling(0.03, slope, weak)
+    assert 400 <= done.stalls <= 402
+    assert rolling(0.03, 0.2, weak).stalls == -1
+
+
+def test_smoothing_keeps_what_is_even_and_the_length_of_the_line() -> None:
+    assert smoothed(np.full(40, 0.3), 1.0) == pytest.approx(np.full(40, 0.3))
+    spike = np.zeros(41)
+    spike[20] = 9.0
+    assert smoothed(spike, 1.0)[16:25] == pytest.approx(np.ones(9))
+    assert smoothed(np.array([0.2]), 1.0).tolist() == [0.2]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mass_kg", 0.0),
+        ("mass_kg", 2e6),
+        ("efficiency", 1.2),
+        ("efficiency", 0.0),
+        ("rotating", 0.5),
+        ("power_w", math.nan),
+    ],
+)
+def test_machines_that_cannot_be_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        RouteMachine(**{name: value})
