@@ -1,7 +1,11 @@
-"""Machines for routes: what a drive costs depends on them."""
+"""Routes: machines that drive them, and what a drive costs (docs/protocol.md, "Routes")."""
+
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+
+from protocol.arrays import Floats
 
 MAX_MASS_KG = 1e6
 MAX_ROTATING = 2.0
@@ -36,3 +40,49 @@ class RouteMachine:
             raise ValueError(f"efficiency: {self.efficiency:g} is over 1")
         if not 1 <= self.rotating <= MAX_ROTATING:
             raise ValueError(f"rotating: {self.rotating:g} is not between 1 and {MAX_ROTATING:g}")
+
+
+@dataclass(frozen=True)
+class RouteSteps:
+    """n steps along a route, in its direction.
+
+    way_m (n,): from the begin to the end of each; length_m; x_m, y_m: of its begin, in `map`. resistance, slope, their
+    deviations and confidence: means, NaN where nothing is known of them; unknown: share of its length of which nothing
+    is. energy_j: what drives the wheels; braked_j: what brakes take; time_s; speed_mps: mean.
+    """
+
+    way_m: Floats
+    length_m: Floats
+    x_m: Floats
+    y_m: Floats
+    resistance: Floats
+    resistance_std: Floats
+    slope: Floats
+    slope_std: Floats
+    confidence: Floats
+    unknown: Floats
+    energy_j: Floats
+    braked_j: Floats
+    time_s: Floats
+    speed_mps: Floats
+
+
+@dataclass(frozen=True)
+class RouteTotals:
+    """All of a route. low, high: its 90 % interval. lift_m: how much higher its end is. unknown: share of its length.
+
+    energy_j: drive force times way. At the wheels it is more by their slip, which the map does not know: 1 to 4 % on
+    firm ground, 10 % in sand. fuel_j: over the machine's efficiency.
+    """
+
+    length_m: float
+    lift_m: float
+    unknown: float
+    energy_j: float
+    energy_low_j: float
+    energy_high_j: float
+    braked_j: float
+    fuel_j: float
+    time_s: float
+    time_low_s: float
+    time_high_s: float

@@ -1,0 +1,177 @@
+"""A route: what the ground is like along a line, and what a machine's drive over it costs, with 90 % intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapserver.routes.drive import SMOOTH_M, Drive, drive, smoothed
+from mapserver.routes.ground import Field, dearest
+from mapserver.routes.line import Steps, limits, steps
+from protocol.arrays import Bools, Floats
+from protocol.errors import QueryError, Refusal
+from protocol.queries.routing import RouteMachine, RouteSteps, RouteTotals
+
+# What a route reads of the map. Of gaps between known cells it takes what fills them; beyond, ground is unknown.
+LAYERS = (
+    "resistance_filled",
+    "grade_east_filled",
+    "grade_north_filled",
+    "resistance_std",
+    "grade_std",
+    "visits",
+    "confidence",
+)
+STEP_M = 1.0  # of the drive; what is answered is of longer ones
+SURE_VISITS = 10.0  # more passes over a cell do not make its value surer: what they err in is the same
+ALIKE_M = 25.0  # over so much way errors of the map are alike: positions, and what a machine's estimator lags behind
+COMMON_STD = 0.001  # what calibration leaves in the zeros of machines, the same everywhere [-]
+UNKNOWN_STD = 0.5  # of the resistance of unknown ground, as a share of it
+UNKNOWN_SLOPE_STD = 0.05  # of its slope, which is taken for none [m/m]
+NINETY = 1.645  # standard deviations to each side that hold 90 %
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground along n steps.
+
+    resistance, slope (n,): along, unknown ground filled in; their deviations; confidence: NaN where unknown; unknown.
+    """
+
+    resistance: Floats
+    slope: Floats
+    resistance_std: Floats
+    slope_std: Floats
+    confidence: Floats
+    unknown: Bools
+
+
+def ground_along(layers: Mapping[str, Field], cut: Steps, unknown_resistance: float | None) -> Ground:
+    """The ground along a line; what is unknown has this resistance, None: that of the dearest tenth of what was read.
+
+    QueryError where all is unknown and nothing says what that is to cost.
+    """
+    along = {name: layers[name].at(cut.position_m) for name in LAYERS}
+    east, north = cut.direction.T
+    resistance = along["resistance_filled"]
+    slope = along["grade_east_filled"] * east + along["grade_north_filled"] * north
+    unknown = ~np.isfinite(resistance + slope)
+    if unknown_resistance is None:
+        unknown_resistance = dearest(layers["resistance_filled"].values)
+        if unknown.all() or not np.isfinite(unknown_resistance):
+            raise QueryError(Refusal.OUT_OF_RANGE, "nobody has driven near this line yet: say what `unknown` ground is")
+    passes = np.sqrt(np.clip(np.nan_to_num(along["visits"], nan=1.0), 1.0, SURE_VISITS))
+    # cells between known ones have values, but no votes of their own that would spread
+    spread = np.where(np.isfinite(along["resistance_std"]), along["resistance_std"], 0.25 * np.nan_to_num(resistance))
+    tilt = np.where(np.isfinite(along["grade_std"]), along["grade_std"], 0.01)
+    return Ground(
+        resistance=np.where(unknown, unknown_resistance, resistance),
+        slope=np.where(unknown, 0.0, slope),
+        resistance_std=np.where(unknown, UNKNOWN_STD * unknown_resistance, spread / passes),
+        slope_std=np.where(unknown, UNKNOWN_SLOPE_STD, tilt / passes),
+        confidence=np.where(unknown, np.nan, along["confidence"]),
+        unknown=unknown,
+    )
+
+
+def mean_std(std: Floats, length_m: Floats) -> float:
+    """Deviation of the mean of values along steps (n,), whose errors are alike over ALIKE_M and partly everywhere.
+
+    Errors of two steps correlate by exp(-way between / ALIKE_M).
+    """
+    way_m = float(length_m.sum())
+    weighted = std * length_m / way_m
+    fade = np.exp(-length_m / ALIKE_M)
+    total, carried = 0.0, 0.0
+    for value, kept in zip(weighted.tolist(), fade.tolist(), strict=True):
+        total += value * value + 2 * value * carried
+        carried = (carried + value) * kept
+    return float(np.sqrt(total + COMMON_STD**2))
+
+
+def route(
+    line_m: Floats,
+    layers: Mapping[str, Field],
+    machine: RouteMachine,
+    *,
+    stops: tuple[bool, bool] = (True, True),
+    step_m: float = 25.0,
+    unknown_resistance: float | None = None,
+) -> tuple[RouteSteps, RouteTotals]:
+    """What a drive along a line (k, 2) costs. layers: LAYERS, around all of it. stops: at its begin and its end.
+
+    step_m: of the steps that are answered. QueryError where the machine's power does not do it, or nothing is known.
+    """
+    cut = steps(line_m, STEP_M)
+    ground = ground_along(layers, cut, unknown_resistance)
+    limit = limits(line_m, cut.end_m, machine.lateral_mps2)
+    limit[[0, -1]] = np.where(stops, 0.0, limit[[0, -1]])
+    resistance, slope = (smoothed(values, STEP_M) for values in (ground.resistance, ground.slope))
+    done = drive(cut.length_m, resistance, slope, limit, machine)
+    if done.stalls >= 0:
+        x, y = cut.position_m[done.stalls]
+        climbs = 100 * float(resistance[done.stalls] + slope[done.stalls])
+        problem = (
+            f"the machine cannot climb at {x:.0f}, {y:.0f} m: resistance and slope make {climbs:.1f} % of its weight"
+        )
+        raise QueryError(Refusal.OUT_OF_RANGE, f"{problem}; more `power`, less `mass` or another line")
+    off = NINETY * mean_std(np.hypot(ground.resistance_std, ground.slope_std), cut.length_m)
+    low, high = (drive(cut.length_m, resistance + by, slope, limit, machine) for by in (-off, off))
+    return _by_step(cut, ground, done, step_m), _totals(cut, ground, machine, done, (low, high))
+
+
+def _totals(cut: Steps, ground: Ground, machine: RouteMachine, done: Drive, bounds: tuple[Drive, Drive]) -> RouteTotals:
+    low, high = bounds
+    energy_j = float(done.energy_j.sum())
+    return RouteTotals(
+        length_m=float(cut.length_m.sum()),
+        lift_m=float((ground.slope * cut.length_m).sum()),
+        unknown=float(ground.unknown.mean()),
+        energy_j=energy_j,
+        energy_low_j=float(low.energy_j.sum()),
+        energy_high_j=float(high.energy_j.sum()),
+        braked_j=float(done.braked_j.sum()),
+        fuel_j=energy_j / machine.efficiency,
+        time_s=float(done.time_s.sum()),
+        time_low_s=float(low.time_s.sum()),
+        time_high_s=float(high.time_s.sum()),
+    )
+
+
+def _by_step(cut: Steps, ground: Ground, done: Drive, step_m: float) -> RouteSteps:
+    """Steps of the drive summed to those of an answer: as many whole ones, as near to step_m as divide it evenly."""
+    n = max(1, round(cut.end_m[-1] / step_m))
+    of_step = np.minimum(((cut.end_m[1:] - cut.length_m / 2) / cut.end_m[-1] * n).astype(int), n - 1)
+    first = np.searchsorted(of_step, np.arange(n))
+    length_m = np.add.reduceat(cut.length_m, first)
+
+    def mean(values: Floats) -> Floats:
+        known = np.isfinite(values)
+        total = np.add.reduceat(np.where(known, values, 0.0) * cut.length_m, first)
+        weight = np.add.reduceat(known * cut.length_m, first)
+        return np.where(weight > 0, total / np.where(weight > 0, weight, 1.0), np.nan)
+
+    time_s = np.add.reduceat(done.time_s, first)
+    return RouteSteps(
+        way_m=np.cumsum(length_m),
+        length_m=length_m,
+        x_m=cut.position_m[first, 0],
+        y_m=cut.position_m[first, 1],
+        resistance=mean(ground.resistance),
+        resistance_std=mean(ground.resistance_std),
+        slope=mean(ground.slope),
+        slope_std=mean(ground.slope_std),
+        confidence=mean(ground.confidence),
+        unknown=mean(ground.unknown.astype(float)),
+        energy_j=np.add.reduceat(done.energy_j, first),
+        braked_j=np.add.reduceat(done.braked_j, first),
+        time_s=time_s,
+        speed_mps=length_m / time_s,
+    )
+
+
+def reach_m() -> float:
+    """How far around a line the map is read: what lies beside it says what unknown ground may be like."""
+    return 2 * SMOOTH_M

@@ -1,0 +1,117 @@
+"""Routes over ground whose cost is known: a plane, two soils, unknown ground."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mapserver.routes.ground import Field
+from mapserver.routes.route import LAYERS, STEP_M, mean_std, route
+from protocol.arrays import Floats
+from protocol.errors import QueryError
+from protocol.queries.routing import RouteMachine
+from protocol.site.geometry import CellWindow
+from protocol.units import GRAVITY_MPS2
+
+SIZE = 220
+SLOW = RouteMachine(mass_kg=20_000.0, speed_mps=2.0)  # so slow that it rolls out without its brakes
+WEIGHT_N = 20_000 * GRAVITY_MPS2
+ROLLING = (False, False)
+
+
+def fields(resistance: Floats | float, east: float = 0.0, north: float = 0.0, std: float = 0.003) -> dict[str, Field]:
+    even = np.zeros((SIZE, SIZE))
+    values = {
+        "resistance_filled": even + resistance,
+        "grade_east_filled": even + east,
+        "grade_north_filled": even + north,
+    }
+    values |= {"resistance_std": even + std, "grade_std": even + std, "visits": even + 4, "confidence": even + 0.9}
+    assert set(values) == set(LAYERS)
+    return {name: Field(CellWindow(0, 0, SIZE, SIZE), 1.0, layer) for name, layer in values.items()}
+
+
+def line(*corners: tuple[float, float]) -> Floats:
+    return np.array(corners, float)
+
+
+def test_on_a_plane_a_route_costs_resistance_and_height() -> None:
+    ahead = line((10, 10), (170, 130))
+    layers = fields(0.03, east=0.004, north=0.01)
+    steps, totals = route(ahead, layers, SLOW, stops=ROLLING)
+    assert totals.length_m == pytest.approx(200)
+    assert totals.lift_m == pytest.approx(160 * 0.004 + 120 * 0.01)
+    assert totals.energy_j == pytest.approx(WEIGHT_N * (0.03 * 200 + totals.lift_m))
+    assert totals.fuel_j == pytest.approx(totals.energy_j / SLOW.efficiency)
+    assert (totals.time_s, totals.unknown, totals.braked_j) == pytest.approx((100, 0, 0))
+    assert steps.slope == pytest.approx(np.full(8, totals.lift_m / 200))
+
+
+def test_there_less_back_is_twice_the_height() -> None:
+    ahead, layers = line((10, 10), (170, 10), (170, 150)), fields(0.03, east=0.004, north=0.01)
+    there, back = (route(way, layers, SLOW, stops=ROLLING)[1] for way in (ahead, ahead[::-1]))
+    assert there.braked_j == back.braked_j == 0
+    assert there.energy_j - back.energy_j == pytest.approx(2 * WEIGHT_N * there.lift_m)
+    assert there.lift_m == pytest.approx(-back.lift_m)
+
+
+def test_two_soils_cost_what_each_costs_and_stand_in_their_steps() -> None:
+    soils = np.where(np.arange(SIZE) < 110, 0.02, 0.06) + np.zeros((SIZE, 1))
+    steps, totals = route(line((10, 50), (210, 50)), fields(soils), SLOW, stops=ROLLING)
+    assert totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 100 + 0.06 * 100), rel=1e-3)
+    assert steps.resistance[[0, -1]] == pytest.approx([0.02, 0.06])
+    assert steps.energy_j.sum() == pytest.approx(totals.energy_j)
+    assert steps.time_s.sum() == pytest.approx(totals.time_s)
+    assert steps.way_m[-1] == pytest.approx(200)
+
+
+def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
+    ahead = line((10, 10), (170, 130))
+    _, sure = route(ahead, fields(0.03, std=0.001), SLOW)
+    _, unsure = route(ahead, fields(0.03, std=0.01), SLOW)
+    for totals in (sure, unsure):
+        assert totals.energy_low_j < totals.energy_j < totals.energy_high_j
+        assert totals.time_low_s <= totals.time_s <= totals.time_high_s
+    assert unsure.energy_high_j - unsure.energy_low_j > 2 * (sure.energy_high_j - sure.energy_low_j)
+
+
+def test_errors_along_a_line_average_out_but_not_over_short_stretches() -> None:
+    std, step = np.full(2000, 0.01), np.full(2000, 1.0)
+    assert mean_std(std[:5], step[:5]) == pytest.approx(0.01, rel=0.1)
+    assert mean_std(std, step) == pytest.approx(math.hypot(0.01 * math.sqrt(2 * 25 / 2000), 0.001), rel=0.02)
+
+
+def test_unknown_ground_counts_as_the_dearest_and_is_said() -> None:
+    soils = np.where(np.arange(SIZE) < 150, 0.02, 0.08) + np.zeros((SIZE, 1))
+    soils[:, 80:120] = np.nan
+    layers = fields(soils)
+    steps, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, step_m=10)
+    assert totals.unknown == pytest.approx(40 / 130, abs=0.02)
+    assert steps.resistance[8] == pytest.approx(0.08)
+    assert np.isnan(steps.confidence[8])
+    _, told = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, unknown_resistance=0.02)
+    assert told.energy_j == pytest.approx(WEIGHT_N * 0.02 * 130, rel=0.01)
+    assert totals.energy_high_j - totals.energy_low_j > told.energy_high_j - told.energy_low_j
+
+
+def test_where_nothing_is_known_a_route_has_no_cost_unless_it_is_said() -> None:
+    layers = fields(math.nan)
+    with pytest.raises(QueryError, match="nobody has driven near this line yet"):
+        route(line((10, 50), (140, 50)), layers, SLOW)
+    _, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, unknown_resistance=0.05)
+    assert (totals.unknown, totals.energy_j) == pytest.approx((1.0, WEIGHT_N * 0.05 * 130))
+
+
+def test_a_machine_too_weak_for_a_slope_is_told_where() -> None:
+    layers = fields(0.03)
+    layers["grade_east_filled"].values[:, 100:140] = 0.9
+    weak = RouteMachine(mass_kg=40_000.0, power_w=60_000.0)
+    with pytest.raises(QueryError, match=r"cannot climb at (9\d|1\d\d), 50 m: .* % of its weight; more `power`"):
+        route(line((10, 50), (200, 50)), layers, weak)
+
+
+def test_a_short_line_is_one_step() -> None:
+    steps, totals = route(line((10, 50), (10.4, 50)), fields(0.03), SLOW)
+    assert steps.length_m == pytest.approx([0.4])
+    assert totals.length_m == pytest.approx(0.4)
+    assert STEP_M > 0.4
