@@ -28,7 +28,7 @@ from mapserver.journal.rows import (
 )
 from protocol.errors import StoreError
 
-SCHEMA = 5  # the only one: a journal of another one is refused
+SCHEMA = 6  # the only one: a journal of another one is refused
 # When and where the samples of a row lie is a table of its own: 50 bytes a row, so that a read by time and place passes
 # over rows without touching the pages of their payloads. Such a read cannot see that it misses a row where a bit of its
 # extent has flipped; so extents have a checksum of their own, which is checked on opening.
