@@ -20,9 +20,8 @@ from benchmarks.measure import Report, in_child, machine, memory_mb
 from benchmarks.merge_restart import CONFIG, SITE, build
 from benchmarks.merge_work import A_SECOND, BATCH, samples_of
 from mapserver.evidence.grid import Grid, warm_up
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.history import History
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.refold import fold_history
 
 LEAST_PAST_H = 2.0  # checkpoints are hourly: of less work there is none
@@ -93,9 +92,9 @@ def fold_timed(folder: Path, count: int) -> Report:
     """Fold a whole journal with so many threads."""
     warm_up(CONFIG.fold)
     grid = Grid(SITE.cell_m, CONFIG.fold)
-    with JournalReader(folder / JOURNAL_FILE) as journal:
+    with JournalLocation(folder).reader() as journal:
         start_s, start_cpu_s = time.perf_counter(), time.process_time()
-        fold_history(grid, History.beside(journal), threads=count)
+        fold_history(grid, History(journal, JournalLocation(folder).archive), threads=count)
         wall_s, cpu_s = time.perf_counter() - start_s, time.process_time() - start_cpu_s
         sent = sum(watermark.seq for watermark in journal.watermarks().values())
     if (samples := grid.folded + grid.skipped) != sent:

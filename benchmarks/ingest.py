@@ -12,6 +12,7 @@ from pathlib import Path
 from benchmarks.measure import START_NS, Report, machine, medians, timed, track
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
+from mapserver.journal.location import JournalLocation
 from mapserver.server import warm_up
 from protocol.arrays import Table
 from protocol.site.site_config import SiteConfig
@@ -57,7 +58,7 @@ def _variant(folder: Path, rows: Table, case: tuple[int, int], cpu_s: list[float
 
     def work() -> float:
         with tempfile.TemporaryDirectory(dir=folder) as path:
-            store = Store(Path(path), SITE, ServerConfig(), lambda: START_NS)
+            store = Store(JournalLocation(Path(path)), SITE, ServerConfig(), lambda: START_NS)
             start_cpu_s = time.process_time()
             seconds = timed(lambda: _take(store, groups))
             cpu_s.append(time.process_time() - start_cpu_s)

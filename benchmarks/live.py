@@ -24,9 +24,9 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import warm_up
 from mapserver.fleet.correction import UNCORRECTED
 from mapserver.ingest.backlog import GROUP_BATCHES
-from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
+from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JournalLocation
 from mapserver.trust.auditor import Auditor
 from mapserver.upkeep.jobs import Audit, ChangeSearch
 from protocol.site.site_config import SiteConfig
@@ -56,8 +56,8 @@ def run(hours: float, seconds: float) -> Report:
 def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:
     # no snapshot of its own accord
     config = replace(CONFIG, store=replace(CONFIG.store, snapshot_s=1e6, archive_after_h=0.0))
-    writer = Writer(Store(folder, SITE, config, lambda: START_NS))
-    reader = JournalReader(folder / JOURNAL_FILE)
+    writer = Writer(Store(JournalLocation(folder), SITE, config, lambda: START_NS))
+    reader = JournalLocation(folder).reader()
     try:
         link, work = Link(writer), batches()
         before = list(islice(work, samples_of(hours) // BATCH))

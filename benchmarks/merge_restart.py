@@ -21,9 +21,9 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES
-from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.store import Store
 from mapserver.journal.facts import NO_FACTS
-from mapserver.journal.journal import Journal
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.rows import Admission
 from protocol.arrays import Table
 from protocol.site.site_config import SiteConfig
@@ -78,7 +78,7 @@ def build(folder: Path, rows: int, tail_rows: int, in_row: int = BATCH) -> None:
 
     in_row: samples in a row: BATCH, or A_SECOND as machines send them that are always connected.
     """
-    journal, grid = Journal(folder / JOURNAL_FILE, SITE.name, SITE.frame), Grid(SITE.cell_m, CONFIG.fold)
+    journal, grid = JournalLocation(folder).open(SITE.name, SITE.frame), Grid(SITE.cell_m, CONFIG.fold)
     sent: Counter[str] = Counter()
     journal.begin()
     for number, (name, batch) in enumerate(islice(_rows(in_row), rows), start=1):
@@ -103,7 +103,7 @@ def _rows(in_row: int) -> Iterator[tuple[str, Table]]:
 def open_timed(folder: Path) -> Report:
     """Open the store; returns how long that took."""
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
-    store = Store(folder, SITE, CONFIG, lambda: START_NS)
+    store = Store(JournalLocation(folder), SITE, CONFIG, lambda: START_NS)
     open_s, open_cpu_s = time.perf_counter() - start_s, time.process_time() - start_cpu_s
     rows = {"journalled": store.journalled, "merged": store.merged, "snapshot_row": store.snapshot_row}
     store.close()

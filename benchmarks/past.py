@@ -13,10 +13,9 @@ import numpy as np
 from benchmarks.measure import START_NS, Report, machine
 from benchmarks.merge_restart import CONFIG, SITE, build
 from benchmarks.merge_work import A_SECOND, samples_of
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.facts import NO_FACTS
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Admission
 from mapserver.past.cell_history import cell_history
 from mapserver.past.making import make
@@ -49,7 +48,7 @@ def run(hours: float, runs: int) -> Report:
         path = Path(folder)
         build(path, samples_of(hours) // A_SECOND, tail_rows=0, in_row=A_SECOND)
         past = Past.of_store(path, SITE.cell_m, CONFIG.fold)
-        with JournalReader(path / JOURNAL_FILE) as reader:
+        with JournalLocation(path).reader() as reader:
             checkpoints = made(past, reader, START_NS + round(hours * HOUR_NS))
             rows = list(_asked(past, reader, START_NS + round(hours * HOUR_NS), runs))
     rows.append(_row("history of a point", history(runs)))
@@ -94,7 +93,7 @@ def history(runs: int) -> list[Took]:
     """What the history of a point takes that all of HISTORY_ROWS journal rows are about, in each of so many runs."""
     draw = np.random.default_rng(1)
     with tempfile.TemporaryDirectory() as folder:
-        journal = Journal(Path(folder) / JOURNAL_FILE, SITE.name, SITE.frame)
+        journal = JournalLocation(Path(folder)).open(SITE.name, SITE.frame)
         journal.begin()
         for number in range(HISTORY_ROWS):
             rows = empty(A_SECOND)
@@ -106,7 +105,7 @@ def history(runs: int) -> list[Took]:
             journal.append(Admission(batch, trimmed=0, lost=0), START_NS)
         journal.commit()
         past, cell = Past.of_store(Path(folder), SITE.cell_m, CONFIG.fold), (int(POINT_M), int(POINT_M))
-        with JournalReader(journal.path) as reader:
+        with JournalLocation(Path(folder)).reader() as reader:
             seconds = [_took_s(lambda: cell_history(past, reader, cell, HISTORY_SPAN_NS)) for _ in range(runs)]
         journal.close()
     return seconds

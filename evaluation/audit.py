@@ -22,10 +22,9 @@ from mapserver.evidence.grid import REFOLD_ROWS, Grid
 from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import Page
 from mapserver.ingest.decisions import Decisions
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import JournalRow
 from protocol.arrays import Ints
 from protocol.machine.samples import content_hash
@@ -62,8 +61,9 @@ def read_audits(audits: Mapping[str, Path]) -> dict[SampleKey, Contents]:
 
 def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, config: ServerConfig) -> AuditResult:
     """Compare audit files with the store of a server that has ended."""
-    with JournalReader(folder / JOURNAL_FILE) as journal:
-        rows = list(history_rows(History.beside(journal)))
+    location = JournalLocation(folder)
+    with location.reader() as journal:
+        rows = list(history_rows(History(journal, location.archive)))
         facts = Decisions.of_journal(journal).facts
     last = rows[-1].row if rows else 0
     _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, facts.of_evidence())

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 
 import zenoh
 
@@ -17,10 +16,10 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import grid
 from mapserver.ingest import batches
 from mapserver.ingest.admission import Verify
-from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.ingest.store_folder import store_id
+from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records
+from mapserver.journal.location import JournalLocation
 from mapserver.past.past import Past
 from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.answering import Answers
@@ -50,7 +49,7 @@ class Server:
         self,
         ingest: zenoh.Session,
         readers: zenoh.Session,
-        folder: Path,
+        location: JournalLocation,
         site: SiteConfig,
         config: ServerConfig,
         now_ns: Callable[[], int],
@@ -67,16 +66,16 @@ class Server:
         """
         self._sign = sign
         with ExitStack() as opened:
-            self._claim = WriterClaim(ingest, site.name, store_id(folder / JOURNAL_FILE))
+            self._claim = WriterClaim(ingest, site.name, location.store_id())
             opened.callback(self._claim.close)
             self._claim.acquire(take_over=take_over)
-            self._writer = Writer(Store(folder, site, config, now_ns, verify))
+            self._writer = Writer(Store(location, site, config, now_ns, verify))
             self._claim.store = self._writer.store_id
             opened.pop_all()
         self._changed = readers.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
-        past = Past.of_store(folder, site.cell_m, config.fold)
+        past = Past.of_store(location.folder, site.cell_m, config.fold)
         self._upkeep = Upkeep(self._writer, self._publish, past)
         self.answers = Answers(self._writer, self._upkeep, past)
         self._now = AnswerPool("query", config.query_threads, ANSWER_BYTES)

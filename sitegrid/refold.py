@@ -20,14 +20,12 @@ from mapserver.config import ServerConfig
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import calibrations, plain
 from mapserver.ingest.losses import lacking
-from mapserver.ingest.store import ACCEPTED, JOURNAL_FILE, Store
+from mapserver.ingest.store import ACCEPTED, Store
 from mapserver.journal import archived_decisions
-from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.copier import Copier, merged
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.rows import JournalRow, Selection, SpoolKey, Watermark
 from protocol.config import from_table
 from protocol.errors import ConfigError, StoreError
@@ -97,7 +95,7 @@ def _build(arguments: Namespace, sources: list[SampleSource], site: SiteConfig, 
         copier = _copy(part, sources, site, selection, headless=arguments.json)
         (part / SITE_FILE).write_text(site_toml(site), encoding="utf-8")
         (part / CONFIG_FILE).write_text(text, encoding="utf-8")
-        with closing(Store(part, site, config, time.time_ns)) as store:  # folds the journal as a server would
+        with closing(Store(JournalLocation(part), site, config, time.time_ns)) as store:
             store.save_snapshot()  # to start from
             info = store.info()
         part.replace(arguments.out)
@@ -125,7 +123,7 @@ def _build(arguments: Namespace, sources: list[SampleSource], site: SiteConfig, 
 def _sources(path: Path, selection: Selection, opened: ExitStack) -> Iterator[SampleSource]:
     """What a Parquet file, a folder of them or a store holds; only samples of the selected time are read."""
     in_time = Selection(from_ns=selection.from_ns, to_ns=selection.to_ns)
-    if (path / JOURNAL_FILE).exists():
+    if JournalLocation(path).exists():
         yield _store(path, in_time, opened)
         return
     if not path.exists():
@@ -141,11 +139,12 @@ def _sources(path: Path, selection: Selection, opened: ExitStack) -> Iterator[Sa
 
 
 def _store(path: Path, selection: Selection, opened: ExitStack) -> SampleSource:
-    if shortfall := lacking(path / JOURNAL_FILE):
+    location = JournalLocation(path)
+    if shortfall := lacking(location):
         advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
-        raise StoreError(path / JOURNAL_FILE, f"{shortfall}; {advice}")
-    journal = opened.enter_context(JournalReader(path / JOURNAL_FILE))
-    history, watermarks = History.beside(journal), journal.watermarks()
+        raise StoreError(location, f"{shortfall}; {advice}")
+    journal = opened.enter_context(location.reader())
+    history, watermarks = History(journal, location.archive), journal.watermarks()
     first = next(history_rows(history), None)
     samples = sum(watermark.seq - watermark.lost for watermark in watermarks.values())
     machines = frozenset(machine for machine, _ in watermarks)
@@ -162,7 +161,7 @@ def _site_of(store: Path) -> SiteConfig | None:
     """The site as a store knows it: a file of its own, or the header of its newest archive."""
     if (store / SITE_FILE).exists():
         return load_site(store / SITE_FILE)
-    paths = Archive(store / FOLDER).paths()
+    paths = JournalLocation(store).archive.paths()
     return ArchiveFile(paths[-1]).header.site if paths else None
 
 
@@ -188,7 +187,7 @@ def _site(sources: list[SampleSource], arguments: Namespace) -> SiteConfig:
 
 def _config(arguments: Namespace) -> tuple[ServerConfig, str]:
     """The server's options and their text: from --config, else from the first store that has its own."""
-    kept = (path / CONFIG_FILE for path in arguments.archives if (path / JOURNAL_FILE).exists())
+    kept = (path / CONFIG_FILE for path in arguments.archives if JournalLocation(path).exists())
     path = arguments.config or next((file for file in kept if file.exists()), None)
     if not path:
         return ServerConfig(), "# Every option has its default.\n"
@@ -198,7 +197,7 @@ def _config(arguments: Namespace) -> tuple[ServerConfig, str]:
 def _copy(part: Path, sources: list[SampleSource], site: SiteConfig, selection: Selection, *, headless: bool) -> Copier:
     """Write the journal of the new store: samples, and what was decided about their corrections."""
     stores = dict.fromkeys(store for source in sources for store in source.stores)
-    journal = Journal(part / JOURNAL_FILE, site.name, site.frame, stores)
+    journal = JournalLocation(part).open(site.name, site.frame, stores)
     copier = Copier(journal, site.frame, selection)
     total, done = sum(source.samples for source in sources), 0
     sources = sorted(sources, key=lambda source: (source.first_ns, sorted(source.machines), source.path))

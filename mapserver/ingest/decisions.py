@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from mapserver.fleet import decisions as calibration
 from mapserver.fleet.correction import LAST_NS, NO_SHARE
 from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions, NewerVersionError
 from mapserver.journal.facts import Facts
-from mapserver.journal.reader import JournalQueries
+from mapserver.journal.journal import JournalQueries
 from mapserver.journal.rows import Event
 from mapserver.trust import decisions as trust
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
@@ -36,7 +35,7 @@ class Decisions:
         decisions, number = cls(), 0
         for event in journal.events():
             if event.kind in KINDS:
-                decisions._take(_decision(event, journal.path))
+                decisions._take(_decision(event, journal.where))
                 number = event.id
         decisions._conclude(number)
         return decisions
@@ -76,7 +75,7 @@ class Decisions:
 
 def calibrations(journal: JournalQueries) -> list[CalibrationDecision]:
     """Decisions about calibration that a journal has, in their order; StoreError as `Decisions.of_journal`."""
-    decisions = (_decision(event, journal.path) for event in journal.events(calibration.KIND))
+    decisions = (_decision(event, journal.where) for event in journal.events(calibration.KIND))
     return [decision for decision in decisions if isinstance(decision, CalibrationDecision)]
 
 
@@ -87,11 +86,11 @@ def plain(decision: Decision) -> tuple[str, int, Mapping[str, Any]]:
     return trust.KIND, decision.stamp_ns, asdict(decision)
 
 
-def _decision(event: Event, path: Path) -> Decision:
+def _decision(event: Event, where: str) -> Decision:
     if event.kind == trust.KIND:
         return TrustDecision(**event.body)
     try:
         return CalibrationDecision.from_body(event.body)
     except NewerVersionError as error:
         problem = f"event {event.id}: {error}; open it with that version, or choose another --store"
-        raise StoreError(path, problem) from None
+        raise StoreError(where, problem) from None

@@ -5,17 +5,13 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
 
 from mapserver.evidence.snapshot import rows_on_disk
 from mapserver.ingest.store_folder import is_in_use
 from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import MachineTotals
 from mapserver.journal.shortfall import KIND, Shortfall, beyond, compare, marked, missing
-from protocol.disk.traces import look_beside
-from protocol.disk.write_ahead_log import LogScan
 
 log = logging.getLogger("mapserver.ingest.losses")
 
@@ -30,20 +26,19 @@ def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shor
         shortfall = beyond(journal.last_row, newest)
         journal.note_shortfall(shortfall)
     if shortfall:
-        log.error("acknowledged samples are missing journal=%s shortfall=%r", journal.path, str(shortfall))
+        log.error("acknowledged samples are missing journal=%s shortfall=%r", journal.where, str(shortfall))
     return [Shortfall.from_event(event) for event in journal.events(KIND)]
 
 
-def lacking(path: Path) -> Shortfall | None:
+def lacking(location: JournalLocation) -> Shortfall | None:
     """What a journal lacks of what was acknowledged, as long as no start of a server has named it.
 
     It may be in use: what proves that it was longer is looked at before it, and is never ahead of it. StoreError where
     it cannot be read.
     """
-    newest, traces = max(rows_on_disk(path.parent), default=0), look_beside(path)
-    if is_in_use(path.parent):
-        traces = replace(traces, log=LogScan())  # it is being written; the server has looked at it when it started
-    with JournalReader(path) as journal:
+    newest = max(rows_on_disk(location.folder), default=0)
+    traces = location.traces(in_use=is_in_use(location.folder))
+    with location.reader() as journal:
         last_row, events, watermarks = journal.last_row, journal.events(), journal.watermarks()
     shortfall = compare(traces, marked(last_row, len(events), watermarks))
     return beyond(last_row, newest) if newest > last_row and not shortfall else shortfall

@@ -5,13 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import sqlite3
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +25,8 @@ from mapserver.ingest.losses import by_machine, name_shortfalls
 from mapserver.ingest.store_folder import hold
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import History, read_history
-from mapserver.journal.journal import Journal
+from mapserver.journal.journal import UnwrittenError
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
 from mapserver.past import checkpoints
@@ -39,7 +38,6 @@ from protocol.version import package_version
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
-JOURNAL_FILE = "journal.db"
 ACCEPTED = "accepted_store"  # kind of an event
 
 
@@ -61,21 +59,23 @@ class Store:
 
     def __init__(
         self,
-        folder: Path,
+        location: JournalLocation,
         site: SiteConfig,
         config: ServerConfig,
         now_ns: Callable[[], int],
         verify: Verify | None = None,
     ) -> None:
         """verify: raises MessageError unless a batch is signed by its machine."""
-        self.site, self.config, self.folder, self.now_ns = site, config, folder, now_ns
+        folder = location.folder
+        self.site, self.config, self.location, self.now_ns = site, config, location, now_ns
         self._verify = verify
         self.counters: Counter[str] = Counter()
         self.commits, self.commit_s = 0, 0.0
         with ExitStack() as opened:
             opened.enter_context(hold(folder))
-            self.journal = Journal(folder / JOURNAL_FILE, site.name, site.frame)
+            self.journal = location.open(site.name, site.frame)
             opened.callback(self.journal.close)
+            self.history = History(self.journal, location.archive)
             self.identity = self.journal.identity()
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
             self._decisions, last_row = Decisions.of_journal(self.journal), self.journal.last_row
@@ -87,7 +87,7 @@ class Store:
             self.merged, self.grid = loaded
             self.snapshot_row = self.merged
             in_snapshot = self.grid.counts()
-            fold_history(self.grid, History.beside(self.journal), self.merged, selection=Selection.by(facts))
+            fold_history(self.grid, self.history, self.merged, selection=Selection.by(facts))
             release_memory()
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
@@ -133,10 +133,10 @@ class Store:
             began_s = time.monotonic()
             self.journal.commit()
             self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
-        except (sqlite3.Error, OSError) as error:
+        except UnwrittenError as error:
             self.journal.rollback()
             self.counters[f"refused_{Refusal.STORE}"] += len(group)
-            return [Refused(Refusal.STORE, f"the server cannot write: {error}") for _ in group]
+            return [Refused(Refusal.STORE, f"the server cannot write: {error.problem}") for _ in group]
         for answer, admission in answers:
             self._count(answer, admission)
         self._fold([admission.batch for _, admission in answers if admission and len(admission.batch.rows)])
@@ -155,7 +155,7 @@ class Store:
         state = grid.state()
 
         def write() -> None:
-            snapshot.save(self.folder, row, state, self.site.cell_m, self.config.fold, facts.of_evidence())
+            snapshot.save(self.location.folder, row, state, self.site.cell_m, self.config.fold, facts.of_evidence())
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
                 self.snapshot_row, self._snapshot_samples = row, samples
 
@@ -168,7 +168,7 @@ class Store:
         """
         grid.touch_all()
         selection = Selection.by(facts)
-        for rows in read_history(History.beside(self.journal), after=row, selection=selection):
+        for rows in read_history(self.history, after=row, selection=selection):
             grid.fold_all(*rows.selected(selection))
         self.grid, self.facts = grid, facts
         self._count_decisions()

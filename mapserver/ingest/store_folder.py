@@ -1,4 +1,4 @@
-"""A store's folder before the store is opened: its lock, as one server on this host has it open, and the id."""
+"""The lock of a store's folder: one server on this host has it open."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mapserver.journal.reader import JournalReader
 from protocol.errors import StoreError
 from protocol.files import make_private
 
@@ -38,11 +37,3 @@ def hold(folder: Path) -> Iterator[None]:
             problem = "another server is using this store; stop it, or choose another --store"
             raise StoreError(folder, problem) from None
         yield
-
-
-def store_id(journal: Path) -> str:
-    """Id of the store of a journal; empty where there is none yet. StoreError where it cannot be read."""
-    if not journal.exists():
-        return ""
-    with JournalReader(journal) as reader:
-        return reader.identity().id

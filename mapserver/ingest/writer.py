@@ -38,7 +38,7 @@ class _Work:
 
 
 class Writer:
-    """Owns a Store on a thread of its own, from here on; site, config, folder, now_ns, store_id: of the store.
+    """Owns a Store on a thread of its own, from here on; site, config, location, now_ns, store_id: of the store.
 
     `submit` and `run` may be called from any thread; both return at once or wait for the owner, never touch the store.
     waits: who waits for a row to be merged.
@@ -46,7 +46,7 @@ class Writer:
 
     def __init__(self, store: Store, clock: Callable[[], float] = time.monotonic) -> None:
         """clock: steady, in seconds."""
-        self.site, self.config, self.folder, self.now_ns = store.site, store.config, store.folder, store.now_ns
+        self.site, self.config, self.location, self.now_ns = store.site, store.config, store.location, store.now_ns
         self.store_id = store.identity.id
         self._store, self._clock = store, clock
         self._turn = threading.Condition()  # of all that waits

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mapserver.journal.archive_file import KEY, NAME, ArchiveFile, ArchiveHeader, arrow, row_range, seal
-from mapserver.journal.reader import LAST, JournalReader
-from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
 from protocol.errors import StoreError
 from protocol.files import sync_folder, whole_file
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE

@@ -20,8 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from mapserver.journal.reader import LAST
-from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
+from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.config import from_table
 from protocol.errors import ConfigError, StoreError

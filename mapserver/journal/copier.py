@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from mapserver.journal.journal import Journal
-from mapserver.journal.reader import LAST
-from mapserver.journal.rows import Admission, JournalRow, Selection, SpoolKey, Watermark
+from mapserver.journal.rows import LAST, Admission, JournalRow, Selection, SpoolKey, Watermark
 from protocol.arrays import Bools
 from protocol.errors import StoreError
 from protocol.wire.messages import SampleBatch

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 
-from mapserver.journal.archive import FOLDER, Archive
-from mapserver.journal.reader import LAST, ArchivedError, JournalQueries
-from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
+from mapserver.journal.archive import Archive
+from mapserver.journal.journal import ArchivedError, JournalQueries
+from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
 
 
 @dataclass(frozen=True)
@@ -17,11 +17,6 @@ class History:
 
     journal: JournalQueries
     archive: Archive
-
-    @classmethod
-    def beside(cls, journal: JournalQueries) -> History:
-        """A journal and the archive beside it."""
-        return cls(journal, Archive(journal.path.parent / FOLDER))
 
 
 def read_history(

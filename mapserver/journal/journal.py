@@ -1,243 +1,196 @@
-"""The journal: what machines sent, in SQLite, committed with FULL sync before it is acknowledged. It is the truth.
+"""What a journal is, whatever keeps it: the seam between a map server and its database.
 
-One journal row is one admitted batch. Row and watermark are written in one transaction, so that exactly-once is
-decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulated power cuts, FULL none
-(docs/evidence.md). Rows up to `archived_row` have moved to Parquet files (archive.py); history.py reads both as one.
+A journal holds what machines sent, in rows that are numbered 1, 2, 3... in the order of their commits, a watermark per
+spool, and events. One writer has it, any number of readers look. Nothing outside of the folders that implement this
+knows which database it is (`location.py` does), nor catches its errors: all are one of those here.
 """
 
 from __future__ import annotations
 
-import json
-import secrets
-import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
 
-from mapserver.journal.progress import Progress
-from mapserver.journal.reader import ROWS_AT_ONCE, SCHEMA, TABLES, JournalQueries
-from mapserver.journal.records import extent_of, record
-from mapserver.journal.rows import Admission, JournalRow, MachineTotals, Watermark, checksum, extent_checksum
-from mapserver.journal.shortfall import EVENT, ROW, Shortfall, compare, marked, spool_name
-from mapserver.journal.shortfall import KIND as SHORTFALL
-from protocol.disk.high_water_mark import HighWaterMark, mark_path
-from protocol.disk.traces import Traces, look_beside
+from mapserver.journal.rows import (
+    ALL,
+    LAST,
+    Admission,
+    Event,
+    JournalRow,
+    JournalRows,
+    MachineTotals,
+    Selection,
+    SpoolKey,
+    StoreIdentity,
+    Watermark,
+)
+from mapserver.journal.shortfall import Shortfall
 from protocol.errors import StoreError
-from protocol.files import make_private
 
-_LAST_EVENT = "SELECT COALESCE(MAX(id), 0) FROM events"
-_WAL_LIMIT = 64 * 2**20
-SPARE = 0.25  # share of free pages above which a file is made smaller
+ROWS_AT_ONCE = 200  # read or removed in one transaction: short ones hold nobody up
 
 
-class Journal(JournalQueries):
-    """One writer's connection to the journal of one site. StoreError where anything in it is damaged (`check`).
+class ArchivedError(StoreError):
+    """Rows that are asked for have moved to the archive. archived_row: the last one that has."""
 
-    shortfall: what was acknowledged and was not in it when it was opened now, None where nothing is missing.
+    def __init__(self, where: object, archived_row: int) -> None:
+        super().__init__(where, f"rows up to {archived_row} are in the archive beside it")
+        self.archived_row = archived_row
+
+
+class UnwrittenError(StoreError):
+    """A transaction failed, as on a full disk: after `rollback` the journal is as it is on disk, and goes on.
+
+    problem: what the database says, without where it is.
     """
 
-    last_row: int
-    shortfall: Shortfall | None = None
+    def __init__(self, where: object, problem: str) -> None:
+        super().__init__(where, problem)
+        self.problem = problem
 
-    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
-        """descends: ids of the stores that a new one is made from."""
-        self.path = path
-        self._changed: dict[str, int] = {}  # by the open transaction, for the mark
-        path.parent.mkdir(parents=True, exist_ok=True)
-        traces = look_beside(path)  # before SQLite drops what it cannot use
-        with ExitStack() as opened:
-            try:
-                make_private(path)
-                self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
-                opened.callback(self._db.close)
-                self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")  # only a new file takes it
-                self._db.execute("PRAGMA journal_mode=WAL")
-                self._db.execute("PRAGMA synchronous=FULL")
-                self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
-                self._create_or_check(site, frame, descends)
-                self.check()
-                self._return_to_disk()
-                self._mark = HighWaterMark(mark_path(path))
-                opened.callback(self._mark.close)
-                self._compare(traces)
-            except (sqlite3.Error, OSError) as error:
-                raise StoreError(path, f"is no usable journal: {error}") from None
-            opened.pop_all()
 
-    def watermark(self, machine: str, spool_id: int) -> Watermark:
-        """Progress of a spool."""
-        return self._progress.watermark(machine, spool_id)
+@dataclass(frozen=True)
+class JournalState:
+    """How far a journal is. epoch: number of its writer, each has a higher one; row, event: the last ones."""
 
-    def watermarks(self) -> dict[tuple[str, int], Watermark]:
+    epoch: int
+    row: int
+    event: int
+
+
+class JournalQueries(Protocol):
+    """What can be read of a journal, by its writer as by a reader."""
+
+    @property
+    def where(self) -> str:
+        """Where it is, for people."""
+
+    @property
+    def last_row(self) -> int:
+        """The last row, archived or not."""
+
+    @property
+    def archived_row(self) -> int:
+        """The last row that has moved to the archive."""
+
+    def identity(self) -> StoreIdentity:
+        """Which store this is; StoreError where that is damaged."""
+
+    def state(self) -> JournalState:
+        """How far it is now."""
+
+    def watermarks(self) -> dict[SpoolKey, Watermark]:
         """Progress of all spools."""
-        return self._progress.watermarks()
 
-    def machines(self) -> dict[str, MachineTotals]:
-        """What each machine sent."""
-        return self._progress.machines()
+    def read(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRow]:
+        """As `read_many`, one by one."""
+
+    def read_many(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRows]:
+        """Rows after < row <= until in order, also those that are committed meanwhile; many at a time, and never none.
+
+        StoreError where a row is missing or not what was written, after those before it; ArchivedError as soon as one
+        of them is archived.
+        """
+
+    def row_checksum(self, row: int) -> int | None:
+        """The checksum that a row was written with; None where it is not there, or archived.
+
+        Who has seen a row knows by this whether the journal still has it, or was restored and went another course.
+        """
+
+    def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
+        """Events beyond the number `after`, of one kind or of all, in the order in which they were written."""
+
+    def stamps_by_chunk(self, after: int, until: int, chunk: int) -> list[tuple[int, int, int]]:
+        """Chunks of so many rows among after < row <= until: number, least and greatest stamp of each."""
+
+    def least_stamp(self, after: int, until: int, from_ns: int) -> int | None:
+        """The least stamp of rows after < row <= until, `from_ns` of a row that reaches across it; None for none."""
+
+    def rows_before(self, after: int, until: int, stamp_ns: int) -> int:
+        """How many of the rows after < row <= until have a stamp before a time; of archived ones none is counted."""
+
+    def check(self) -> None:
+        """Check identity, extents, events and watermarks; StoreError where one is damaged.
+
+        Rows are checked when they are read. A damaged extent would hide its row from a read by time and place, without
+        any error.
+        """
+
+    def close(self) -> None:
+        """Close it; nothing is asked of it from then on."""
+
+
+class JournalReader(JournalQueries, Protocol):
+    """Reads a journal also while a server writes it; used by one thread at a time. site, frame: whose it is."""
+
+    site: str
+    frame: str
+
+    def follow(self, known: JournalState, timeout_s: float) -> JournalState:
+        """Wait until the journal is not as known any more, or for so long; returns how far it is then."""
+
+    def __enter__(self) -> Self:
+        """Use it."""
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+
+
+class Journal(JournalQueries, Protocol):
+    """One writer's connection to the journal of one site.
+
+    Transactions: what fails raises UnwrittenError, and `rollback` is called then. shortfall: what was acknowledged and
+    was not in it when it was opened now, None where nothing is missing. samples: that all machines sent.
+    """
+
+    shortfall: Shortfall | None
 
     @property
     def samples(self) -> int:
         """How many samples all machines sent."""
-        return self._progress.samples
+
+    def watermark(self, machine: str, spool_id: int) -> Watermark:
+        """Progress of a spool."""
+
+    def machines(self) -> dict[str, MachineTotals]:
+        """What each machine sent."""
 
     def begin(self) -> None:
         """Open a transaction; rows appended from here on are one group commit."""
-        self._db.execute("BEGIN IMMEDIATE")
 
     def append(self, admission: Admission, received_ns: int) -> int:
         """Write one row and its watermark into the open transaction; returns the row's number."""
-        batch = admission.batch
-        row = self.last_row + 1
-        written = JournalRow(row, batch.machine, batch.spool_id, batch.first_seq, batch.rows, received_ns)
-        self._db.execute("INSERT INTO journal VALUES (?, ?)", (row, record(written)))
-        extent = (row, *extent_of(batch.rows))
-        self._db.execute("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, extent_checksum(*extent)))
-        before = self.watermark(batch.machine, batch.spool_id)
-        watermark = Watermark(admission.watermark, before.lost + admission.lost, max(before.newest_ns, extent[2]))
-        self.put_watermark(batch.machine, batch.spool_id, watermark)
-        self.last_row = row
-        return row
 
     def declare_lost(self, admission: Admission) -> None:
         """Write a watermark alone into the open transaction: samples at a spool's end that will never come."""
-        batch = admission.batch
-        before = self.watermark(batch.machine, batch.spool_id)
-        after = replace(before, seq=admission.watermark, lost=before.lost + admission.lost)
-        self.put_watermark(batch.machine, batch.spool_id, after)
 
     def put_watermark(self, machine: str, spool_id: int, watermark: Watermark) -> None:
         """Write a watermark into the open transaction."""
-        values = (machine, _spool_bytes(spool_id), watermark.seq, watermark.lost, watermark.newest_ns)
-        self._db.execute("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", (*values, checksum(*values)))
-        self._progress.put(machine, spool_id, watermark)
-        self._changed[spool_name(machine, spool_id)] = watermark.seq
 
     def commit(self) -> None:
         """Commit to disk; only then may anything be acknowledged."""
-        self._db.execute("COMMIT")
-        if self._changed:
-            self._mark.write({ROW: self.last_row, **self._changed})
-            self._changed.clear()
 
     def rollback(self) -> None:
-        """Give up the open transaction and return to what is on disk."""
-        if self._db.in_transaction:
-            self._db.execute("ROLLBACK")
-        self._return_to_disk()
+        """Give up the open transaction, if there is one, and return to what is on disk."""
 
     def append_event(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> int:
         """Commit an event, outside of any other transaction; returns its number."""
-        return self.append_events([(kind, stamp_ns, body)])
 
     def append_events(self, events: Iterable[tuple[str, int, Mapping[str, Any]]]) -> int:
         """Commit events (kind, stamp_ns, body), all or none, outside of other transactions; returns the last number.
 
         The number is 0 where there never was an event.
         """
-        texts = [(kind, stamp_ns, json.dumps(body, allow_nan=False)) for kind, stamp_ns, body in events]
-        with self._transaction():
-            for text in texts:
-                number = self._number(_LAST_EVENT) + 1
-                values = (number, *text)
-                self._db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
-                self._changed[EVENT] = number
-            return self._number(_LAST_EVENT)
 
     def note_shortfall(self, shortfall: Shortfall) -> None:
         """Keep what is missing as an event; no file that proves it is needed from then on."""
-        self.shortfall = shortfall
-        newest_ns = max((mark.newest_ns for mark in self.watermarks().values()), default=0)
-        self.append_event(SHORTFALL, newest_ns, shortfall.body())
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
         """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.
 
         most: how many at most, so that batches need not wait long; call it again until `until` is reached.
         """
-        archived = self.archived_row
-        last = max(archived, min(until, archived + most, self.last_row))
-        with self._transaction():
-            for table in ("journal", "extent"):
-                self._db.execute(f"DELETE FROM {table} WHERE row <= ?", (last,))  # noqa: S608 # one of two constants
-            self._db.execute("REPLACE INTO meta VALUES ('archived_row', ?)", (str(last),))
-        return last
 
-    def shrink(self, most_pages: int = 100) -> int:
-        """Give free pages back to the disk where more than SPARE of the file is free; returns how many.
-
-        Fewer are kept for the rows to come.
-        """
-        pages, free = (self._number(f"PRAGMA {name}") for name in ("page_count", "freelist_count"))
-        spare = min(most_pages, free - int(SPARE * pages))
-        if spare <= 0:
-            return 0
-        self._db.executescript(f"PRAGMA incremental_vacuum({spare})")  # `execute` would stop after the first page
-        return free - self._number("PRAGMA freelist_count")
-
-    def close(self) -> None:
-        """Fold the write-ahead log into the file and close."""
-        self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        self._db.close()
-        self._mark.close()
-
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        self.begin()
-        try:
-            yield
-            self.commit()
-        except (sqlite3.Error, StoreError):
-            self.rollback()
-            raise
-
-    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
-        expected = {"schema": str(SCHEMA), "site": site, "frame": frame}
-        if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
-            self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
-            words = (secrets.token_hex(8), *descends)
-            store = " ".join((*words, f"{checksum(*words):08x}"))
-            self._db.executemany("INSERT INTO meta VALUES (?, ?)", {**expected, "store": store}.items())
-            self._db.execute("COMMIT")
-            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # no damage of a log takes the store's id away
-        meta = self._meta()
-        for key, value in expected.items():
-            if meta.get(key) != value:
-                problem = f"the store has {key} {meta.get(key)!r}, this server {value!r}; choose another --store"
-                raise StoreError(self.path, problem)
-
-    def _compare(self, traces: Traces) -> None:
-        """Compare what there is with the mark and the log beside it, and name what is missing."""
-        present = marked(self.last_row, self._number(_LAST_EVENT), self.watermarks())
-        if shortfall := compare(traces, present):
-            with suppress(OSError):  # a full disk: the shortfall is named all the same
-                traces.keep_log(self.last_row)
-            self._require_agreement()
-            self.note_shortfall(shortfall)
-        with suppress(OSError):  # it stays behind, which is no alarm, or is compared again
-            self._mark.replace(marked(self.last_row, self._number(_LAST_EVENT), self.watermarks()))
-
-    def _require_agreement(self) -> None:
-        """StoreError where pages of different times are in the file, as a damaged log may leave them.
-
-        A watermark behind its rows would take their samples once more.
-        """
-        ((verdict,), *_) = self._query("PRAGMA integrity_check(1)")
-        reached = all(row.first_seq + len(row.rows) - 1 <= self._seq_of(row) for row in self.read(self.archived_row))
-        if verdict != "ok" or not reached:
-            raise self._damaged("what its write-ahead log left")
-
-    def _seq_of(self, row: JournalRow) -> int:
-        return self.watermark(row.machine, row.spool_id).seq
-
-    def _return_to_disk(self) -> None:
-        self._progress = Progress(self._load_watermarks())
-        self.last_row = self._last_row()
-        self._changed.clear()
-
-
-def _spool_bytes(spool_id: int) -> bytes:
-    """SQLite integers are signed: 64-bit ids are stored as bytes."""
-    return spool_id.to_bytes(8, "big")
+    def shrink(self) -> int:
+        """Give free room back to the disk, a piece at a time; returns how many pages."""

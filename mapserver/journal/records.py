@@ -32,6 +32,11 @@ def record(row: JournalRow) -> bytes:
     return body + zlib.crc32(body).to_bytes(_CRC_BYTES, "little")
 
 
+def checksum_of(record: bytes) -> int:
+    """The checksum that a record was written with."""
+    return int.from_bytes(record[-_CRC_BYTES:], "little")
+
+
 def warm_up() -> None:
     """Compile the kernels, or read them from their cache, before a batch waits for them."""
     row = JournalRow(1, "", 1, 1, np.zeros(1, SAMPLE_DTYPE))

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.workers import ALONE, Workers
 from mapserver.journal.history import History, read_history
-from mapserver.journal.reader import LAST
-from mapserver.journal.rows import ALL, Selection
+from mapserver.journal.rows import ALL, LAST, Selection
 from protocol.arrays import Table
 
 # Kernels run beside each other, what is Python between them does not. Not more are tried: docs/results/refold.md

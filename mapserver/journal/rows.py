@@ -21,6 +21,7 @@ from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
 
 SpoolKey = tuple[str, int]  # machine, spool_id
+LAST = 2**63 - 1  # no row has a higher number
 _EXTENT = struct.Struct("<3q4d")
 
 

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mapserver.journal.reader import LAST, JournalReader
-from mapserver.journal.rows import Selection
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.rows import LAST, Selection
 from protocol.arrays import Bools, Ints
 
 CHUNK = 1024  # rows: a look through their extents takes 0.1 ms

@@ -16,7 +16,7 @@ from mapserver.evidence.fold import Scratch, fold
 from mapserver.evidence.fold_config import STD_FLOOR_M
 from mapserver.evidence.grid import PIECE
 from mapserver.evidence.pages import PackedPages
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import ALL, Selection
 from mapserver.past.past import NamedSamples, Past, reach_of
 from protocol.arrays import AnyArray, Bools, Ints, Table

@@ -17,7 +17,7 @@ from mapserver.evidence.grid_state import GridState
 from mapserver.evidence.pages import CompactPages
 from mapserver.evidence.timeline import Block
 from mapserver.journal.facts import Facts
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import Selection
 from mapserver.past.checkpoint_file import Checkpoint, CheckpointWriter, DamagedError, Header
 from mapserver.past.checkpoints import Checkpoints

@@ -22,9 +22,9 @@ from mapserver.evidence.snapshot import parameters
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.history import History, read_history
-from mapserver.journal.reader import LAST, JournalReader
+from mapserver.journal.journal import JournalReader
 from mapserver.journal.refold import THREADS, lent
-from mapserver.journal.rows import JournalRows, Selection
+from mapserver.journal.rows import LAST, JournalRows, Selection
 from mapserver.journal.stamp_index import StampIndex
 from mapserver.past.checkpoint_file import Checkpoint, DamagedError, Header
 from mapserver.past.checkpoints import Checkpoints, FactsBefore

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
@@ -54,7 +53,7 @@ class Answers:
         self._open = OpenRegions()
         self._tiles = Tiles(writer)
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
-        self._past = PastMaps(writer.folder / JOURNAL_FILE, past, self._config)
+        self._past = PastMaps(writer.location, past, self._config)
 
     def size(self, query: MapQuery) -> int:
         """About how many bytes the answer has."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +15,8 @@ from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block, evidence
 from mapserver.ingest.store import Store
 from mapserver.journal.facts import Facts
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.journal import JournalReader
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.past.cell_history import CellHistory, cell_history
@@ -53,7 +53,7 @@ class View:
 class PastMaps:
     """Maps of one store as of any time. Every call opens the journal anew, so that any thread may ask."""
 
-    journal: Path
+    journal: JournalLocation
     past: Past
     config: ServerConfig
 
@@ -72,7 +72,7 @@ class PastMaps:
     @contextmanager
     def _reader(self) -> Iterator[tuple[JournalReader, int]]:
         try:
-            with JournalReader(self.journal) as reader:
+            with self.journal.reader() as reader:
                 yield reader, reader.last_row
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None

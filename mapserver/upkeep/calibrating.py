@@ -19,9 +19,7 @@ from mapserver.fleet.calibration import Calibration, calibrate, epochs_of_each, 
 from mapserver.fleet.correction import Correction
 from mapserver.fleet.ledger import Ledger
 from mapserver.fleet.machine_state import MachineState, remembered_of
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
-from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import JournalRows, Selection
 from mapserver.past.past import Past
 from mapserver.past.plan import DAY_NS
@@ -58,7 +56,7 @@ class Calibrating:
         self.solved: tuple[Calibration, int] = calibrate({}), 0
         self._writer, self._past, self._decide, self._doubtful, self._ending = writer, past, decide, doubtful, ending
         self._earlier = earlier
-        self._reader = JournalReader(writer.folder / JOURNAL_FILE)
+        self._reader = writer.location.reader()
         self._ledgers: dict[str, Ledger] = {}
         self._begins_ns: dict[str, int] = {}  # by machine, from when on there may be samples of it
         self._followed = 0

@@ -13,7 +13,7 @@ from typing import Any
 
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.journal import JournalReader
 from mapserver.past.checkpoints import Entry
 from mapserver.past.making import make, remove_unfinished
 from mapserver.past.past import Past
@@ -118,7 +118,7 @@ class Checkpointing:
     def _has_room(self, now_ns: int, entries: list[Entry], more: int) -> bool:
         """Make room for so many bytes, within the limit and what the disk has to spare; whether there is."""
         there = sum(entry.bytes for entry in entries)
-        spare = shutil.disk_usage(self._writer.folder).free - RESERVE_BYTES
+        spare = shutil.disk_usage(self._writer.location.folder).free - RESERVE_BYTES
         most = min(self._limit_bytes, there + spare) - more
         if there > most:
             begin_ns = self._past.next_stamp(self._reader, 0) or 0

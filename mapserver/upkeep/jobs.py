@@ -26,8 +26,8 @@ from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
-from mapserver.journal.archive import FOLDER, archive
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.archive import archive
+from mapserver.journal.journal import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
 from protocol.queries.answers import GroundChange
 
@@ -153,7 +153,7 @@ class Archiving:
         if not after_h or time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + LOOK_S
-        now_ns, folder = self._writer.now_ns(), self._writer.folder / FOLDER
+        now_ns, folder = self._writer.now_ns(), self._writer.location.archive.folder
         before_ns = now_ns - round(after_h * 3600e9)
         hours = archive(folder, self._reader, self._writer.site, before_ns, self._forget, now_ns)
         if path := next(hours, None):

@@ -9,7 +9,6 @@ recent samples alone, and else with nothing.
 from __future__ import annotations
 
 import logging
-import sqlite3
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,13 +19,13 @@ from mapserver.fleet.calibration import Calibration
 from mapserver.fleet.correction import Correction, Corrections
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import Decision, Decisions
-from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import History
-from mapserver.journal.reader import LAST, JournalReader
+from mapserver.journal.journal import UnwrittenError
 from mapserver.journal.refold import fold_history, fold_samples, release_memory
-from mapserver.journal.rows import Selection
+from mapserver.journal.rows import LAST, Selection
 from mapserver.past.past import Past
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import TrustDecision
@@ -44,7 +43,7 @@ class Refolding:
 
     def __init__(self, writer: Writer, past: Past) -> None:
         self._writer, self._past = writer, past
-        self._reader = JournalReader(writer.folder / JOURNAL_FILE)
+        self._reader = writer.location.reader()
         self._decisions = Decisions.of_journal(self._reader)
         self._wanted = self._decisions.facts
         self._changed = threading.Condition()  # its holder never waits for the writer, which takes it
@@ -132,8 +131,8 @@ class Refolding:
         except TimeoutError:  # an OSError, but the work still waits
             problem = "the server has not written the decision yet, and may still do so; ask for `machines`"
             raise QueryError(Refusal.AFTER_TIMEOUT, problem) from None
-        except (sqlite3.Error, OSError) as error:
-            problem = f"the decision cannot be written, so it does not count: {error}"
+        except UnwrittenError as error:
+            problem = f"the decision cannot be written, so it does not count: {error.problem}"
             raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
 
     def _judge(self, store: Store, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
@@ -203,7 +202,7 @@ class Refolding:
         if facts == self.facts():
             return True
         began_s = time.monotonic()
-        history, selection, rounds = History.beside(self._reader), Selection.by(facts), 0
+        history, selection, rounds = History(self._reader, self._past.archive), Selection.by(facts), 0
         begun = self._begun(facts)
         if begun is None:
             return False

@@ -10,10 +10,8 @@ from typing import Any
 
 from mapserver.fleet.correction import Corrections
 from mapserver.fleet.machine_state import MachineState, state_of
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
-from mapserver.journal.reader import JournalReader
 from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from mapserver.upkeep.calibrating import Calibrating
@@ -42,7 +40,7 @@ class Upkeep:
 
     def __init__(self, writer: Writer, publish: Publish, past: Past) -> None:
         self._writer = writer
-        self._reader = reader = JournalReader(writer.folder / JOURNAL_FILE)
+        self._reader = reader = writer.location.reader()
         self._ending = threading.Event()
         self._refolding = Refolding(writer, past)
         refolding = self._refolding

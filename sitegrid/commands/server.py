@@ -49,6 +49,7 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Serve until stopped; then finish what has come in, commit, snapshot."""
     from mapserver.config import ServerConfig
+    from mapserver.journal.location import JournalLocation
     from mapserver.server import Server, warm_up
 
     stop = stop_flag()
@@ -62,12 +63,11 @@ def run(arguments: Namespace) -> int:
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
         ingest = opened.enter_context(closing(open_session(joined)))
         readers = opened.enter_context(closing(open_session(joined)))
+        location = JournalLocation(arguments.store)
         check, take_over = _verifier(arguments.signed), arguments.take_over
         key = signer(arguments.keys)
         sign = key.sign_reply if key else None
-        server = Server(
-            ingest, readers, arguments.store, site, config, time.time_ns, check, sign=sign, take_over=take_over
-        )
+        server = Server(ingest, readers, location, site, config, time.time_ns, check, sign=sign, take_over=take_over)
         opened.callback(server.close)
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:

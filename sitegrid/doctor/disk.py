@@ -163,15 +163,15 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     # imported here: needs the `server` extra, which a machine's host does not have
     from mapserver.evidence import snapshot
     from mapserver.ingest.losses import lacking
-    from mapserver.ingest.store import JOURNAL_FILE
     from mapserver.journal import shortfall as short
-    from mapserver.journal.reader import SCHEMA, JournalReader
+    from mapserver.journal.location import JOURNAL_FILE, SCHEMA, JournalLocation
     from mapserver.past.checkpoints import Checkpoints
 
-    if not (folder / JOURNAL_FILE).is_file():
+    location = JournalLocation(folder)
+    if not location.exists():
         raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")
-    lacks = lacking(folder / JOURNAL_FILE)
-    with JournalReader(folder / JOURNAL_FILE) as journal:
+    lacks = lacking(location)
+    with location.reader() as journal:
         journal.check()
         last_row, archived = journal.last_row, journal.archived_row
         watermarks, events = journal.watermarks(), journal.events()

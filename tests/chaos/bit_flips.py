@@ -15,8 +15,9 @@ from typing import Any
 
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
-from mapserver.ingest.store import JOURNAL_FILE, Store
-from mapserver.journal.history import History, history_rows
+from mapserver.ingest.store import Store
+from mapserver.journal.history import history_rows
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
@@ -24,6 +25,7 @@ from protocol.site.site_file import load_site
 from tests.chaos.chaos_site import ROUTER, SERVER, ChaosSite
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
+from tests.journals import history_beside
 
 STUCK_S = 2.0  # reading a spool of the suite takes milliseconds
 
@@ -83,11 +85,11 @@ def _files(site: ChaosSite) -> list[tuple[Path, Callable[[Path], Content]]]:
 
 def read_store(folder: Path, definition: Any) -> Content:
     """All that a server would take from its folder: rows, watermarks, grid."""
-    store = Store(folder, definition, ServerConfig(), lambda: 10**18)
+    store = Store(JournalLocation(folder), definition, ServerConfig(), lambda: 10**18)
     try:
         rows = {
             row.row: (row.machine, row.spool_id, row.first_seq, row.received_ns, row.rows.tobytes())
-            for row in history_rows(History.beside(store.journal))
+            for row in history_rows(history_beside(store.journal))
         }
         grid = store.grid.state()
         votes = [(at.x, at.y, at.tier, at.index, at.page.votes.tobytes()) for at in grid.pages]

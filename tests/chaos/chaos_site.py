@@ -15,11 +15,11 @@ from agents.delivery.audit import read_audit
 from benchmarks.measure import memory_mb
 from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
-from mapserver.ingest.store import JOURNAL_FILE
-from mapserver.journal.history import History, history_rows
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.history import history_rows
+from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.rows import Watermark
 from mapserver.journal.shortfall import KIND, Shortfall, missing
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.errors import StoreError
 from protocol.machine.log_folder import open_log
 from protocol.site.site_config import site_toml
@@ -28,6 +28,7 @@ from protocol.wire.session import free_endpoint
 from tests.chaos.leashed import Process
 from tests.chaos.outcome import Console, FaultOutcome, TimeSpan, longest_pause
 from tests.chaos.recordings import IDLE, SECONDS, SPEED, START_NS, Recordings
+from tests.journals import history_beside
 
 READY_S = 120.0  # a server's first start in a new folder compiles its kernels
 RESUME_S = 60.0
@@ -276,7 +277,7 @@ class ChaosSite:
     def _marks(self) -> Mapping[tuple[str, int], Watermark]:
         """Progress of every run in the journal; nothing while it is being made, or recovered."""
         try:
-            with JournalReader(self.folder / "store" / JOURNAL_FILE) as reader:
+            with SqliteReader(self.folder / "store" / JOURNAL_FILE) as reader:
                 return reader.watermarks()
         except StoreError:
             return {}
@@ -300,8 +301,8 @@ class ChaosSite:
         audits = {machine: self.folder / "audit" / machine for machine in self.machines}
         store, site = self.folder / "store", load_site(self.folder / "site.toml")
         result = audit_store(audits, store, site, ServerConfig())
-        with JournalReader(store / JOURNAL_FILE) as reader:
-            rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(History.beside(reader))]
+        with SqliteReader(store / JOURNAL_FILE) as reader:
+            rows = [(r.machine, r.received_ns * 1e-9) for r in history_rows(history_beside(reader))]
             declared = sum(mark.lost for mark in reader.watermarks().values())
             shortfalls = [Shortfall.from_event(event) for event in reader.events(KIND)]
             named = missing(shortfalls, reader.watermarks()).total()  # as `info`, metrics and the doctor have it

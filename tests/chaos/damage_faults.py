@@ -16,10 +16,10 @@ from pathlib import Path
 from agents.delivery.spool import Spool, SpoolConfig
 from agents.estimation.calibration import Calibration
 from agents.estimation.calibration_file import load, save
-from mapserver.ingest.store import JOURNAL_FILE
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.shortfall import KIND, Shortfall, missing
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.disk.write_ahead_log import HEADER, scan
 from protocol.errors import StoreError
 from protocol.site.site_file import load_site
@@ -101,7 +101,7 @@ def _flip_copies(site: ChaosSite, victim: str, rng: random.Random, n: int) -> Co
 def _look_at_journal(path: Path, site: ChaosSite) -> tuple[int, int]:
     """Samples that a journal has, and those that it says are missing."""
     definition = load_site(site.folder / "site.toml")
-    with closing(Journal(path, definition.name, definition.frame)) as journal:
+    with closing(SqliteJournal(path, definition.name, definition.frame)) as journal:
         shortfalls = [Shortfall.from_event(event) for event in journal.events(KIND)]
         watermarks = journal.watermarks()
     return sum(mark.seq for mark in watermarks.values()), missing(shortfalls, watermarks).total()
@@ -223,7 +223,7 @@ def _flip_calibration(path: Path, machine: str) -> tuple[int, int]:
 
 
 def _lost_by_machine(site: ChaosSite) -> dict[str, int]:
-    with JournalReader(site.folder / "store" / JOURNAL_FILE) as reader:
+    with SqliteReader(site.folder / "store" / JOURNAL_FILE) as reader:
         lost = Counter[str]()
         for (machine, _), mark in reader.watermarks().items():
             lost[machine] += mark.lost

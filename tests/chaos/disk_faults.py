@@ -22,7 +22,8 @@ from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import Incoming, Store
-from mapserver.journal.history import History, history_rows
+from mapserver.journal.history import history_rows
+from mapserver.journal.location import JournalLocation
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash, empty
 from protocol.wire.codec import encode_batch
@@ -32,6 +33,7 @@ from tests.chaos.disk_model import SECTOR, Disk, Kind, Operation, read_trace
 from tests.chaos.disk_shim import DiskError, FailingDisk, build
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
+from tests.journals import history_beside
 
 CUTS = 2000  # of the whole suite, half of them of the spool
 STEPS = {"spool": 400, "store": 200}
@@ -163,11 +165,11 @@ def _look_at_store(folder: Path) -> Remains:
     contents: dict[SampleNumber, list[str]] = {}
     config = ServerConfig()
     try:
-        store = Store(folder / work.STORE_FOLDER, work.SITE, config, lambda: 10**18)
+        store = Store(JournalLocation(folder / work.STORE_FOLDER), work.SITE, config, lambda: 10**18)
     except StoreError as error:
         return Remains({}, f"store does not open: {error}")
     refolded = Grid(work.SITE.cell_m, config.fold)
-    for row in history_rows(History.beside(store.journal)):
+    for row in history_rows(history_beside(store.journal)):
         refolded.fold(row.rows, row.machine)
         for i, sample in enumerate(row.rows):
             contents.setdefault((row.spool_id, row.first_seq + i), []).append(content_hash(sample))

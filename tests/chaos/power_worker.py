@@ -18,8 +18,9 @@ import numpy as np
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
-from mapserver.journal.journal import Journal
+from mapserver.journal.location import JournalLocation
 from mapserver.journal.shortfall import ROW
+from mapserver.journal.sqlite.journal import SqliteJournal
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash, empty
@@ -99,7 +100,7 @@ def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, carele
         if chance.random() > 0.2:
             waiting = np.concatenate([waiting, drive(rng, chance.randint(1, 40), 1 + step * 1000)])
         with suppress(StoreError, sqlite3.Error, OSError):
-            store = store or Store(folder / STORE_FOLDER, SITE, ServerConfig(), lambda: 10**18)
+            store = store or Store(JournalLocation(folder / STORE_FOLDER), SITE, ServerConfig(), lambda: 10**18)
             _sync(store.journal._db, careless)
             payload = encode_batch(SampleBatch(MACHINE, SPOOL_ID, done + 1, waiting, SITE.frame, 0))
             answers = store.commit([Incoming(MACHINE, payload)] * chance.randint(1, 2))
@@ -115,13 +116,13 @@ def use_store(folder: Path, promises: Promises, seed: int, steps: int, *, carele
 
 def mark_before_commit() -> None:
     """Have the journal write its mark too early: it then claims what a power cut may take away."""
-    commit = Journal.commit
+    commit = SqliteJournal.commit
 
-    def hasty(journal: Journal) -> None:
+    def hasty(journal: SqliteJournal) -> None:
         journal._mark.write({ROW: journal.last_row, **journal._changed})
         commit(journal)
 
-    Journal.commit = hasty  # type: ignore[method-assign]
+    SqliteJournal.commit = hasty  # type: ignore[method-assign]
 
 
 def _sync(db: sqlite3.Connection, careless: bool) -> None:

@@ -6,8 +6,8 @@ import sqlite3
 import time
 from contextlib import closing
 
-from mapserver.ingest.store import JOURNAL_FILE
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE
+from mapserver.journal.sqlite.reader import SqliteReader
 from tests.chaos import stepped_clock
 from tests.chaos.chaos_site import HOUR_S, ROUTER, SECOND, SERVER, ChaosSite
 from tests.chaos.outcome import FaultOutcome
@@ -52,7 +52,7 @@ def second_server(scenario: FaultRun) -> FaultOutcome:
             site.start(SERVER)
             _has_ended(site, SECOND, TAKEN_OVER)
             site.wait_ready(SERVER)
-        with JournalReader(site.folder / SECOND / JOURNAL_FILE) as reader:
+        with SqliteReader(site.folder / SECOND / JOURNAL_FILE) as reader:
             if taken := reader.last_row:
                 site.problem(f"the second store took {taken} batches of runs that are bound to the first")
         return site.finish(scenario.fault, 3)
@@ -103,7 +103,7 @@ def far_future(scenario: FaultRun) -> FaultOutcome:
                 stepped_clock.write(clocks[role], 0)
             site.linger(1.0)
         outcome = site.finish(scenario.fault, 3)
-        with JournalReader(site.folder / "store" / JOURNAL_FILE) as reader:
+        with SqliteReader(site.folder / "store" / JOURNAL_FILE) as reader:
             newest_ns = max(mark.newest_ns for mark in reader.watermarks().values())
         if newest_ns > time.time_ns() + DAY_NS:
             site.problem(f"the journal holds a stamp {(newest_ns - time.time_ns()) / DAY_NS:.0f} days ahead")
@@ -131,13 +131,13 @@ def archive_clock(scenario: FaultRun) -> FaultOutcome:
         for off_s in (YEAR_S, 0):
             stepped_clock.write(path, off_s * 10**9)
             site.linger(WRONG_S)
-        with JournalReader(site.folder / "store" / JOURNAL_FILE) as reader:
+        with SqliteReader(site.folder / "store" / JOURNAL_FILE) as reader:
             old = reader.last_row
         stepped_clock.write(path, 40 * HOUR_S * 10**9)
         site.kill(SERVER)  # a server looks for rows that are old enough when it starts
         site.wait_ready(SERVER)
         archived = 0
-        with JournalReader(site.folder / "store" / JOURNAL_FILE) as reader:
+        with SqliteReader(site.folder / "store" / JOURNAL_FILE) as reader:
             end_s = time.monotonic() + 20.0
             while (archived := reader.archived_row) < old and time.monotonic() < end_s:
                 site.linger(0.25)

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 
 from mapserver.config import ServerConfig
 from mapserver.ingest.admission import GapError, admit, check_store, judge
-from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
-from mapserver.journal.journal import Journal
+from mapserver.ingest.store import Incoming, Store
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.rows import Admission, StoreIdentity
+from mapserver.journal.sqlite.journal import SqliteJournal
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import decode_batch
@@ -152,12 +153,12 @@ class RealServer:
         return {run: (mark.seq, mark.lost) for run, mark in self._journal.watermarks().items()}
 
     @property
-    def _journal(self) -> Journal:
+    def _journal(self) -> SqliteJournal:
         return self._store.journal
 
     def _open(self) -> None:
         self._plan = FaultPlan()
-        self._store = Store(self._folder, self._site, ServerConfig(), self._now_ns)
+        self._store = Store(JournalLocation(self._folder), self._site, ServerConfig(), self._now_ns)
         path = self._folder / JOURNAL_FILE
         self._journal._db.close()
         db: Any = sqlite3.connect(path, isolation_level=None, check_same_thread=False, factory=FaultyConnection)

@@ -23,6 +23,7 @@ from agents.localisation.filters.belief import PoseBelief
 from agents.presence import PATIENCE, Presence, find_namesake
 from agents.sampling import Samples
 from mapserver.config import ServerConfig
+from mapserver.journal.location import JournalLocation
 from mapserver.server import Server
 from protocol.errors import LinkError
 from protocol.machine.machine_config import MachineConfig, SensorConfig
@@ -273,7 +274,7 @@ def uplink_of(session: zenoh.Session, path: Path, n: int) -> Iterator[Spool]:
 @contextlib.contextmanager
 def server_at(endpoint: str, folder: Path) -> Iterator[None]:
     session: Any = open_session(SessionConfig(endpoint))
-    server = Server(session, session, folder, SITE, ServerConfig(), time.time_ns)
+    server = Server(session, session, JournalLocation(folder), SITE, ServerConfig(), time.time_ns)
     yield
     server.close()
     session.close()

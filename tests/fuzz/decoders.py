@@ -27,9 +27,9 @@ from mapserver.config import ServerConfig
 from mapserver.journal.archive import FOLDER as ARCHIVE
 from mapserver.journal.archive import next_file
 from mapserver.journal.archive_file import ArchiveFile
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Admission, JournalRow
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.config import from_table
 from protocol.errors import ConfigError, LogFolderError, MessageError, QueryError, StoreError
 from protocol.files import load_toml, sealed
@@ -325,7 +325,7 @@ def _journal(folder: Path) -> Decoder:
 
     def decode(data: bytes) -> None:
         db.execute("UPDATE journal SET record = ? WHERE row = 2", (data,))
-        with JournalReader(path) as reader:
+        with SqliteReader(path) as reader:
             _compare(list(reader.read()), expected)
 
     return Decoder("journal", (record,), decode, (StoreError,), files, "row 2 is damaged")
@@ -334,7 +334,7 @@ def _journal(folder: Path) -> Decoder:
 def _archive(folder: Path) -> Decoder:
     """A file that is damaged anywhere."""
     expected = _write_journal(folder)
-    with JournalReader(folder / "journal.db") as reader:
+    with SqliteReader(folder / "journal.db") as reader:
         made = next_file(folder / ARCHIVE, reader, SITE, T0 + 360_000 * 10**9)
     assert made is not None
 
@@ -347,7 +347,7 @@ def _archive(folder: Path) -> Decoder:
 
 def _write_journal(folder: Path) -> list[JournalRow]:
     """Make a journal of three rows; returns what has to be read from it."""
-    journal = Journal(folder / "journal.db", SITE.name, SITE.frame)
+    journal = SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
     journal.begin()
     for i in range(3):
         batch = SampleBatch("loader-1", 7, 1 + 3 * i, rows(), SITE.frame)

@@ -19,9 +19,10 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import LAST_NS, Correction, Corrections
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
-from mapserver.ingest.store import JOURNAL_FILE, Store
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
+from mapserver.ingest.store import Store
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.arrays import Table
 from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
@@ -58,7 +59,7 @@ def serve(site: SiteRun) -> Child:
 
 
 def stored(folder: Path, site: SiteRun) -> closing[Store]:
-    return closing(Store(folder, load_site(site.site_file), ServerConfig(), time.time_ns))
+    return closing(Store(JournalLocation(folder), load_site(site.site_file), ServerConfig(), time.time_ns))
 
 
 def folded(site: SiteRun, corrections: Corrections, sent: dict[str, Table]) -> Grid:
@@ -84,7 +85,7 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
 
 
 def sample_bytes(journal: Path) -> dict[tuple[str, int], bytes]:
-    with JournalReader(journal) as reader:
+    with SqliteReader(journal) as reader:
         return {(row.machine, row.first_seq): row.rows.tobytes() for row in reader.read()}
 
 
@@ -191,7 +192,7 @@ def test_a_fact_of_a_newer_version_keeps_the_server_from_starting_in_one_line(si
     server.stop()
     config, path = load_site(site.site_file), site.folder / "store" / JOURNAL_FILE
     decision = CalibrationDecision("a", PERSON, "why", 1, by_person("a").each)
-    with closing(Journal(path, config.name, config.frame)) as journal:
+    with closing(SqliteJournal(path, config.name, config.frame)) as journal:
         journal.append_event("calibration", 1, decision.body() | {"version": 2})
     words = ("--site-file", site.site_file, "--store", site.folder / "store")
     refused = run("server", "--endpoint", site.endpoint, *words)
@@ -231,7 +232,7 @@ def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path:
     serve(site).stop()
     config, path = load_site(site.site_file), tmp_path / "store" / JOURNAL_FILE
     covariance = ((4e-7, 0.0, 0.0), (0.0, 2e-5, 0.0), (0.0, 0.0, 1e-6))
-    with closing(Journal(path, config.name, config.frame)) as journal:
+    with closing(SqliteJournal(path, config.name, config.frame)) as journal:
         for name in (one, other):
             offered = Correction(name, 0, LAST_NS, 0.004, 0.03, 0.0, covariance)
             decision = CalibrationDecision(name, SOLVER, "", START_NS, (offered,))
@@ -243,7 +244,7 @@ def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path:
     assert (calibrations[one]["offers"], calibrations[one]["offer_ns"]) == (1, START_NS)
     assert "offers" not in calibrations[other]
     server.stop()
-    with JournalReader(path) as reader:
+    with SqliteReader(path) as reader:
         stated = {
             name: np.concatenate([row.rows["applied_scale"] for row in reader.read() if row.machine == name])
             for name in (one, other)

@@ -20,10 +20,11 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
-from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
+from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.archive import HOUR_NS, archive
-from mapserver.journal.history import History, history_rows
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.history import history_rows
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
@@ -34,6 +35,7 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid.process.children import Child, Children, wait_until
 from tests.integration.site_run import READY_S, SiteRun  # beside this file
+from tests.journals import history_beside
 
 pytestmark = pytest.mark.processes
 
@@ -94,7 +96,7 @@ class Sender:
 
 
 def committed(store: Path) -> dict[str, int]:
-    with JournalReader(store / JOURNAL_FILE) as journal:
+    with SqliteReader(store / JOURNAL_FILE) as journal:
         return {machine: mark.seq for (machine, _), mark in journal.watermarks().items()}
 
 
@@ -115,7 +117,7 @@ def test_a_router_with_many_sessions_ends_in_time(site: SiteRun):
 
 def old_rows(store: Path, site: SiteConfig) -> None:
     """Fill a store with what has to be archived at once."""
-    with closing(Store(store, site, ServerConfig(), lambda: NOW_NS)) as opened:
+    with closing(Store(JournalLocation(store), site, ServerConfig(), lambda: NOW_NS)) as opened:
         for i in range(50):
             batch = SampleBatch("old", 7, 1 + 1000 * i, drive(1000, seed=i, first_s=100 * i), site.frame)
             assert isinstance(opened.commit([Incoming("old", encode_batch(batch))])[0], Ack)
@@ -384,19 +386,19 @@ def test_a_backup_as_the_operators_page_has_it_is_a_whole_store(tmp_path: Path, 
     text = (root / "docs" / "operation.md").read_text().split("## Backup")[1].split("```python\n")[1].split("```")[0]
     code = text.replace('"STORE', f'"{store}').replace('"BACKUP', f'"{backup}')
     first, second = code.split("if os.path")
-    with closing(Store(store, site, ServerConfig(), lambda: NOW_NS)) as opened:
+    with closing(Store(JournalLocation(store), site, ServerConfig(), lambda: NOW_NS)) as opened:
         late = SampleBatch("late", 7, 1, drive(10, seed=1), site.frame)
         assert isinstance(opened.commit([Incoming("late", encode_batch(late))])[0], Ack)
         names: dict[str, Any] = {}
         exec(compile(first, "docs/operation.md", "exec"), names)
-        with JournalReader(store / JOURNAL_FILE) as reader:  # rows move just in between
+        with SqliteReader(store / JOURNAL_FILE) as reader:  # rows move just in between
             assert list(archive(store / "archive", reader, site, NOW_NS + 3 * HOUR_NS, opened.journal.forget))
         exec(compile(f"if os.path{second}", "docs/operation.md", "exec"), names)
         folded = opened.grid.folded
-    with closing(Store(backup, site, ServerConfig(), lambda: NOW_NS)) as restored:
+    with closing(Store(JournalLocation(backup), site, ServerConfig(), lambda: NOW_NS)) as restored:
         assert restored.machines()["late"]["samples"] == 10
         assert restored.grid.folded == folded == 50_010
-        with JournalReader(backup / JOURNAL_FILE) as reader:
+        with SqliteReader(backup / JOURNAL_FILE) as reader:
             assert list(archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.journal.forget))
-            rows = [row.row for row in history_rows(History.beside(reader))]
+            rows = [row.row for row in history_rows(history_beside(reader))]
     assert rows == list(range(1, 52))

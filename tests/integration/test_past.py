@@ -14,9 +14,9 @@ from benchmarks.measure import START_NS
 from benchmarks.merge_work import BATCH, batches, samples_of
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.store import JOURNAL_FILE
-from mapserver.journal.journal import Journal
+from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.rows import Admission
+from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.past.plan import HOUR_NS
 from mapserver.query.views import read_cells, view_of
 from protocol.arrays import Table
@@ -44,7 +44,7 @@ def filled_journal(folder: Path) -> Sent:
     late = [i for i, (_, rows) in enumerate(sent) if 0.5 < (rows["stamp_ns"][0] - START_NS) / HOUR_NS % 1 < 0.75]
     sent = [each for i, each in enumerate(sent) if i not in set(late)] + [sent[i] for i in late]
     folder.mkdir()
-    journal, numbers = Journal(folder / JOURNAL_FILE, SITE.name, SITE.frame), Counter[str]()
+    journal, numbers = SqliteJournal(folder / JOURNAL_FILE, SITE.name, SITE.frame), Counter[str]()
     journal.begin()
     for name, rows in sent:
         batch = SampleBatch(name, 1, numbers[name] + 1, rows, SITE.frame)

@@ -18,6 +18,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.ingest.store import Store
+from mapserver.journal.location import JournalLocation
 from protocol.errors import QueryError, Refusal
 from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
@@ -52,7 +53,9 @@ def serve(site: SiteRun) -> Child:
 
 
 def store_of(site: SiteRun) -> closing[Store]:
-    return closing(Store(site.folder / "store", load_site(site.site_file), ServerConfig(), time.time_ns))
+    return closing(
+        Store(JournalLocation(site.folder / "store"), load_site(site.site_file), ServerConfig(), time.time_ns)
+    )
 
 
 def fold_without(site: SiteRun, machines: set[str]) -> Grid:

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mapserver.ingest.store import JOURNAL_FILE
-from mapserver.ingest.store_folder import store_id
+from mapserver.journal.location import JournalLocation
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.cli import main
@@ -38,7 +37,7 @@ def cut_short(site_run: SiteRun) -> str:
         more = "every machine has more of them"
         wait_until(lambda: all(n > first[name] for name, n in _samples(client).items()), READY_S, more)
     kill(server)
-    return store_id(site_run.folder / "store" / JOURNAL_FILE)
+    return JournalLocation(site_run.folder / "store").store_id()
 
 
 def _samples(client: Client) -> dict[str, int]:

@@ -28,6 +28,8 @@ def test_it_is_never_uploaded_and_has_its_extras(root: Path):
         *(
             "agent",
             "archive",
+            "cluster",
+            "postgres",
             "server",
             "sim",
             "eval",

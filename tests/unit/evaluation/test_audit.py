@@ -13,12 +13,13 @@ from agents.delivery.audit import AuditLog
 from evaluation.audit import AuditResult, audit_store, compare, grid_difference, read_audits
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
+from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.archive import FOLDER, archive
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.records import record
 from mapserver.journal.rows import JournalRow
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.decisions import KIND, PERSON, TrustDecision
 from protocol.arrays import Table
 from protocol.machine.samples import content_hash, empty
@@ -46,7 +47,7 @@ def recorded_rows(seed: int) -> Table:
 def clean(tmp_path_factory) -> tuple[Path, dict[str, Path]]:
     """The store and the audit files of a run in which nothing went wrong."""
     folder = tmp_path_factory.mktemp("run")
-    store, audits = Store(folder / "store", SITE, CONFIG, time.time_ns), {}
+    store, audits = Store(JournalLocation(folder / "store"), SITE, CONFIG, time.time_ns), {}
     for seed, (machine, spool) in enumerate(SPOOLS.items()):
         rows, audits[machine] = recorded_rows(seed), folder / f"{machine}.audit"
         log = AuditLog(audits[machine])
@@ -86,7 +87,7 @@ def run(clean, folder) -> Callable[..., AuditResult]:
 
 @pytest.fixture
 def journal(clean) -> list[JournalRow]:
-    with JournalReader(clean[0] / JOURNAL_FILE) as reader:
+    with SqliteReader(clean[0] / JOURNAL_FILE) as reader:
         return list(reader.read())
 
 
@@ -188,7 +189,7 @@ def test_renumbered_samples_count_once_under_their_new_identity(clean, journal, 
 
 
 def test_an_empty_store_has_lost_everything(clean, tmp_path):
-    Store(tmp_path / "store", SITE, CONFIG, time.time_ns).close()
+    Store(JournalLocation(tmp_path / "store"), SITE, CONFIG, time.time_ns).close()
     result = audit_store(clean[1], tmp_path / "store", SITE, CONFIG)
     assert result == AuditResult(recorded=2 * N, merged=0, lost=2 * N, double=0, unrecorded=0)
 
@@ -215,10 +216,10 @@ def test_pages_that_were_summed_by_age_are_compared_too(journal):
 
 
 def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, folder):
-    store = Store(folder, SITE, CONFIG, time.time_ns)
+    store = Store(JournalLocation(folder), SITE, CONFIG, time.time_ns)
     store.journal.append_event(KIND, 1, asdict(TrustDecision("b", trusted=False, by=PERSON, reason="test", stamp_ns=1)))
     store.close()
-    store = Store(folder, SITE, CONFIG, time.time_ns)
+    store = Store(JournalLocation(folder), SITE, CONFIG, time.time_ns)
     assert store.facts.excluded == {"b"}
     store.save_snapshot()
     store.close()
@@ -227,8 +228,8 @@ def test_a_machine_that_is_left_out_of_the_map_has_lost_nothing(clean, folder):
 
 
 def test_rows_that_are_archived_are_not_lost(clean, folder):
-    writer = Journal(folder / JOURNAL_FILE, SITE.name, SITE.frame)
-    with JournalReader(folder / JOURNAL_FILE) as reader:
+    writer = SqliteJournal(folder / JOURNAL_FILE, SITE.name, SITE.frame)
+    with SqliteReader(folder / JOURNAL_FILE) as reader:
         assert list(archive(folder / FOLDER, reader, SITE, 2**62, writer.forget))
     writer.close()
     assert audit_store(clean[1], folder, SITE, CONFIG) == CLEAN

@@ -19,6 +19,7 @@ from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import CompactPages, Page
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal.location import JournalLocation
 from mapserver.past.past import Past
 from protocol.arrays import Table
 from protocol.machine.samples import empty
@@ -167,7 +168,7 @@ def grid_copy(store: Store) -> Grid:
 
 
 def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE) -> Store:
-    return Store(folder, site, config, now_ns)
+    return Store(JournalLocation(folder), site, config, now_ns)
 
 
 def open_writer(
@@ -177,7 +178,7 @@ def open_writer(
 
 
 def past_of(writer: Writer) -> Past:
-    return Past.of_store(writer.folder, writer.site.cell_m, writer.config.fold)
+    return Past.of_store(writer.location.folder, writer.site.cell_m, writer.config.fold)
 
 
 class Replies:

@@ -7,6 +7,7 @@ import pytest
 import zenoh
 
 from mapserver import server as server_module
+from mapserver.journal.location import JournalLocation
 from mapserver.query import region_pieces
 from mapserver.query.answering import SMALL_BYTES
 from mapserver.server import Server
@@ -53,7 +54,7 @@ def sessions():
 @pytest.fixture
 def served(sessions, tmp_path):
     router, client = sessions
-    server = Server(router, router, tmp_path, SITE, CONFIG, now_ns)
+    server = Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)
     yield server, client
     server.close()
 
@@ -148,7 +149,9 @@ def test_a_bug_in_a_query_is_answered(served, monkeypatch):
 @pytest.mark.parametrize(("query_threads", "together"), [(1, False), (2, True)])
 def test_so_many_queries_are_answered_at_once(sessions, tmp_path, monkeypatch, query_threads, together):
     router, client = sessions
-    server = Server(router, router, tmp_path, SITE, replace(CONFIG, query_threads=query_threads), now_ns)
+    server = Server(
+        router, router, JournalLocation(tmp_path), SITE, replace(CONFIG, query_threads=query_threads), now_ns
+    )
     both = threading.Barrier(2)
     met = []
 
@@ -173,12 +176,12 @@ def test_so_many_queries_are_answered_at_once(sessions, tmp_path, monkeypatch, q
 
 def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     router, client = sessions
-    server = Server(router, router, tmp_path, SITE, CONFIG, now_ns)
+    server = Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)
     deliver(client, batch(samples(5)))
     server.close()
     assert not server.failed
     assert list(client.get(keys.ingest("pit", "a"), payload=b"", timeout=WAIT_S)) == []  # nobody listens
-    server = Server(router, router, tmp_path, SITE, CONFIG, now_ns)
+    server = Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)
     ack = deliver(client, batch(samples(0)))
     assert ack == Ack(5, 1, store=ack.store)
     assert server.answers.info()["samples_merged"] == 5
@@ -214,7 +217,7 @@ def test_waiting_queries_keep_no_other_from_an_answer_and_get_theirs(served):
 def test_queries_beyond_a_budget_have_to_come_again(sessions, tmp_path, monkeypatch, limit, key, parameters, held):
     router, client = sessions
     monkeypatch.setattr(server_module, limit, 2 if limit != "ANSWER_BYTES" else 2 * SMALL_BYTES)
-    with closing(Server(router, router, tmp_path, SITE, CONFIG, now_ns)) as server:
+    with closing(Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)) as server:
         release = threading.Event()
 
         def hold(*_):

@@ -17,12 +17,13 @@ from mapserver.evidence.grid import Grid
 from mapserver.fleet import decisions
 from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
-from mapserver.ingest.store import JOURNAL_FILE, Incoming, Store
+from mapserver.ingest.store import Incoming, Store
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
-from mapserver.journal.history import History, history_rows
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.history import history_rows
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.rows import JournalRow
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.arrays import Table
 from protocol.config import from_table
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
@@ -34,6 +35,7 @@ from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import refold as fold
 from sitegrid.cli import main
+from tests.journals import history_beside
 from tests.unit.mapserver.data import same_evidence
 
 pytest.importorskip("pyarrow.parquet")
@@ -73,7 +75,7 @@ def make_store(
 ) -> Path:
     """A store of these machines, a batch an hour; what came in the first `archived` hours is in its archive."""
     clock = [T0]
-    store = Store(folder, site, ServerConfig(), lambda: clock[0])
+    store = Store(JournalLocation(folder), site, ServerConfig(), lambda: clock[0])
     for first in range(0, 120, batch):
         for name in names:
             rows = TRACKS[name][first : first + batch].copy()
@@ -82,7 +84,7 @@ def make_store(
             sent = encode_batch(SampleBatch(name, spool_id, first + 1, rows, site.frame))
             assert isinstance(store.commit([Incoming(name, sent)])[0], Ack)
         clock[0] += HOUR_NS
-    with JournalReader(folder / JOURNAL_FILE) as reader:
+    with SqliteReader(folder / JOURNAL_FILE) as reader:
         list(archive(folder / FOLDER, reader, site, int(T0 + archived * HOUR_NS), store.journal.forget))
     store.close()
     (folder / "site.toml").write_text(site_toml(site))
@@ -96,12 +98,12 @@ def run(*words: object) -> int:
 def opened(folder: Path) -> Store:
     """As `sitegrid server` opens it."""
     config = from_table(ServerConfig, load_toml(folder / "server.toml"), "server.toml")
-    return Store(folder, load_site(folder / "site.toml"), config, time.time_ns)
+    return Store(JournalLocation(folder), load_site(folder / "site.toml"), config, time.time_ns)
 
 
 def rows_of(folder: Path) -> list[JournalRow]:
-    with JournalReader(folder / JOURNAL_FILE) as reader:
-        return list(history_rows(History.beside(reader)))
+    with SqliteReader(folder / JOURNAL_FILE) as reader:
+        return list(history_rows(history_beside(reader)))
 
 
 def identities(folder: Path) -> list[tuple[object, ...]]:
@@ -130,7 +132,7 @@ def test_a_store_folded_again_is_the_same_store(store: Path, tmp_path: Path):
     again = opened(tmp_path / "new")
     assert same_evidence(again.grid, folded())
     assert again.snapshot_row == again.journalled == again.merged == 18  # it starts from a snapshot
-    with JournalReader(store / JOURNAL_FILE) as reader:
+    with SqliteReader(store / JOURNAL_FILE) as reader:
         assert again.journal.watermarks() == reader.watermarks()
         old = reader.identity()
     assert (again.site, again.newest_ns) == (SITE, T0 + 1190 * S)
@@ -148,11 +150,11 @@ FACTS = [
 
 def decide(store: Path) -> Grid:
     """Have corrections with a store, as its server decides them; returns its map."""
-    with closing(Store(store, SITE, ServerConfig(), time.time_ns)) as opened_store:
+    with closing(Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns)) as opened_store:
         for decision in FACTS:
             opened_store.decide(decision)
         archived_decisions.save(store / FOLDER, opened_store.identity.id, FACTS)
-    with closing(Store(store, SITE, ServerConfig(), time.time_ns)) as opened_store:
+    with closing(Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns)) as opened_store:
         return opened_store.grid
 
 
@@ -175,10 +177,10 @@ def test_a_correction_that_was_taken_back_and_given_again_counts(tmp_path: Path)
     source = make_store(tmp_path / "source", archived=9)
     back = CalibrationDecision("b", PERSON, "", T0 + 700 * S, ())
     decided = [FACTS[1], back, FACTS[1]]
-    with closing(Store(source, SITE, ServerConfig(), time.time_ns)) as opened_store:
+    with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
         opened_store.decide(*decided)
         archived_decisions.save(source / FOLDER, opened_store.identity.id, decided[:2])  # a little behind
-    with closing(Store(source, SITE, ServerConfig(), time.time_ns)) as opened_store:
+    with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
         live = opened_store.grid
     for i, paths in enumerate(([source], [source, source / FOLDER], [source / FOLDER])):
         out = tmp_path / str(i)
@@ -232,7 +234,7 @@ def test_corrections_of_a_newer_version_are_refused(tmp_path: Path, capsys, monk
     source = make_store(tmp_path / "source", archived=9)
     with monkeypatch.context() as later:
         later.setattr(decisions, "VERSION", 2)
-        with closing(Store(source, SITE, ServerConfig(), time.time_ns)) as opened_store:
+        with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
             opened_store.decide(FACTS[0])
             archived_decisions.save(source / FOLDER, opened_store.identity.id, FACTS)
     for path in (source, source / FOLDER):
@@ -249,14 +251,14 @@ def test_a_store_that_lacks_what_was_acknowledged_is_not_folded_without_a_word(t
     assert run(source, "--out", tmp_path / "new") == 1
     assert "30 acknowledged samples of a are gone; restore a backup, or start a map server" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
-    Store(source, SITE, ServerConfig(), time.time_ns).close()
+    Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns).close()
     assert run(source, "--out", tmp_path / "new") == 0
 
 
 def test_a_store_lists_all_that_it_descends_from(store: Path, tmp_path: Path):
     gone = "0123456789abcdef"
     shutil.copytree(store, tmp_path / "copy")
-    with closing(Store(tmp_path / "copy", SITE, ServerConfig(), time.time_ns)) as first:
+    with closing(Store(JournalLocation(tmp_path / "copy"), SITE, ServerConfig(), time.time_ns)) as first:
         first.accept(gone, "its disk died")
         old = first.identity.id
     assert run(store / "archive", "--out", tmp_path / "files") == 0  # files alone say which store they are of
@@ -327,7 +329,7 @@ def test_samples_out_of_time_in_the_middle_of_a_batch_cut_it_in_two(tmp_path: Pa
     folder = make_store(tmp_path / "store", "a", batch=120)
     rows = TRACKS["a"][:6].copy()
     rows["stamp_ns"] = T0 + S * np.array([5, 6, 900, 7, 8, 901])
-    store = Store(folder, SITE, ServerConfig(), lambda: T0)
+    store = Store(JournalLocation(folder), SITE, ServerConfig(), lambda: T0)
     store.commit([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
     store.close()
     assert run(folder, "--out", tmp_path / "new", "--until", "2026-01-01T00:00:10") == 0

@@ -3,6 +3,7 @@
 import pytest
 
 from mapserver.ingest.store import Store
+from mapserver.journal.location import JournalLocation
 from protocol.wire import keys
 from protocol.wire.messages import Ack
 from sitegrid.security.signing import Signer, Verifier, make_signing_key
@@ -14,7 +15,7 @@ OTHER, _ = make_signing_key()
 
 @pytest.fixture
 def store(tmp_path):
-    opened = Store(tmp_path, SITE, CONFIG, now_ns, Verifier({"a": PUBLIC}).check)
+    opened = Store(JournalLocation(tmp_path), SITE, CONFIG, now_ns, Verifier({"a": PUBLIC}).check)
     yield opened
     opened.close()
 

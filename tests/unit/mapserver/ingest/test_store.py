@@ -16,6 +16,8 @@ from mapserver.fleet.correction import LAST_NS, NO_SHARE, Correction
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.store import Store
 from mapserver.journal.facts import NO_FACTS, Facts
+from mapserver.journal.journal import UnwrittenError
+from mapserver.journal.location import JournalLocation
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import Refusal, StoreError
 from protocol.wire.messages import Ack, CalibrationOffer, Refused
@@ -89,7 +91,7 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
     store.commit([incoming(samples(2))])
 
     def full():
-        raise sqlite3.OperationalError("database or disk is full")
+        raise UnwrittenError("journal", "database or disk is full")
 
     with monkeypatch.context() as patched:
         patched.setattr(store.journal, "commit", full)
@@ -115,7 +117,7 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
 def test_a_journal_that_cannot_be_written_refuses(store, monkeypatch, method):
 
     def locked(*_):
-        raise sqlite3.OperationalError("database is locked")
+        raise UnwrittenError("journal", "database is locked")
 
     with monkeypatch.context() as patched:
         patched.setattr(store.journal, method, locked)
@@ -418,12 +420,13 @@ def test_a_machine_from_the_future_bears_out_no_other_once_it_is_distrusted(tmp_
 
 def test_a_server_whose_clock_went_back_says_so_until_it_is_right_again(tmp_path):
     clock = [NOW_NS + 400 * DAY]
-    with closing(Store(tmp_path, SITE, CONFIG, lambda: clock[0])) as store:
+    with closing(Store(JournalLocation(tmp_path), SITE, CONFIG, lambda: clock[0])) as store:
         assert isinstance(store.commit([incoming(samples(1, stamp_ns=clock[0]))])[0], Ack)
         clock[0] -= 300 * DAY
         monday = incoming(samples(1, stamp_ns=NOW_NS + 403 * DAY), 2)
         assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
-    with closing(Store(tmp_path, SITE, CONFIG, lambda: clock[0])) as store:  # it is known from the journal, too
+    # it is known from the journal, too
+    with closing(Store(JournalLocation(tmp_path), SITE, CONFIG, lambda: clock[0])) as store:
         assert store.commit([monday])[0].reason == Refusal.SERVER_CLOCK
         clock[0] += 303 * DAY
         assert isinstance(store.commit([monday])[0], Ack)

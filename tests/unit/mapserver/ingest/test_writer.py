@@ -1,6 +1,5 @@
 import math
 import queue
-import sqlite3
 import threading
 import time
 from collections import Counter
@@ -20,7 +19,8 @@ from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, MOST_RETRY_S, s
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
-from mapserver.journal.journal import Journal
+from mapserver.journal.journal import UnwrittenError
+from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import ServerAlive
@@ -65,14 +65,14 @@ def start(tmp_path, monkeypatch):
 def spied(monkeypatch, method: str) -> list[str]:
     """Record the calls of a method of Journal; a test may add what else happens."""
     events: list[str] = []
-    real = getattr(Journal, method)
+    real = getattr(SqliteJournal, method)
 
     def spy(self, *args):
         result = real(self, *args)
         events.append(method)
         return result
 
-    monkeypatch.setattr(Journal, method, spy)
+    monkeypatch.setattr(SqliteJournal, method, spy)
     return events
 
 
@@ -132,7 +132,7 @@ def test_a_failed_commit_refuses_all_and_later_batches_work(start, monkeypatch):
     journal = writer.run(lambda store: store.journal)
 
     def full():
-        raise sqlite3.OperationalError("database or disk is full")
+        raise UnwrittenError("journal", "database or disk is full")
 
     monkeypatch.setattr(journal, "commit", full)
     with held(writer):

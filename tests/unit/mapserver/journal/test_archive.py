@@ -20,10 +20,10 @@ from mapserver.journal import archive as ar
 from mapserver.journal import archive_file
 from mapserver.journal.archive import HOUR_NS, Archive, archive, next_file
 from mapserver.journal.archive_file import ArchiveFile
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import LAST, JournalReader
 from mapserver.journal.records import record
-from mapserver.journal.rows import ALL, Admission, JournalRow, Selection
+from mapserver.journal.rows import ALL, LAST, Admission, JournalRow, Selection
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol import files
 from protocol.errors import ConfigError, StoreError
 from protocol.site.geometry import Bounds
@@ -39,8 +39,8 @@ class Machines:
     """Writes batches of several machines to a journal."""
 
     def __init__(self, folder: Path) -> None:
-        self.journal = Journal(folder / "journal.db", SITE.name, SITE.frame)
-        self.reader = JournalReader(folder / "journal.db")
+        self.journal = SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
+        self.reader = SqliteReader(folder / "journal.db")
         self.folder = folder / ar.FOLDER
         self._next: dict[str, int] = {}
 
@@ -447,13 +447,13 @@ from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from mapserver.journal.archive import archive
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.site.site_config import SiteConfig
 
 site = SiteConfig("pit", 48.0, 11.0)
 folder, step, calls = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
-journal = Journal(folder / "journal.db", site.name, site.frame)
+journal = SqliteJournal(folder / "journal.db", site.name, site.frame)
 
 def killing(real):
     def call(*arguments):
@@ -475,7 +475,7 @@ else:
     module, _, name = step.rpartition(".")
     module = import_module(f"mapserver.journal.{module}")
     setattr(module, name, killing(getattr(module, name)))
-for _ in archive(folder / "archive", JournalReader(folder / "journal.db"), site, 2**62, forget):
+for _ in archive(folder / "archive", SqliteReader(folder / "journal.db"), site, 2**62, forget):
     pass
 """
 

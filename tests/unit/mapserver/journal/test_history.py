@@ -7,19 +7,20 @@ import pytest
 
 from mapserver.journal.archive import FOLDER, HOUR_NS, Archive, archive
 from mapserver.journal.history import History, history_rows
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Admission, JournalRow, Selection
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
+from tests.journals import history_beside
 from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, random_samples, samples
 
 pytest.importorskip("pyarrow.parquet")
 PARTS = {name: np.split(random_samples(200, seed, half_m=25.0), 10) for seed, name in enumerate("ab")}
 
 
-def add(journal: Journal, rows: Table, first_seq: int, machine: str = "a", received_ns: int = NOW_NS) -> None:
+def add(journal: SqliteJournal, rows: Table, first_seq: int, machine: str = "a", received_ns: int = NOW_NS) -> None:
     journal.begin()
     journal.append(Admission(batch(rows, first_seq, machine), 0, 0), received_ns)
     journal.commit()
@@ -29,14 +30,14 @@ def add(journal: Journal, rows: Table, first_seq: int, machine: str = "a", recei
 def store(request, tmp_path_factory) -> Iterator[History]:
     """Twenty rows of two machines, some or all of them in the archive; nothing writes to it."""
     folder = tmp_path_factory.mktemp("store")
-    journal = Journal(folder / "journal.db", SITE.name, SITE.frame)
+    journal = SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
     for i in range(10):
         for machine in "ab":
             add(journal, PARTS[machine][i], 1 + 20 * i, machine, NOW_NS + journal.last_row * HOUR_NS)
-    reader = JournalReader(journal.path)
+    reader = SqliteReader(journal.path)
     list(archive(folder / FOLDER, reader, SITE, NOW_NS + request.param * HOUR_NS, journal.forget))
     assert journal.archived_row == request.param
-    yield History.beside(reader)
+    yield history_beside(reader)
     reader.close(), journal.close()
 
 
@@ -58,13 +59,13 @@ def test_filters_reach_archive_and_journal(store):
 @pytest.mark.parametrize("where", [0, 7, 20, 25])
 def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
     """More rows than are read at once; archiving overtakes a reader that stands at any of them, twice."""
-    journal = Journal(tmp_path / "journal.db", SITE.name, SITE.frame)
+    journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
     journal.begin()
     for i in range(600):
         journal.append(Admission(batch(samples(1), i + 1), 0, 0), NOW_NS + i // 100 * HOUR_NS)
     journal.commit()
-    reader, other = JournalReader(journal.path), JournalReader(journal.path)
-    rows, read = history_rows(History.beside(reader)), []
+    reader, other = SqliteReader(journal.path), SqliteReader(journal.path)
+    rows, read = history_rows(history_beside(reader)), []
     for i in range(2):
         read += [next(rows).row for _ in range(10 * where + 5 * i)]
         list(archive(tmp_path / FOLDER, other, SITE, NOW_NS + 3 * (i + 1) * HOUR_NS, journal.forget))
@@ -74,13 +75,13 @@ def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
 
 @pytest.mark.slow
 def test_rows_come_once_while_another_thread_archives_and_the_owner_writes(tmp_path):
-    journal = Journal(tmp_path / "journal.db", SITE.name, SITE.frame)
+    journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
     for i in range(120):
         add(journal, samples(1), i + 1, received_ns=NOW_NS + i // 10 * HOUR_NS)
     owner_calls: list[int] = []
 
     def age() -> None:
-        mine = JournalReader(journal.path)
+        mine = SqliteReader(journal.path)
         list(archive(tmp_path / FOLDER, mine, SITE, NOW_NS + 8 * HOUR_NS, forget))
         mine.close()
 
@@ -91,8 +92,8 @@ def test_rows_come_once_while_another_thread_archives_and_the_owner_writes(tmp_p
     thread = Thread(target=age)
     thread.start()
     while thread.is_alive():
-        reader = JournalReader(journal.path)
-        assert numbers(history_rows(History.beside(reader))) == list(range(1, 121))
+        reader = SqliteReader(journal.path)
+        assert numbers(history_rows(history_beside(reader))) == list(range(1, 121))
         reader.close()
     thread.join(WAIT_S)
     assert journal.archived_row == 80
@@ -100,11 +101,11 @@ def test_rows_come_once_while_another_thread_archives_and_the_owner_writes(tmp_p
 
 
 def test_a_missing_file_is_no_silent_gap(tmp_path):
-    journal = Journal(tmp_path / "journal.db", SITE.name, SITE.frame)
+    journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
     for i in range(3):
         add(journal, samples(1), i + 1, received_ns=NOW_NS + i * HOUR_NS)
-    history = History.beside(journal)
-    with JournalReader(journal.path) as reader:
+    history = history_beside(journal)
+    with SqliteReader(journal.path) as reader:
         list(archive(tmp_path / FOLDER, reader, SITE, NOW_NS + 2 * HOUR_NS, journal.forget))
     history.archive.paths()[1].unlink()
     with pytest.raises(StoreError, match="the file with row 2 is missing"):
@@ -113,8 +114,8 @@ def test_a_missing_file_is_no_silent_gap(tmp_path):
 
 
 def test_an_archive_stands_beside_its_journal(tmp_path):
-    journal = Journal(tmp_path / "journal.db", SITE.name, SITE.frame)
-    history = History.beside(journal)
+    journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
+    history = history_beside(journal)
     assert (history.journal, history.archive.folder) == (journal, Path(tmp_path / FOLDER))
     assert isinstance(history.archive, Archive)
     journal.close()

@@ -8,38 +8,39 @@ import numpy as np
 import pytest
 
 from mapserver.evidence.fold_config import name_hash
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import ArchivedError, JournalQueries, JournalReader
+from mapserver.journal.journal import ArchivedError, UnwrittenError
 from mapserver.journal.rows import ALL, Admission, Event, Selection, Watermark
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteQueries, SqliteReader
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples, samples
 
 
-def newest_ns(journal: Journal | JournalReader) -> int:
+def newest_ns(journal: SqliteJournal | SqliteReader) -> int:
     """The newest stamp of all samples, archived or not."""
     return max((mark.newest_ns for mark in journal.watermarks().values()), default=0)
 
 
-def open_journal(folder: Path, site: str = SITE.name, frame: str = SITE.frame) -> Journal:
-    return Journal(folder / "journal.db", site, frame)
+def open_journal(folder: Path, site: str = SITE.name, frame: str = SITE.frame) -> SqliteJournal:
+    return SqliteJournal(folder / "journal.db", site, frame)
 
 
 @pytest.fixture
-def journal(tmp_path) -> Iterator[Journal]:
+def journal(tmp_path) -> Iterator[SqliteJournal]:
     journal = open_journal(tmp_path)
     yield journal
-    with suppress(sqlite3.ProgrammingError):  # a test may have closed it
+    with suppress(UnwrittenError):  # a test may have closed it
         journal.close()
 
 
-def sql(journal: JournalQueries, statement: str) -> list[tuple]:
+def sql(journal: SqliteQueries, statement: str) -> list[tuple]:
     """What a statement gives on a connection of its own."""
     with closing(sqlite3.connect(journal.path, isolation_level=None)) as db:
         return db.execute(statement).fetchall()
 
 
-def write(journal: Journal, *admissions: Admission) -> None:
+def write(journal: SqliteJournal, *admissions: Admission) -> None:
     journal.begin()
     for admission in admissions:
         journal.append(admission, NOW_NS)
@@ -76,7 +77,7 @@ def test_spool_ids_beyond_signed_integers_are_kept_apart(tmp_path):
     journal.close()
 
 
-def change_record(journal: JournalQueries, row: int, offset: int) -> None:
+def change_record(journal: SqliteQueries, row: int, offset: int) -> None:
     """Flip a bit."""
     record = bytearray(sql(journal, f"SELECT record FROM journal WHERE row = {row}")[0][0])
     record[offset] ^= 1
@@ -115,7 +116,7 @@ def test_row_and_watermark_are_of_one_transaction(tmp_path):
 def test_a_failed_watermark_takes_its_row_with_it(journal):
     sql(journal, "CREATE TRIGGER full BEFORE INSERT ON watermark BEGIN SELECT RAISE(FAIL, 'full'); END")
     journal.begin()
-    with pytest.raises(sqlite3.Error, match="full"):
+    with pytest.raises(UnwrittenError, match="full"):
         journal.append(admission(), NOW_NS)
     journal.rollback()
     assert (list(journal.read()), journal.watermarks(), journal.last_row) == ([], {}, 0)
@@ -146,7 +147,7 @@ def test_a_journal_of_another_schema_is_refused_with_what_to_do(tmp_path, schema
     journal = open_journal(tmp_path)
     sql(journal, f"UPDATE meta SET value = '{schema}' WHERE key = 'schema'")
     journal.close()
-    for opened in (lambda: open_journal(tmp_path), lambda: JournalReader(journal.path)):
+    for opened in (lambda: open_journal(tmp_path), lambda: SqliteReader(journal.path)):
         with pytest.raises(StoreError, match=f"schema '{schema}', this version knows 6; open it with the version that"):
             opened()
 
@@ -158,7 +159,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path):
 
 
 def test_tables_and_their_names_are_made_in_one_transaction(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.journal.journal.TABLES", "CREATE TABLE meta (key, value, more); ")
+    monkeypatch.setattr("mapserver.journal.sqlite.journal.TABLES", "CREATE TABLE meta (key, value, more); ")
     with pytest.raises(StoreError):
         open_journal(tmp_path)
     monkeypatch.undo()
@@ -281,7 +282,7 @@ def test_opening_and_the_newest_stamp_read_no_journal_row(placed):
 
 def test_many_rows_are_one_table(journal, monkeypatch):
     """Names of all lengths that share beginnings; a machine's rows lie between those of others."""
-    monkeypatch.setattr("mapserver.journal.reader.BYTES_AT_ONCE", 2**17)
+    monkeypatch.setattr("mapserver.journal.sqlite.reader.BYTES_AT_ONCE", 2**17)
     machines = ["a", "ab", "b", "a" * 63, "a" * 62 + "b", *(f"loader-{i}" for i in range(300))]
     drawn = np.random.default_rng(8).choice(machines, 900).tolist()
     reached = Counter()
@@ -312,7 +313,7 @@ def test_samples_are_selected_from_many_rows(placed):
 
 def test_a_reader_sees_what_is_committed(journal):
     write(journal, admission(3))
-    reader = JournalReader(journal.path)
+    reader = SqliteReader(journal.path)
     journal.begin()
     journal.append(admission(2, first_seq=4), NOW_NS)
     assert (numbers(reader.read()), reader.last_row, reader.watermarks()["a", 7].seq) == ([1], 1, 3)
@@ -324,16 +325,16 @@ def test_a_reader_sees_what_is_committed(journal):
 
 def test_a_reader_cannot_write(tmp_path):
     open_journal(tmp_path).close()
-    reader = JournalReader(tmp_path / "journal.db")
+    reader = SqliteReader(tmp_path / "journal.db")
     with pytest.raises(sqlite3.OperationalError, match="readonly"):
         reader._db.execute("DELETE FROM journal")
     reader.close()
 
 
 def test_a_reader_in_the_middle_holds_no_lock_on_the_log(journal, monkeypatch):
-    monkeypatch.setattr("mapserver.journal.reader.BYTES_AT_ONCE", 1)  # the fewest rows at a time
+    monkeypatch.setattr("mapserver.journal.sqlite.reader.BYTES_AT_ONCE", 1)  # the fewest rows at a time
     write(journal, *(admission(1, first_seq=i + 1) for i in range(300)))
-    reader = JournalReader(journal.path)
+    reader = SqliteReader(journal.path)
     rows = reader.read()
     next(rows)
     write(journal, admission(1, first_seq=301))
@@ -344,7 +345,7 @@ def test_a_reader_in_the_middle_holds_no_lock_on_the_log(journal, monkeypatch):
 
 def test_a_reader_of_nothing_is_refused(tmp_path):
     with pytest.raises(StoreError, match="no usable journal"):
-        JournalReader(tmp_path / "journal.db")
+        SqliteReader(tmp_path / "journal.db")
 
 
 # --- rows that are archived ------------------------------------------------------------------------------------------
@@ -376,7 +377,7 @@ def test_numbers_marks_and_now_outlive_the_rows(placed):
 
 def test_forgetting_is_one_transaction(placed):
     sql(placed, "CREATE TRIGGER full BEFORE INSERT ON meta BEGIN SELECT RAISE(FAIL, 'full'); END")
-    with pytest.raises(sqlite3.Error, match="full"):
+    with pytest.raises(UnwrittenError, match="full"):
         placed.forget(3)
     assert (placed.archived_row, numbers(placed.read())) == (0, [1, 2, 3, 4])
 
@@ -404,7 +405,7 @@ def test_events_are_kept_in_order(tmp_path):
     bodies = [{"machine": "a", "why": "gain"}, {"cells": [1, 2]}, {"machine": "b"}]
     ids = [journal.append_event(kind, i, body) for i, (kind, body) in enumerate(zip("tct", bodies, strict=True))]
     journal.close()
-    reader = JournalReader(journal.path)
+    reader = SqliteReader(journal.path)
     assert [e.body for e in reader.events()] == bodies
     assert reader.events("t") == [Event(ids[0], "t", 0, bodies[0]), Event(ids[2], "t", 2, bodies[2])]
     assert [e.kind for e in reader.events(after=ids[0])] == ["c", "t"]
@@ -414,7 +415,7 @@ def test_events_are_kept_in_order(tmp_path):
 def test_an_event_is_never_part_of_a_group_commit(journal):
     journal.begin()
     journal.append(admission(), NOW_NS)
-    with pytest.raises(sqlite3.OperationalError, match="within a transaction"):
+    with pytest.raises(UnwrittenError, match="within a transaction"):
         journal.append_event("t", 1, {})
     journal.commit()
     assert (numbers(journal.read()), journal.events()) == ([1], [])
@@ -483,7 +484,7 @@ def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
     ],
 )
 def test_what_stands_beside_the_rows_is_checked_on_opening(placed, monkeypatch, change, problem):
-    monkeypatch.setattr("mapserver.journal.reader._EXTENTS_AT_ONCE", 3)  # read in two pieces
+    monkeypatch.setattr("mapserver.journal.queries._EXTENTS_AT_ONCE", 3)  # read in two pieces
     for i in range(2):
         placed.append_event("t", i, {"machine": "a"})
     placed.check()

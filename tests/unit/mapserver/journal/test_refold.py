@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.journal import refold
 from mapserver.journal.history import History
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.refold import AHEAD, ahead, fold_history
 from mapserver.journal.rows import Selection
+from mapserver.journal.sqlite.reader import SqliteReader
+from tests.journals import history_beside
 from tests.unit.mapserver.data import CONFIG, SITE, incoming, open_store, random_samples, same
 
 
@@ -26,8 +27,8 @@ def history(tmp_path: Path) -> Iterator[History]:
     with closing(open_store(tmp_path)) as store:
         for number in range(20):
             store.commit([incoming(rows_of(name, number), 1 + 25 * number, name) for name in "abc"])
-    with JournalReader(tmp_path / JOURNAL_FILE) as reader:
-        yield History.beside(reader)
+    with SqliteReader(tmp_path / JOURNAL_FILE) as reader:
+        yield history_beside(reader)
 
 
 def rows_of(machine: str, number: int):

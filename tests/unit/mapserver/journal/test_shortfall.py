@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Admission, Watermark
 from mapserver.journal.shortfall import KIND, Shortfall, SpoolShortfall, missing
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.disk.high_water_mark import mark_path
 from protocol.errors import StoreError
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples
@@ -23,11 +23,11 @@ MACHINES = ("loader-1", "loader-2")
 BATCHES, SAMPLES = 10, 100  # of each machine, of each batch
 
 
-def open_journal(folder: Path) -> Journal:
-    return Journal(folder / "journal.db", SITE.name, SITE.frame)
+def open_journal(folder: Path) -> SqliteJournal:
+    return SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
 
 
-def write(journal: Journal, machine: str, first_seq: int, n: int = SAMPLES, lost: int = 0) -> None:
+def write(journal: SqliteJournal, machine: str, first_seq: int, n: int = SAMPLES, lost: int = 0) -> None:
     journal.begin()
     sent = batch(random_samples(n, first_seq), first_seq, machine=machine)
     journal.append(Admission(sent, trimmed=0, lost=lost), NOW_NS)
@@ -59,7 +59,7 @@ def flip(path: Path, at: int, bit: int) -> None:
     path.write_bytes(content)
 
 
-def gone_of(journal: Journal) -> dict[str, int]:
+def gone_of(journal: SqliteJournal) -> dict[str, int]:
     return dict(missing([Shortfall.from_event(event) for event in journal.events(KIND)], journal.watermarks()))
 
 
@@ -195,7 +195,7 @@ def test_a_watermark_behind_its_rows_ends_the_start(folder):
 
 def test_readers_beside_the_journal_need_no_mark(folder):
     mark_path(folder / "journal.db").unlink()
-    with JournalReader(folder / "journal.db") as reader:
+    with SqliteReader(folder / "journal.db") as reader:
         assert reader.last_row == 2 * BATCHES
 
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.journal import stamp_index
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import LAST, JournalReader
-from mapserver.journal.rows import Admission, Selection
+from mapserver.journal.rows import LAST, Admission, Selection
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.journal.stamp_index import StampIndex
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, samples
 
@@ -24,7 +24,7 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(stamp_index, "CHUNK", 4)
 
 
-def append(journal: Journal, first_s: int, last_s: int) -> None:
+def append(journal: SqliteJournal, first_s: int, last_s: int) -> None:
     journal.begin()
     stamps = NOW_NS + np.array([first_s, last_s]) * S
     journal.append(Admission(batch(samples(2, stamp_ns=stamps), 1 + 2 * journal.last_row), 0, 0), NOW_NS)
@@ -46,8 +46,8 @@ ROWS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 6)), min_size=1, ma
 def test_no_selected_row_is_passed_over(rows, cut, archived, begin, length):
     selection = Selection(NOW_NS + begin * S, NOW_NS + (begin + length) * S)
     with tempfile.TemporaryDirectory() as folder:
-        journal = Journal(Path(folder) / "journal.db", SITE.name, SITE.frame)
-        with closing(journal), JournalReader(journal.path) as reader:
+        journal = SqliteJournal(Path(folder) / "journal.db", SITE.name, SITE.frame)
+        with closing(journal), SqliteReader(journal.path) as reader:
             index = StampIndex()
             for number, (first, more) in enumerate(rows, start=1):
                 append(journal, first, first + more)
@@ -70,10 +70,10 @@ def test_no_selected_row_is_passed_over(rows, cut, archived, begin, length):
 
 
 def test_rows_of_other_hours_are_passed_over(tmp_path):
-    with closing(Journal(tmp_path / "journal.db", SITE.name, SITE.frame)) as journal:
+    with closing(SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)) as journal:
         for number in range(20):
             append(journal, number * 10, number * 10 + 1)
         append(journal, 0, 1)  # late
-        with JournalReader(journal.path) as reader:
+        with SqliteReader(journal.path) as reader:
             got = list(StampIndex().stretches(reader, 0, LAST, Selection(NOW_NS + 80 * S, NOW_NS + 130 * S)))
     assert got == [(8, 16), (20, LAST)]

@@ -18,6 +18,7 @@ from prometheus_client import CollectorRegistry, Metric, ProcessCollector, gener
 from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 
+from mapserver.journal.location import JournalLocation
 from mapserver.monitoring.exporter import Exporter
 from mapserver.monitoring.metrics import MOST_AGENTS, HealthListener, ReceivedHealth, ServerCollector, size_of
 from mapserver.server import Server
@@ -284,7 +285,10 @@ def test_made_up_names_do_not_fill_the_memory():
 
 
 def test_a_server_exposes_its_metrics(tmp_path: Path):
-    with routed() as (router, client), closing(Server(router, router, tmp_path, SITE, CONFIG, now_ns)) as server:
+    with (
+        routed() as (router, client),
+        closing(Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)) as server,
+    ):
         batch = encode_batch(SampleBatch("loader-1", 5, 3, samples(4), SITE.frame, lost_before=2))
         for payload in (batch, batch, b"nonsense"):
             list(client.get(keys.ingest("pit", "loader-1"), payload=payload, timeout=10.0))

@@ -9,9 +9,9 @@ from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.facts import Facts
-from mapserver.journal.journal import Journal
-from mapserver.journal.reader import JournalReader
 from mapserver.journal.rows import Admission
+from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past.making import make
 from mapserver.past.past import Past
 from mapserver.past.plan import HOUR_NS
@@ -27,8 +27,8 @@ class PastStore:
 
     def __init__(self, folder: Path, cell_m: float = 1.0, config: FoldConfig = FOLD) -> None:
         self.folder = folder
-        self.journal = Journal(folder / "journal.db", SITE.name, SITE.frame)
-        self.reader = JournalReader(self.journal.path)
+        self.journal = SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
+        self.reader = SqliteReader(self.journal.path)
         self.past = Past.of_store(folder, cell_m, config)
         self.sent: list[tuple[str, Table]] = []
 

@@ -5,6 +5,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from mapserver.journal.location import JournalLocation
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
@@ -237,7 +238,7 @@ def test_a_site_without_samples_has_no_history(served):
 @pytest.mark.parametrize("query", [PointQuery(0, 0, when=When(1)), HistoryQuery(0, 0)])
 def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
     with closing(open_writer(tmp_path)) as writer:
-        writer.folder = tmp_path / "elsewhere"
+        writer.location = JournalLocation(tmp_path / "elsewhere")
         with pytest.raises(QueryError, match="no usable journal") as caught:
             getattr(Answers(writer, FakeUpkeep(), past_of(writer)), query.name)(query)
     assert caught.value.reason == Refusal.STORE

@@ -17,10 +17,10 @@ from mapserver.fleet import calibration
 from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import corrected
 from mapserver.fleet.ledger import Ledger
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.upkeep import calibrating as calibrating_module
 from mapserver.upkeep import upkeep
 from mapserver.upkeep.calibrating import EVERY_NS, Calibrating
@@ -89,7 +89,7 @@ def test_followed_live_made_at_a_start_or_from_the_archive_ledgers_are_the_same(
             live.run()
         result = live.solve()[0]
     assert solved(writer) == result
-    with JournalReader(tmp_path / JOURNAL_FILE) as reader:
+    with SqliteReader(tmp_path / JOURNAL_FILE) as reader:
         half = writer.run(lambda store: store.journalled) // 2
 
         def forget(until: int) -> int:

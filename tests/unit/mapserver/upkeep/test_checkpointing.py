@@ -10,10 +10,11 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past.plan import HOUR_NS
 from mapserver.upkeep import checkpointing
 from mapserver.upkeep.checkpointing import RESERVE_BYTES, Checkpointing
@@ -37,8 +38,8 @@ class Site:
 
     def __init__(self, folder: Path, sent: list[tuple[str, Table]], checkpoints_gb: float = 5.0) -> None:
         self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0, checkpoints_gb=checkpoints_gb))
-        self.writer = Writer(Store(folder, SITE, self.config, lambda: NOW_NS + 200 * HOUR_NS))
-        self.reader = JournalReader(folder / JOURNAL_FILE)
+        self.writer = Writer(Store(JournalLocation(folder), SITE, self.config, lambda: NOW_NS + 200 * HOUR_NS))
+        self.reader = SqliteReader(folder / JOURNAL_FILE)
         self.past = past_of(self.writer)
         self.ending = threading.Event()
         self.job = Checkpointing(self.writer, self.reader, self.past, self.ending)
@@ -250,7 +251,7 @@ def test_a_disk_that_is_nearly_full_is_left_to_what_machines_send(opened, monkey
     with opened() as site:
         site.drive([8, 9, 10])
         site.run()
-        usage = shutil.disk_usage(site.writer.folder)
+        usage = shutil.disk_usage(site.writer.location.folder)
         monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=RESERVE_BYTES - 10**9))
         site.drive([11])
         site.job.run()

@@ -18,11 +18,12 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, Corrections
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
-from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.rows import Selection
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past.cell_history import cell_history
 from mapserver.past.making import make
 from mapserver.past.past import Past
@@ -148,7 +149,7 @@ def test_the_journal_stays_byte_for_byte_what_was_sent(writer):
         refolds.wait(refolds.decide(decision("a")), WAIT_S)
         fleet.send(writer, 3)
         assert writer.run(journal_bytes)[: len(before)] == before
-        with JournalReader(writer.folder / JOURNAL_FILE) as reader:
+        with SqliteReader(writer.location.folder / JOURNAL_FILE) as reader:
             assert all(
                 row.rows.tobytes() == fleet.rows[row.machine][row.first_seq - 1 :][: len(row.rows)].tobytes()
                 for row in reader.read()
@@ -175,7 +176,7 @@ def test_maps_of_the_past_have_the_facts_of_now_and_a_checkpoint_that_lacks_them
     fleet.send(writer, 30)
     later = tuple(replace(one, from_ns=one.from_ns and one.from_ns + HOUR_NS) for one in MADE[1:])
     later = tuple(replace(one, to_ns=max(one.to_ns, one.from_ns + HOUR_NS)) for one in later)
-    with closing(Refolding(writer, past)) as refolds, JournalReader(writer.folder / JOURNAL_FILE) as reader:
+    with closing(Refolding(writer, past)) as refolds, SqliteReader(writer.location.folder / JOURNAL_FILE) as reader:
         for hour in (1, 2, 3):
             assert list(make(past, reader, NOW_NS + hour * HOUR_NS, writer.run(lambda store: store.facts)))
         for name in "ab":
@@ -205,7 +206,7 @@ def test_a_fold_begins_with_the_newest_checkpoint_that_stays_true(writer, monkey
         return original(self, reader, base, selection, until)
 
     original = Past.lacking
-    with closing(Refolding(writer, past)) as refolds, JournalReader(writer.folder / JOURNAL_FILE) as reader:
+    with closing(Refolding(writer, past)) as refolds, SqliteReader(writer.location.folder / JOURNAL_FILE) as reader:
         for hour in (1, 2, 3):
             assert list(make(past, reader, NOW_NS + hour * HOUR_NS, Facts()))
         monkeypatch.setattr(Past, "lacking", lacking)
@@ -223,7 +224,7 @@ def test_the_history_of_a_cell_is_that_of_corrected_samples(writer):
     send(writer, [incoming(rows)])
     past = past_of(writer)
     facts = Facts(corrections=Corrections([Correction("a", NOW_NS + 1000 * S, END_NS, -0.2, 0.0, 0.0, ())]))
-    with JournalReader(writer.folder / JOURNAL_FILE) as reader:
+    with SqliteReader(writer.location.folder / JOURNAL_FILE) as reader:
         there, before = (cell_history(past, reader, (8, 8), 500 * S, Selection.by(each)) for each in (facts, Facts()))
         assert len(there.first_ns) == len(before.first_ns) >= 4
         differs = (there.evidence.counts != before.evidence.counts).any(axis=(1, 2))

@@ -15,9 +15,10 @@ from mapserver.fleet.calibration import Calibration
 from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.fleet.decisions import EVERY_NS
 from mapserver.fleet.observability import CommonScale
-from mapserver.ingest.store import JOURNAL_FILE, Store
+from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import DISTRUST_AFTER, KIND, PERSON, TrustDecision
 from mapserver.trust.judgement import Reason
@@ -244,7 +245,7 @@ def room(store: Store, *, full: bool) -> None:
 def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer, tmp_path):
     long = decision("b", reason="a reason that needs new pages" * 1000)
     before = writer.run(lambda store: store.grid)
-    with closing(Refolding(writer, past_of(writer))) as refolds, JournalReader(tmp_path / JOURNAL_FILE) as reader:
+    with closing(Refolding(writer, past_of(writer))) as refolds, SqliteReader(tmp_path / JOURNAL_FILE) as reader:
         writer.run(lambda store: room(store, full=True))
         with pytest.raises(QueryError, match=r"cannot be written, so it does not count: .*full; make room") as refused:
             refolds.decide(long)

@@ -15,12 +15,12 @@ from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.fleet.machine_state import MachineState
-from mapserver.ingest.store import JOURNAL_FILE
 from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
-from mapserver.journal import reader as journal_reader
 from mapserver.journal.archive import FOLDER
-from mapserver.journal.reader import JournalReader
+from mapserver.journal.location import JOURNAL_FILE
+from mapserver.journal.sqlite import reader as journal_reader
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.judgement import Reason
 from mapserver.upkeep import refolding, upkeep
 from mapserver.upkeep.jobs import Archiving, Audit
@@ -86,7 +86,7 @@ def opened(tmp_path, monkeypatch):
 def store(tmp_path):
     """A writer without a upkeep, and a reader of its journal."""
     folder = tmp_path / "store"
-    with closing(open_writer(folder)) as writer, JournalReader(folder / JOURNAL_FILE) as reader:
+    with closing(open_writer(folder)) as writer, SqliteReader(folder / JOURNAL_FILE) as reader:
         yield writer, reader
 
 
@@ -242,7 +242,7 @@ def test_a_change_is_published_listed_and_kept(opened):
 # --- archiving -------------------------------------------------------------------------------------------------------
 
 
-def archiving(writer: Writer, reader: JournalReader, after_h: float, hours_later: float = 3.0) -> Archiving:
+def archiving(writer: Writer, reader: SqliteReader, after_h: float, hours_later: float = 3.0) -> Archiving:
     writer = copy(writer)
     writer.now_ns = lambda: NOW_NS + round(hours_later * HOUR_NS)
     writer.config = ServerConfig(store=StoreConfig(archive_after_h=after_h))
@@ -296,7 +296,7 @@ def test_where_nothing_was_old_enough_it_looks_again_only_later(store):
 
 
 def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, caplog):
-    with opened() as site, JournalReader(tmp_path / "store" / JOURNAL_FILE) as reader:
+    with opened() as site, SqliteReader(tmp_path / "store" / JOURNAL_FILE) as reader:
         send(site.writer, [incoming(samples(5))])
         archiving(site.writer, reader, 1.0).run()
         (path,) = (tmp_path / "store" / FOLDER).glob("*.parquet")
@@ -315,7 +315,7 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
 
 def audit_of(
     writer: Writer,
-    reader: JournalReader,
+    reader: SqliteReader,
     report: Any,
     judge_s: float = 1e-9,
     known: Any = lambda: (UNCORRECTED, {}),

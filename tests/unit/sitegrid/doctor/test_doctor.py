@@ -24,6 +24,7 @@ import pytest
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
+from mapserver.journal.location import JournalLocation
 from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty
@@ -335,7 +336,7 @@ def test_a_spool_that_cannot_be_used_is_a_finding(tmp_path: Path, broken: str, c
 
 
 def filled_store(folder: Path) -> None:
-    with closing(Store(folder, SITE, ServerConfig(), time.time_ns)) as store:
+    with closing(Store(JournalLocation(folder), SITE, ServerConfig(), time.time_ns)) as store:
         payload = encode_batch(SampleBatch("loader-1", 5, 1, samples(4), SITE.frame))
         assert isinstance(store.commit([Incoming("loader-1", payload)])[0], Ack)
         store.save_snapshot()
@@ -356,7 +357,7 @@ def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
     with pytest.raises(StoreError, match=r"holds no journal\.db"):
         disk.read_store(tmp_path, time.time())
     filled_store(tmp_path)
-    with closing(Store(tmp_path, SITE, ServerConfig(), time.time_ns)):
+    with closing(Store(JournalLocation(tmp_path), SITE, ServerConfig(), time.time_ns)):
         state = disk.read_store(tmp_path, time.time() + 100)
     assert state == StoreState("pit", SITE.frame, 5, 2, 0, 1, 1, state.snapshot_age_s)
     assert 99 < state.snapshot_age_s < 160
@@ -364,7 +365,7 @@ def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
 
 def test_a_store_whose_log_is_damaged_is_a_finding_before_the_server_starts(tmp_path: Path, capsys):
     left = tmp_path / "left"
-    with closing(Store(tmp_path / "store", SITE, ServerConfig(), time.time_ns)) as store:
+    with closing(Store(JournalLocation(tmp_path / "store"), SITE, ServerConfig(), time.time_ns)) as store:
         for first_seq in (1, 5, 9):
             payload = encode_batch(SampleBatch("loader-1", 5, first_seq, samples(4), SITE.frame))
             assert isinstance(store.commit([Incoming("loader-1", payload)])[0], Ack)
@@ -375,7 +376,7 @@ def test_a_store_whose_log_is_damaged_is_a_finding_before_the_server_starts(tmp_
     assert "4 acknowledged samples of loader-1 are gone" in disk.read_store(left, time.time()).shortfall
     assert main(["doctor", "--endpoint", free_endpoint(), "--store", str(left)]) == 1
     assert "4 acknowledged samples of loader-1 are gone; restore a backup" in capsys.readouterr().out
-    Store(left, SITE, ServerConfig(), time.time_ns).close()
+    Store(JournalLocation(left), SITE, ServerConfig(), time.time_ns).close()
     state = disk.read_store(left, time.time())
     assert (state.shortfall, state.missing) == ("", {"loader-1": 4})
 
@@ -441,7 +442,7 @@ def test_a_healthy_site_passes_and_nothing_is_left_behind(site: Site, capsys):
     with closing(Spool(site.folder / "spool.db", SpoolConfig())):
         pass
     with closing(
-        Server(site.session, site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)
+        Server(site.session, site.session, JournalLocation(site.folder / "store"), SITE, ServerConfig(), time.time_ns)
     ) as server:
         files = ("--site-file", site.site_file, "--store", site.folder / "store", "--spool", site.folder / "spool.db")
         code, findings = site.doctor(capsys, *files)
@@ -457,7 +458,9 @@ def test_a_healthy_site_passes_and_nothing_is_left_behind(site: Site, capsys):
 
 def test_the_wrong_site_file_is_found_out(site: Site, capsys):
     site.site_file.write_text(SITE_TOML.replace("48.0", "47.0"))
-    with closing(Server(site.session, site.session, site.folder / "store", SITE, ServerConfig(), time.time_ns)):
+    with closing(
+        Server(site.session, site.session, JournalLocation(site.folder / "store"), SITE, ServerConfig(), time.time_ns)
+    ):
         code, findings = site.doctor(capsys, "--site-file", site.site_file, "--machine", "loader-7")
     assert code == 1
     assert findings["site"].level == Level.FAIL

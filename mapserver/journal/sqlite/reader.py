@@ -1,0 +1,146 @@
+"""The tables of a journal in SQLite, and what can be read of them, by its owner as by any other thread or process."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Self
+
+from mapserver.journal.journal import ROWS_AT_ONCE, JournalState
+from mapserver.journal.queries import BYTES_AT_ONCE, TableQueries, size_of
+from mapserver.journal.rows import Selection
+from protocol.errors import StoreError
+
+SCHEMA = 6
+TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE journal (
+    row INTEGER PRIMARY KEY AUTOINCREMENT,
+    record BLOB NOT NULL
+);
+CREATE TABLE watermark (
+    machine TEXT NOT NULL, spool_id BLOB NOT NULL,
+    seq INTEGER NOT NULL, lost INTEGER NOT NULL, newest_ns INTEGER NOT NULL, crc32 INTEGER NOT NULL,
+    PRIMARY KEY (machine, spool_id)
+) WITHOUT ROWID;
+CREATE TABLE extent (
+    row INTEGER PRIMARY KEY,
+    first_stamp_ns INTEGER NOT NULL, last_stamp_ns INTEGER NOT NULL,
+    west_m REAL NOT NULL, south_m REAL NOT NULL, east_m REAL NOT NULL, north_m REAL NOT NULL,
+    crc32 INTEGER NOT NULL
+);
+CREATE TABLE events (
+    id INTEGER PRIMARY KEY,
+    kind TEXT NOT NULL, stamp_ns INTEGER NOT NULL, body TEXT NOT NULL, crc32 INTEGER NOT NULL
+);
+"""
+_READ_ALL = "SELECT row, record FROM journal WHERE row > :after AND row <= :until ORDER BY row"
+# LEFT JOIN keeps SQLite from walking the journal first, and shows a row that is not there.
+_READ_SOME = """SELECT row, record FROM extent LEFT JOIN journal USING (row)
+WHERE extent.last_stamp_ns >= :from_ns AND extent.first_stamp_ns <= :to_ns
+    AND west_m <= :east_m AND east_m >= :west_m AND south_m <= :north_m AND north_m >= :south_m
+    AND row > :after AND row <= :until ORDER BY row"""
+_LOOK_S = 0.02  # between two looks whether the file has changed, which cost 10 us
+_EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
+
+
+class SqliteQueries(TableQueries):
+    """What can be read of a journal, on its owner's connection as on a reader's; see `JournalQueries`."""
+
+    schema = SCHEMA
+    path: Path
+    _db: sqlite3.Connection
+
+    @property
+    def where(self) -> str:
+        """The file."""
+        return str(self.path)
+
+    @property
+    def last_row(self) -> int:
+        """See `JournalQueries`; also where all rows are archived."""
+        return self._number("SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'")
+
+    @contextmanager
+    def _one_state(self) -> Iterator[None]:
+        self._query("BEGIN")
+        try:
+            yield
+        finally:
+            if self._db.in_transaction:  # SQLite itself ends it where the disk fails
+                self._db.execute("ROLLBACK")
+
+    def _query(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        try:
+            return self._db.execute(query, values).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(self.path, f"cannot be read: {error}") from None
+
+    def _piece(self, after: int, until: int, selection: Selection) -> tuple[list[int], list[Any], bool]:
+        """Numbers and records of the next rows, and whether there are no more."""
+        span: dict[str, float] = {"after": after, "until": until}
+        if selection.everywhere:
+            query, values = _READ_ALL, span
+        else:
+            box = asdict(selection.bounds) if selection.bounds else _EVERYWHERE
+            query, values = _READ_SOME, {**span, **box, "from_ns": selection.from_ns, "to_ns": selection.to_ns}
+        numbers: list[int] = []
+        records: list[Any] = []
+        size = 0
+        try:
+            cursor = self._db.execute(query, values)
+            while size < BYTES_AT_ONCE and (part := cursor.fetchmany(ROWS_AT_ONCE)):
+                more, some = zip(*part, strict=True)
+                numbers += more
+                records += some
+                size += size_of(some)
+            cursor.close()  # which ends the transaction
+        except sqlite3.Error as error:
+            raise StoreError(self.path, f"cannot be read: {error}") from None
+        return numbers, records, size < BYTES_AT_ONCE
+
+
+class SqliteReader(SqliteQueries):
+    """A read-only connection for threads other than the owner's, also while a server writes; see `JournalReader`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with ExitStack() as opened:
+            try:
+                self._db = sqlite3.connect(
+                    f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None, check_same_thread=False
+                )
+                opened.callback(self._db.close)
+                meta = self._meta()
+            except sqlite3.Error as error:
+                raise StoreError(path, f"is no usable journal: {error}") from None
+            self.site, self.frame = meta.get("site", ""), meta.get("frame", "")
+            opened.pop_all()
+
+    def follow(self, known: JournalState, timeout_s: float) -> JournalState:
+        """See `JournalReader`: looks again and again, since SQLite tells nobody."""
+        end_s, state, version = time.monotonic() + timeout_s, self.state(), self._version()
+        while state == known and time.monotonic() < end_s:
+            time.sleep(_LOOK_S)
+            if (newer := self._version()) != version:
+                state, version = self.state(), newer
+        return state
+
+    def _version(self) -> int:
+        """A number that is another one once a server has committed."""
+        return self._number("PRAGMA data_version")
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._db.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
