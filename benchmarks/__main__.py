@@ -8,8 +8,10 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import fleet, fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
+from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
 from benchmarks.agents import filter as filters
+from benchmarks.fleets import fleet, follow
+from benchmarks.folds import archive
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 from benchmarks.web import pages as web
@@ -50,6 +52,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         "journals that are folded again, and a decision about a machine",
         {"hours": HOURS, "samples": 20_000_000, "runs": 1},
     ),
+    "archive": (
+        archive.run,
+        "an archive that is folded by threads, processes and a cluster",
+        {"samples": 50_000_000, "runs": 1},
+    ),
     "live": (
         live.run,
         "processor time of a server at work, by thread",
@@ -62,6 +69,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         fleet.run,
         "a fleet at a real server: acknowledgements, and what they cost",
         {"machines": 500, "seconds": 70.0, "hours": HOURS},
+    ),
+    "follow": (
+        follow.run,
+        "followers: how soon they show a sample, what readers cost the machines with them and without",
+        {"machines": 100, "seconds": 15.0, "hours": 1.0, "runs": 3},
     ),
     "web": (
         web.run,

@@ -31,11 +31,20 @@ log = logging.getLogger("mapserver.claim")
 
 @dataclass(frozen=True)
 class Claimant:
-    """A server that writes for a site, or asks whether it may. store: id of its store, empty where it has none yet."""
+    """A server that writes for a site, or asks whether it may.
+
+    store: id of its store, empty where it has none yet. shared: whether servers take turns in writing its journal; of
+    those with one journal its database says whose turn it is.
+    """
 
     owner: Owner
     store: str
     writes: bool
+    shared: bool = False
+
+    def is_with(self, other: Claimant) -> bool:
+        """Whether both have one journal, which only one of them writes at a time."""
+        return self.shared and other.shared and self.store != "" and self.store == other.store
 
     def precedes(self, other: Claimant) -> bool:
         """Whether this one goes on, and the other one ends."""
@@ -51,9 +60,9 @@ class WriterClaim:
     held: whether it may take batches now. ended: why it has to end, empty while it need not.
     """
 
-    def __init__(self, session: zenoh.Session, site: str, store: str) -> None:
-        """store: id of the store, empty where it is to be made: it may be set later."""
-        self.store, self.held, self.ended = store, False, ""
+    def __init__(self, session: zenoh.Session, site: str, store: str, *, shared: bool = False) -> None:
+        """store: id of the store, empty where it is to be made: it may be set later. shared: see `Claimant`."""
+        self.store, self.shared, self.held, self.ended = store, shared, False, ""
         self._session, self._site, self._key = session, site, keys.writer(site)
         self._owner, self._writes = this_process(), False
         self._behind_router = bool(session.info.routers_zid())
@@ -79,6 +88,11 @@ class WriterClaim:
             time.sleep(BETWEEN_S)
         self._writes = self.held = True
         self._watch.start()
+
+    def require(self) -> None:
+        """LinkError where this server has to end."""
+        if self.ended:
+            raise LinkError(f"site {self._site}", self.ended)
 
     def close(self) -> None:
         """Let another one write."""
@@ -106,15 +120,15 @@ class WriterClaim:
         question = self._encoded(take_over=take_over)
         replies = self._session.get(self._key, payload=question, timeout=ANSWER_S, **EVERY_OTHER)
         others = [other for reply in replies if (other := _claimant(reply)) and other.owner != self._owner]
-        before = [other for other in others if other.precedes(self._this)]
+        before = [other for other in others if other.precedes(self._this) and not other.is_with(self._this)]
         return min(before, key=lambda other: (not other.writes, other.owner), default=None)
 
     @property
     def _this(self) -> Claimant:
-        return Claimant(self._owner, self.store, self._writes)
+        return Claimant(self._owner, self.store, self._writes, self.shared)
 
     def _encoded(self, **more: Any) -> bytes:
-        return encode_owner(self._owner, store=self.store, writes=self._writes, **more)
+        return encode_owner(self._owner, store=self.store, writes=self._writes, shared=self.shared, **more)
 
     def _end(self, why: str) -> None:
         self.held, self.ended = False, why
@@ -140,6 +154,6 @@ class WriterClaim:
 def _claimant(reply: zenoh.Reply) -> Claimant | None:
     try:
         owner, table = decode_owner(reply.ok.payload.to_bytes() if reply.ok else b"")
-        return Claimant(owner, take(table, "store", str), take(table, "writes", bool))
+        return Claimant(owner, take(table, "store", str), take(table, "writes", bool), take(table, "shared", bool))
     except MessageError:
         return None

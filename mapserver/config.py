@@ -15,9 +15,9 @@ from protocol.config import require_positive
 class StoreConfig:
     """What is kept on disk beside the journal.
 
-    snapshot_s: a snapshot of the grid is written so often. archive_after_h: journal rows move to Parquet files once
-    they are so old, 0 for never. checkpoints_gb: so much room have checkpoints, which make maps of the past quick; 0
-    for none.
+    snapshot_s: a snapshot of the grid is written so often. archive_after_h: rows of a journal in SQLite move to Parquet
+    files once they are so old, 0 for never. checkpoints_gb: so much room have checkpoints, which make maps of the past
+    quick; 0 for none.
     """
 
     snapshot_s: float = 60.0

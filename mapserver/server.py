@@ -16,6 +16,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import grid
 from mapserver.ingest import batches
 from mapserver.ingest.admission import Verify
+from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records
@@ -23,21 +24,20 @@ from mapserver.journal.location import JournalLocation
 from mapserver.past.past import Past
 from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.answering import Answers
+from mapserver.query.journal_queryable import JournalQueryable
+from mapserver.query.queryable import MapQueryable, Replies, question
+from mapserver.query.server_source import Commands, ServerSource
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import ConfigError, QueryError, Refusal
-from protocol.queries.answer_codec import encode_change, encode_error
+from protocol.queries.answer_codec import encode_change
 from protocol.queries.answers import GroundChange
-from protocol.queries.parameters import split_selector
-from protocol.queries.requests import parse_query, reads_past
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import encode_reply
 from protocol.wire.messages import Ack, Refused
 
 COMMAND_THREADS = 8  # a command waits for its map; those given meanwhile are kept at once, and folded together
-ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 pieces, or 2000 points
-MOST_PAST, MOST_COMMANDS = 16, 16  # that wait or are in work
-MAX_QUESTION = 4096  # bytes of a query's parameters
+MOST_COMMANDS = 16  # that wait or are in work
 SignReply = Callable[[str, bytes, bytes], bytes]  # key expression, batch and reply to signature
 log = logging.getLogger("mapserver")
 
@@ -57,19 +57,32 @@ class Server:
         *,
         sign: SignReply | None = None,
         take_over: bool = False,
+        standing_by: Callable[[bool], None] = lambda _: None,
     ) -> None:
         """ingest: for batches alone, since an answer that nobody takes holds up its whole link. readers: for all else.
 
         verify: of signed batches, see Store; without it signatures are not asked for. sign: makes the
         signature that goes beside the reply to a signed batch. take_over: have another server of
-        the site end, where there is one; otherwise a LinkError says so.
+        the site end, where there is one; otherwise a LinkError says so. standing_by: is called again and again while
+        another server writes a journal that is shared, with whether this one has folded all that there is; what it
+        raises ends the wait.
         """
         self._sign = sign
         with ExitStack() as opened:
-            self._claim = WriterClaim(ingest, site.name, location.store_id())
+            self._claim = claim = WriterClaim(ingest, site.name, location.store_id(), shared=location.is_shared)
             opened.callback(self._claim.close)
             self._claim.acquire(take_over=take_over)
-            self._writer = Writer(Store(location, site, config, now_ns, verify))
+
+            def check(warm: bool) -> None:  # noqa: FBT001
+                standing_by(warm)
+                claim.require()
+
+            standby = Standby(location, site, config, check) if location.is_shared else None
+            if standby:
+                opened.callback(standby.close)
+            self._writer = Writer(Store(location, site, config, now_ns, verify, standby))
+            if standby:
+                standby.close()
             self._claim.store = self._writer.store_id
             opened.pop_all()
         self._changed = readers.declare_publisher(
@@ -77,14 +90,14 @@ class Server:
         )
         past = Past.of_store(location.folder, site.cell_m, config.fold)
         self._upkeep = Upkeep(self._writer, self._publish, past)
-        self.answers = Answers(self._writer, self._upkeep, past)
-        self._now = AnswerPool("query", config.query_threads, ANSWER_BYTES)
-        # Others: a fold of the past, or a command that waits for one, must not keep the map as it is from answering.
-        self._past = AnswerPool("past", 1, MOST_PAST)
-        self._commands = AnswerPool("command", COMMAND_THREADS, MOST_COMMANDS)
+        source = ServerSource(self._writer, self._upkeep, past)
+        self.answers = Answers(source)
+        self._replies, self._commands = Replies(source), Commands(self._writer, self._upkeep, self.answers.info)
+        self._pool = AnswerPool("command", COMMAND_THREADS, MOST_COMMANDS)
+        self._queries = MapQueryable(readers, keys.map_queries_all(site.name), source, self.answers)
+        self._rows = JournalQueryable(readers, keys.journal(site.name), source)
         self._queryables = [
             ingest.declare_queryable(keys.ingest_all(site.name), self._on_batch),
-            readers.declare_queryable(keys.map_queries_all(site.name), self._on_query),
             readers.declare_queryable(keys.admin_all(site.name), self._on_command),
         ]
 
@@ -98,12 +111,19 @@ class Server:
         """Why another server is the site's writer now, empty while none is; the process should end."""
         return self._claim.ended
 
+    @property
+    def fenced(self) -> str:
+        """Why this server may not write any more, since another one took over; the process should end."""
+        return self._writer.fenced
+
     def close(self) -> None:
         """Stop listening, finish what has come in, commit, snapshot."""
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
-        for pool in (self._now, self._past, self._commands):
-            pool.close()
+        self._queries.stop()
+        self._rows.close()
+        self._queries.close()
+        self._pool.close()
         self._upkeep.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]
         self._writer.close()
@@ -132,57 +152,13 @@ class Server:
             return
         self._writer.submit(Incoming(machine, payload, signature), reply)
 
-    def _on_query(self, asked: zenoh.Query) -> None:
-        """Parse a query and let it wait, without a thread, for the journal row that it asks for; then for a thread."""
-        try:
-            name, parameters = _asked(asked)
-            query = parse_query(name, parameters)
-            pool, size = (self._past, 1) if reads_past(query) else (self._now, self.answers.size(query))
-        except QueryError as error:
-            self._refuse(asked, error)
-            return
-
-        def enter(error: QueryError | None) -> None:
-            if error:
-                self._refuse(asked, error)
-            else:
-                self._submit(pool, size, asked, lambda: self.answers.answer(query))
-
-        try:
-            self._writer.waits.add(query.fresh.after, query.fresh.wait_s, enter)
-        except QueryError as error:
-            self._refuse(asked, error)
-
     def _on_command(self, asked: zenoh.Query) -> None:
         try:
-            name, parameters = _asked(asked)
+            name, parameters = question(asked)
         except QueryError as error:
-            self._refuse(asked, error)
+            self._replies.refuse(asked, error)
         else:
-            self._submit(self._commands, 1, asked, lambda: self.answers.obey(name, parameters))
-
-    def _submit(self, pool: AnswerPool, size: int, asked: zenoh.Query, answer: Callable[[], bytes]) -> None:
-        try:
-            pool.submit(size, lambda: self._reply(asked, answer))
-        except QueryError as error:
-            self._refuse(asked, error)
-
-    def _reply(self, asked: zenoh.Query, answer: Callable[[], bytes]) -> None:
-        try:
-            data = answer()
-        except QueryError as error:
-            self._refuse(asked, error)
-        except Exception as error:  # a bug must not leave the asker waiting
-            log.exception("query failed query=%s", asked.key_expr)
-            self._refuse(asked, QueryError("internal", f"the server failed: {error}"))
-        else:
-            with asked:
-                _send(asked, lambda: asked.reply(asked.key_expr, data))
-
-    def _refuse(self, asked: zenoh.Query, error: QueryError) -> None:
-        self._writer.count_refusal(error.reason)
-        with asked:
-            _send(asked, lambda: asked.reply_err(encode_error(error)))
+            self._replies.submit(self._pool, 1, asked, lambda: self._commands.obey(name, parameters))
 
     def _publish(self, change: GroundChange) -> None:
         self._changed.put(encode_change(change))
@@ -193,18 +169,3 @@ def warm_up(config: ServerConfig) -> None:
     grid.warm_up(config.fold)
     batches.warm_up()
     records.warm_up()
-
-
-def _asked(query: zenoh.Query) -> tuple[str, dict[str, str]]:
-    """Name and parameters. QueryError for what no client sends: what waits is kept in memory."""
-    parameters = str(query.parameters)
-    if len(parameters) > MAX_QUESTION or query.payload:
-        raise QueryError(Refusal.TOO_LARGE, f"a query has at most {MAX_QUESTION} bytes of parameters, and no payload")
-    return keys.query_of(str(query.key_expr)), split_selector(parameters)
-
-
-def _send(asked: zenoh.Query, send: Callable[[], object]) -> None:
-    try:
-        send()
-    except zenoh.ZError as error:  # the asker is gone
-        log.info("reply failed query=%s error=%r", asked.key_expr, str(error))

@@ -34,6 +34,7 @@ class Refusal(StrEnum):
     UNKNOWN_MACHINE = "unknown_machine"
     AFTER_TIMEOUT = "after_timeout"
     EXPIRED = "expired"
+    NOT_HERE = "not_here"
 
 
 MAX_LINE = 500  # characters

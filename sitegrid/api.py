@@ -2,6 +2,7 @@
 
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
 from protocol.queries.answers import (
+    FollowerState,
     GroundChange,
     HistorySpan,
     MachineState,
@@ -16,6 +17,7 @@ from protocol.queries.answers import (
 )
 from protocol.queries.calibration import CalibrationAnswer, CorrectedSpan, MachineCalibration
 from protocol.queries.map_tiles import MapTile, TilesAnswer
+from protocol.queries.origin import Origin
 from protocol.queries.reasons import CellReasons, Votes
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
@@ -27,6 +29,6 @@ __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
 __all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
 __all__ += ["CalibrationAnswer", "CorrectedSpan", "MachineCalibration"]
-__all__ += ["CellReasons", "MapTile", "MapVersion", "TilesAnswer", "Votes"]
+__all__ += ["CellReasons", "FollowerState", "MapTile", "MapVersion", "Origin", "TilesAnswer", "Votes"]
 __all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __version__ = package_version()

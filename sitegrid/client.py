@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import zenoh
 
-from protocol.errors import LinkError, QueryError, Refusal
+from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec, requests
 from protocol.queries.answers import (
+    FollowerState,
     GroundChange,
     HistorySpan,
     MachineState,
@@ -25,26 +25,24 @@ from protocol.queries.answers import (
 from protocol.queries.calibration import CalibrationAnswer, decode_calibration
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command
 from protocol.queries.map_tiles import TilesAnswer, decode_tiles
-from protocol.queries.parameters import selector_of
+from protocol.queries.origin import SERVER, Origin
 from protocol.queries.pieces import Progress, joined
 from protocol.queries.reasons import CellReasons, decode_why
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
+from sitegrid.asking import Answered, Asker
 from sitegrid.listener import Listener
 from sitegrid.security.join import join
 
-# Nobody answers, at once: the server starts again, or has just connected (Zenoh issue 2767). It may answer in a moment.
-AGAIN_S = 0.1
-PAST_S = 120.0  # how much longer an answer may take that the server has to fold from its journal
 SOLVE_S = 30.0  # likewise, that it has to calibrate a fleet for: a large one on a busy host
 REGION_ATTEMPTS = 3
-TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 
 
 class Client:
-    """Asks the map server of one site.
+    """Asks the map server of one site, and its followers where there are any.
 
+    origin: who gave the last answer, and how far behind the journal its map was.
     Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read). A
     question that nobody takes, or whose server ends, is asked again for timeout_s: a restart of router or server shows
     as an answer that comes later.
@@ -55,7 +53,8 @@ class Client:
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float = 10.0) -> None:
         self.session, self.site = session, site
-        self._endpoint, self._timeout_s = endpoint, timeout_s
+        self.origin = SERVER
+        self._asker = Asker(session, endpoint, site, timeout_s)
         self._listeners: list[Listener[GroundChange]] = []
 
     def point(
@@ -129,8 +128,8 @@ class Client:
         tiles = list(first.tiles)
         while answer.next_place:
             answer = decode_tiles(self._ask(requests.TilesQuery(since, as_of_ns, answer.next_place)))
-            if answer.version.store != first.version.store or answer.whole != first.whole:
-                return self.tiles(as_of_ns=as_of_ns)  # another store took over in between
+            if _goes_back(first, answer):
+                return self.tiles(as_of_ns=as_of_ns)
             tiles += answer.tiles
         return replace(first, tiles=tuple(tiles), next_place=None)
 
@@ -141,6 +140,12 @@ class Client:
     def alive(self) -> ServerAlive:
         """Whether the server takes batches: for probes, since it waits for nothing."""
         return answer_codec.decode_alive(self._ask(requests.AliveQuery()))
+
+    def followers(self) -> list[FollowerState]:
+        """Followers that answer, and how far behind the journal each is; LinkError where there is no server either."""
+        if not (followers := self._asker.followers()):
+            self.alive()
+        return followers
 
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
@@ -210,7 +215,8 @@ class Client:
     def accept(self, store: str, reason: str) -> MapInfo:
         """Let the map server's store take the place of another one, which is gone: machines go on with it."""
         command = AcceptCommand(store, reason)
-        return answer_codec.decode_info(self._get(keys.admin(self.site, command.name), encode_command(command), 0.0))
+        key = keys.admin(self.site, command.name)
+        return answer_codec.decode_info(self._asker.command(key, encode_command(command), 0.0))
 
     def close(self) -> None:
         """Close the session and its listeners."""
@@ -225,47 +231,36 @@ class Client:
         self.close()
 
     def _ask(self, query: requests.MapQuery) -> bytes:
-        wait_s = query.fresh.wait_s if query.fresh.after else 0.0
-        wait_s += PAST_S if requests.reads_past(query) else 0.0
-        return self._get(keys.map_query(self.site, query.name), requests.encode_query(query), wait_s)
+        return self._answered(query).data
+
+    def _answered(self, query: requests.MapQuery, *, at: Origin | None = None) -> Answered:
+        answered = self._asker.ask(query, at=at)
+        self.origin = answered.origin  # of the last answer of any thread: nothing here goes on with it
+        return answered
 
     def _pieces(self, query: requests.RegionQuery) -> Iterator[Region]:
-        """The region, or piece after piece of it."""
-        yield (first := answer_codec.decode_region(self._ask(query)))
+        """The region, or piece after piece of it, all from whom has the first one."""
+        answered = self._answered(query)
+        yield (first := answer_codec.decode_region(answered.data))
         if first.piece:
             for number in range(1, first.piece.count):
-                yield answer_codec.decode_region(self._ask(requests.PieceQuery(first.piece.cursor, number)))
+                piece = requests.PieceQuery(first.piece.cursor, number)
+                yield answer_codec.decode_region(self._answered(piece, at=answered.origin).data)
 
     def _command(self, command: TrustCommand) -> TrustAnswer:
         key = keys.admin(self.site, command.name)
-        return answer_codec.decode_machine(self._get(key, encode_command(command), command.wait_s))
+        return answer_codec.decode_machine(self._asker.command(key, encode_command(command), command.wait_s))
 
     def _calibrate(self, command: CalibrateCommand) -> CalibrationAnswer:
         key = keys.admin(self.site, command.name)
-        return decode_calibration(self._get(key, encode_command(command), SOLVE_S + command.wait_s))
+        return decode_calibration(self._asker.command(key, encode_command(command), SOLVE_S + command.wait_s))
 
-    def _get(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
-        selector = zenoh.Selector(key, selector_of(parameters)) if parameters else zenoh.Selector(key)
-        held_s, text = time.monotonic(), b""  # until when somebody held the question; the last error reply
-        end_s = held_s + self._timeout_s + wait_s
-        while (asked_s := time.monotonic()) < min(end_s, held_s + self._timeout_s):
-            for reply in self.session.get(selector, timeout=end_s - asked_s):
-                if reply.ok is not None:
-                    return reply.ok.payload.to_bytes()
-                if reply.err is not None and (text := reply.err.payload.to_bytes()) != TIMED_OUT:
-                    error, held_s = answer_codec.decode_error(text), time.monotonic()
-                    if not 0 < error.retry_after_s < end_s - held_s - AGAIN_S:
-                        raise error
-                    time.sleep(error.retry_after_s)
-            if time.monotonic() > asked_s + AGAIN_S:
-                held_s = time.monotonic()
-            time.sleep(AGAIN_S)
-        problem = f"no map server answers for site {self.site!r}: start one with `sitegrid server`, or check the name"
-        if text == TIMED_OUT:
-            problem = f"the map server of site {self.site!r} did not answer in time: it hangs, or has too much to do"
-        if self._endpoint.startswith("tls/"):
-            problem += "; or these keys may not ask this (see docs/security.md)"
-        raise LinkError(self._endpoint, problem)
+
+def _goes_back(first: TilesAnswer, answer: TilesAnswer) -> bool:
+    """Whether another store, or a process that is behind the first one, answers the rest of the tiles."""
+    before, now = first.version, answer.version
+    same = (before.store, first.whole) == (now.store, answer.whole)
+    return not same or now.row < before.row or now.fact < before.fact
 
 
 def connect(

@@ -78,9 +78,10 @@ def build_parser() -> ArgumentParser:
     """The parser of all commands."""
     parser = ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True)
-    for info in pkgutil.iter_modules(commands.__path__, f"{commands.__name__}."):
-        module = import_module(info.name)
-        noun = add_command(nouns, info.name.rpartition(".")[2], module.HELP)
+    those = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")
+    for word, name in sorted((info.name.rpartition(".")[2], info.name) for info in those if not info.ispkg):
+        module = import_module(name)
+        noun = add_command(nouns, word, module.HELP)
         noun.set_defaults(run=module.run, extra=getattr(module, "EXTRA", ""))
         module.add_options(noun)
     return parser

@@ -29,11 +29,14 @@ class Command(NamedTuple):
         line: list[str] = []
         for word, parser in zip(self.words, self.parsers, strict=True):
             line.append(word)
+            groups = [group._group_actions for group in parser._mutually_exclusive_groups if group.required]
+            chosen = [group[0] for group in groups if not any(option.dest in given for option in group)]
             for option in parser._actions:
                 if isinstance(option, _SubParsersAction):
                     continue
                 value = given.get(option.dest)
-                if value is None and (option.required or not option.option_strings) and option.nargs != "?":
+                is_needed = option.required or option in chosen or not option.option_strings
+                if value is None and is_needed and option.nargs != "?":
                     value = _anything(option)
                 if value is not None:
                     line += [*option.option_strings[-1:], value]

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from benchmarks.postgres import server as postgres
 from sitegrid.process.lifetime import SIGNALS
 from tests.paths import ROOT, SHARED_DATA
 
@@ -40,6 +41,30 @@ def husky_data() -> Path:
     if not folder.exists():
         pytest.skip("the Husky log is not beside the project (../shared/data/rl_test1_husky)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def postgres_cluster() -> Iterator[postgres.Cluster]:
+    """A real PostgreSQL server, one for all tests of a process."""
+    try:
+        with postgres.cluster() as cluster:
+            yield cluster
+    except RuntimeError as error:
+        pytest.fail(str(error), pytrace=False)
+
+
+@pytest.fixture
+def database(postgres_cluster: postgres.Cluster) -> postgres.Database:
+    """An empty database on it."""
+    return postgres_cluster.new_database()
+
+
+def pytest_report_header() -> str:
+    """Which PostgreSQL the tests use."""
+    try:
+        return f"PostgreSQL: {postgres.binaries()}"
+    except RuntimeError as error:
+        return f"PostgreSQL: none, tests that need it fail: {error}"
 
 
 @pytest.fixture(autouse=True)

@@ -36,7 +36,7 @@ class ChangeLog:
         self, cell_m: float, change: ChangeConfig, read: cell_layers.ReadConfig, kept: Iterable[Mapping[str, Any]] = ()
     ) -> None:
         self._cell_m, self._config, self._read = cell_m, change, read
-        self._changes = {values["id"]: GroundChange(**{**values, "bounds": tuple(values["bounds"])}) for values in kept}
+        self._changes = {change.id: change for change in map(change_of, kept)}
         self._logged: dict[Block, Ints] = {}  # changed_ns of cells that are part of a change already
         self._members: dict[int, set[tuple[int, int]]] = {number: set() for number in self._changes}
 
@@ -118,6 +118,11 @@ class ChangeLog:
         (west, south, east, north), (w, s, e, n) = one.bounds, other.bounds
         apart = w > east + reach_m or e < west - reach_m or s > north + reach_m or n < south - reach_m
         return not apart and other.first_ns <= one.last_ns + SAME_NS and other.last_ns >= one.first_ns - SAME_NS
+
+
+def change_of(values: Mapping[str, Any]) -> GroundChange:
+    """A change from the plain values that its event has."""
+    return GroundChange(**{**values, "bounds": tuple(values["bounds"])})
 
 
 def _of_one_time(area: Bools, changed_ns: Ints) -> tuple[Ints, Ints]:

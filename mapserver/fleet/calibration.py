@@ -7,7 +7,7 @@ gain may then be let in again.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from mapserver.fleet.applied_part import FAULT_SIGMAS, FAULTY_SIGMAS, Applied, applied_part, beyond_data_sheet
 from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS, EPOCHS, Stated, newest, stated
-from mapserver.fleet.machine_state import MachineState, is_unsure
+from mapserver.fleet.machine_state import MachineState, is_surer
 from mapserver.fleet.observability import CommonScale, Observed, observe
 from mapserver.fleet.passages import sound
 from mapserver.fleet.solver import SCALE_STD, Estimate, Prior, Problem, against, estimate, problem
@@ -39,14 +39,15 @@ AT_ONCE = 0.1
 class Calibration:
     """What a solve says: corrections in the order of stamps, states of all machines, and their common scale.
 
-    stated: by machine and number of the epoch, what the machine applied itself. begins_ns: by machine, from when on
-    there may be samples of it.
+    stated: by machine and number of the epoch, what the machine applied itself. remembered: machines whose scale is no
+    evidence of now. begins_ns: by machine, from when on there may be samples of it.
     """
 
     corrections: tuple[Correction, ...]
     machines: Mapping[str, MachineState]
     common: CommonScale
     stated: Mapping[str, Mapping[int, Stated]] = field(default_factory=dict)
+    remembered: frozenset[str] = frozenset()
     begins_ns: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -59,19 +60,20 @@ def calibrate(
     """Solve for all machines.
 
     ledgers: stays by machine, as `Ledger.stays` has them, MOST_MACHINES at most. excluded: machines without a say,
-    beside those that are at fault. areas: whose c_rr the site states. remembered: what was observed of machines before;
-    it counts for those whose scale these stays do not show for sure, unless slopes contradict each other now.
+    beside those that are at fault. areas: whose c_rr the site states. remembered: what evidence showed of machines
+    before; it counts for those whose scale these stays do not show as surely.
     """
     sane = {name: stays for name, table in ledgers.items() if len(stays := sound(table))}
     known = {name: newest(table, epochs_of_each(len(sane))) for name, table in sane.items()}
     if not set(known) - set(excluded):
         return Calibration((), {}, CommonScale(False, SCALE_STD, "no_machine"))
-    solved, contradiction = _solved(known, excluded, areas, {})
+    solved = _solved(known, excluded, areas, {})
     states = solved.machines
-    silent = {name: prior for name, prior in (remembered or {}).items() if is_unsure(states.get(name))}
-    if silent and not contradiction:
-        solved, _ = _solved(known, excluded, areas, silent)
-    return replace(solved, stated={name: stated(table) for name, table in known.items()})
+    silent = {name: prior for name, prior in (remembered or {}).items() if is_surer(prior, states.get(name))}
+    if silent:
+        solved = _solved(known, excluded, areas, silent)
+    own = {name: stated(table) for name, table in known.items()}
+    return replace(solved, stated=own, remembered=frozenset(silent))
 
 
 def epochs_of_each(machines: int) -> int:
@@ -92,8 +94,9 @@ def joined(parts: Sequence[Calibration]) -> Calibration:
     applied = {name: of_machine for part in parts for name, of_machine in part.stated.items()}
     corrections = tuple(one for part in parts for one in part.corrections)
     common = max((part.common for part in parts), key=lambda common: (not common.observed, common.std))
+    remembered = frozenset(name for part in parts for name in part.remembered)
     begins_ns = {name: begin_ns for part in parts for name, begin_ns in part.begins_ns.items()}
-    return Calibration(corrections, dict(sorted(states.items())), common, applied, begins_ns)
+    return Calibration(corrections, dict(sorted(states.items())), common, applied, remembered, begins_ns)
 
 
 def _solved(
@@ -101,8 +104,8 @@ def _solved(
     excluded: Collection[str],
     areas: Sequence[KnownGround],
     priors: Mapping[str, Prior],
-) -> tuple[Calibration, str]:
-    """What a solve with these priors says, and why slopes contradict each other, "" if they do not."""
+) -> Calibration:
+    """What a solve with these priors says."""
     trusted = {name: table for name, table in known.items() if name not in excluded}
     pb, result = _common_ground(trusted, areas, priors)
     observed = observe(pb, result)
@@ -112,7 +115,7 @@ def _solved(
         alone = against(own, pb, result)
         more, state = _said(own, alone, observe(own, alone), observed.common)
         corrections, states = corrections + more, states | state
-    return Calibration(tuple(corrections), dict(sorted(states.items())), observed.common), result.edges
+    return Calibration(tuple(corrections), dict(sorted(states.items())), observed.common)
 
 
 def _common_ground(
@@ -120,33 +123,47 @@ def _common_ground(
 ) -> tuple[Problem, Estimate]:
     """The ground of all machines but those that are at fault: one alone can put the slopes of a whole site in doubt.
 
-    Without the oddest machine, and the next, as long as there is one and most remain; as if there were none where that
-    does not end the doubt.
+    Where slopes are in doubt, less is odd. But if nobody's absence ends the doubt, the ground itself is the reason, and
+    only those are left out that are at fault for sure; nobody where most seem to be.
     """
-    left = dict(trusted)
-    first = pb, result = _estimated(left, areas, priors)
-    while odd := _oddest(pb, result, math.ceil(AT_ONCE * len(trusted))):
-        for name in odd:
-            del left[name]
+
+    def solved(some: Mapping[str, Table]) -> tuple[Problem, Estimate]:
+        pb = problem(some, areas, priors)
+        return pb, estimate(pb)
+
+    all_of_them = solved(trusted)
+    most_seem = all_of_them[1].edges and 2 * len(_odd(*all_of_them, FAULT_SIGMAS)) >= len(trusted)
+    others = all_of_them if most_seem else _without_odd(trusted, all_of_them, FAULT_SIGMAS[1], solved)
+    fewer = _without_odd(trusted, others, FAULTY_SIGMAS, solved) if others[1].edges else others
+    return others if fewer[1].edges else fewer
+
+
+def _without_odd(
+    trusted: Mapping[str, Table],
+    first: tuple[Problem, Estimate],
+    in_doubt: float,
+    solved: Callable[[Mapping[str, Table]], tuple[Problem, Estimate]],
+) -> tuple[Problem, Estimate]:
+    """Solved without the oddest machine, and the next, as long as there is one; the first where not most would remain.
+
+    trusted: all machines. first: as solved with those that have a say still. in_doubt: standard deviations of a scale
+    that is odd while slopes are in doubt.
+    """
+    now = first
+    while odd := _odd(*now, (FAULT_SIGMAS[0], in_doubt if now[1].edges else FAULT_SIGMAS[1]))[
+        : math.ceil(AT_ONCE * len(trusted))
+    ]:
+        left = [name for name in now[0].names if name not in odd]
         if 2 * len(left) <= len(trusted):
             return first
-        pb, result = _estimated(left, areas, priors)
-    return first if result.edges else (pb, result)
+        now = solved({name: trusted[name] for name in left})
+    return now
 
 
-def _estimated(
-    ledgers: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]
-) -> tuple[Problem, Estimate]:
-    pb = problem(ledgers, areas, priors)
-    return pb, estimate(pb)
-
-
-def _oddest(pb: Problem, result: Estimate, most: int) -> list[str]:
-    """The machines that are furthest beyond what their data sheets may mean, `most` at most."""
-    far = (beyond_data_sheet(pb, result) / ((FAULT_SIGMAS[0], FAULTY_SIGMAS) if result.edges else FAULT_SIGMAS)).max(
-        axis=1
-    )
-    return [pb.names[index] for index in np.argsort(-far, kind="stable")[:most].tolist() if far[index] > 1]
+def _odd(pb: Problem, result: Estimate, sigmas: tuple[float, float]) -> list[str]:
+    """Machines whose zero or scale is off by more standard deviations of the data sheet, the furthest first."""
+    far = (beyond_data_sheet(pb, result) / sigmas).max(axis=1)
+    return [pb.names[index] for index in np.argsort(-far, kind="stable").tolist() if far[index] > 1]
 
 
 def _said(

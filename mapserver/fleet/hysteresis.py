@@ -15,7 +15,7 @@ from mapserver.fleet.spans import at, values
 
 IN_A_ROW = 2  # solves that have to differ from what counts
 LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better
-FROZEN_NS = 4 * 3600 * 10**9  # so long after it was first seen, an epoch keeps its correction
+FROZEN_NS = 4 * 3600 * 10**9  # so long after it was first seen, an epoch keeps its zero
 MOST_STEP_NS = 600 * 10**9  # of site time between two judgements: more is a jump, of a wrong clock or at night
 
 
@@ -78,9 +78,9 @@ class Hysteresis:
         return self._epochs[machine][from_ns].differs > 0
 
     def decided(self, machine: str, corrections: Sequence[Correction]) -> None:
-        """Begin to count anew what was decided, in order of time."""
+        """Begin to count anew what was decided."""
         for from_ns, epoch in self._epochs.get(machine, {}).items():
-            if at(corrections, from_ns):
+            if any(one.from_ns <= from_ns < one.to_ns for one in corrections):
                 epoch.differs = 0
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mapserver.fleet.correction import LAST_NS
 from mapserver.fleet.stays import SLOT_NS, SLOT_SHIFT, STAY, VALUE_UNITS, merged, stays
 from protocol.arrays import Ints, Table
 from protocol.machine.samples import APPLIED
@@ -22,10 +23,14 @@ _PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
 
 
 class Ledger:
-    """Stays of one machine. cell_m: edge of the cells. epochs: how many it remembers, which may become fewer."""
+    """Stays of one machine. cell_m: edge of the cells.
+
+    epochs: how many it remembers. until_ns: what is stamped later was stamped by a clock that was ahead, or will be of
+    interest; as many epochs of it are remembered beside those up to then, and displace none of them.
+    """
 
     def __init__(self, cell_m: float = CELL_M) -> None:
-        self.epochs = EPOCHS
+        self.epochs, self.until_ns = EPOCHS, LAST_NS
         self._cell_m = cell_m
         self._stays: Table = np.zeros(0, STAY)
         self._pending: list[Table] = []
@@ -44,22 +49,30 @@ class Ledger:
         if self._waiting > max(_PENDING_ROWS, len(self._stays) // 4):
             self._merge()
 
-    def stays(self) -> Table:
-        """All stays, by their keys."""
-        if self._pending or len(np.unique(epochs_of(self._stays))) > self.epochs:
-            self._merge()
-        return self._stays
+    @property
+    def newest_ns(self) -> int:
+        """When the newest epoch began, 0 without any."""
+        self._merge()
+        return int(epochs_of(self._stays)[-1]) * EPOCH_NS if len(self._stays) else 0
+
+    def stays(self, from_ns: int = 0) -> Table:
+        """Stays of the newest epochs that began from a time on and up to `until_ns`, by their keys."""
+        self._merge()
+        each = epochs_of(self._stays)
+        first, end = np.searchsorted(each, [-(-from_ns // EPOCH_NS), self.until_ns // EPOCH_NS + 1]).tolist()
+        return newest(self._stays[first:end], self.epochs)
 
     def _merge(self) -> None:
         """Sum what waits, and forget the oldest epochs.
 
         An epoch that is forgotten can never come back among the newest ones, so that when this runs has no influence.
         """
-        whole = self._stays
-        if self._pending:
-            whole = merged(whole, np.concatenate(self._pending))
+        if not self._pending:
+            return
+        whole = merged(self._stays, np.concatenate(self._pending))
         self._pending, self._waiting = [], 0
-        self._stays = newest(whole, self.epochs).copy()
+        later = int(np.searchsorted(epochs_of(whole), self.until_ns // EPOCH_NS + 1))
+        self._stays = np.concatenate([newest(part, self.epochs) for part in (whole[:later], whole[later:])])
 
 
 class Stated(NamedTuple):

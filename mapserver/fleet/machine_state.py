@@ -35,15 +35,15 @@ class MachineState:
     beyond: tuple[float, float]
 
 
-def is_unsure(state: MachineState | None) -> bool:
-    """Whether what was remembered of a scale is surer than what a solve without it says."""
-    return state is not None and state.scale_std > REMEMBERED_STD
+def is_surer(prior: Prior, state: MachineState | None) -> bool:
+    """Whether what is remembered of a scale is surer than what a solve without it says."""
+    return state is not None and state.scale_std**2 > prior.covariance[1][1]
 
 
-def remembered_of(corrections: Iterable[Correction]) -> dict[str, Prior]:
-    """What earlier solves observed of machines, by their newest corrections. A zero wanders, and is not remembered."""
+def remembered_of(shown: Iterable[Correction]) -> dict[str, Prior]:
+    """What evidence showed of scales, by the last correction of each machine. A zero wanders, and is not remembered."""
     out = {}
-    for one in corrections:
+    for one in shown:
         if one.most_share >= ANY_SHARE and one.covariance:
             state = state_of(one)
             variance = max(state.scale_std, REMEMBERED_STD) ** 2

@@ -22,6 +22,10 @@ Decision = TrustDecision | CalibrationDecision
 KINDS = (trust.KIND, calibration.KIND)
 
 
+class NewerDecisionError(StoreError):
+    """A decision that only a newer version understands."""
+
+
 class Decisions:
     """Decisions about machines. trust, calibration: those of either kind; facts: what all of them come to."""
 
@@ -32,13 +36,18 @@ class Decisions:
     @classmethod
     def of_journal(cls, journal: JournalQueries) -> Decisions:
         """Those that a journal has; StoreError where one was written by a newer version."""
-        decisions, number = cls(), 0
-        for event in journal.events():
-            if event.kind in KINDS:
-                decisions._take(_decision(event, journal.where))
-                number = event.id
-        decisions._conclude(number)
+        decisions = cls()
+        decisions.hear(journal.events(), journal.where)
         return decisions
+
+    def hear(self, events: Iterable[Event], where: str) -> None:
+        """Have the decisions among further events of a journal count; StoreError as `of_journal`."""
+        number = self.facts.number
+        for event in events:
+            if event.kind in KINDS:
+                self._take(_decision(event, where))
+                number = event.id
+        self._conclude(number)
 
     def add(self, decisions: Iterable[Decision], number: int) -> None:
         """Have more decisions count. number: of the last one's event."""
@@ -93,4 +102,4 @@ def _decision(event: Event, where: str) -> Decision:
         return CalibrationDecision.from_body(event.body)
     except NewerVersionError as error:
         problem = f"event {event.id}: {error}; open it with that version, or choose another --store"
-        raise StoreError(where, problem) from None
+        raise NewerDecisionError(where, problem) from None

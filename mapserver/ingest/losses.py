@@ -10,6 +10,7 @@ from mapserver.evidence.snapshot import rows_on_disk
 from mapserver.ingest.store_folder import is_in_use
 from mapserver.journal.journal import Journal
 from mapserver.journal.location import JournalLocation
+from mapserver.journal.progress import Progress
 from mapserver.journal.rows import MachineTotals
 from mapserver.journal.shortfall import KIND, Shortfall, beyond, compare, marked, missing
 
@@ -44,9 +45,9 @@ def lacking(location: JournalLocation) -> Shortfall | None:
     return beyond(last_row, newest) if newest > last_row and not shortfall else shortfall
 
 
-def by_machine(journal: Journal, shortfalls: Sequence[Shortfall]) -> dict[str, dict[str, int]]:
+def by_machine(progress: Journal | Progress, shortfalls: Sequence[Shortfall]) -> dict[str, dict[str, int]]:
     """What each machine sent: spools, samples, samples that it declared lost, newest stamp, and what is missing."""
-    gone = missing(shortfalls, journal.watermarks()) if shortfalls else Counter()
-    sent = journal.machines()
+    gone = missing(shortfalls, progress.watermarks()) if shortfalls else Counter()
+    sent = progress.machines()
     names = dict.fromkeys([*sent, *gone])
     return {name: {**vars(sent.get(name, MachineTotals())), "missing": gone[name]} for name in names}

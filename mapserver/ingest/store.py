@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-import os
-import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,10 +20,12 @@ from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.decisions import Decision, Decisions, plain
 from mapserver.ingest.losses import by_machine, name_shortfalls
+from mapserver.ingest.standby import Standby
 from mapserver.ingest.store_folder import hold
+from mapserver.ingest.store_state import state_of
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import History, read_history
-from mapserver.journal.journal import UnwrittenError
+from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
@@ -34,7 +34,6 @@ from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
-from protocol.version import package_version
 from protocol.wire.messages import Ack, Refused, SampleBatch
 
 log = logging.getLogger("mapserver.ingest.store")
@@ -64,8 +63,12 @@ class Store:
         config: ServerConfig,
         now_ns: Callable[[], int],
         verify: Verify | None = None,
+        standby: Standby | None = None,
     ) -> None:
-        """verify: raises MessageError unless a batch is signed by its machine."""
+        """verify: raises MessageError unless a batch is signed by its machine.
+
+        standby: follows a shared journal while another server writes it.
+        """
         folder = location.folder
         self.site, self.config, self.location, self.now_ns = site, config, location, now_ns
         self._verify = verify
@@ -73,7 +76,7 @@ class Store:
         self.commits, self.commit_s = 0, 0.0
         with ExitStack() as opened:
             opened.enter_context(hold(folder))
-            self.journal = location.open(site.name, site.frame)
+            self.journal = location.open(site.name, site.frame, waiting=standby.follow if standby else None)
             opened.callback(self.journal.close)
             self.history = History(self.journal, location.archive)
             self.identity = self.journal.identity()
@@ -81,11 +84,13 @@ class Store:
             self._decisions, last_row = Decisions.of_journal(self.journal), self.journal.last_row
             self.facts = facts = self._decisions.facts
             self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
-            snapshot.remove_beyond(folder, last_row)
-            checkpoints.remove_beyond(folder, last_row)
-            loaded = snapshot.load_newest(folder, last_row, site.cell_m, config.fold, facts.of_evidence())
-            self.merged, self.grid = loaded
-            self.snapshot_row = self.merged
+            snapshot.remove_beyond(folder, self.journal.trusted_row)
+            checkpoints.remove_beyond(folder, self.journal.trusted_row)
+            warm = standby.grid_for(self.journal, facts) if standby else None
+            self.merged, self.grid = warm or snapshot.load_newest(
+                folder, last_row, site.cell_m, config.fold, facts.of_evidence()
+            )
+            self.snapshot_row = 0 if warm else self.merged
             in_snapshot = self.grid.counts()
             fold_history(self.grid, self.history, self.merged, selection=Selection.by(facts))
             release_memory()
@@ -129,12 +134,15 @@ class Store:
         batches = self._decode(group)
         try:
             self.journal.begin()
+            self._catch_up()
             answers = [self._admit(incoming, batch) for incoming, batch in zip(group, batches, strict=True)]
             began_s = time.monotonic()
             self.journal.commit()
             self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
         except UnwrittenError as error:
             self.journal.rollback()
+            if isinstance(error, FencedError):
+                raise
             self.counters[f"refused_{Refusal.STORE}"] += len(group)
             return [Refused(Refusal.STORE, f"the server cannot write: {error.problem}") for _ in group]
         for answer, admission in answers:
@@ -183,9 +191,9 @@ class Store:
         self._count_decisions()
         return self._decisions.facts
 
-    def confirm(self, machines: Iterable[str], now_ns: int) -> None:
-        """Date what is offered to machines: the solver says the same of them now [site's]."""
-        self._decisions.calibration.confirm(machines, now_ns)
+    def confirm(self, confirmed: Mapping[str, int]) -> None:
+        """Date what is offered to machines: the solver says the same of them, as of when [ns]."""
+        self._decisions.calibration.confirm(confirmed)
 
     def accept(self, store: str, reason: str) -> None:
         """Take the place of another store for good, since a person says so: its runs are taken on here."""
@@ -200,32 +208,12 @@ class Store:
 
     def info(self) -> dict[str, Any]:
         """State of the store in plain values, from counters."""
-        counts = self.grid.counts()
-        return {
-            "site": {**asdict(self.site), "frame": self.site.frame, "crs": self.site.crs},
-            "store": self.identity.id,
-            "descends": list(self.identity.descends),
-            "accepted": sorted(self.accepted),
-            "fact": self.fact,
-            "decided": self._decisions.facts.number,
-            "corrections": len(self.facts.corrections),
-            "journalled": self.journalled,
-            "merged": self.merged,
-            "snapshot": self.snapshot_row,
-            "samples_merged": counts.folded,
-            "samples_too_unsure": counts.skipped,
-            "cells": counts.cells,
-            "bounds": counts.bounds,
-            "first_ns": self.grid.oldest_ns,
-            "stamp_ns": self.newest_ns,
-            "wall_ns": self.now_ns(),
-            "version": package_version(),
-            "server": {"host": socket.gethostname(), "pid": os.getpid()},
-            "machines": self.machines(),
-            "distrusted": sorted(self.facts.excluded),
-            "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
-            "counters": dict(self.counters),
-        }
+        return state_of(self)
+
+    @property
+    def decided(self) -> int:
+        """Number of the last decision that is kept, also if the map does not follow it yet."""
+        return self._decisions.facts.number
 
     def machines(self) -> dict[str, dict[str, int]]:
         """What each machine sent and lost; see `by_machine`."""
@@ -256,7 +244,9 @@ class Store:
         if admission.lost and not new:
             self.journal.declare_lost(admission)
         offer = self._decisions.offer(batch.machine) if new else None
-        return Ack(admission.watermark, row, admission.trimmed, self.identity.id, replaces, offer), admission
+        return Ack(
+            admission.watermark, row, admission.trimmed, self.identity.id, replaces, offer, self.journal.epoch
+        ), admission
 
     def _newest_but(self, machine: str) -> int:
         """The newest stamp of the machines in the map but one."""
@@ -293,6 +283,16 @@ class Store:
             newest_ns = int(batch.rows["stamp_ns"].max())
             self._newest[batch.machine] = max(self._newest.get(batch.machine, 0), newest_ns)
         self.merged = self.journalled
+
+    def _catch_up(self) -> None:
+        """Fold what was committed though its batches were refused, since the database's answer was lost."""
+        if self.journal.last_row > self.merged:
+            selection = Selection.by(self.facts)
+            for rows in read_history(self.history, after=self.merged, selection=selection):
+                self.grid.fold_all(*rows.selected(selection))
+            self._newest |= {name: totals.newest_ns for name, totals in self.journal.machines().items()}
+            log.warning("committed without an answer rows=%d", self.journal.last_row - self.merged)
+            self.merged = self.journal.last_row
 
     def _count_decisions(self) -> None:
         """Count further decisions as followed where they come to the facts that the grid has."""

@@ -16,6 +16,7 @@ from mapserver.ingest.backlog import Backlog, Pace, size_of
 from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.ingest.snapshot_times import SnapshotTimes
 from mapserver.ingest.store import Incoming, Store
+from mapserver.journal.journal import FencedError
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import ServerAlive
 from protocol.wire.messages import Ack, Refused
@@ -54,24 +55,29 @@ class Writer:
         self._group: list[_Batch] = []  # of this turn, as far as nobody has an answer
         self._works: deque[_Work] = deque()
         self._pace = Pace()
-        self._refusals: Counter[str] = Counter()  # of what never comes to the store
+        self._counts: Counter[str] = Counter()  # of what never comes to the store
         self._is_closing = False
         self._ended = ""  # why nothing is taken any more
         self._busy_since_s: float | None = None
         self._committed_s = -math.inf  # when the last commit began
         self.waits = MergeWaits(store.merged)
-        self.failed = False
+        self.failed, self._fenced = False, ""
         self._times = SnapshotTimes(self.config.store.snapshot_s, clock())
         self._snapshots = ThreadPoolExecutor(1, thread_name_prefix="snapshot")
         self._thread = threading.Thread(target=self._guard, name="writer", daemon=True)
         self._thread.start()
+
+    @property
+    def fenced(self) -> str:
+        """Why this server may not write any more, since another one does; empty while it may."""
+        return self._fenced or self._store.journal.fenced
 
     def submit(self, incoming: Incoming, reply: Reply) -> None:
         """Hand in a batch; `reply` is called on the owner's thread, or at once for one that has to come again later."""
         with self._turn:
             ended = self._ended
             gone = [] if ended else self._backlog.add(incoming.machine, size_of(incoming.payload), (incoming, reply))
-            self._refusals[f"refused_{Refusal.OVERLOADED}"] += len(gone)
+            self._counts[f"refused_{Refusal.OVERLOADED}"] += len(gone)
             retry_after_s = self._pace.retry_after_s(self._backlog.size)
             self._turn.notify()
         if ended:
@@ -90,10 +96,10 @@ class Writer:
             self._turn.notify()
         return result.result(timeout_s)
 
-    def count_refusal(self, reason: str) -> None:
-        """Count a refused query."""
+    def count(self, what: str) -> None:
+        """Count something that never comes to the store: what became of a query."""
         with self._turn:
-            self._refusals[f"refused_query_{reason}"] += 1
+            self._counts[what] += 1
 
     def alive(self) -> ServerAlive:
         """Whether batches are taken, without waiting for the owner; QueryError where it has ended, or hangs."""
@@ -113,7 +119,7 @@ class Writer:
         waiting = {"waiting": len(self._backlog), "waiting_bytes": self._backlog.size}
         info["writer"] = {**waiting, "commits": commits, "commit_s": commit_s}
         with self._turn:
-            info["counters"] |= +self._refusals
+            info["counters"] |= +self._counts
         return info
 
     def close(self) -> None:
@@ -128,6 +134,12 @@ class Writer:
         """A bug must end the process visibly: a server that accepts nothing more is worse than none."""
         try:
             self._serve()
+        except FencedError as error:
+            with self._turn:
+                self._fenced = self._ended = error.problem
+            log.error("fenced problem=%r", error.problem)
+            self._refuse_all(Refusal.NOT_WRITER)
+            self._snapshots.shutdown()
         except Exception:
             with self._turn:  # what comes from here on is refused by who hands it in
                 self.failed, self._ended = True, "the server's writer has failed; restart the server"
@@ -141,11 +153,11 @@ class Writer:
         finally:
             self._store.close()
 
-    def _refuse_all(self) -> None:
+    def _refuse_all(self, reason: Refusal = Refusal.STORE) -> None:
         """Leave nobody waiting."""
         while self._group or self._backlog:
             for _, reply in self._group:
-                reply(Refused(Refusal.STORE, self._ended))
+                reply(Refused(reason, self._ended))
             self._group = self._backlog.take()
         for item in self._works:
             item.result.set_exception(QueryError(Refusal.STORE, self._ended))

@@ -13,7 +13,7 @@ from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from itertools import chain, zip_longest
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 
@@ -53,6 +53,11 @@ class Archive:
 
     def read_many(self, after: int, until: int, selection: Selection = ALL) -> Iterator[JournalRows]:
         """Rows after < row <= until, many at a time; StoreError where a file is missing, or two hold the same row."""
+        for path in self.cover(until, after):
+            yield from self.open(path).read_many(after, until, selection)
+
+    def cover(self, until: int, after: int = 0) -> Iterator[Path]:
+        """The files with rows after < row <= until; StoreError as soon as one is missing, or two hold the same row."""
         reached = after
         for path in self.paths():
             first, last = row_range(path)
@@ -62,7 +67,7 @@ class Archive:
                 break
             if after < first <= reached:
                 raise StoreError(path, f"row {first} is also in another file; move one of them away")
-            yield from self.open(path).read_many(after, until, selection)
+            yield path
             reached = last
         if reached < until:
             problem = f"the file with row {reached + 1} is missing; restore it from a backup"
@@ -176,8 +181,7 @@ def write_file(folder: Path, store: str, site: SiteConfig, rows: Iterator[Receiv
         with whole_file(temporary, READABLE) as file:
             last_row = write_parquet(file, store, site, chain([first], (row for row, _ in rows)))
             seal(file)
-        hour = datetime.fromtimestamp(received_ns // HOUR_NS * 3600, UTC).strftime("%Y-%m-%dT%H")
-        path = folder / f"{hour}_{first.row:06d}-{last_row:06d}.parquet"
+        path = folder / file_name(received_ns, first.row, last_row)
         temporary.rename(path)
         sync_folder(folder)
     except OSError as error:
@@ -187,10 +191,59 @@ def write_file(folder: Path, store: str, site: SiteConfig, rows: Iterator[Receiv
     return path
 
 
+def file_name(received_ns: int, first_row: int, last_row: int) -> str:
+    """Name of a file: hour of reception (UTC), first and last row."""
+    hour = datetime.fromtimestamp(received_ns // HOUR_NS * 3600, UTC).strftime("%Y-%m-%dT%H")
+    return f"{hour}_{first_row:06d}-{last_row:06d}.parquet"
+
+
 def write_parquet(file: BinaryIO, store: str, site: SiteConfig, rows: Iterator[JournalRow]) -> int:
     """Write rows, row group by row group; returns the last one's number."""
+    with ArchiveWriter(file, store, site) as writer:
+        for group in _groups(rows):
+            writer.add(JournalRows.joined(group))
+    return group[-1].row
+
+
+class ArchiveWriter:
+    """Writes the rows of a file in row groups of about GROUP_SAMPLES; use it as a context, then `seal` the file.
+
+    store, site: what the file states about its rows.
+    """
+
+    def __init__(self, file: BinaryIO, store: str, site: SiteConfig) -> None:
+        self._store, self._site = store, site
+        self._machines: set[str] = set()
+        self._waiting: list[Any] = []
+        self._parquet = arrow("parquet").ParquetWriter(file, _schema(), **_options())
+
+    def add(self, rows: JournalRows) -> None:
+        """Write rows; a batch is never cut."""
+        self._machines |= {rows.machines[number] for number in np.unique(rows.machine).tolist()}
+        self._waiting.append(_table(rows))
+        if sum(table.num_rows for table in self._waiting) >= GROUP_SAMPLES:
+            self._flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self._flush()
+            machines = tuple(sorted(self._machines))
+            header = ArchiveHeader(self._store, self._site, self._site.frame, self._site.crs, machines)
+            self._parquet.add_key_value_metadata({KEY: json.dumps(asdict(header))})
+        self._parquet.close()
+
+    def _flush(self) -> None:
+        if self._waiting:
+            self._parquet.write_table(arrow().concat_tables(self._waiting))
+        self._waiting = []
+
+
+def _options() -> dict[str, Any]:
     delta = dict.fromkeys(("seq", "row", "stamp_ns"), "DELTA_BINARY_PACKED")
-    options = {
+    return {
         "compression": "zstd",
         "use_dictionary": ["machine", "spool_id", "received_ns"],
         # Never a dictionary for samples: it would take every NaN for the same. Split by byte they also shrink better.
@@ -198,14 +251,6 @@ def write_parquet(file: BinaryIO, store: str, site: SiteConfig, rows: Iterator[J
         "write_page_checksum": True,
         "write_page_index": True,
     }
-    machines: set[str] = set()
-    with arrow("parquet").ParquetWriter(file, _schema(), **options) as writer:
-        for group in _groups(rows):
-            writer.write_table(_table(group))
-            machines |= {row.machine for row in group}
-        header = ArchiveHeader(store, site, site.frame, site.crs, tuple(sorted(machines)))
-        writer.add_key_value_metadata({KEY: json.dumps(asdict(header))})
-    return group[-1].row
 
 
 def _groups(rows: Iterator[JournalRow]) -> Iterator[list[JournalRow]]:
@@ -230,17 +275,16 @@ def _schema() -> Any:
     return pa.schema([pa.field(name, kind, nullable=False) for name, kind in types.items()])
 
 
-def _table(group: list[JournalRow]) -> Any:
+def _table(rows: JournalRows) -> Any:
     """One line per sample."""
-    samples = np.concatenate([row.rows for row in group])
-    lengths = [len(row.rows) for row in group]
-    batch = np.repeat(np.arange(len(group)), lengths)
+    batch = np.repeat(np.arange(len(rows)), rows.lengths)
+    firsts = np.cumsum(rows.lengths) - rows.lengths
     columns: dict[str, Any] = {
-        "machine": np.array([row.machine for row in group], object)[batch],
-        "spool_id": np.array([row.spool_id for row in group], np.uint64)[batch],
-        "seq": np.concatenate([row.first_seq + np.arange(len(row.rows)) for row in group]),
-        "row": np.array([row.row for row in group], np.int64)[batch],
-        "received_ns": np.array([row.received_ns for row in group], np.int64)[batch],
+        "machine": np.array(rows.machines, object)[rows.machine[batch]],
+        "spool_id": rows.spool_ids[batch],
+        "seq": np.arange(len(batch)) + (rows.first_seqs - firsts)[batch],
+        "row": rows.numbers[batch],
+        "received_ns": rows.received_ns[batch],
     }
-    columns |= {name: np.ascontiguousarray(samples[name]) for name in COLUMNS}
+    columns |= {name: np.ascontiguousarray(rows.samples[name]) for name in COLUMNS}
     return arrow().table(columns, schema=_schema())

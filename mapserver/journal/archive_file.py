@@ -11,7 +11,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import chain
@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from mapserver.journal.places import Place
 from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.config import from_table
@@ -30,6 +31,7 @@ from protocol.site.site_config import SiteConfig
 SCHEMA = 4
 KEY = b"sitegrid"  # of our own metadata
 NAME = re.compile(r"\d{4}-\d\d-\d\dT\d\d_(\d+)-(\d+)\.parquet")
+_IDENTITY = ["machine", "row", "spool_id", "seq", "received_ns"]  # columns beside those of samples
 _SEAL = b"SGRD"
 _SEAL_BYTES = 12
 
@@ -72,12 +74,15 @@ class _Spans:
 class ArchiveFile:
     """One file of an archive. StoreError, with its name, where it is damaged or no file of an archive.
 
-    first_row, last_row, samples, first_received_ns: of the whole file.
+    first_row, last_row, samples, first_received_ns: of the whole file. identity: hex digits, which other contents do
+    not have.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | Place) -> None:
         self.path = path
-        metadata = arrow("parquet").read_metadata(arrow().BufferReader(_tail(path)))
+        tail = _tail(path)
+        self.identity = tail[len(_SEAL) : _SEAL_BYTES].hex()
+        metadata = arrow("parquet").read_metadata(arrow().BufferReader(tail))
         self.header = _header(path, metadata.metadata)
         low, high = _statistics(metadata)
         self._groups = _spans(low, high)
@@ -91,14 +96,20 @@ class ArchiveFile:
         """Journal rows exactly as they were, in order; selected as by `JournalReader.read`."""
         return chain.from_iterable(self.read_many(after, until, selection))
 
-    def read_many(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRows]:
-        """As `read`, many at a time."""
+    def read_many(
+        self, after: int = 0, until: int = LAST, selection: Selection = ALL, columns: Sequence[str] = COLUMNS
+    ) -> Iterator[JournalRows]:
+        """As `read`, many at a time.
+
+        columns: of samples; the others are zero. `stamp_ns`, `x_m` and `y_m` are among them.
+        """
         groups = np.flatnonzero(self._groups.may_hold(after, until, selection)).tolist()
         if not groups or selection.without.issuperset(self.header.machines):
             return
         file = arrow("parquet").ParquetFile(arrow().BufferReader(_checked(self.path)))
         for group in groups:
-            if len(rows := _rows(file.read_row_group(group), after, until, selection)):
+            table = file.read_row_group(group, [*_IDENTITY, *columns])
+            if len(rows := _rows(table, columns, after, until, selection)):
                 yield rows
 
     def next_stamp(self, from_ns: int) -> int | None:
@@ -111,16 +122,16 @@ class ArchiveFile:
         return min(stamps, default=None)
 
 
-def row_range(path: Path) -> tuple[int, int]:
+def row_range(path: Path | Place) -> tuple[int, int]:
     """First and last journal row of a file, by its name."""
     first, last = path.stem.partition("_")[2].split("-")
     return int(first), int(last)
 
 
-def _rows(table: Any, after: int, until: int, selection: Selection) -> JournalRows:
+def _rows(table: Any, of_samples: Sequence[str], after: int, until: int, selection: Selection) -> JournalRows:
     """The selected journal rows of a row group."""
-    samples: Table = np.empty(table.num_rows, SAMPLE_DTYPE)
-    for name in COLUMNS:
+    samples: Table = np.zeros(table.num_rows, SAMPLE_DTYPE)
+    for name in of_samples:
         samples[name] = table.column(name).to_numpy()
     numbers = table.column("row").to_numpy()
     starts = np.flatnonzero(np.diff(numbers, prepend=-1))
@@ -128,7 +139,7 @@ def _rows(table: Any, after: int, until: int, selection: Selection) -> JournalRo
     low, high = (
         {name: f.reduceat(values, starts) for name, values in ranged.items()} for f in (np.minimum, np.maximum)
     )
-    heads = table.select(["machine", "row", "spool_id", "seq", "received_ns"]).take(starts)
+    heads = table.select(_IDENTITY).take(starts)
     names = heads.column("machine").combine_chunks().dictionary_encode()
     columns = (heads.column(name).to_numpy() for name in ("row", "spool_id", "seq", "received_ns"))
     machines, machine = tuple(names.dictionary.to_pylist()), names.indices.to_numpy().astype(np.int64)
@@ -161,7 +172,7 @@ def seal(file: BinaryIO) -> None:
     file.flush()
 
 
-def _tail(path: Path) -> bytes:
+def _tail(path: Path | Place) -> bytes:
     """Seal and footer, checked, without reading the rest."""
     length = int.from_bytes(_read(path, 8)[:4], "little")  # of the footer alone
     tail = _read(path, _SEAL_BYTES + length + 8)
@@ -172,7 +183,7 @@ def _tail(path: Path) -> bytes:
     return tail
 
 
-def _checked(path: Path) -> bytes:
+def _checked(path: Path | Place) -> bytes:
     """All bytes of a file, read once, so that what is decoded is what was checked."""
     tail = _tail(path)
     data = _read(path)
@@ -182,7 +193,7 @@ def _checked(path: Path) -> bytes:
     return data
 
 
-def _read(path: Path, last: int | None = None) -> bytes:
+def _read(path: Path | Place, last: int | None = None) -> bytes:
     """The bytes of a file, or so many of its last ones."""
     try:
         with path.open("rb") as file:
@@ -190,10 +201,10 @@ def _read(path: Path, last: int | None = None) -> bytes:
                 file.seek(max(0, file.seek(0, os.SEEK_END) - last))
             return file.read()
     except OSError as error:
-        raise StoreError(path, f"cannot be read: {error.strerror}") from None
+        raise StoreError(path, f"cannot be read: {error.strerror or error}") from None
 
 
-def _header(path: Path, metadata: dict[bytes, bytes]) -> ArchiveHeader:
+def _header(path: Path | Place, metadata: dict[bytes, bytes]) -> ArchiveHeader:
     table = json.loads(metadata[KEY])
     if table["schema"] != SCHEMA:
         problem = f"has schema {table['schema']}, this version knows {SCHEMA}"

@@ -49,6 +49,10 @@ class UnwrittenError(StoreError):
         self.problem = problem
 
 
+class FencedError(UnwrittenError):
+    """Another server has taken over the journal: this one acknowledges nothing any more, and ends."""
+
+
 @dataclass(frozen=True)
 class JournalState:
     """How far a journal is. epoch: number of its writer, each has a higher one; row, event: the last ones."""
@@ -72,6 +76,17 @@ class JournalQueries(Protocol):
     @property
     def archived_row(self) -> int:
         """The last row that has moved to the archive."""
+
+    @property
+    def schema(self) -> int:
+        """Number of its tables' form."""
+
+    @property
+    def replica(self) -> str:
+        """What stands behind the disk: "synchronous" where a commit waits for another machine's disk too.
+
+        "asynchronous" where another one follows without that, else "none".
+        """
 
     def identity(self) -> StoreIdentity:
         """Which store this is; StoreError where that is damaged."""
@@ -147,6 +162,18 @@ class Journal(JournalQueries, Protocol):
     shortfall: Shortfall | None
 
     @property
+    def epoch(self) -> int:
+        """Its number among all writers of this journal, higher than that of those before."""
+
+    @property
+    def fenced(self) -> str:
+        """Why it may not write any more since another server does, empty while it may; for any thread."""
+
+    @property
+    def trusted_row(self) -> int:
+        """What the server's folder has of rows up to this one, snapshots and checkpoints, is of this journal."""
+
+    @property
     def samples(self) -> int:
         """How many samples all machines sent."""
 
@@ -157,16 +184,16 @@ class Journal(JournalQueries, Protocol):
         """What each machine sent."""
 
     def begin(self) -> None:
-        """Open a transaction; rows appended from here on are one group commit."""
+        """Open a transaction; rows appended from here on are one group commit.
+
+        There may be rows then that were committed though an error said otherwise, as the answer of a database was lost.
+        """
 
     def append(self, admission: Admission, received_ns: int) -> int:
         """Write one row and its watermark into the open transaction; returns the row's number."""
 
     def declare_lost(self, admission: Admission) -> None:
         """Write a watermark alone into the open transaction: samples at a spool's end that will never come."""
-
-    def put_watermark(self, machine: str, spool_id: int, watermark: Watermark) -> None:
-        """Write a watermark into the open transaction."""
 
     def commit(self) -> None:
         """Commit to disk; only then may anything be acknowledged."""

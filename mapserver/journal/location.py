@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from mapserver.journal.archive import FOLDER, Archive
-from mapserver.journal.journal import Journal, JournalReader
+from mapserver.journal.journal import Journal, JournalQueries, JournalReader
+from mapserver.journal.postgres import MARK_FILE
+from mapserver.journal.rows import StoreIdentity
 from mapserver.journal.sqlite.journal import SqliteJournal
-from mapserver.journal.sqlite.reader import SCHEMA, SqliteReader
+from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.disk.traces import Traces, look_beside
 from protocol.disk.write_ahead_log import LogScan
+from protocol.errors import ConfigError, one_line
 
-__all__ = ["JOURNAL_FILE", "SCHEMA", "JournalLocation"]
 JOURNAL_FILE = "journal.db"
 
 
 @dataclass(frozen=True)
 class JournalLocation:
-    """The journal of the store in a folder. folder: has snapshots, checkpoints and archive too."""
+    """The journal of one store.
+
+    folder: of the server, with snapshots, checkpoints and archive. url: of a PostgreSQL database that has the journal,
+    which several servers share: the folder is a cache then. Empty where the journal is a file in the folder.
+    """
 
     folder: Path
+    url: str = ""
 
     def __str__(self) -> str:
-        return str(self._file)
+        return _postgres().connection.shown(self.url) if self.url else str(self._file)
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether servers on several hosts may take turns in writing it."""
+        return bool(self.url)
 
     @property
     def archive(self) -> Archive:
@@ -33,17 +46,38 @@ class JournalLocation:
 
     def exists(self) -> bool:
         """Whether there is one."""
-        return self._file.is_file()
+        return _postgres().reader.exists(self.url) if self.url else self._file.is_file()
 
-    def open(self, site: str, frame: str, descends: Iterable[str] = ()) -> Journal:
+    def open(
+        self, site: str, frame: str, descends: Iterable[str] = (), waiting: Callable[[float], None] | None = None
+    ) -> Journal:
         """Become its writer, and make it where there is none; StoreError says why not.
 
-        descends: ids of the stores that a new one is made from.
+        descends: ids of the stores that a new one is made from. waiting: is called, for so many seconds, again and
+        again while another server writes a journal that is shared; without it, that is an error.
         """
+        self._require_one()
+        if self.url:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            words = (self.url, self.folder, site, frame, descends, waiting)
+            journal: Journal = _postgres().journal.PostgresJournal(*words)
+            return journal
+        return self.open_file(site, frame, descends)
+
+    def open_file(self, site: str, frame: str, descends: Iterable[str] = ()) -> SqliteJournal:
+        """As `open`, of a file in the folder, which can be made to go on after an archive."""
         return SqliteJournal(self._file, site, frame, descends)
+
+    def open_copy(self, identity: StoreIdentity, site: str, frame: str) -> Journal:
+        """Become the writer of a copy of another journal, with the identity of that; make it where there is none."""
+        return SqliteJournal(self._file, site, frame, identity.descends, identity.id)
 
     def reader(self) -> JournalReader:
         """Read it; StoreError where that cannot be done."""
+        return _postgres().reader.PostgresReader(self.url) if self.url else SqliteReader(self._file)
+
+    def file_reader(self) -> SqliteReader:
+        """As `reader`, of a file in the folder, which can be copied."""
         return SqliteReader(self._file)
 
     def store_id(self) -> str:
@@ -53,11 +87,37 @@ class JournalLocation:
         with self.reader() as reader:
             return reader.identity().id
 
+    def trusted_row(self, journal: JournalQueries) -> int:
+        """What the folder has of rows up to this one is of the journal; see `Journal`. Before it is opened to write."""
+        return int(_postgres().mark.trusted_row(self.folder, journal)) if self.url else journal.last_row
+
     def traces(self, *, in_use: bool) -> Traces:
         """What lies beside it and tells how far it once was. in_use: by a server, which has looked at its log."""
+        if self.url:
+            mark: Traces = _postgres().mark.traces_in(self.folder)
+            return mark
         traces = look_beside(self._file)
         return replace(traces, log=LogScan()) if in_use else traces
+
+    def _require_one(self) -> None:
+        """ConfigError where the folder is another journal's: its snapshots are not true for this one."""
+        if self.url and self._file.exists():
+            raise ConfigError(self.folder, f"has a {JOURNAL_FILE} of its own; choose another --store for --journal")
+        if not self.url and (self.folder / MARK_FILE).exists():
+            problem = "is beside a journal in PostgreSQL; give its --journal, or choose another --store"
+            raise ConfigError(self.folder, problem)
 
     @property
     def _file(self) -> Path:
         return self.folder / JOURNAL_FILE
+
+
+def _postgres() -> Any:
+    """The modules that need the extra `postgres`; ConfigError where it is not installed."""
+    try:
+        from mapserver.journal import postgres
+        from mapserver.journal.postgres import connection, journal, mark, reader  # noqa: F401
+    except ImportError as error:
+        advice = "a journal in PostgreSQL needs psycopg: pip install 'sitegrid[postgres]'"
+        raise ConfigError("--journal", f"{advice} ({one_line(str(error))})") from None
+    return postgres

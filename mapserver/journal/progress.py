@@ -21,6 +21,10 @@ class Progress:
         """Progress of one spool."""
         return self._watermarks.get((machine, spool_id), Watermark())
 
+    def known(self, spool: SpoolKey) -> Watermark | None:
+        """Progress of one spool, None for one that there is not."""
+        return self._watermarks.get(spool)
+
     def watermarks(self) -> dict[SpoolKey, Watermark]:
         """Progress of all spools."""
         return dict(self._watermarks)

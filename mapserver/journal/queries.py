@@ -52,6 +52,15 @@ class TableQueries(ABC):
     def last_row(self) -> int:
         """See `JournalQueries`."""
 
+    @property
+    @abstractmethod
+    def archived_row(self) -> int:
+        """See `JournalQueries`."""
+
+    @abstractmethod
+    def state(self) -> JournalState:
+        """See `JournalQueries`."""
+
     @abstractmethod
     def _query(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """All lines of an answer. query: values are question marks; raises StoreError."""
@@ -63,11 +72,6 @@ class TableQueries(ABC):
     @abstractmethod
     def _one_state(self) -> AbstractContextManager[None]:
         """Have all that is read be of one time, also while a server writes."""
-
-    def state(self) -> JournalState:
-        """See `JournalQueries`."""
-        epoch = self._number("SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = 'epoch'")
-        return JournalState(epoch, self.last_row, self._last_event())
 
     def watermarks(self) -> dict[SpoolKey, Watermark]:
         """See `JournalQueries`."""
@@ -105,7 +109,7 @@ class TableQueries(ABC):
     def stamps_by_chunk(self, after: int, until: int, chunk: int) -> list[tuple[int, int, int]]:
         """See `JournalQueries`."""
         query = "SELECT (row - 1) / ?, MIN(first_stamp_ns), MAX(last_stamp_ns) FROM extent"
-        return self._query(f"{query} WHERE row > ? AND row <= ? GROUP BY 1", (chunk, after, until))
+        return self._query(f"{query} WHERE row > ? AND row <= ? GROUP BY 1 ORDER BY 1", (chunk, after, until))
 
     def least_stamp(self, after: int, until: int, from_ns: int) -> int | None:
         """See `JournalQueries`."""
@@ -125,11 +129,6 @@ class TableQueries(ABC):
         if len(words) < 2 or words[-1] != f"{checksum(*words[:-1]):08x}":
             raise self._damaged("the id of the store")
         return StoreIdentity(words[0], tuple(words[1:-1]))
-
-    @property
-    def archived_row(self) -> int:
-        """See `JournalQueries`."""
-        return self._number("SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = 'archived_row'")
 
     def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
         """See `JournalQueries`."""
@@ -164,9 +163,6 @@ class TableQueries(ABC):
             return int(value)
         except ValueError:
             raise self._damaged(f"the value {value!r}") from None
-
-    def _last_event(self) -> int:
-        return self._number("SELECT COALESCE(MAX(id), 0) FROM events")
 
     def _require_each(self, numbers: Iterable[int], after: int, last: int = 0) -> None:
         """StoreError unless each number follows the one before, from `after` on, to `last` at least."""

@@ -20,7 +20,7 @@ from mapserver.journal.rows import ALL, LAST, Selection
 from protocol.arrays import Table
 
 # Kernels run beside each other, what is Python between them does not. Not more are tried: docs/results/refold.md
-THREADS = min(2, os.cpu_count() or 1)
+THREADS = min(2, len(os.sched_getaffinity(0)))
 PIECE = 16_384  # samples
 AHEAD = 24  # pieces that are read ahead: about as many as are folded at once, while nothing is taken
 Samples = tuple[Table, NDArray[np.uint64]]  # and the hashes of their machines' names

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from mapserver.fleet.correction import UNCORRECTED, Corrections
 from mapserver.journal.facts import Facts
 from protocol.arrays import Bools, Ints, Table
 from protocol.machine.readings import MAX_STAMP_NS
-from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
+from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE, joined
 from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
 
@@ -68,6 +68,21 @@ class JournalRows:
     first_seqs: Ints
     received_ns: Ints
 
+    @classmethod
+    def joined(cls, rows: Sequence[JournalRow]) -> JournalRows:
+        """Rows in one table."""
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(row.machine for row in rows))}
+        return cls(
+            joined([row.rows for row in rows]),
+            np.array([len(row.rows) for row in rows], np.int64),
+            tuple(numbers),
+            np.array([numbers[row.machine] for row in rows], np.int64),
+            np.array([row.row for row in rows], np.int64),
+            np.array([row.spool_id for row in rows], np.uint64),
+            np.array([row.first_seq for row in rows], np.int64),
+            np.array([row.received_ns for row in rows], np.int64),
+        )
+
     def __len__(self) -> int:
         return len(self.numbers)
 
@@ -90,6 +105,30 @@ class JournalRows:
         columns = ("lengths", "machine", "numbers", "spool_ids", "first_seqs", "received_ns")
         samples = self.samples.view(RAW_SAMPLE)[np.repeat(rows, self.lengths)].view(SAMPLE_DTYPE)
         return replace(self, samples=samples, **{name: getattr(self, name)[rows] for name in columns})
+
+    def cut(self, kept: Bools, number: int) -> JournalRows:
+        """Those samples (n,) alone, rows numbered from `number` on; one is cut where a sample in it is not kept."""
+        if kept.all():
+            return replace(self, numbers=np.arange(number, number + len(self)))
+        begins = self.pieces(kept)
+        row, at = np.repeat(np.arange(len(self)), self.lengths), np.flatnonzero(begins)
+        owner, first = row[at], np.cumsum(self.lengths) - self.lengths
+        columns = {name: getattr(self, name)[owner] for name in ("machine", "spool_ids", "received_ns")}
+        return replace(
+            self,
+            samples=self.samples.view(RAW_SAMPLE)[kept].view(SAMPLE_DTYPE),
+            lengths=np.bincount(np.cumsum(begins)[kept] - 1, minlength=len(at)),
+            numbers=np.arange(number, number + len(at)),
+            first_seqs=self.first_seqs[owner] + at - first[owner],
+            **columns,
+        )
+
+    def pieces(self, kept: Bools) -> Bools:
+        """Which samples (n,) begin a row of what `cut` gives."""
+        starts: Bools = np.zeros(len(self.samples), np.bool_)
+        starts[np.cumsum(self.lengths) - self.lengths] = True
+        begins: Bools = kept & (starts | ~np.append(False, kept[:-1]))
+        return begins
 
     def first(self, n: int) -> JournalRows:
         """The first `n` rows alone."""

@@ -122,10 +122,12 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
     queries = _without(counters, _REFUSED_QUERY)
     batches = {k: v for k, v in _without(counters, _REFUSED).items() if not k.startswith("query_")}
     trimmed, past = counters.get("samples_trimmed", 0), info["checkpoints"]
+    answered = counters.get("queries_answered", 0)
     return [
         _counter("sitegrid_batches_total", "Batches with new samples that were taken.", counters.get("batches", 0)),
         _counter("sitegrid_batches_refused_total", "Batches that were refused.", batches, "reason"),
         _counter("sitegrid_queries_refused_total", "Map queries that were refused.", queries, "reason"),
+        _counter("sitegrid_queries_answered_total", "Map queries that were answered.", answered),
         _counter("sitegrid_samples_trimmed_total", "Samples that came in once more, and do not count.", trimmed),
         _gauge("sitegrid_journal_rows", "The last row of the journal on disk.", info["journalled"]),
         _gauge("sitegrid_merged_rows", "The last row of the journal that is in the map.", info["merged"]),

@@ -1,31 +1,26 @@
-"""Map queries and commands answered: pages come from the writer's thread, layers are derived here, outside it."""
+"""Map queries answered: pages come from whoever has the map, layers are derived here, on the asking thread."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.ingest.writer import Writer
-from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
-from mapserver.past.past import Past
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
+from mapserver.query.source import MapSource
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
 from mapserver.query.why import reasons
-from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
 from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
-from protocol.queries.calibration import CalibrationAnswer, encode_calibration
-from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, parse_command
+from protocol.queries.calibration import encode_calibration
 from protocol.queries.map_tiles import TilesAnswer, encode_tiles
 from protocol.queries.reasons import CellReasons, encode_why
 from protocol.queries.requests import (
@@ -47,13 +42,16 @@ WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 class Answers:
     """Answers the queries of one map, from any thread."""
 
-    def __init__(self, writer: Writer, upkeep: Upkeep, past: Past) -> None:
-        self._writer, self._upkeep = writer, upkeep
-        self._site, self._config = writer.site, writer.config
+    def __init__(self, source: MapSource) -> None:
+        self._source = source
+        self._site, self._config = source.site, source.config
         self._open = OpenRegions()
-        self._tiles = Tiles(writer)
+        self._tiles = Tiles(source)
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
-        self._past = PastMaps(writer.location, past, self._config)
+
+    @property
+    def _past(self) -> PastMaps:
+        return PastMaps(self._source.location, self._source.past, self._config)
 
     def size(self, query: MapQuery) -> int:
         """About how many bytes the answer has."""
@@ -63,16 +61,6 @@ class Answers:
             return SMALL_BYTES
         window, layers = self._site.geometry.window(query.bounds), len(query.layers or cell_layers.LAYERS)
         return min(PIECE_BYTES, 4 * window.columns * window.rows * layers + SMALL_BYTES)
-
-    def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
-        """Parse and carry out one command; QueryError says what is wrong with it."""
-        command = parse_command(name, parameters)
-        if isinstance(command, AcceptCommand):
-            self._writer.run(lambda store: store.accept(command.store, command.reason))
-            return codec.encode_info(self.info())
-        if isinstance(command, CalibrateCommand):
-            return encode_calibration(self.calibrate(command))
-        return codec.encode_machine(self.trust(command))
 
     def answer(self, query: MapQuery) -> bytes:
         """Answer one query; QueryError says what is wrong with it."""
@@ -90,26 +78,26 @@ class Answers:
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
             case _:
-                return self._of_server(query)
+                return self._of_process(query)
 
-    def _of_server(self, query: MapQuery) -> bytes:
+    def _of_process(self, query: MapQuery) -> bytes:
         """Answers that are not about cells."""
         match query:
             case requests.AliveQuery():
-                return codec.encode_alive(self._writer.alive())
+                return codec.encode_alive(self._source.alive())
             case requests.MachinesQuery():
-                return codec.encode_machines(self._upkeep.machines(), self._version())
+                return codec.encode_machines(self._source.machines(), self._version())
             case requests.CalibrationQuery():
-                return encode_calibration(self._upkeep.calibration())
+                return encode_calibration(self._source.calibration())
             case requests.ChangesQuery():
-                changes = self._upkeep.changes(query.after)[: codec.MAX_CHANGES]
+                changes = self._source.changes(query.after)[: codec.MAX_CHANGES]
                 return codec.encode_changes(changes, self._version())
         return codec.encode_info(self.info())
 
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
         names = {"layers": [*cell_layers.LAYERS, *AREA_LAYERS], "boundaries": list(self._config.read.boundaries)}
-        return {**self._writer.info(), "checkpoints": self._past.past.checkpoints.state, **names}
+        return {**self._source.info(), "checkpoints": self._source.past.checkpoints.state, **names}
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
@@ -136,59 +124,41 @@ class Answers:
     def history(self, query: HistoryQuery) -> HistoryAnswer:
         """Layers of the cell that a position lies in, span by span."""
         names = _of_cells(query.layers)
-        now_ns, facts = self._writer.run(lambda store: store.newest_ns), self._upkeep.facts()
+        now_ns, facts = self._source.run(lambda state: (state.newest_ns, state.facts))
         span_s = query.span_s or self._config.fold.bucket_s
         from_ns, to_ns = _time_of(query, now_ns, span_s)
         cell = self._cell(query.x_m, query.y_m)
-        selection = Selection.by(facts, from_ns, to_ns)
-        past, merged = self._past.history((cell.column, cell.row), selection, round(span_s * 1e9))
+        past, version = self._past.history((cell.column, cell.row), (from_ns, to_ns), round(span_s * 1e9), facts)
         x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
-        version = MapVersion(self._writer.store_id, merged, facts.number)
         return HistoryAnswer(x_m, y_m, self._spans(past, names), version, now_ns)
 
     def tiles(self, query: TilesQuery) -> TilesAnswer:
         """Tiles of the map as it is, or of all of it as of a time."""
         if query.as_of_ns is None:
             return self._tiles.answer(query)
-        fact = self._writer.run(lambda store: store.fact)
+        fact = self._source.run(lambda state: state.version.fact)
         kept = self._past_tiles
         if query.place is None or kept is None or (kept.stamp_ns, kept.version.fact) != (query.as_of_ns, fact):
             self._past_tiles = kept = self._tiles_as_of(query.as_of_ns)
         return cut(kept, query.place)
 
     def _tiles_as_of(self, as_of_ns: int) -> TilesAnswer:
-        bounds, version = self._writer.run(lambda store: (store.grid.bounds(), store.version))
+        bounds, version = self._source.run(lambda state: (state.grid.bounds(), state.version))
         if bounds is None:
             return TilesAnswer(version, as_of_ns, self._site.cell_m, whole=True, tiles=())
         west, south, east, north = bounds
         view = self._view(CellWindow(west, south, east - west, north - south), as_of_ns)
-        return tiles_of(view, MapVersion(version.store, view.merged, view.fact), self._site.cell_m, self._config)
+        return tiles_of(view, self._site.cell_m, self._config)
 
     def why(self, query: WhyQuery) -> CellReasons:
         """Everything that is known of the cell that a position lies in."""
         window = self._cell(query.x_m, query.y_m)
         view = self._view(window, query.as_of_ns)
-        excluded = self._upkeep.facts().excluded
-        names = self._writer.run(lambda store: [name for name in store.machines() if name not in excluded])
-        version = MapVersion(self._writer.store_id, view.merged, view.fact)
-        return reasons(view, version, (window.column, window.row), names, self._site.cell_m, self._config)
-
-    def trust(self, command: TrustCommand) -> dict[str, Any]:
-        """What is known of the machine once the command counts, and the version of the map that it counts in."""
-        row = self._upkeep.trust(command.machine, command.trusted, command.reason, command.wait_s)
-        version = self._version()
-        return {**row, "store": version.store, "merged": version.row, "fact": version.fact}
-
-    def calibrate(self, command: CalibrateCommand) -> CalibrationAnswer:
-        """What is known of all machines once the command counts."""
-        if command.machine:
-            self._upkeep.correct(command)
-        else:
-            self._upkeep.calibrate(command.wait_s)
-        return self._upkeep.calibration()
+        names = self._source.run(lambda state: [name for name in state.machines() if name not in state.facts.excluded])
+        return reasons(view, (window.column, window.row), names, self._site.cell_m, self._config)
 
     def _version(self) -> MapVersion:
-        return self._writer.run(lambda store: store.version)
+        return self._source.run(lambda state: state.version)
 
     def _cell(self, x_m: float, y_m: float) -> CellWindow:
         window = self._site.geometry.window(Bounds(x_m, y_m, np.nextafter(x_m, np.inf), np.nextafter(y_m, np.inf)))
@@ -225,14 +195,14 @@ class Answers:
             y_m=geometry.centres(window.row, window.rows),
             cell_m=self._site.cell_m,
             layers={name: cropped(layer, wide, window) for name, layer in areas.items()},
-            version=MapVersion(self._writer.store_id, view.merged, view.fact),
+            version=view.version,
             stamp_ns=view.stamp_ns,
         )
 
     def _view(self, window: CellWindow, as_of_ns: int | None) -> View:
         if as_of_ns is None:
-            return self._writer.run(lambda store: view_now(store, window))
-        return self._past.view(window, as_of_ns, self._upkeep.facts())
+            return self._source.run(lambda state: view_now(state, window))
+        return self._past.view(window, as_of_ns, self._source.run(lambda state: state.facts))
 
     def _spans(self, past: CellHistory, names: tuple[str, ...]) -> tuple[HistorySpan, ...]:
         values = cell_layers.read(past.evidence, names, self._config.read, past.last_ns[:, None])

@@ -10,18 +10,18 @@ import threading
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from weakref import ReferenceType, ref
 
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import Pages, around, valid_pages
 from mapserver.config import ServerConfig
-from mapserver.evidence.grid import chunks
+from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block, evidence
-from mapserver.ingest.store import Store
-from mapserver.ingest.writer import Writer
 from mapserver.layers import cell_layers
 from mapserver.query.region_pieces import PIECE_BYTES
+from mapserver.query.source import MapSource, MapState
 from mapserver.query.views import View
 from protocol.arrays import AnyArray, Ints
 from protocol.queries.answers import MapVersion
@@ -58,15 +58,16 @@ class _Square:
 class Tiles:
     """Tiles of the map as it is; for any thread. What it costs is for what changed since somebody last asked."""
 
-    def __init__(self, writer: Writer) -> None:
-        self._writer, self._config = writer, writer.config
-        self._cell_m = writer.site.cell_m
+    def __init__(self, source: MapSource) -> None:
+        self._source, self._config = source, source.config
+        self._cell_m = source.site.cell_m
         self._reach = reach_blocks(self._cell_m, self._config.change)
         self._lock = threading.Lock()
         self._squares: dict[Place, _Square] = {}
         self._tiles: dict[Place, MapTile] = {}
         self._holding: dict[Block, bytes] = {}  # the pages of blocks that hold, where not all do
-        self._turn, self._fact = -1, -1
+        self._turn, self._fact, self._row = -1, -1, 0
+        self._grid: ReferenceType[Grid] | None = None  # the last one; a fact may bring another one
 
     def answer(self, query: TilesQuery) -> TilesAnswer:
         """Tiles that differ since the version that the query names; all where it names none of this store."""
@@ -81,8 +82,9 @@ class Tiles:
 
     def _update(self) -> tuple[MapVersion, int]:
         """Make anew what evidence came into, and what lies so near that a change of the ground there counts for it."""
-        blocks, folded, pages, turn, version, stamp_ns = self._writer.run(self._folded)
-        whole = version.fact != self._fact
+        blocks, folded, pages, whole, version, stamp_ns = self._source.run(self._folded)
+        if version.row < self._row:  # rows are gone: what was said of them differs from no version
+            self._tiles = {}
         squares: dict[Place, _Square] = {} if whole else self._squares
         first = valid_pages(pages, self._cell_m, self._config.change)
         holding = {block: first[block].tobytes() if first[block].any() else b"" for block in blocks}
@@ -96,18 +98,20 @@ class Tiles:
             known = self._tiles.get(place)
             if known is None or (known.planes, known.newest_ns) != (tile.planes, tile.newest_ns):
                 self._tiles[place] = tile
-        self._squares, self._turn, self._fact = squares, turn, version.fact
+        self._squares, self._fact, self._row = squares, version.fact, version.row
         return version, stamp_ns
 
-    def _folded(self, store: Store) -> tuple[list[Block], set[Block], Pages, int, MapVersion, int]:
+    def _folded(self, state: MapState) -> tuple[list[Block], set[Block], Pages, bool, MapVersion, int]:
         """Blocks that may be others, those of them that evidence came into, and pages of all that lies around them."""
-        grid, whole = store.grid, store.fact != self._fact  # after a fact, the map may be another grid
-        folded, turn = grid.folded_since(-1 if whole else self._turn)
+        grid, known_grid = state.grid, self._grid and self._grid()
+        whole = state.version.fact != self._fact or grid is not known_grid
+        folded, self._turn = grid.folded_since(-1 if whole else self._turn)
+        self._grid = ref(grid)
         blocks = folded if whole else sorted({near for one in folded for near in around(one, self._reach)})
         wide = sorted({near for block in blocks for near in around(block, self._reach)})
         pages = {block: pages for block, pages in zip(wide, grid.pages(wide), strict=True) if pages}
         known = [block for block in blocks if block in pages]
-        return known, set(folded), pages, turn, store.version, store.newest_ns
+        return known, set(folded), pages, whole, state.version, state.newest_ns
 
 
 def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:
@@ -127,8 +131,9 @@ def _place(tile: MapTile) -> Place:
     return tile.x, tile.y
 
 
-def tiles_of(view: View, version: MapVersion, cell_m: float, config: ServerConfig) -> TilesAnswer:
+def tiles_of(view: View, cell_m: float, config: ServerConfig) -> TilesAnswer:
     """All tiles of a view."""
+    version = view.version
     squares: dict[Place, _Square] = {}
     fill(squares, view.pages, valid_pages(view.pages, cell_m, config.change), view.pages, config)
     tiles = tuple(square.tile(place, version.row, version.fact) for place, square in sorted(squares.items()))

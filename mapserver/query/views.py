@@ -13,7 +13,6 @@ from mapserver.change.validity import Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block, evidence
-from mapserver.ingest.store import Store
 from mapserver.journal.facts import Facts
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.location import JournalLocation
@@ -21,8 +20,10 @@ from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.past.cell_history import CellHistory, cell_history
 from mapserver.past.past import Past
+from mapserver.query.source import MapState
 from protocol.arrays import Floats32
 from protocol.errors import QueryError, Refusal, StoreError
+from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 
@@ -30,13 +31,12 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 class View:
     """Pages of a window's blocks and of those around them: a change is seen with its surroundings.
 
-    merged, fact: the journal row and the fact that they are true for. stamp_ns: the time that they are as of.
+    version: of the map that they are of. stamp_ns: the time that they are as of.
     """
 
     pages: Pages
-    merged: int
+    version: MapVersion
     stamp_ns: int
-    fact: int = 0
 
     def around(self, window: CellWindow, reach: int) -> View:
         """Only what a part of the window is read from."""
@@ -60,33 +60,35 @@ class PastMaps:
     def view(self, window: CellWindow, stamp_ns: int, facts: Facts) -> View:
         """The map from samples stamped so or earlier; journal rows that are committed meanwhile may be in it."""
         reach = reach_blocks(self.past.cell_m, self.config.change)
-        with self._reader() as (reader, last_row):
+        with self._reader(facts) as (reader, version):
             grid = self.past.grid_as_of(reader, stamp_ns, _surroundings(window, reach), facts)
-        return View(_pages(grid, window, reach), last_row, stamp_ns, facts.number)
+        return View(_pages(grid, window, reach), version, stamp_ns)
 
-    def history(self, cell: tuple[int, int], selection: Selection, span_ns: int) -> tuple[CellHistory, int]:
-        """Evidence of a cell (column, row) span by span, and the journal row that it is true for."""
-        with self._reader() as (reader, last_row):
-            return cell_history(self.past, reader, cell, span_ns, selection), last_row
+    def history(
+        self, cell: tuple[int, int], times: tuple[int, int], span_ns: int, facts: Facts
+    ) -> tuple[CellHistory, MapVersion]:
+        """Evidence of a cell (column, row) from the first to the last of the times [ns], span by span."""
+        with self._reader(facts) as (reader, version):
+            return cell_history(self.past, reader, cell, span_ns, Selection.by(facts, *times)), version
 
     @contextmanager
-    def _reader(self) -> Iterator[tuple[JournalReader, int]]:
+    def _reader(self, facts: Facts) -> Iterator[tuple[JournalReader, MapVersion]]:
         try:
             with self.journal.reader() as reader:
-                yield reader, reader.last_row
+                yield reader, MapVersion(reader.identity().id, reader.last_row, facts.number)
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None
 
 
-def view_now(store: Store, window: CellWindow) -> View:
-    """The map as it is; on the thread that owns the store."""
-    reach = reach_blocks(store.site.cell_m, store.config.change)
-    return View(_pages(store.grid, window, reach), store.merged, store.newest_ns, store.fact)
+def view_now(state: MapState, window: CellWindow) -> View:
+    """The map as it is, on the thread that has it."""
+    reach = reach_blocks(state.site.cell_m, state.config.change)
+    return View(_pages(state.grid, window, reach), state.version, state.newest_ns)
 
 
 def view_of(grid: Grid, window: CellWindow, config: ServerConfig) -> View:
     """The map that a grid makes, without a journal."""
-    return View(_pages(grid, window, reach_blocks(grid.cell_m, config.change)), 0, grid.newest_ns)
+    return View(_pages(grid, window, reach_blocks(grid.cell_m, config.change)), MapVersion("", 0, 0), grid.newest_ns)
 
 
 def read_cells(

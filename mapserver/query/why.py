@@ -16,7 +16,6 @@ from mapserver.evidence.timeline import evidence
 from mapserver.layers import cell_layers
 from mapserver.query.views import View
 from protocol.arrays import AnyArray
-from protocol.queries.answers import MapVersion
 from protocol.queries.reasons import CellReasons, Votes
 from protocol.site.geometry import BLOCK_CELLS
 
@@ -27,7 +26,7 @@ MACHINE_SHIFT = 58  # the top six bits of a name's hash choose its bit
 
 
 def reasons(
-    view: View, version: MapVersion, cell: tuple[int, int], names: Iterable[str], cell_m: float, config: ServerConfig
+    view: View, cell: tuple[int, int], names: Iterable[str], cell_m: float, config: ServerConfig
 ) -> CellReasons:
     """What is known of one cell (column, row).
 
@@ -43,9 +42,9 @@ def reasons(
     before = dataclasses.replace(everything, counts=everything.counts - holds.counts)
     bits = int(holds.bitmaps[0, 0, ev.MACHINES])
     return CellReasons(
-        store=version.store,
-        merged=version.row,
-        fact=version.fact,
+        store=view.version.store,
+        merged=view.version.row,
+        fact=view.version.fact,
         stamp_ns=view.stamp_ns,
         x_m=(cell[0] + 0.5) * cell_m,
         y_m=(cell[1] + 0.5) * cell_m,

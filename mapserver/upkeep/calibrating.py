@@ -23,10 +23,12 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal.rows import JournalRows, Selection
 from mapserver.past.past import Past
 from mapserver.past.plan import DAY_NS
+from mapserver.upkeep.site_clock import SiteClock
 from protocol.errors import StoreError
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 
-DAYS = 2  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
+SPAN_NS = 2 * DAY_NS  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
+AHEAD_NS = 600 * 10**9  # of the site's now: machines' clocks, and what is on its way, differ by less
 EVERY_NS = 60 * 10**9  # of site time, between two solves: a fifth of an epoch
 REST = 50.0  # times as long as a solve took: 2 % of a core, also where a log is replayed
 TURN_SAMPLES = 200_000  # read in one turn, in about 0.2 s
@@ -38,8 +40,8 @@ log = logging.getLogger("mapserver.upkeep.calibrating")
 class Calibrating:
     """Ledgers of all machines, and what they come to. solved: the last solve, and the site's now then [ns].
 
-    decide: is given each solve and the site's now [ns]. doubtful: machines that are to have no say now. earlier: the
-    newest corrections that the solver decided.
+    decide: is given each solve and the site's now [ns]. doubtful: machines that are to have no say now. shown: the last
+    corrections whose scale evidence showed.
     """
 
     name = "calibration"
@@ -50,21 +52,22 @@ class Calibrating:
         past: Past,
         decide: Decide,
         doubtful: Callable[[], frozenset[str]],
-        earlier: Callable[[], Iterable[Correction]],
+        shown: Callable[[], Iterable[Correction]],
         ending: threading.Event,
     ) -> None:
         self.solved: tuple[Calibration, int] = calibrate({}), 0
         self._writer, self._past, self._decide, self._doubtful, self._ending = writer, past, decide, doubtful, ending
-        self._earlier = earlier
+        self._shown = shown
         self._reader = writer.location.reader()
+        self._clock = SiteClock()
         self._ledgers: dict[str, Ledger] = {}
-        self._begins_ns: dict[str, int] = {}  # by machine, from when on there may be samples of it
+        # By machine, from when on there may be samples of it: of one that was here before, not all are read.
+        self._begins_ns = dict.fromkeys((machine for machine, _ in self._reader.watermarks()), 0)
         self._followed = 0
         self._passed_over = 0  # rows that could not be read, at the next attempt
         self._parts: dict[Group, Calibration] = {}  # the last solve of each group
         self._next = -1  # of the groups
         self._from_ns: int | None = None  # of samples that are read: until it has caught up, those of the last days
-        self._solved_ns = self._now_ns()  # or the start: what was known by then is decided already
         self._due_s = 0.0
         self._turn = threading.Lock()  # of all that is used here: `solve` is for any thread
 
@@ -77,10 +80,9 @@ class Calibrating:
         with self._turn:
             if not self._follow(TURN_SAMPLES) or time.monotonic() < self._due_s:
                 return
-            now_ns = self._now_ns()
-            if self._solved_ns <= now_ns < self._solved_ns + EVERY_NS:
+            if self._clock.passed_ns(self._doubtful()) < EVERY_NS:
                 return
-            together = groups(self._ledgers)
+            now_ns, together = self._begun()
             self._next = (self._next + 1) % len(together)
             solved = self._solve(together[self._next], together, now_ns)
             if self._writer.config.calibration.automatic and not self._ending.is_set():
@@ -91,8 +93,7 @@ class Calibrating:
         with self._turn:
             while not self._follow(TURN_SAMPLES) and not self._ending.is_set():
                 pass
-            now_ns = self._now_ns()
-            together = groups(self._ledgers)
+            now_ns, together = self._begun()
             for some in together:
                 if not self._ending.is_set():
                     self._solve(some, together, now_ns)
@@ -103,15 +104,23 @@ class Calibrating:
         if self._turn.acquire(timeout=wait_s):
             self._reader.close()  # and keep the turn: nothing runs any more
 
-    def _now_ns(self) -> int:
-        return self._writer.run(lambda store: store.newest_ns)
+    def _begun(self) -> tuple[int, list[Group]]:
+        """The site's now, and all groups of machines, without those that left: as after a start."""
+        now_ns = self._clock.now_ns(self._doubtful())
+        self._clock.mark()
+        self._ledgers = {name: own for name, own in self._ledgers.items() if own.newest_ns >= now_ns - SPAN_NS}
+        self._share_room()
+        return now_ns, groups(self._ledgers)
 
     def _solve(self, names: Group, together: Sequence[Group], now_ns: int) -> Calibration:
         """Solve one group of machines; what it says. together: all groups."""
-        began_s, self._solved_ns = time.thread_time(), now_ns
+        began_s = time.thread_time()
         try:
-            stays = {name: self._ledgers[name].stays() for name in names}
-            remembered = remembered_of(self._earlier())
+            stays = {}
+            for name in names:
+                self._ledgers[name].until_ns = now_ns + AHEAD_NS
+                stays[name] = self._ledgers[name].stays(now_ns - SPAN_NS)
+            remembered = remembered_of(self._shown())
             solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground, remembered)
             solved = replace(solved, begins_ns={name: self._begins_ns[name] for name in names})
             self._parts = {some: part for some, part in self._parts.items() if some in together} | {names: solved}
@@ -130,7 +139,7 @@ class Calibrating:
         makes corrections less sure, not wrong.
         """
         if self._from_ns is None:
-            self._from_ns = max(0, self._now_ns() - DAYS * DAY_NS)
+            self._from_ns = max(0, self._writer.run(lambda store: store.newest_ns) - SPAN_NS)
         until, taken = self._reader.last_row, 0
         self._followed = min(self._followed + self._passed_over, until)
         try:
@@ -153,21 +162,29 @@ class Calibrating:
     def _add(self, rows: JournalRows) -> None:
         machine = np.repeat(rows.machine, rows.lengths)
         machine[~is_foldable(rows.samples, self._past.config)] = -1
-        for index, name in enumerate(rows.machines):
-            own = rows.samples.view(RAW_SAMPLE)[machine == index].view(SAMPLE_DTYPE)
-            if not len(own):
-                continue
+        parts = {
+            name: rows.samples.view(RAW_SAMPLE)[machine == index].view(SAMPLE_DTYPE)
+            for index, name in enumerate(rows.machines)
+        }
+        parts = {name: own for name, own in parts.items() if len(own)}
+        for name, own in parts.items():
+            first_ns = int(own["stamp_ns"].min())
+            self._begins_ns[name] = min(first_ns, self._begins_ns.get(name, first_ns))
+            self._clock.add(name, first_ns, int(own["stamp_ns"][-1]))
+        until_ns = self._clock.now_ns(self._doubtful()) + AHEAD_NS
+        for name, own in parts.items():
             if name not in self._ledgers:
                 self._ledgers[name] = Ledger()
                 self._share_room()
-            first_ns = 0 if self._from_ns else int(own["stamp_ns"].min())  # what was before the last days is not read
-            self._begins_ns[name] = min(first_ns, self._begins_ns.get(name, first_ns))
+            self._ledgers[name].until_ns = until_ns
             self._ledgers[name].add(own)
+        if self._from_ns:  # what was known before the start is decided already
+            self._clock.mark()
 
     def _share_room(self) -> None:
         """Have each ledger remember what a solve of so many machines takes, and no more."""
         epochs = epochs_of_each(len(self._ledgers))
+        if any(ledger.epochs != epochs for ledger in self._ledgers.values()):
+            log.info("calibration machines=%d epochs=%d: so many of each are remembered", len(self._ledgers), epochs)
         for ledger in self._ledgers.values():
-            if epochs < ledger.epochs:
-                ledger.epochs = epochs
-                log.info("calibration machines=%d epochs=%d: a solve takes no more", len(self._ledgers), epochs)
+            ledger.epochs = epochs

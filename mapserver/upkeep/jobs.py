@@ -138,7 +138,10 @@ class ChangeSearch:
 
 
 class Archiving:
-    """Moves journal rows that are old enough into hourly Parquet files, and keeps decisions beside these."""
+    """Moves journal rows that are old enough into hourly Parquet files, and keeps decisions beside these.
+
+    Those of a shared journal stay where all servers find them: files in the folder of one would be gone with its host.
+    """
 
     name = "archiving"
 
@@ -150,7 +153,7 @@ class Archiving:
     def run(self) -> None:
         """Move the next hour of old rows, where it is time: an hour a turn, so that the end need not wait."""
         after_h = self._writer.config.store.archive_after_h
-        if not after_h or time.monotonic() < self._due_s:
+        if not after_h or self._writer.location.is_shared or time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + LOOK_S
         now_ns, folder = self._writer.now_ns(), self._writer.location.archive.folder

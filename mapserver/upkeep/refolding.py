@@ -1,9 +1,7 @@
 """Decisions about machines: kept with the journal, then the map is folded again with the facts that they come to.
 
-The grid belongs to the writer's thread. So a map with other facts is folded on a thread of its own, in rounds, each
-with what came in during the one before; the writer folds what the last round left, a few rows, and goes on with it.
-It begins with the newest checkpoint whose evidence the new facts leave as it is, which is recent where they are about
-recent samples alone, and else with nothing.
+The grid belongs to the writer's thread. So a map with other facts is folded on a thread of its own (`fold_anew`); the
+writer folds what that left, a few rows, and goes on with it.
 """
 
 from __future__ import annotations
@@ -22,17 +20,14 @@ from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
-from mapserver.journal.history import History
 from mapserver.journal.journal import UnwrittenError
-from mapserver.journal.refold import fold_history, fold_samples, release_memory
-from mapserver.journal.rows import LAST, Selection
+from mapserver.journal.refold import release_memory
+from mapserver.past.anew import fold_anew
 from mapserver.past.past import Past
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
 
-FEW_ROWS = 8  # may be left to the writer's thread: some ms
-MOST_ROUNDS = 20  # where batches come in as fast as they are folded, the writer has to make them wait
 RETRY_S, MOST_RETRY_S = 1.0, 60.0  # after rows that could not be read; doubled, as a fold up to them may take minutes
 T = TypeVar("T")
 log = logging.getLogger("mapserver.upkeep.refolding")
@@ -78,6 +73,11 @@ class Refolding:
         with self._changed:
             return self._decisions.calibration.of_solver()
 
+    def shown(self) -> list[Correction]:
+        """The last of each machine whose scale evidence showed."""
+        with self._changed:
+            return self._decisions.calibration.shown()
+
     def calibration(self, machine: str) -> CalibrationDecision | None:
         """The newest decision about the calibration of a machine that counts."""
         with self._changed:
@@ -94,7 +94,7 @@ class Refolding:
     def calibrate(self, solved: Calibration, stamp_ns: int, *, asked: bool = False) -> int:
         """Decide what the solver may decide, or all that it would where a person asks; returns a number to wait for.
 
-        While the map does not follow what is decided, the solver waits: folds of a large site take longer than it.
+        While the map does not follow what is decided, what the solver wants waits: folds of a large site take longer.
         Raises QueryError as `decide` does; the solver then decides the same the next time.
         """
         return self._write(lambda store: self._calibrate(store, solved, stamp_ns, asked=asked))
@@ -144,7 +144,7 @@ class Refolding:
         with self._changed:
             decisions = self._decisions.calibration.judge(solved, stamp_ns, asked=asked)
             waits = not asked and self._folded < self._decided
-            store.confirm(self._decisions.calibration.confirmed, stamp_ns)
+            store.confirm(self._decisions.calibration.confirmed)
         return self._keep(store, () if waits else decisions)
 
     def _keep(self, store: Store, decisions: Sequence[Decision]) -> int:
@@ -202,36 +202,21 @@ class Refolding:
         if facts == self.facts():
             return True
         began_s = time.monotonic()
-        history, selection, rounds = History(self._reader, self._past.archive), Selection.by(facts), 0
-        begun = self._begun(facts)
-        if begun is None:
+        folded = fold_anew(self._past, self._reader, facts, lambda: self._superseded(facts))
+        if folded is None:
             return False
-        grid, row = begun
-        while (last := self._reader.last_row) - row > FEW_ROWS and rounds < MOST_ROUNDS:
-            if not fold_history(grid, history, row, last, selection, lambda: self._superseded(facts)):
-                return False
-            row, rounds = last, rounds + 1
         replaced: list[Grid] = []
 
         def adopt(store: Store) -> None:
             replaced.append(store.grid)
-            store.adopt(grid, row, facts)
+            store.adopt(folded.grid, folded.row, facts)
 
         self._writer.run(adopt)
         replaced.clear()  # here: to let go of a grid takes time that the writer's thread does not have
         release_memory()
-        values = (facts.number, ",".join(sorted(facts.excluded)), rounds, time.monotonic() - began_s)
+        values = (facts.number, ",".join(sorted(facts.excluded)), folded.rounds, time.monotonic() - began_s)
         log.warning("map folded again fact=%d without=%s rounds=%d seconds=%.1f", *values)
         return True
-
-    def _begun(self, facts: Facts) -> tuple[Grid, int] | None:
-        """The map up to a journal row that a checkpoint makes quick, or an empty one; None where it is not wanted."""
-        last = self._reader.last_row
-        grid, base = self._past.nearest(self._reader, LAST, None, facts)
-        if base is None:
-            return grid, 0
-        samples = self._past.lacking(self._reader, base, Selection.by(facts), last)
-        return (grid, last) if fold_samples(grid, samples, lambda: self._superseded(facts)) else None
 
     def _superseded(self, facts: Facts) -> bool:
         """Whether a fold is to be given up, since other facts are wanted meanwhile.

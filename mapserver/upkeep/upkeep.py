@@ -11,7 +11,6 @@ from typing import Any
 from mapserver.fleet.correction import Corrections
 from mapserver.fleet.machine_state import MachineState, state_of
 from mapserver.ingest.writer import Writer
-from mapserver.journal.facts import Facts
 from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
 from mapserver.upkeep.calibrating import Calibrating
@@ -44,8 +43,8 @@ class Upkeep:
         self._ending = threading.Event()
         self._refolding = Refolding(writer, past)
         refolding = self._refolding
-        earlier = refolding.solver_corrections
-        self._calibrating = Calibrating(writer, past, refolding.calibrate, self._doubtful, earlier, self._ending)
+        decide, shown = refolding.calibrate, refolding.shown
+        self._calibrating = Calibrating(writer, past, decide, self._doubtful, shown, self._ending)
         self._audit = Audit(writer, reader, self._refolding.judge, self._known, self._ending)
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
@@ -59,10 +58,6 @@ class Upkeep:
         ]
         for thread in self._threads:
             thread.start()
-
-    def facts(self) -> Facts:
-        """What the map is folded with."""
-        return self._refolding.facts()
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with a number beyond `after`."""

@@ -168,18 +168,21 @@ class MapInfo:
     """State of the map and its server.
 
     store: its id; descends: ids of the stores that it was folded from; accepted: ids of those whose place a person let
-    it take; fact: see MapVersion; decided: number of the last decision about a machine that there is: the map is folded
-    again for it where it is beyond `fact`; corrections: how many stretches of samples have one. journalled, merged,
-    snapshot: journal rows. bounds: first column, first row, end column and end row of the blocks with evidence; None
-    without any. first_ns, stamp_ns: the map's oldest stamp, and the site's now; 0 without any. wall_ns: the server's
-    clock. distrusted: machines whose samples are excluded. boundaries: of the classes of resistance. shortfalls: what
-    the journal lacked of what was acknowledged, one line for each start that noticed.
+    it take; epoch: number of its server among all that ever wrote it; replica: what stands behind its disk:
+    "synchronous", "asynchronous" or "none". fact: see MapVersion; decided: number of the last decision about a machine
+    that there is: the map is folded again for it where it is beyond `fact`; corrections: how many stretches of samples
+    have one. journalled, merged, snapshot: journal rows. bounds: first column, first row, end column and end row of the
+    blocks with evidence; None without any. first_ns, stamp_ns: the map's oldest stamp, and the site's now; 0 without
+    any. wall_ns: the server's clock. distrusted: machines whose samples are excluded. boundaries: of the classes of
+    resistance. shortfalls: what the journal lacked of what was acknowledged, one line for each start that noticed.
     """
 
     site: SiteInfo
     store: str
     descends: tuple[str, ...]
     accepted: tuple[str, ...]
+    epoch: int
+    replica: str
     fact: int
     decided: int
     corrections: int
@@ -215,6 +218,24 @@ class ServerAlive:
     journalled: int
     merged: int
     busy_s: float
+
+
+@dataclass(frozen=True)
+class FollowerState:
+    """A follower that answers. store, merged: see MapVersion; journalled: the last row of the journal, as it knows.
+
+    behind_rows: rows that its map lacks. behind_s: its map had all that was in the journal so long ago, or later.
+    """
+
+    name: str
+    store: str
+    journalled: int
+    merged: int
+    behind_rows: int
+    behind_s: float
+
+    def __str__(self) -> str:
+        return f"{self.name}: journal row {self.merged}, {self.behind_rows} rows and {self.behind_s:.1f} s behind"
 
 
 @dataclass(frozen=True)

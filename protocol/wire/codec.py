@@ -185,6 +185,7 @@ def encode_reply(reply: Ack | Refused) -> bytes:
     if isinstance(reply, Ack):
         table = {"ack": True, "watermark": reply.watermark, "row": reply.row, "trimmed": reply.trimmed}
         table |= {"store": reply.store} | ({"replaces": reply.replaces} if reply.replaces else {})
+        table |= {"epoch": reply.epoch} if reply.epoch else {}
         return pack(table | ({"offer": reply.offer} if reply.offer else {}))
     table = {"ack": False, "reason": reply.reason, "problem": reply.problem, "expected": reply.expected}
     return pack(table | ({"retry_after_s": reply.retry_after_s} if reply.retry_after_s else {}))
@@ -196,7 +197,8 @@ def decode_reply(data: bytes) -> Ack | Refused:
     if take(table, "ack", bool):
         watermark, row, trimmed = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
         replaces = take_store(table, "replaces", optional=True)
-        return Ack(watermark, row, trimmed, take_store(table), replaces, table.get("offer"))
+        epoch = _take_int(table, "epoch", 0, MAX_SEQ) if "epoch" in table else 0
+        return Ack(watermark, row, trimmed, take_store(table), replaces, table.get("offer"), epoch)
     expected, retry_after_s = _take_int(table, "expected", 0, MAX_SEQ), take(table, "retry_after_s", float, 0.0)
     if not 0 <= retry_after_s <= MAX_RETRY_S:
         problem = f"{retry_after_s} is not between 0 and {MAX_RETRY_S}"

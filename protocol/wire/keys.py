@@ -98,6 +98,49 @@ def writer(site: str) -> str:
     return f"{ROOT}/{check_name(site, 'site')}/writer"
 
 
+def follower_query(site: str, follower: str, query: str) -> str:
+    """A map query to one follower, which nobody else answers."""
+    return f"{_follower(site, follower)}/{check_name(query, 'query')}"
+
+
+def follower_queries(site: str, follower: str) -> str:
+    """All that one follower is asked."""
+    return f"{_follower(site, follower)}/*"
+
+
+def follower_queries_all(site: str) -> str:
+    """All that any follower is asked."""
+    return f"{ROOT}/{check_name(site, 'site')}/follower/*/*"
+
+
+def follower_alive(site: str, follower: str) -> str:
+    """Liveliness token of one follower: it is there while the follower answers."""
+    return f"{_follower(site, follower)}/alive"
+
+
+def followers_alive_all(site: str) -> str:
+    """Liveliness tokens of every follower."""
+    return f"{ROOT}/{check_name(site, 'site')}/follower/*/alive"
+
+
+def follower_owner(site: str, follower: str) -> str:
+    """Which process has the name of a follower: a query that followers of one name ask each other."""
+    return _follower(site, follower)
+
+
+def follower_of(key: str) -> str:
+    """Name of the follower in a key; a ConfigError where there is none."""
+    parts = key.split("/")
+    if len(parts) == 5 and parts[0] == ROOT and parts[2] == "follower":
+        return check_name(parts[3], f"key {key}")
+    raise ConfigError(f"key {key}", "names no follower")
+
+
+def journal(site: str) -> str:
+    """The rows of a site's journal: a query that the map server answers, piece by piece."""
+    return f"{ROOT}/{check_name(site, 'site')}/journal"
+
+
 def machine_of(key: str) -> str:
     """Name of the machine in a key of `ingest/` or `machine/`; a ConfigError where there is none."""
     parts = key.split("/")
@@ -113,3 +156,7 @@ def query_of(key: str) -> str:
 
 def _machine(site: str, machine: str, leaf: str) -> str:
     return f"{ROOT}/{check_name(site, 'site')}/machine/{check_name(machine, 'machine')}/{leaf}"
+
+
+def _follower(site: str, follower: str) -> str:
+    return f"{ROOT}/{check_name(site, 'site')}/follower/{check_name(follower, 'follower')}"

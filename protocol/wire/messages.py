@@ -66,7 +66,8 @@ class Ack:
 
     row: the journal row; trimmed: samples it had already. store: id of the server's store; replaces: that of the batch,
     where it is another one, whose place this store takes. offer: a table of `CalibrationOffer`, or None; it is not
-    checked with the acknowledgement, which holds whatever is offered.
+    checked with the acknowledgement, which holds whatever is offered. epoch: number of the server among all that ever
+    wrote the store, 0 where it has none; of two acknowledgements that contradict each other, the higher one counts.
     """
 
     watermark: int
@@ -75,6 +76,7 @@ class Ack:
     store: str = ""
     replaces: str = ""
     offer: Any = None
+    epoch: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True)

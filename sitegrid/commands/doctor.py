@@ -22,6 +22,7 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--machine", help="name of the machine (default: that of the keys)")
     parser.add_argument("--spool", type=Path, help="file of an agent's spool")
     parser.add_argument("--store", type=Path, help="folder of a map server's store")
+    parser.add_argument("--journal", metavar="URL", default="", help="PostgreSQL database with that server's journal")
 
 
 def run(arguments: Namespace) -> int:

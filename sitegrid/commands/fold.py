@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import Any
 
 from sitegrid.options.outputs import FOLDER
 from sitegrid.options.times import STAMP_HELP, parse_stamp
-from sitegrid.options.values import positive
+from sitegrid.options.values import count, positive
 
 HELP = "build a new store from archives, with other parameters"
 EXTRA = "server"
@@ -16,7 +17,8 @@ EXTRA = "server"
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add = parser.add_argument
-    add("archives", type=Path, nargs="+", metavar="ARCHIVE", help="a Parquet file, a folder of them, or a store")
+    what = "a Parquet file, a folder of them, or a store; also at any address that fsspec reaches (s3://...)"
+    add("archives", type=archive_place, nargs="+", metavar="ARCHIVE", help=what)
     add("--out", type=FOLDER, required=True, metavar="STORE", help="folder of the new store")
     add("--site-file", type=Path, help="site file, if the archives hold no site (site.toml)")
     add("--cell", type=positive, metavar="M", help="edge of a cell in metres (default: that of the site)")
@@ -25,10 +27,19 @@ def add_options(parser: ArgumentParser) -> None:
     for name, what in (("from", "at or after T"), ("until", "before T")):
         summary = f"only samples with a stamp {what}; T: {STAMP_HELP}"
         add(f"--{name}", type=parse_stamp, dest=f"{name}_ns", metavar="T", help=summary)
+    add("--jobs", type=count, default=1, metavar="N", help="fold in N processes (1: this one, on two threads)")
+    add("--engine", metavar="ADDRESS", help="fold on a Dask cluster: dask://HOST:PORT of its scheduler")
+
+
+def archive_place(word: str) -> Any:
+    """Parse a path or an address; what that takes is imported for this command alone."""
+    from mapserver.journal.places import place
+
+    return place(word)
 
 
 def run(arguments: Namespace) -> int:
     """Fold once and print what became of the samples."""
-    from sitegrid.refold import run as refold
+    from sitegrid.refold.command import run as refold
 
     return refold(arguments)

@@ -58,6 +58,7 @@ def add_options(parser: ArgumentParser) -> None:
     changes = _add_query(queries, _changes, "list of ground changes: place and time")
     changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
     _add_query(queries, _info, "state of the map and its server")
+    _add_query(queries, _followers, "followers that answer, and how far behind they are")
     _add_query(queries, _alive, "whether the map server takes batches: for probes")
 
 
@@ -247,6 +248,11 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
         ),
         *(f"  {name}: {count}" for name, count in sorted(info.counters.items())),
     ]
+
+
+def _followers(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:
+    followers = client.followers()
+    return followers, [*map(str, followers)] or ["no follower answers"]
 
 
 def _alive(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:

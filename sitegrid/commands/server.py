@@ -19,7 +19,7 @@ from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
 from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import address
-from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
+from sitegrid.process.lifetime import return_large_blocks, say, stop_flag, tell
 from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
 
@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 
 HELP = "run the map server of a site"
 EXTRA = "server"
+FENCED = 3  # exit code of a server that another one took over from
+
+
+class _StoppedError(Exception):
+    """A signal came while another server was waited for."""
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -37,6 +42,10 @@ def add_options(parser: ArgumentParser) -> None:
     add_network(parser)
     add("--site-file", type=Path, required=True, help="site file: name, origin, cells (config/site.toml)")
     add("--store", type=FOLDER, required=True, help="folder with journal, archive and snapshots")
+    database = (
+        "PostgreSQL database with the journal, postgresql://...: --store is a cache then, and further servers wait"
+    )
+    add("--journal", metavar="URL", default="", help=database)
     add("--config", type=Path, help="file with options (config/server.toml)")
     add("--signed", type=Path, metavar="KEYS", help="accept only signed batches; KEYS is the folder with the register")
     over = "have another map server of the site end, and take its place; without this, it stays, and this one ends"
@@ -63,11 +72,24 @@ def run(arguments: Namespace) -> int:
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
         ingest = opened.enter_context(closing(open_session(joined)))
         readers = opened.enter_context(closing(open_session(joined)))
-        location = JournalLocation(arguments.store)
+        location = JournalLocation(arguments.store, arguments.journal)
         check, take_over = _verifier(arguments.signed), arguments.take_over
         key = signer(arguments.keys)
         sign = key.sign_reply if key else None
-        server = Server(ingest, readers, location, site, config, time.time_ns, check, sign=sign, take_over=take_over)
+        said: list[str] = []
+
+        def standing_by(warm: bool) -> None:  # noqa: FBT001
+            if warm and not said:
+                said.append("standby")
+                say({"standby": "server", "site": site.name, "store": str(arguments.store)})
+            if stop.is_set():
+                raise _StoppedError
+
+        more = {"sign": sign, "take_over": take_over, "standing_by": standing_by}
+        try:
+            server = Server(ingest, readers, location, site, config, time.time_ns, check, **more)
+        except _StoppedError:
+            return 0
         opened.callback(server.close)
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:
@@ -78,6 +100,9 @@ def run(arguments: Namespace) -> int:
                 break
             if server.ended:
                 raise LinkError(arguments.endpoint, f"{server.ended}; this one ends")
+            if server.fenced:
+                tell(f"sitegrid server: {location}: {server.fenced}; this one ends")
+                return FENCED
     return 1 if server.failed else 0
 
 

@@ -156,27 +156,32 @@ class StoreState:
     checkpoints: int = 0
     checkpoint_bytes: int = 0
     damaged_checkpoints: int = 0
+    replica: str = ""  # of a journal in PostgreSQL
 
 
-def read_store(folder: Path, now_s: float) -> StoreState:
-    """The state of a store, also while a server uses it; StoreError where it cannot be used."""
+def read_store(folder: Path, now_s: float, url: str = "") -> StoreState:
+    """The state of a store, also while a server uses it; StoreError where it cannot be used.
+
+    url: of its journal in PostgreSQL.
+    """
     # imported here: needs the `server` extra, which a machine's host does not have
     from mapserver.evidence import snapshot
     from mapserver.ingest.losses import lacking
     from mapserver.journal import shortfall as short
-    from mapserver.journal.location import JOURNAL_FILE, SCHEMA, JournalLocation
+    from mapserver.journal.location import JOURNAL_FILE, JournalLocation
     from mapserver.past.checkpoints import Checkpoints
 
-    location = JournalLocation(folder)
+    location = JournalLocation(folder, url)
     if not location.exists():
-        raise StoreError(folder, f"holds no {JOURNAL_FILE}; a server makes it when it starts")
+        what = "tables of a journal" if url else JOURNAL_FILE
+        raise StoreError(location if url else folder, f"holds no {what}; a server makes it when it starts")
     lacks = lacking(location)
     with location.reader() as journal:
         journal.check()
         last_row, archived = journal.last_row, journal.archived_row
         watermarks, events = journal.watermarks(), journal.events()
         machines = {machine for machine, _ in watermarks}
-        site, frame = journal.site, journal.frame
+        site, frame, schema, replica = journal.site, journal.frame, journal.schema, journal.replica
     known = [short.Shortfall.from_event(event) for event in events if event.kind == short.KIND]
     missing = short.missing(known, watermarks)
     newest = next(iter(snapshot.rows_on_disk(folder)), 0)
@@ -184,8 +189,9 @@ def read_store(folder: Path, now_s: float) -> StoreState:
     text = str(lacks) if lacks else ""
     past = Checkpoints(folder).entries(lambda _: {}, last_row)
     sizes, damaged = sum(entry.bytes for entry in past), sum(entry.header is None for entry in past)
-    rows = (SCHEMA, last_row, archived, len(machines), newest, age_s)
-    return StoreState(site, frame, *rows, text, missing, len(past) - damaged, sizes, damaged)
+    rows = (schema, last_row, archived, len(machines), newest, age_s)
+    behind = replica if url else ""
+    return StoreState(site, frame, *rows, text, missing, len(past) - damaged, sizes, damaged, behind)
 
 
 def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
@@ -197,6 +203,7 @@ def check_store(state: StoreState, site: SiteConfig | None) -> Finding:
     if state.damaged_checkpoints:
         checkpoints += f"; {state.damaged_checkpoints} damaged, the server makes them again"
     message = f"site {state.site}, schema {state.schema}: {rows}; {snapshot or 'no snapshot'}; {checkpoints}"
+    message += f"; in PostgreSQL, replica: {state.replica}" if state.replica else ""
     if site and (site.name, site.frame) != (state.site, state.frame):
         problem = f"it is of site {state.site} with frame {state.frame}, the site file {site.name} with {site.frame}"
         return Finding(Level.FAIL, "store", problem, "choose another --store, or the site file that belongs to it")

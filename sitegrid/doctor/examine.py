@@ -17,6 +17,7 @@ from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials
+from sitegrid.asking import Asker
 from sitegrid.doctor import Finding, Level, base, disk, network, skipped
 from sitegrid.doctor.keys import check_certificate, read_certificate
 from sitegrid.doctor.positions import check_positions
@@ -24,7 +25,8 @@ from sitegrid.security.join import join
 
 ANYBODY = "doctor"  # where there are no keys, every name is as good
 ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
-OF_SERVER = ("server", "losses", "clock", "time", "writer", "version", "permission")  # checks that need the map server
+# Checks that need the map server:
+OF_SERVER = ("server", "losses", "clock", "time", "writer", "followers", "version", "permission")
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ def examine(arguments: Namespace) -> list[Finding]:
     """Check what the options name."""
     findings, subject = _keys(arguments)
     findings += _network(subject) if subject else [skipped("router", "these keys cannot be used")]
-    return findings + _store(arguments.store, subject.site_file if subject else None)
+    return findings + _store(arguments.store, arguments.journal, subject.site_file if subject else None)
 
 
 def _subject(arguments: Namespace, identity: Identity | None) -> Subject:
@@ -109,6 +111,7 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
             network.check_clock(*network.offset_of(info, asked_ns), site),
             network.check_time(info),
             network.check_writers(network.ask_writers(session, subject.site)),
+            network.check_followers(Asker(session, "", subject.site, network.ANSWER_S).followers(), info),
             network.check_version(package_version(), info.version),
         ]
     return [*findings, _permission(subject, session, info)]
@@ -154,11 +157,11 @@ def _spool_itself(subject: Subject, path: Path, session: zenoh.Session | None) -
         return [Finding(Level.FAIL, "spool", str(error))]
 
 
-def _store(folder: Path | None, site: SiteConfig | None) -> list[Finding]:
+def _store(folder: Path | None, journal: str, site: SiteConfig | None) -> list[Finding]:
     if folder is None:
         return [skipped("store", "give --store FOLDER, where the map server runs")]
     try:
-        store = disk.check_store(disk.read_store(folder, time.time()), site)
+        store = disk.check_store(disk.read_store(folder, time.time(), journal), site)
     except SitegridError as error:
         store = Finding(Level.FAIL, "store", str(error))
     return [store, disk.check_disk("store", disk.free_bytes(folder))]

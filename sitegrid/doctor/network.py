@@ -19,7 +19,8 @@ import zenoh
 from protocol.errors import LinkError, MessageError, Refusal
 from protocol.machine.samples import empty
 from protocol.queries.answer_codec import decode_info
-from protocol.queries.answers import MapInfo
+from protocol.queries.answers import FollowerState, MapInfo
+from protocol.queries.origin import SHOWN_S
 from protocol.site.site_config import SiteConfig
 from protocol.version import UNKNOWN
 from protocol.wire import keys
@@ -132,6 +133,21 @@ def check_writers(servers: list[MapInfo]) -> Finding:
         return skipped("writer", "no map server has answered a second time")
     problem = f"{len(servers)} map servers take samples of this site: {'; '.join(names)}"
     return Finding(Level.FAIL, "writer", problem, "stop all but one: each lacks what the others have")
+
+
+def check_followers(followers: list[FollowerState], info: MapInfo) -> Finding:
+    """Whether followers are of the server's store, and how far behind it."""
+    if not followers:
+        return skipped("followers", "none answers; where readers are many, start `sitegrid follow`")
+    if others := [one.name for one in followers if one.store != info.store]:
+        problem = f"{', '.join(others)} has the map of another store than the map server, {info.store}"
+        return Finding(Level.FAIL, "followers", problem, "start it with the --store of the server, or a new --copy")
+    worst = max(followers, key=lambda one: one.behind_s)
+    if worst.behind_s > SHOWN_S:
+        advice = "clients ask others meanwhile; look at its log, and at the load of its host"
+        return Finding(Level.WARN, "followers", str(worst), advice)
+    names = ", ".join(one.name for one in followers)
+    return Finding(Level.PASS, "followers", f"{names}: at most {worst.behind_s:.1f} s behind")
 
 
 def offset_of(info: MapInfo, asked_ns: tuple[int, int]) -> tuple[float, float]:

@@ -38,18 +38,21 @@ class Grant:
 def grant(role: str, site: str, name: str) -> Grant:
     """What the holder of a role may do under its name."""
     map_all, poses, health = _whole(site, "map"), keys.poses_all(site), keys.health_all(site)
-    asks, alive = keys.map_queries_all(site), (keys.alive(site, name),)
+    asks, alive = (keys.map_queries_all(site), keys.follower_queries_all(site)), (keys.alive(site, name),)
+    followers = keys.followers_alive_all(site)
     visitor = Grant(
-        subscribe=(map_all, poses, health, keys.corrections_all(site)), query=(asks,), watch=(keys.alive_all(site),)
+        subscribe=(map_all, poses, health, keys.corrections_all(site)),
+        query=asks,
+        watch=(keys.alive_all(site), followers),
     )
     grants = {
         "machine": Grant(
             publish=(_whole(site, "machine", name),),
             subscribe=(keys.sensors(site, name), map_all, keys.corrections_all(site)),
-            query=(keys.ingest(site, name), asks, *alive),
+            query=(keys.ingest(site, name), *asks, *alive),
             answer=alive,  # who holds the name, if a second one comes
             alive=alive,
-            watch=alive,
+            watch=(*alive, followers),
         ),
         "base": Grant(
             publish=(keys.corrections(site, name), keys.health(site, name)),
@@ -60,13 +63,24 @@ def grant(role: str, site: str, name: str) -> Grant:
             watch=alive,
         ),
         "visitor": visitor,
-        "admin": replace(visitor, query=(asks, keys.admin_all(site))),
+        "admin": replace(visitor, query=(*asks, keys.admin_all(site))),
         "server": Grant(
             publish=(map_all,),
             subscribe=(poses, health),
             query=(keys.writer(site),),
-            answer=(keys.ingest_all(site), asks, keys.admin_all(site), keys.writer(site)),
+            answer=(
+                keys.ingest_all(site),
+                keys.map_queries_all(site),
+                keys.admin_all(site),
+                keys.writer(site),
+                keys.journal(site),
+            ),
             watch=(keys.alive_all(site),),
+        ),
+        "follower": Grant(
+            query=(keys.journal(site), keys.follower_owner(site, name)),
+            answer=(keys.follower_queries(site, name), keys.follower_owner(site, name)),
+            alive=(keys.follower_alive(site, name),),
         ),
         "sim": Grant(publish=(_sensors_all(site),)),
     }
@@ -99,6 +113,8 @@ def size_limits(site: str) -> list[dict[str, Any]]:
     limits = (
         ("batches", ["query"], keys.ingest_all(site), MAX_BATCH_BYTES + SPARE_BYTES),
         ("questions", ["query"], keys.map_queries_all(site), MAX_BUNDLE_BYTES),
+        ("questions to followers", ["query"], keys.follower_queries_all(site), MAX_SMALL_BYTES),
+        ("rows", ["query"], keys.journal(site), MAX_SMALL_BYTES),
         ("claims", ["query"], keys.writer(site), MAX_SMALL_BYTES),
         ("commands", ["query"], keys.admin_all(site), MAX_SMALL_BYTES),
         ("readings", ["put"], _sensors_all(site), MAX_BUNDLE_BYTES),

@@ -101,6 +101,8 @@ _SINGLE = (
     "tiles",
     "why",
     "alive",
+    "origin",
+    "journal_piece",
     *PLAIN[1:],
     "error",
 )

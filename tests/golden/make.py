@@ -36,7 +36,15 @@ from protocol.queries.calibration import (
     decode_calibration,
     encode_calibration,
 )
+from protocol.queries.journal_piece import (
+    EventMessage,
+    JournalPiece,
+    RowMessage,
+    decode_journal_piece,
+    encode_journal_piece,
+)
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
+from protocol.queries.origin import Origin, decode_origin, encode_origin
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
 from protocol.wire import codec, correction_codec
 from protocol.wire.messages import (
@@ -216,11 +224,20 @@ WHY = CellReasons(
 ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 OVERLOADED = QueryError(Refusal.OVERLOADED, "the server has too many queries to answer", 2.5)
 
+JOURNAL = JournalPiece(
+    STORE,
+    ("fedcba9876543210",),
+    18,
+    0x1234ABCD,
+    (RowMessage(17, T0, codec.encode_batch(BATCH)), RowMessage(18, T0 + 1, codec.encode_batch(BATCH))),
+    (EventMessage(4, "trust", T0, {"machine": "loader-1", "trusted": False, "by": "person", "reason": "drifts"}),),
+)
 GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
     "batch_lost.bin": Golden(LOST, codec.encode_batch, decode_batch),
     "batch_empty.bin": Golden(ASK, codec.encode_batch, decode_batch),
     "ack.bin": Golden(Ack(43, 17, 2, STORE), codec.encode_reply, codec.decode_reply),
+    "ack_epoch.bin": Golden(Ack(43, 17, 2, STORE, epoch=7), codec.encode_reply, codec.decode_reply),
     "ack_replaces.bin": Golden(Ack(43, 17, 2, STORE, "fedcba9876543210"), codec.encode_reply, codec.decode_reply),
     "ack_offer.bin": Golden(Ack(43, 17, 0, STORE, offer=encode_offer(OFFER)), codec.encode_reply, codec.decode_reply),
     "refused.bin": Golden(Refused("gap", "first_seq: 41: 12 is expected", 12), codec.encode_reply, codec.decode_reply),
@@ -255,6 +272,9 @@ GOLDEN: dict[str, Golden] = {
         answers.decode_changes,
     ),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
+    "journal_piece.bin": Golden(JOURNAL, encode_journal_piece, decode_journal_piece),
+    "origin.bin": Golden(Origin("reader-1", 3, 0.25), encode_origin, decode_origin),
+    "origin_server.bin": Golden(Origin(), encode_origin, decode_origin),
     "alive.bin": Golden(records.ServerAlive(STORE, 18, 17, 0.25), answers.encode_alive, answers.decode_alive),
     "info.bin": Golden({"site": "paper", "merged": 17, "refused": {"gap": 1}}, answers.encode_info, decode_info_table),
     "error.bin": Golden(ERROR, answers.encode_error, answers.decode_error),

@@ -33,13 +33,14 @@ def asking() -> Iterator[Callable[[Client], Future[MapInfo]]]:
     with ThreadPoolExecutor(1) as pool:
 
         def ask(client: Client) -> Future[MapInfo]:
-            out, get = threading.Event(), client.session.get
+            asker = client._asker
+            out, get = threading.Event(), asker._session.get
 
             def noted(*words, **options):
                 out.set()
                 return get(*words, **options)
 
-            client.session = _Noted(client.session, noted)  # type: ignore[assignment]
+            asker._session = _Noted(asker._session, noted)  # type: ignore[assignment]
             answer = pool.submit(client.info)
             assert out.wait(10.0)
             return answer
@@ -103,6 +104,6 @@ def test_a_server_that_hangs_is_no_answer_in_time(site: SiteRun):
         with pytest.raises(LinkError, match="did not answer in time"):
             client.info()
         assert 1.0 <= time.monotonic() - began_s < 3.0
-        assert raw(client, 0.5) == [b"Timeout"], "of Zenoh itself, no map"
+        assert set(raw(client, 0.5)) == {b"Timeout"}, "of Zenoh itself, no map"
         server.send(signal.SIGCONT)
         assert client.info().site.name == site.site

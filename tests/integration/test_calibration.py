@@ -20,6 +20,7 @@ from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import LAST_NS, Correction, Corrections
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.store import Store
+from mapserver.journal.history import history_rows
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
@@ -31,6 +32,7 @@ from sim.simulator import START_NS
 from sitegrid.process.children import Child, Children
 from tests.integration.site_run import READY_S, SiteRun, kill
 from tests.integration.test_evidence import Senders
+from tests.journals import history_beside
 from tests.reference.correction import in_numpy
 from tests.unit.mapserver.data import same, same_evidence
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
@@ -86,7 +88,7 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
 
 def sample_bytes(journal: Path) -> dict[tuple[str, int], bytes]:
     with SqliteReader(journal) as reader:
-        return {(row.machine, row.first_seq): row.rows.tobytes() for row in reader.read()}
+        return {(row.machine, row.first_seq): row.rows.tobytes() for row in history_rows(history_beside(reader))}
 
 
 def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
@@ -234,7 +236,7 @@ def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path:
     covariance = ((4e-7, 0.0, 0.0), (0.0, 2e-5, 0.0), (0.0, 0.0, 1e-6))
     with closing(SqliteJournal(path, config.name, config.frame)) as journal:
         for name in (one, other):
-            offered = Correction(name, 0, LAST_NS, 0.004, 0.03, 0.0, covariance)
+            offered = Correction(name, START_NS, LAST_NS, 0.004, 0.03, 0.0, covariance)
             decision = CalibrationDecision(name, SOLVER, "", START_NS, (offered,))
             journal.append_event("calibration", START_NS, decision.body())
     server = serve(site)

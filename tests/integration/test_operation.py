@@ -21,8 +21,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
-from mapserver.journal.archive import HOUR_NS, archive
-from mapserver.journal.history import history_rows
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.machine.samples import empty
@@ -35,7 +33,6 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid.process.children import Child, Children, wait_until
 from tests.integration.site_run import READY_S, SiteRun  # beside this file
-from tests.journals import history_beside
 
 pytestmark = pytest.mark.processes
 
@@ -373,32 +370,3 @@ def test_the_doctor_tells_denials_from_absence(guarded: Callable[..., tuple[int,
     code, revoked = guarded("gone", "--site-file", "config/site.toml")
     assert code == 1
     assert "revoked" in revoked["server"]["advice"] + revoked["router"]["advice"]
-
-
-# --- backup ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_backup_as_the_operators_page_has_it_is_a_whole_store(tmp_path: Path, root: Path):
-    site = SiteConfig("pit", 48.0, 11.0)
-    store, backup = tmp_path / "store", tmp_path / "backup"
-    backup.mkdir()
-    old_rows(store, site)
-    text = (root / "docs" / "operation.md").read_text().split("## Backup")[1].split("```python\n")[1].split("```")[0]
-    code = text.replace('"STORE', f'"{store}').replace('"BACKUP', f'"{backup}')
-    first, second = code.split("if os.path")
-    with closing(Store(JournalLocation(store), site, ServerConfig(), lambda: NOW_NS)) as opened:
-        late = SampleBatch("late", 7, 1, drive(10, seed=1), site.frame)
-        assert isinstance(opened.commit([Incoming("late", encode_batch(late))])[0], Ack)
-        names: dict[str, Any] = {}
-        exec(compile(first, "docs/operation.md", "exec"), names)
-        with SqliteReader(store / JOURNAL_FILE) as reader:  # rows move just in between
-            assert list(archive(store / "archive", reader, site, NOW_NS + 3 * HOUR_NS, opened.journal.forget))
-        exec(compile(f"if os.path{second}", "docs/operation.md", "exec"), names)
-        folded = opened.grid.folded
-    with closing(Store(JournalLocation(backup), site, ServerConfig(), lambda: NOW_NS)) as restored:
-        assert restored.machines()["late"]["samples"] == 10
-        assert restored.grid.folded == folded == 50_010
-        with SqliteReader(backup / JOURNAL_FILE) as reader:
-            assert list(archive(backup / "archive", reader, site, NOW_NS + 3 * HOUR_NS, restored.journal.forget))
-            rows = [row.row for row in history_rows(history_beside(reader))]
-    assert rows == list(range(1, 52))

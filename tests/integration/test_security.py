@@ -48,6 +48,7 @@ ROLES = {
     "boss": "admin",
     "sim": "sim",
     "base-1": "base",
+    "reader-1": "follower",
 }
 DAY = timedelta(days=1)
 
@@ -153,6 +154,26 @@ def test_a_machine_gets_its_acknowledgements_from_the_map_server(guarded: Guarde
         for _ in range(200):  # faster than any rate limit: these never fall under one
             assert is_taken(guarded, session, "loader-1")
         assert client.info(after=before + 200).journalled == before + 200
+
+
+def test_a_follower_with_keys_copies_the_journal_and_answers_under_its_own_name_alone(guarded: Guarded, tmp_path: Path):
+    with guarded.session("loader-1") as session:
+        assert is_taken(guarded, session, "loader-1")
+    words = ("--site-file", guarded.site_file, "--copy", tmp_path / "copy")
+    other = guarded.children.start("other", "follow", *guarded.network("reader-1"), *words, "--name", "reader-2")
+    assert other.wait(READY_S) == 1, "the name is that of the keys"
+    network = guarded.network("reader-1")
+    follower = guarded.children.start("reader-1", "follow", *network, *words, "--name", "reader-1")
+    follower.expect("ready", READY_S)
+    with connect(guarded.endpoint, SITE, keys=guarded.keys / "guest") as client:
+        row = client.info().journalled
+        assert client.point(1.0, 1.0, after=row).version.row == row
+        assert client.origin.follower == "reader-1", f"follower pid {follower.pid}"
+        assert [one.name for one in client.followers()] == ["reader-1"]
+    for name in ("guest", "loader-1", "boss"):  # rows are for followers
+        with guarded.session(name) as session:
+            assert answers(session, keys.journal(SITE)) == []
+    follower.stop()
 
 
 def test_agent_and_simulator_work_with_keys_as_without(guarded: Guarded, tmp_path: Path):

@@ -50,6 +50,7 @@ def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
         site.drive(60)
         journalled = site.client.info().journalled
         wait_until(lambda: f'-{journalled}-0"' in site.get("xyz/resistance.json").headers["etag"], 30, "the newest map")
+        wait_until(lambda: "bounds" in site.get("xyz/resistance.json").json, 30, "a look at what is folded")
         yield site
 
 

@@ -29,11 +29,17 @@ def site_info(site: SiteConfig) -> SiteInfo:
 
 
 def map_info(site: SiteConfig, **values: Any) -> MapInfo:
-    rows = ("fact", "decided", "corrections", "journalled", "merged", "snapshot")
+    rows = ("epoch", "fact", "decided", "corrections", "journalled", "merged", "snapshot")
     zeros = (*rows, "samples_merged", "samples_too_unsure", "cells", "first_ns", "stamp_ns", "wall_ns")
     defaults: dict[str, Any] = dict.fromkeys(zeros, 0)
     defaults |= {"site": site_info(site), "version": "1.0", "bounds": None}
-    defaults |= {"store": STORE, "descends": (), "accepted": (), "server": ServerProcess("office", 7)}
+    defaults |= {
+        "store": STORE,
+        "descends": (),
+        "accepted": (),
+        "replica": "none",
+        "server": ServerProcess("office", 7),
+    }
     defaults |= {"checkpoints": CheckpointCounts(0, 0, 0, 0)}
     defaults |= {"machines": {}, "distrusted": (), "shortfalls": (), "counters": {}, "layers": (), "boundaries": ()}
     return MapInfo(**(defaults | values))

@@ -7,22 +7,18 @@ decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulate
 
 from __future__ import annotations
 
-import json
-import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mapserver.journal.journal import ROWS_AT_ONCE, UnwrittenError
 from mapserver.journal.progress import Progress
-from mapserver.journal.records import extent_of, record
-from mapserver.journal.rows import Admission, JournalRow, MachineTotals, Watermark, checksum, extent_checksum
-from mapserver.journal.shortfall import EVENT, ROW, Shortfall, compare, marked, spool_name
-from mapserver.journal.shortfall import KIND as SHORTFALL
+from mapserver.journal.rows import JournalRow, SpoolKey, Watermark
+from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
 from mapserver.journal.sqlite.reader import SCHEMA, TABLES, SqliteQueries
+from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, new_meta, watermark_line
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
 from protocol.disk.traces import Traces, look_beside
 from protocol.errors import StoreError
@@ -32,13 +28,13 @@ _WAL_LIMIT = 64 * 2**20
 SPARE = 0.25  # share of free pages above which a file is made smaller
 
 
-class SqliteJournal(SqliteQueries):
+class SqliteJournal(TableWriter, SqliteQueries):
     """See `Journal`. StoreError where anything in it is damaged (`check`)."""
 
-    shortfall: Shortfall | None = None
+    fenced = ""
 
-    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
-        """descends: ids of the stores that a new one is made from."""
+    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = (), store: str = "") -> None:
+        """descends: ids of the stores that a new one is made from. store: id of the one that a new one is a copy of."""
         self.path, self._row = path, 0
         self._changed: dict[str, int] = {}  # by the open transaction, for the mark
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -52,10 +48,11 @@ class SqliteJournal(SqliteQueries):
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
-                self._create_or_check(site, frame, descends)
+                self._create_or_check(site, frame, descends, store)
                 self._row = super().last_row
                 self.check()
-                self._db.execute("REPLACE INTO meta SELECT 'epoch', ?", (str(self.state().epoch + 1),))
+                self.epoch = self.state().epoch + 1
+                self._db.execute("REPLACE INTO meta VALUES ('epoch', ?)", (str(self.epoch),))
                 self._return_to_disk()
                 self._mark = HighWaterMark(mark_path(path))
                 opened.callback(self._mark.close)
@@ -69,52 +66,24 @@ class SqliteJournal(SqliteQueries):
         """The last row, also of the open transaction."""
         return self._row
 
-    def watermark(self, machine: str, spool_id: int) -> Watermark:
-        """Progress of a spool."""
-        return self._progress.watermark(machine, spool_id)
-
-    def watermarks(self) -> dict[tuple[str, int], Watermark]:
-        """Progress of all spools."""
-        return self._progress.watermarks()
-
-    def machines(self) -> dict[str, MachineTotals]:
-        """What each machine sent."""
-        return self._progress.machines()
-
     @property
-    def samples(self) -> int:
-        """How many samples all machines sent."""
-        return self._progress.samples
+    def trusted_row(self) -> int:
+        """See `Journal`: the folder is the journal's own."""
+        return self._row
 
     def begin(self) -> None:
         """Open a transaction; rows appended from here on are one group commit."""
         self._write("BEGIN IMMEDIATE")
 
-    def append(self, admission: Admission, received_ns: int) -> int:
-        """Write one row and its watermark into the open transaction; returns the row's number."""
-        batch = admission.batch
-        row = self._row + 1
-        written = JournalRow(row, batch.machine, batch.spool_id, batch.first_seq, batch.rows, received_ns)
-        self._write("INSERT INTO journal VALUES (?, ?)", (row, record(written)))
-        extent = (row, *extent_of(batch.rows))
-        self._write("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*extent, extent_checksum(*extent)))
-        before = self.watermark(batch.machine, batch.spool_id)
-        watermark = Watermark(admission.watermark, before.lost + admission.lost, max(before.newest_ns, extent[2]))
-        self.put_watermark(batch.machine, batch.spool_id, watermark)
+    def _insert(self, row: int, record: bytes, extent: Line) -> None:
+        self._write("INSERT INTO journal VALUES (?, ?)", (row, record))
+        self._write("INSERT INTO extent VALUES (?, ?, ?, ?, ?, ?, ?, ?)", extent)
         self._row = row
-        return row
-
-    def declare_lost(self, admission: Admission) -> None:
-        """Write a watermark alone into the open transaction: samples at a spool's end that will never come."""
-        batch = admission.batch
-        before = self.watermark(batch.machine, batch.spool_id)
-        after = replace(before, seq=admission.watermark, lost=before.lost + admission.lost)
-        self.put_watermark(batch.machine, batch.spool_id, after)
 
     def put_watermark(self, machine: str, spool_id: int, watermark: Watermark) -> None:
-        """Write a watermark into the open transaction."""
-        values = (machine, _spool_bytes(spool_id), watermark.seq, watermark.lost, watermark.newest_ns)
-        self._write("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", (*values, checksum(*values)))
+        """See `Journal`."""
+        line = watermark_line(machine, spool_id, watermark)
+        self._write("REPLACE INTO watermark VALUES (?, ?, ?, ?, ?, ?)", line)
         self._progress.put(machine, spool_id, watermark)
         self._changed[spool_name(machine, spool_id)] = watermark.seq
 
@@ -131,29 +100,23 @@ class SqliteJournal(SqliteQueries):
             self._write("ROLLBACK")
         self._return_to_disk()
 
-    def append_event(self, kind: str, stamp_ns: int, body: Mapping[str, Any]) -> int:
-        """Commit an event, outside of any other transaction; returns its number."""
-        return self.append_events([(kind, stamp_ns, body)])
-
-    def append_events(self, events: Iterable[tuple[str, int, Mapping[str, Any]]]) -> int:
-        """Commit events (kind, stamp_ns, body), all or none, outside of other transactions; returns the last number.
-
-        The number is 0 where there never was an event.
-        """
-        texts = [(kind, stamp_ns, json.dumps(body, allow_nan=False)) for kind, stamp_ns, body in events]
+    def append_events(self, events: Iterable[PlainEvent]) -> int:
+        """See `Journal`."""
+        lines = event_lines(events, self._last_event())
         with self._transaction():
-            for text in texts:
-                number = self._last_event() + 1
-                values = (number, *text)
-                self._write("INSERT INTO events VALUES (?, ?, ?, ?, ?)", (*values, checksum(*values)))
-                self._changed[EVENT] = number
+            for line in lines:
+                self._write("INSERT INTO events VALUES (?, ?, ?, ?, ?)", line)
+                self._changed[EVENT] = line[0]
             return self._last_event()
 
-    def note_shortfall(self, shortfall: Shortfall) -> None:
-        """Keep what is missing as an event; no file that proves it is needed from then on."""
-        self.shortfall = shortfall
-        newest_ns = max((mark.newest_ns for mark in self.watermarks().values()), default=0)
-        self.append_event(SHORTFALL, newest_ns, shortfall.body())
+    def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
+        """Have a new journal go on after an archive with rows up to `row`, and spools up to these watermarks."""
+        with self._transaction():
+            self._write("INSERT INTO sqlite_sequence VALUES ('journal', ?)", (row,))
+            self._write("REPLACE INTO meta VALUES ('archived_row', ?)", (str(row),))
+            self._row = row
+            for spool, watermark in watermarks.items():
+                self.put_watermark(*spool, watermark)
 
     def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
         """Remove the next rows up to `until`, which are archived, and commit; returns the new `archived_row`.
@@ -205,20 +168,14 @@ class SqliteJournal(SqliteQueries):
             self.rollback()
             raise
 
-    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
-        expected = {"schema": str(SCHEMA), "site": site, "frame": frame}
+    def _create_or_check(self, site: str, frame: str, descends: Iterable[str], store: str) -> None:
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
             self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
-            words = (secrets.token_hex(8), *descends)
-            store = " ".join((*words, f"{checksum(*words):08x}"))
-            self._db.executemany("INSERT INTO meta VALUES (?, ?)", {**expected, "store": store}.items())
+            meta = new_meta(SCHEMA, site, frame, descends, store)
+            self._db.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
             self._db.execute("COMMIT")
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # no damage of a log takes the store's id away
-        meta = self._meta()
-        for key, value in expected.items():
-            if meta.get(key) != value:
-                problem = f"the store has {key} {meta.get(key)!r}, this server {value!r}; choose another --store"
-                raise StoreError(self.path, problem)
+        self._require_meta(site, frame)
 
     def _compare(self, traces: Traces) -> None:
         """Compare what there is with the mark and the log beside it, and name what is missing."""
@@ -248,8 +205,3 @@ class SqliteJournal(SqliteQueries):
         self._progress = Progress(self._load_watermarks())
         self._row = super().last_row
         self._changed.clear()
-
-
-def _spool_bytes(spool_id: int) -> bytes:
-    """SQLite integers are signed: 64-bit ids are stored as bytes."""
-    return spool_id.to_bytes(8, "big")

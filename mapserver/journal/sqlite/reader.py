@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self
@@ -15,6 +16,7 @@ from mapserver.journal.journal import ROWS_AT_ONCE, JournalState
 from mapserver.journal.queries import BYTES_AT_ONCE, TableQueries, size_of
 from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
+from protocol.files import make_private
 
 SCHEMA = 6
 TABLES = """
@@ -52,7 +54,7 @@ _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "n
 class SqliteQueries(TableQueries):
     """What can be read of a journal, on its owner's connection as on a reader's; see `JournalQueries`."""
 
-    schema = SCHEMA
+    schema, replica = SCHEMA, "none"
     path: Path
     _db: sqlite3.Connection
 
@@ -65,6 +67,19 @@ class SqliteQueries(TableQueries):
     def last_row(self) -> int:
         """See `JournalQueries`; also where all rows are archived."""
         return self._number("SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'journal'")
+
+    @property
+    def archived_row(self) -> int:
+        """See `JournalQueries`."""
+        return self._number("SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = 'archived_row'")
+
+    def state(self) -> JournalState:
+        """See `JournalQueries`."""
+        epoch = self._number("SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = 'epoch'")
+        return JournalState(epoch, self.last_row, self._last_event())
+
+    def _last_event(self) -> int:
+        return self._number("SELECT COALESCE(MAX(id), 0) FROM events")
 
     @contextmanager
     def _one_state(self) -> Iterator[None]:
@@ -130,6 +145,25 @@ class SqliteReader(SqliteQueries):
             if (newer := self._version()) != version:
                 state, version = self.state(), newer
         return state
+
+    def copy_to(self, path: Path) -> None:
+        """Copy all of it, as it is at one commit, into a new file, also while a server writes; StoreError."""
+        try:
+            make_private(path)
+            with closing(sqlite3.connect(path)) as copy:
+                self._db.backup(copy)  # all pages at once: a writer goes on meanwhile, in the write-ahead log
+                copy.execute("PRAGMA synchronous=FULL")
+                copy.execute("PRAGMA journal_mode=DELETE")  # so that the copy is this one file
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+        except (sqlite3.Error, OSError) as error:
+            raise StoreError(path, f"cannot be written: {error}") from None
+
+    def require_sound(self) -> None:
+        """StoreError where SQLite finds damage in the file; `check` and reading rows find what it cannot."""
+        ((verdict,), *_) = self._query("PRAGMA integrity_check(1)")
+        if verdict != "ok":
+            raise self._damaged(f"the file ({verdict})")
 
     def _version(self) -> int:
         """A number that is another one once a server has committed."""

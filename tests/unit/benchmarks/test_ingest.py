@@ -4,23 +4,33 @@ import pytest
 
 from benchmarks.__main__ import BENCHMARKS, OPTIONS, main
 
+COLUMNS = ["journal", "batch", "batches_per_commit", "samples_per_s", "samples_per_cpu_s", "ms_per_commit", "of_sqlite"]
 
+
+@pytest.mark.slow
 def test_ingest_prints_one_json_object(capsys):
     assert main(["ingest", "--json", "--samples", "250", "--runs", "1"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["benchmark"], result["samples"]) == ("ingest", 250)
-    assert [(row["batch"], row["batches_per_commit"]) for row in result["rows"]] == [
-        (size, group) for size in (6, 100, 1000) for group in (1, 16)
+    journals = ("sqlite", "postgres", "postgres, synchronous replica")
+    assert [(row["batch"], row["batches_per_commit"], row["journal"]) for row in result["rows"]] == [
+        (size, group, journal) for size in (6, 100, 1000) for group in (1, 16) for journal in journals
     ]
-    names = {"batch", "batches_per_commit", "samples_per_s", "samples_per_cpu_s", "ms_per_commit"}
-    assert all(set(row) == names for row in result["rows"])
-    assert all(value > 0 for row in result["rows"] for value in row.values())
+    assert all(list(row) == COLUMNS for row in result["rows"])
+    assert all(row[name] > 0 for row in result["rows"] for name in COLUMNS[1:])
+    assert all(row["of_sqlite"] == 1.0 for row in result["rows"] if row["journal"] == "sqlite")
 
 
-def test_without_json_a_table_is_printed(capsys):
+def test_without_a_database_that_is_said_and_a_table_of_the_others_is_printed(capsys, monkeypatch):
+    def nothing() -> None:
+        raise RuntimeError("apt-get install postgresql")
+
+    monkeypatch.setattr("benchmarks.postgres.server.binaries", nothing)
     main(["ingest", "--samples", "100", "--runs", "1"])
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["batch", "batches_per_commit", "samples_per_s", "samples_per_cpu_s", "ms_per_commit"]
+    shown = capsys.readouterr()
+    assert shown.err == "not measured: postgres; apt-get install postgresql\n"
+    lines = shown.out.splitlines()
+    assert lines[0].split() == COLUMNS
     assert len(lines) == 7
     assert len({len(line) for line in lines}) == 1
 

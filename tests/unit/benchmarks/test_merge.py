@@ -176,7 +176,9 @@ def test_restart_opens_a_store_with_snapshot_and_tail(monkeypatch, capsys):
 
 def test_a_store_of_the_benchmark_holds_the_same_grid_as_folding_all_of_it(tmp_path):
     merge_restart.build(tmp_path, 20, tail_rows=7)
-    store = merge_restart.Store(tmp_path, merge_restart.SITE, merge_restart.CONFIG, lambda: START_NS)
+    store = merge_restart.Store(
+        merge_restart.JournalLocation(tmp_path), merge_restart.SITE, merge_restart.CONFIG, lambda: START_NS
+    )
     grid = merge_restart.Grid(1.0, merge_restart.CONFIG.fold)
     for name, rows in islice(merge_work.batches(), 20):
         grid.fold(rows, name)

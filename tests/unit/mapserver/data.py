@@ -113,7 +113,11 @@ def total(grid: Grid) -> np.ndarray:
 
 def same(one: Grid, other: Grid) -> bool:
     """Equal to the bit."""
-    a, b = one.state(), other.state()
+    return same_state(one.state(), other.state())
+
+
+def same_state(a: GridState, b: GridState) -> bool:
+    """Equal to the bit."""
     totals = [(state.folded, state.skipped, state.newest_ns, state.oldest_ns) for state in (a, b)]
     return totals[0] == totals[1] and [*map(_bits, a.pages)] == [*map(_bits, b.pages)]
 

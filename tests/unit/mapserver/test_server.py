@@ -8,7 +8,7 @@ import zenoh
 
 from mapserver import server as server_module
 from mapserver.journal.location import JournalLocation
-from mapserver.query import region_pieces
+from mapserver.query import queryable, region_pieces
 from mapserver.query.answering import SMALL_BYTES
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
@@ -211,12 +211,13 @@ def test_waiting_queries_keep_no_other_from_an_answer_and_get_theirs(served):
     [
         ("ANSWER_BYTES", keys.map_query("pit", "info"), {}, "info"),
         ("MOST_PAST", keys.map_query("pit", "point"), {"x": "0", "y": "0", "as_of": "1"}, "point"),
-        ("MOST_COMMANDS", keys.admin("pit", "trust"), {"machine": "a", "trusted": "yes"}, "trust"),
+        ("MOST_COMMANDS", keys.admin("pit", "trust"), {"machine": "a", "trusted": "yes"}, "_trust"),
     ],
 )
 def test_queries_beyond_a_budget_have_to_come_again(sessions, tmp_path, monkeypatch, limit, key, parameters, held):
     router, client = sessions
-    monkeypatch.setattr(server_module, limit, 2 if limit != "ANSWER_BYTES" else 2 * SMALL_BYTES)
+    module = server_module if limit == "MOST_COMMANDS" else queryable
+    monkeypatch.setattr(module, limit, 2 if limit != "ANSWER_BYTES" else 2 * SMALL_BYTES)
     with closing(Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)) as server:
         release = threading.Event()
 
@@ -224,7 +225,7 @@ def test_queries_beyond_a_budget_have_to_come_again(sessions, tmp_path, monkeypa
             assert release.wait(WAIT_S)
             raise QueryError(Refusal.STORE, "held")
 
-        monkeypatch.setattr(server.answers, held, hold)
+        monkeypatch.setattr(server._commands if limit == "MOST_COMMANDS" else server.answers, held, hold)
         first = begun(client, key, parameters, 2)
         refused = codec.decode_error(get(client, key, parameters).err.payload.to_bytes())
         assert refused.reason == Refusal.OVERLOADED
@@ -329,7 +330,7 @@ def test_the_map_as_it_is_does_not_wait_for_what_is_slow(served, monkeypatch, sl
         raise QueryError(Refusal.STORE, "held")
 
     monkeypatch.setattr(server.answers, "history", hold)
-    monkeypatch.setattr(server.answers, "trust", hold)
+    monkeypatch.setattr(server._commands, "_trust", hold)
     key, asked = {
         "past": (keys.map_query("pit", "history"), encode_query(HistoryQuery(0, 0))),
         "command": (keys.admin("pit", "trust"), encode_command(TrustCommand("a", True))),

@@ -19,6 +19,7 @@ COMMANDS = (
     *(
         "accept",
         "agent",
+        "backup",
         "demo",
         "distrust",
         "doctor",
@@ -27,11 +28,13 @@ COMMANDS = (
         "keys",
         "plot",
         "query",
+        "restore",
         "router",
         "server",
         "sim",
     ),
     "trust",
+    "verify",
 )
 
 
@@ -49,7 +52,7 @@ def test_each_command_has_help_and_a_module(command: str, capsys):
         cli.main([command, "--help"])
     assert end.value.code == 0
     assert "--json" in capsys.readouterr().out
-    assert (Path(cli.__file__).parent / "commands" / f"{command}.py").exists()
+    assert list((Path(cli.__file__).parent / "commands").rglob(f"{command}.py"))
 
 
 @pytest.mark.parametrize(("set_to", "is_then"), [(None, "1"), ("3", "3")])

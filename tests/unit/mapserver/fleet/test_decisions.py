@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import LAST_NS, LEVEL_SHARE, Correction, Corrections
+from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, Corrections
 from mapserver.fleet.decisions import (
     EVERY_NS,
     PERSON,
@@ -266,6 +266,15 @@ def test_the_first_correction_of_a_machine_is_that_of_all_its_samples_before(beg
     assert [each.from_ns // EPOCH_NS for each in decisions.corrections.each] == [expected, 1001, 1002, 1003]
 
 
+@pytest.mark.parametrize(("applied", "expected"), [({}, 0), ({1000: Stated(0.001)}, 1000)])
+def test_samples_before_are_not_given_the_zero_of_a_machine_that_stated_its_own(applied, expected):
+    calibration = replace(solved(one(0.003, 1000), one(0.005, 1001)), begins_ns={}, stated={"a": applied})
+    decisions = CalibrationDecisions()
+    for decision in decisions.judge(calibration, NOW_NS, asked=True):
+        decisions.add(decision)
+    assert decisions.corrections.each[0].from_ns == expected * EPOCH_NS
+
+
 def test_before_what_the_machine_knows_itself_nothing_is_corrected():
     calibration = solved(one(0.003, 1000), one(0.02, 1001))
     calibration = replace(calibration, begins_ns={}, stated={"a": {1000: Stated(0.003), 1001: Stated(0.003)}})
@@ -281,16 +290,120 @@ def test_what_the_solver_says_again_is_as_of_now():
     for _ in range(2):
         solver.hears(one(0.003))
     assert solver.decisions.as_of_ns("a") == NOW_NS + 60 * 10**9
-    solver.watches(6 * EVERY_NS, one(0.0031))
-    assert solver.decisions.as_of_ns("a") == solver.now_ns - EVERY_NS, "the same in an hour"
-    said_ns = solver.decisions.as_of_ns("a")
-    solver.hears(one(0.009))
+    solver.now_ns += 6 * EVERY_NS
+    solver.hears(one(0.0031, 1012))
+    said_ns = NOW_NS + 120 * 10**9 + 6 * EVERY_NS
+    assert solver.decisions.as_of_ns("a") == said_ns, "the same in an hour"
+    solver.hears(one(0.009, 1012))
     assert solver.decisions.as_of_ns("a") == said_ns, "in doubt"
     old = CalibrationDecision("a", SOLVER, "", solver.now_ns, (one(0.1, 990, to_ns=991 * EPOCH_NS),))
     solver.decisions.add(old)
     assert solver.decisions.as_of_ns("a") == said_ns, "a decision about earlier samples says nothing of these"
     solver.decisions.add(person(0.02))
     assert solver.decisions.as_of_ns("a") == NOW_NS
+
+
+@pytest.mark.parametrize("epochs", [(1000,), (999, 1000)])
+def test_what_is_known_of_a_machine_that_stands_is_as_of_its_last_epoch(epochs):
+    """Others drive on, so that it is solved for again and again; nothing of it is known by that."""
+    solver = Solver()
+    own = [one(0.003, epoch) for epoch in epochs]
+    for _ in range(2):
+        solver.hears(*own, after_ns=EVERY_NS)
+    assert solver.decisions.as_of_ns("a") == NOW_NS + EPOCH_NS
+    solver.watches(20 * EVERY_NS, *own)
+    assert solver.decisions.as_of_ns("a") == NOW_NS + EPOCH_NS
+    started_anew = CalibrationDecisions(solver.decisions.newest("a") for _ in range(1))
+    assert started_anew.as_of_ns("a") == NOW_NS + EPOCH_NS
+
+
+# --- what is known late ----------------------------------------------------------------------------------------------
+
+
+def unknown(zero: float, epoch: int, across_std: float = 0.0045, **more: float) -> Correction:
+    """Of samples on slopes nothing was known."""
+    covariance = np.diag([1e-6, 2e-3, across_std**2]).tolist()
+    return one(zero, epoch, most_share=LEVEL_SHARE, covariance=covariance, **more)
+
+
+def test_a_scale_and_a_lateral_zero_that_are_found_late_are_those_of_all_samples():
+    """Else the map would step where they were found, and the ground would seem to have changed there."""
+    solver = Solver()
+    old = [unknown(0.002 * (i + 1), 1000 + i) for i in range(3)]
+    solver.watches(2 * EVERY_NS, *old)
+    now = 1000 + FROZEN_NS // EPOCH_NS
+    solver.watches(FROZEN_NS + 2 * EVERY_NS, *old)
+    known = [one(0.009, 1002, scale=0.08, across=0.003), one(0.004, now, scale=0.08, across=0.003)]
+    for _ in range(2):
+        solver.hears(*known)
+    spans = solver.decisions.corrections.spans_of("a")
+    assert [each.from_ns // EPOCH_NS for each in spans] == [1000, 1001, 1002, now]
+    assert [each.zero for each in spans] == [0.002, 0.004, 0.006, 0.004], "old zeros stay"
+    assert {(each.scale, each.across, each.most_share) for each in spans} == {(0.08, 0.003, ANY_SHARE)}
+    variances = np.array([np.diag(each.covariance) for each in spans])
+    assert np.unique(variances[:, 1:], axis=0).tolist() == [np.diag(SURE)[1:].tolist()]
+    assert variances[:3, 0].tolist() == [1e-6] * 3
+
+
+def test_what_was_shown_of_a_scale_then_stays():
+    """Where a machine was mended since, it was right then; and a fault was not always there."""
+    solver = Solver()
+    solver.watches(2 * EVERY_NS, one(0.001, scale=0.08))
+    later = one(0.001, 1100, scale=-0.02)
+    for _ in range(2):
+        solver.hears(later)
+    assert [each.scale for each in solver.decisions.corrections.each] == [0.08, -0.02]
+    solver = Solver()
+    solver.watches(2 * EVERY_NS, unknown(0.003, 1000))
+    for _ in range(2):
+        solver.hears(one(0.001, 1100, scale=0.4))
+    assert [each.scale for each in solver.decisions.corrections.each] == [0.0, 0.4]
+
+
+def test_what_was_known_is_not_painted_over_by_what_is_not():
+    solver = Solver()
+    solver.watches(2 * EVERY_NS, one(0.001, scale=0.08, across=0.003))
+    for _ in range(2):
+        solver.hears(unknown(0.001, 1100))
+    assert [(each.scale, each.across) for each in solver.decisions.corrections.each] == [(0.08, 0.003), (0.0, 0.0)]
+
+
+# --- machines that are not solved together ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("groups", [1, 2, 3])
+def test_what_is_wanted_of_machines_waits_for_the_next_decision_whoever_is_solved_then(groups):
+    solver, stamps_ns = Solver(), set[int]()
+    for minute in range(120):
+        solver.hears(one(0.001 * (minute // groups // 2), machine=f"m{minute % groups}"))
+        stamps_ns.add(solver.decisions.decided_ns or NOW_NS)
+        for group in range(groups):
+            least = 0.001 * ((minute - 10 - 2 * groups) // groups // 2)
+            assert (solver.zero(machine=f"m{group}") or 0.0) >= least, "no older than a decision and a round"
+    assert min(after - before for before, after in pairwise(sorted(stamps_ns)[1:])) >= EVERY_NS
+
+
+def test_what_cannot_be_decided_now_is_not_forgotten():
+    """The map does not follow yet, or nothing could be written: the caller adds nothing."""
+    decisions = CalibrationDecisions()
+    for minute in range(2):
+        made = decisions.judge(solved(one(0.003)), NOW_NS + minute)
+    assert len(made) == 1
+    others = decisions.judge(solved(one(0.001, machine="b")), NOW_NS + 3)
+    assert [each.machine for each in others] == ["a"]
+    decisions.add(others[0])
+    assert decisions.judge(solved(one(0.001, machine="b")), NOW_NS + EVERY_NS + 3)[0].machine == "b"
+
+
+def test_what_is_wanted_no_more_does_not_wait():
+    solver = Solver()
+    solver.hears(one(0.002), one(0.002, machine="b"))
+    solver.hears(one(0.002), one(0.002, machine="b"))
+    for zero in (0.009, 0.009, 0.002):
+        solver.hears(one(zero, machine="b"))
+    solver.decisions.add(person(0.02))
+    assert solver.hears(one(0.009), after_ns=EVERY_NS) == 0
+    assert solver.hears(one(0.002, machine="b")) == 0
 
 
 def test_neighbours_that_do_the_same_become_one():

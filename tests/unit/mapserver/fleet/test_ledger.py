@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapserver.fleet import stays as st
-from mapserver.fleet.ledger import EPOCH_NS, EPOCH_SLOTS, EPOCHS, Ledger
+from mapserver.fleet.ledger import EPOCH_NS, EPOCH_SLOTS, EPOCHS, Ledger, epochs_of
 from mapserver.fleet.passages import links, passages
 from protocol.arrays import Table
 from tests.unit.mapserver.data import random_samples
@@ -33,6 +33,35 @@ def test_only_the_newest_epochs_are_remembered() -> None:
     assert len(np.unique(st.slot(stays["key"]) // EPOCH_SLOTS)) == EPOCHS
     newest = rows["stamp_ns"] // EPOCH_NS > rows["stamp_ns"].max() // EPOCH_NS - EPOCHS
     assert stays.tobytes() == stays_of([rows[newest]]).tobytes()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_clock_that_is_ahead_displaces_nothing_whenever_its_samples_come(seed: int) -> None:
+    right = np.concatenate([drive(LOW, seconds=5.0, start_s=300.0 * i) for i in range(EPOCHS + 5)])
+    ahead = np.concatenate([drive(LOW, seconds=5.0, start_s=72_000.0 + 300.0 * i) for i in range(EPOCHS + 5)])
+    rng, until_ns = np.random.default_rng(seed), int(right["stamp_ns"].max())
+    rows = rng.permutation(np.concatenate([right, ahead]))
+    ledger = Ledger()
+    ledger.until_ns = until_ns
+    for part in np.array_split(rows, 40):
+        ledger.add(part)
+        ledger.stays()
+    assert ledger.stays().tobytes() == stays_of([right]).tobytes()
+    assert len(np.unique(epochs_of(ledger._stays))) == 2 * EPOCHS, "and memory is bounded"
+    ledger.until_ns = int(ahead["stamp_ns"].max())
+    assert ledger.stays().tobytes() == stays_of([ahead]).tobytes(), "where it was not ahead, it was right"
+
+
+def test_what_is_older_than_asked_for_is_not_there() -> None:
+    rows = np.concatenate([drive(LOW, seconds=5.0, start_s=300.0 * i) for i in range(4)])
+    ledger = Ledger()
+    assert ledger.newest_ns == 0
+    ledger.add(rows)
+    begins_ns = [int(epoch) * EPOCH_NS for epoch in np.unique(epochs_of(ledger.stays()))]
+    assert ledger.newest_ns == begins_ns[-1]
+    assert epochs_of(ledger.stays(begins_ns[2])).min() * EPOCH_NS == begins_ns[2]
+    assert epochs_of(ledger.stays(begins_ns[2] - 1)).min() * EPOCH_NS == begins_ns[2]
+    assert len(ledger.stays(begins_ns[-1] + 1)) == 0
 
 
 def test_samples_without_slope_or_distance_show_nothing() -> None:

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import Calibration, calibrate
-from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, NO_SHARE, Correction
-from mapserver.fleet.decisions import EVERY_NS, CalibrationDecisions
-from mapserver.fleet.ledger import Ledger, newest, stated
+from mapserver.fleet.calibration import SCALE_FLOOR, Calibration, calibrate
+from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction, corrected
+from mapserver.fleet.decisions import EVERY_NS, SOLVER, CalibrationDecision, CalibrationDecisions
+from mapserver.fleet.ledger import EPOCH_NS, Ledger, newest, stated
 from mapserver.fleet.machine_state import REMEMBERED_STD, remembered_of
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from protocol.arrays import Floats, Table
 from tests.unit.mapserver.fleet.drives import (
+    FOOT_M,
     LOW,
     OPEN,
     RAMP,
     RAMP_AGAIN,
     START_NS,
+    TOP_M,
     Errors,
+    Site,
     drive,
     height_slope,
     ledgers,
@@ -29,6 +33,7 @@ from tests.unit.mapserver.fleet.drives import (
 
 S = 10**9
 ERRORS = {"a": Errors(0.0, 0.2), "b": Errors(0.002, 0.0), "c": Errors(0.004, 0.03)}
+BOTH = ((20.0, 10.0), (110.0, 10.0))  # up and down the ramp, in one lane
 ROUTES = {"a": RAMP, "b": RAMP_AGAIN, "c": RAMP}
 SURE = ((1.6e-7, 0.0, 0.0), (0.0, 1.6e-5, 0.0), (0.0, 0.0, 1.6e-7))
 KNOWN = [Correction(name, 0, 1, 0.0, e.scale / (1 + e.scale), 0.0, SURE) for name, e in ERRORS.items()]
@@ -36,6 +41,10 @@ KNOWN = [Correction(name, 0, 1, 0.0, e.scale / (1 + e.scale), 0.0, SURE) for nam
 
 def level(seed: int = 7) -> dict[str, Table]:
     return ledgers({name: drive(LOW, e, seed=seed + i) for i, (name, e) in enumerate(ERRORS.items())})
+
+
+def scales_of(errors: Mapping[str, Errors]) -> dict[str, float]:
+    return {name: error.scale for name, error in errors.items()}
 
 
 def scales(result: Calibration) -> dict[str, float]:
@@ -52,7 +61,7 @@ def test_a_scale_that_was_observed_stays_where_nothing_shows_it_any_more() -> No
             ledger.add(rows)
         stays = {name: newest(ledger.stays(), 3) for name, ledger in sites.items()}
         for minute in range(2):
-            solved = calibrate(stays, remembered=remembered_of(decisions.of_solver()))
+            solved = calibrate(stays, remembered=remembered_of(decisions.shown()))
             now_ns = START_NS + 900 * (quarter + 1) * S + 60 * minute * S
             for decision in decisions.judge(solved, now_ns):
                 decisions.add(decision)
@@ -72,14 +81,78 @@ def test_evidence_of_now_counts_more_than_what_is_remembered() -> None:
     assert calibrate(mended, remembered=remembered_of(KNOWN)).machines["a"].scale < 0.15, "and a weak one pulls"
 
 
-def test_what_slopes_contradict_now_is_not_remembered() -> None:
-    def paved(x_m: Floats, y_m: Floats, heading: Floats) -> Floats:
-        return soils(x_m, y_m, heading) - 0.02 * (height_slope(x_m) > 0)
+def paved(x_m: Floats, y_m: Floats, heading: Floats) -> Floats:
+    """Ramps of better ground than what is around them."""
+    return soils(x_m, y_m, heading) - 0.02 * (height_slope(x_m) > 0)
 
-    rows = {name: drive(ROUTES[name], Errors(), site=paved, seed=i) for i, name in enumerate(ERRORS)}
+
+def borders(x_m: Floats, y_m: Floats, _: Floats) -> Floats:
+    """Borders of soils at the foot of two of three lanes."""
+    return 0.03 + 0.02 * ((y_m < 17.0) & (x_m > FOOT_M)) + 0.02 * ((y_m > 32.0) & (x_m < FOOT_M))
+
+
+@pytest.mark.parametrize(("site", "reason"), [(paved, "ground_changes_with_slope"), (borders, "places_disagree")])
+def test_a_scale_that_was_shown_counts_where_slopes_contradict_each_other(site: Site, reason: str) -> None:
+    rows = {name: drive(ROUTES[name], e, site=site, seed=i) for i, (name, e) in enumerate(ERRORS.items())}
+    alone = calibrate(ledgers(rows))
+    assert (alone.common.reason, {one.most_share for one in alone.corrections}) == (reason, {LEVEL_SHARE})
     result = calibrate(ledgers(rows), remembered=remembered_of(KNOWN))
-    assert result.common.reason == "ground_changes_with_slope"
-    assert {one.most_share for one in result.corrections} == {LEVEL_SHARE}
+    assert {one.most_share for one in result.corrections} == {ANY_SHARE}
+    assert scales(result) == pytest.approx(scales_of(ERRORS), abs=0.015)
+
+
+def test_a_scale_that_is_remembered_does_not_wear_out() -> None:
+    """A decision every ten minutes, since the zero wanders; the scale is shown in the first one."""
+    decisions, ledger, kept = CalibrationDecisions(), Ledger(), []
+    ledger.epochs = 1
+    for turn in range(10):
+        error = Errors(0.002 * (turn % 2), 0.12)
+        ledger.add(drive(LOW if turn else BOTH, error, seconds=200.0, seed=turn, start_s=600.0 * turn))
+        for minute in range(2):
+            solved = calibrate({"a": ledger.stays()}, remembered=remembered_of(decisions.shown()))
+            for decision in decisions.judge(solved, START_NS + (600 * turn + 300 + 60 * minute) * S):
+                decisions.add(CalibrationDecision.from_body(decision.body()))
+                kept.append(decision)
+    assert [each.remembered for each in kept] == [False] + [True] * (len(kept) - 1)
+    assert len(kept) > 5
+    newest = decisions.corrections.newest("a")
+    assert newest.most_share == ANY_SHARE
+    assert newest.scale == kept[0].corrections[-1].scale
+    assert newest.covariance[1][1] == pytest.approx(REMEMBERED_STD**2 + SCALE_FLOOR**2, rel=0.01)
+    assert remembered_of(CalibrationDecisions(kept).shown()) == remembered_of(decisions.shown()), "after a start, too"
+
+
+def test_a_scale_that_is_found_late_leaves_no_step_in_the_map() -> None:
+    """Paved ramps show nothing, until the machine drives one both ways; what it drove before is right then, too."""
+    ledger, decisions, driven = Ledger(), CalibrationDecisions(), []
+    ledger.epochs = 2
+    for turn in range(6):
+        route = BOTH if turn == 4 else RAMP
+        driven.append(drive(route, Errors(0.006, 0.1), site=paved, seconds=300.0, seed=turn, start_s=600.0 * turn))
+        ledger.add(driven[-1])
+        for minute in range(2):
+            solved = calibrate({"a": ledger.stays()}, remembered=remembered_of(decisions.shown()))
+            for decision in decisions.judge(solved, START_NS + (600 * turn + 300 + 60 * minute) * S):
+                decisions.add(decision)
+        assert decisions.corrections.newest("a").most_share == (ANY_SHARE if turn >= 4 else LEVEL_SHARE)
+    on_ramps = []
+    for rows in (driven[0], driven[-1]):
+        right = corrected(rows, decisions.corrections.spans_of("a"))
+        uphill = (np.abs(right["x_m"] - (FOOT_M + TOP_M) / 2) < 6.0) & (right["y_m"] < 20.0)
+        on_ramps.append(np.nanmean(right["c_rr"][uphill]))
+    assert on_ramps == pytest.approx([0.02, 0.02], abs=0.004)
+
+
+def test_a_quarter_of_an_hour_in_which_nothing_is_shown_erases_nothing() -> None:
+    decisions = CalibrationDecisions()
+    level = Correction("a", EPOCH_NS, LAST_NS, 0.003, 0.0, 0.0, SURE, LEVEL_SHARE)
+    for one in (KNOWN[0], level, replace(level, most_share=NO_SHARE)):
+        decisions.add(CalibrationDecision("a", SOLVER, "", 0, (one,)))
+        assert remembered_of(decisions.shown()) == remembered_of(KNOWN[:1])
+    decisions.add(CalibrationDecision("a", SOLVER, "", 0, (replace(KNOWN[0], scale=0.1),), remembered=True))
+    assert remembered_of(decisions.shown()) == remembered_of(KNOWN[:1])
+    decisions.add(CalibrationDecision("a", SOLVER, "", 0, (replace(KNOWN[0], scale=0.1),)))
+    assert remembered_of(decisions.shown())["a"].scale == pytest.approx(0.1 / 0.9)
 
 
 def test_only_scales_that_were_observed_are_remembered() -> None:

@@ -21,7 +21,6 @@ from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
 from mapserver.journal.journal import UnwrittenError
 from mapserver.journal.sqlite.journal import SqliteJournal
-from mapserver.query.answering import Answers
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import ServerAlive
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
@@ -38,14 +37,13 @@ from tests.unit.mapserver.data import (
     held,
     incoming,
     open_writer,
-    past_of,
     random_samples,
     same,
     samples,
     send,
     wait_for,
 )
-from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered
+from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
 
 
 @pytest.fixture
@@ -575,7 +573,7 @@ QUERIES = [
 def test_a_refused_query_says_why(start, reason, name, parameters):
     writer = start()
     with pytest.raises(QueryError) as caught:
-        answered(Answers(writer, FakeUpkeep(), past_of(writer)), name, parameters)
+        answered(answers_of(writer), name, parameters)
     assert caught.value.reason == reason
 
 
@@ -583,6 +581,7 @@ def test_every_reason_to_refuse_is_provoked_here():
     elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
     elsewhere |= {Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}  # in the tests of admission, and of the claim
     elsewhere |= {Refusal.UNSIGNED}  # which a sender says, and no server
+    elsewhere |= {Refusal.NOT_HERE}  # which followers say
     elsewhere |= {Refusal.UNKNOWN_MACHINE, Refusal.EXPIRED}  # commands and tiles, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
 
@@ -590,7 +589,7 @@ def test_every_reason_to_refuse_is_provoked_here():
 def test_refused_queries_are_counted_by_reason(start):
     writer = start()
     for _ in range(2):
-        writer.count_refusal(Refusal.UNKNOWN_LAYER)
-    writer.count_refusal(Refusal.TOO_LARGE)
+        writer.count("refused_query_unknown_layer")
+    writer.count("refused_query_too_large")
     counters = writer.info()["counters"]
     assert (counters["refused_query_unknown_layer"], counters["refused_query_too_large"]) == (2, 1)

@@ -510,3 +510,17 @@ def test_machines_that_are_excluded_are_not_missed(journal):
     write(journal, *(admission(1, first_seq=1 + i // 2, machine="ab"[i % 2]) for i in range(500)))
     assert numbers(journal.read(selection=Selection(without=frozenset("a")))) == list(range(2, 501, 2))
     assert numbers(journal.read(selection=Selection(without=frozenset("ab")))) == []
+
+
+def test_a_new_journal_goes_on_after_an_archive(tmp_path):
+    marks = {("a", 7): Watermark(50, 3, 40), ("b", 2**64 - 1): Watermark(9, 0, 60)}
+    with closing(SqliteJournal(tmp_path / "journal.db", "pit", SITE.frame)) as journal:
+        journal.follow_archive(20, marks)
+        assert (journal.last_row, journal.archived_row, journal.watermarks()) == (20, 20, marks)
+        assert journal.samples == 56
+        journal.begin()
+        journal.append(Admission(batch(samples(3), 51), trimmed=0, lost=0), NOW_NS)
+        journal.commit()
+        journal.check()
+    with closing(SqliteJournal(tmp_path / "journal.db", "pit", SITE.frame)) as again:
+        assert (again.last_row, again.archived_row, again.samples, again.shortfall) == (21, 20, 59, None)

@@ -47,7 +47,13 @@ INFO: dict[str, Any] = {
     },
     "distrusted": ["loader-2"],
     "shortfalls": ["5 acknowledged samples of loader-1 are gone"],
-    "counters": {"batches": 12, "samples_trimmed": 7, "refused_gap": 2, "refused_query_unknown_layer": 1},
+    "counters": {
+        "batches": 12,
+        "samples_trimmed": 7,
+        "queries_answered": 5,
+        "refused_gap": 2,
+        "refused_query_unknown_layer": 1,
+    },
     "writer": {"waiting": 3, "waiting_bytes": 4096, "commits": 20, "commit_s": 0.5},
 }
 HEALTH = {
@@ -88,6 +94,7 @@ def test_the_state_of_the_server_is_exposed(tmp_path: Path):
     assert {name: value for name, value in plain.items() if not name.startswith("process")} == {
         "batches_total": 12,
         "samples_trimmed_total": 7,
+        "queries_answered_total": 5,
         "journal_rows": 12,
         "merged_rows": 11,
         "snapshot_rows": 5,

@@ -4,21 +4,21 @@ from concurrent.futures import Future
 from dataclasses import asdict
 from typing import Any
 
-from mapserver.journal.facts import Facts
+from mapserver.ingest.writer import Writer
 from mapserver.query.answering import Answers
+from mapserver.query.server_source import ServerSource
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import GroundChange
 from protocol.queries.requests import parse_query
-from tests.unit.mapserver.data import WAIT_S
+from tests.unit.mapserver.data import WAIT_S, past_of
 from tests.unit.records import machine_state
 
 
 class FakeUpkeep:
     """Stands for a Upkeep that knows the machines a and b; notes what it is asked."""
 
-    def __init__(self, *excluded: str) -> None:
+    def __init__(self) -> None:
         self.asked: list[object] = []
-        self._excluded = frozenset(excluded)
 
     def machines(self) -> list[dict[str, Any]]:
         return [asdict(machine_state("a")), asdict(machine_state("b", trusted=False))]
@@ -33,14 +33,15 @@ class FakeUpkeep:
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine}` is not known")
         return asdict(machine_state(machine, trusted=trusted is not False))
 
-    def facts(self) -> Facts:
-        return Facts(self._excluded)
+
+def answers_of(writer: Writer, upkeep: FakeUpkeep | None = None) -> Answers:
+    return Answers(ServerSource(writer, upkeep or FakeUpkeep(), past_of(writer)))  # type: ignore[arg-type]
 
 
 def answered(answers: Answers, name: str, parameters: dict[str, str]) -> bytes:
     """Parse a query, wait for the row that it asks for, and answer it."""
     query, waited = parse_query(name, parameters), Future()
-    answers._writer.waits.add(query.fresh.after, query.fresh.wait_s, waited.set_result)
+    answers._source.waits.add(query.fresh.after, query.fresh.wait_s, waited.set_result)
     if error := waited.result(WAIT_S):
         raise error
     return answers.answer(query)

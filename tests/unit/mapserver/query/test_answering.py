@@ -21,12 +21,11 @@ from tests.unit.mapserver.data import (
     folded,
     incoming,
     open_writer,
-    past_of,
     random_samples,
     samples,
     send,
 )
-from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered
+from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
 
 # One sample in each cell of two diagonals, the value tells the cell.
 STEPS = np.arange(-40, 40)
@@ -37,7 +36,7 @@ def diagonal() -> np.ndarray:
 
 
 def asked(writer: Writer) -> Answers:
-    return Answers(writer, FakeUpkeep(), past_of(writer))
+    return answers_of(writer)
 
 
 @pytest.fixture
@@ -169,7 +168,7 @@ def driven(
     return passes
 
 
-def answers_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tuple[Writer, Answers]:
+def map_of(folder, rows: list[np.ndarray], site=SITE, config=CONFIG) -> tuple[Writer, Answers]:
     """The map of passes, which are folded past the door: there, a batch has so many samples at most."""
     writer = open_writer(folder, config, site)
 
@@ -203,7 +202,7 @@ def assert_parts_are_cut_from_the_whole(answers: Answers, cell_m: float, half: i
 # The repaved area lies across two and across four blocks, and along the border of one.
 @pytest.mark.parametrize("changed", [(10, 2, 22, 12), (-8, -7, 6, 9), (16, 16, 23, 22), (-23, -5, -16, 1)])
 def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, changed):
-    writer, answers = answers_of(tmp_path, driven(1.0, 40, changed))
+    writer, answers = map_of(tmp_path, driven(1.0, 40, changed))
     whole = assert_parts_are_cut_from_the_whole(answers, 1.0, 48, CHANGED, seed=1)
     west, south, east, north = (edge + 48 for edge in changed)
     inside = np.zeros((96, 96), np.bool_)
@@ -231,7 +230,7 @@ def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, chan
 def test_a_change_is_seen_with_all_its_surroundings_in_cells_of_any_size(tmp_path, cell_m, c_rr, edge_m):
     cells = round(edge_m / cell_m)  # a metre more than the least
     rows = driven(cell_m, cells + 20, (-cells + 3, -4, 3, cells - 4), c_rr=c_rr)
-    writer, answers = answers_of(tmp_path, rows, replace(SITE, cell_m=cell_m))
+    writer, answers = map_of(tmp_path, rows, replace(SITE, cell_m=cell_m))
     try:
         names = ("resistance", "grade_east", "changed_s")
         whole = assert_parts_are_cut_from_the_whole(answers, cell_m, cells + 16, names, seed=2)
@@ -242,7 +241,7 @@ def test_a_change_is_seen_with_all_its_surroundings_in_cells_of_any_size(tmp_pat
 
 @pytest.mark.parametrize("step", [3, 5])
 def test_gaps_are_filled_alike_in_every_window(tmp_path, step):
-    writer, answers = answers_of(tmp_path, driven(1.0, 40, (-8, -7, 6, 9), step))
+    writer, answers = map_of(tmp_path, driven(1.0, 40, (-8, -7, 6, 9), step))
     whole = assert_parts_are_cut_from_the_whole(answers, 1.0, 48, FILLED, seed=3)
     writer.close()
     assert np.isfinite(whole["resistance_filled"]).sum() > 2 * np.isfinite(whole["resistance"]).sum()
@@ -252,7 +251,7 @@ def test_the_change_options_reach_the_answer(tmp_path):
     rows = driven(1.0, 20, (-6, -6, 6, 6))
     for detect in (True, False):
         config = replace(CONFIG, change=replace(CONFIG.change, detect=detect))
-        writer, answers = answers_of(tmp_path / str(detect), rows, config=config)
+        writer, answers = map_of(tmp_path / str(detect), rows, config=config)
         changed_s = region(answers, -20, -20, 20, 20, names=("changed_s",))["changed_s"]
         writer.close()
         assert np.isfinite(changed_s).any() == detect

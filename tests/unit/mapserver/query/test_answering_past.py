@@ -5,16 +5,18 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answering import Answers
+from mapserver.query.server_source import Commands
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.requests import MAX_SPANS, Freshness, HistoryQuery, PointQuery, RegionQuery, When, reads_past
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, past_of, random_samples, samples, send
-from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered
+from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, samples, send
+from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered, answers_of
 
 S, HOUR_NS = 10**9, 3600 * 10**9
 BOX = Bounds(-40, -40, 40, 40)
@@ -29,14 +31,15 @@ def served(tmp_path_factory):
     """Function that starts a writer with the samples of each machine in two rows, in a folder of its own."""
     opened = []
 
-    def start(rows=None, upkeep=None) -> Answers:
+    def start(rows=None, upkeep=None, excluded=()) -> Answers:
         writer = open_writer(tmp_path_factory.mktemp("store"))
         opened.append(writer)
         for machine, table in (ROWS if rows is None else rows).items():
             half = len(table) // 2
             send(writer, [incoming(part, machine=machine) for part in (table[:half],) if len(part)])
             send(writer, [incoming(table[half:], 1 + half, machine)])
-        return Answers(writer, upkeep or FakeUpkeep(), past_of(writer))
+        writer.run(lambda store: setattr(store, "facts", Facts(frozenset(excluded))))
+        return answers_of(writer, upkeep)
 
     yield start
     for writer in opened:
@@ -111,7 +114,7 @@ def test_what_changed_later_has_not_changed_yet(served):
 
 
 def test_excluded_machines_are_excluded_from_the_past(answers, served):
-    without = served(upkeep=FakeUpkeep("b"))
+    without = served(excluded="b")
     only_a = served({"a": ROWS["a"]})
     when = When(as_of_ns=NEWEST_NS)
     here, there = (asked.region(RegionQuery(BOX, ("resistance",), when=when)) for asked in (without, only_a))
@@ -219,7 +222,7 @@ def test_without_a_first_time_the_newest_spans_are_answered(served):
 
 def test_a_history_leaves_out_machines_and_filled_layers(served):
     rows = hours(0.02, 0.05)
-    assert served(rows, FakeUpkeep("a")).history(HistoryQuery(8.5, 8.5)).spans == ()
+    assert served(rows, excluded="a").history(HistoryQuery(8.5, 8.5)).spans == ()
     with pytest.raises(QueryError, match="`resistance_filled` is made from a cell's neighbours") as caught:
         served(rows).history(HistoryQuery(8.5, 8.5, ("visits", "resistance_filled")))
     assert caught.value.reason == Refusal.UNKNOWN_LAYER
@@ -240,7 +243,7 @@ def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
     with closing(open_writer(tmp_path)) as writer:
         writer.location = JournalLocation(tmp_path / "elsewhere")
         with pytest.raises(QueryError, match="no usable journal") as caught:
-            getattr(Answers(writer, FakeUpkeep(), past_of(writer)), query.name)(query)
+            getattr(answers_of(writer), query.name)(query)
     assert caught.value.reason == Refusal.STORE
 
 
@@ -276,16 +279,17 @@ def test_answers_about_the_past_travel_as_bytes(answers):
 def test_the_upkeep_is_asked(served):
     upkeep = FakeUpkeep()
     answers = served(upkeep=upkeep)
+    commands = Commands(answers._source._writer, upkeep, answers.info)  # type: ignore[arg-type]
     machines = codec.decode_machines(answered(answers, "machines", {"after": "1"})).machines
     assert [(machine.name, machine.trusted) for machine in machines] == [("a", True), ("b", False)]
     changes = codec.decode_changes(answered(answers, "changes", {"after": "41"})).changes
     assert [change.id for change in changes] == [42]
-    row = codec.decode_machine(answers.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
+    row = codec.decode_machine(commands.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
     assert (row.name, row.trusted, row.merged) == ("b", False, 4)
-    answers.obey("trust", {"machine": "b", "trusted": "auto"})
+    commands.obey("trust", {"machine": "b", "trusted": "auto"})
     assert upkeep.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]
     with pytest.raises(QueryError, match="`c` is not known") as caught:
-        answers.obey("trust", {"machine": "c", "trusted": "yes"})
+        commands.obey("trust", {"machine": "c", "trusted": "yes"})
     assert caught.value.reason == Refusal.UNKNOWN_MACHINE
     with pytest.raises(QueryError, match="row 9 is not merged"):
         answered(answers, "machines", {"after": "9", "wait": "0.01"})

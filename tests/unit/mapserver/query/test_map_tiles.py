@@ -11,8 +11,8 @@ from protocol.queries.answers import MapVersion
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.requests import PointQuery, RegionQuery, TilesQuery, WhyQuery, parse_query
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import NOW_NS, SITE, incoming, open_writer, past_of, random_samples, samples, send
-from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep
+from tests.unit.mapserver.data import NOW_NS, SITE, incoming, open_writer, random_samples, samples, send
+from tests.unit.mapserver.query.fake_upkeep import answers_of
 
 
 def content(tiles: dict[tuple[int, int], MapTile]) -> dict[tuple[int, int], tuple[int, bytes]]:
@@ -42,7 +42,7 @@ class Page:
 def test_tiles_say_what_a_region_says(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(random_samples(4000, seed=3))])
-        answers = Answers(writer, FakeUpkeep(), past_of(writer))
+        answers = answers_of(writer)
         page = Page(answers)
         answer = page.ask()
         assert answer.whole
@@ -66,7 +66,7 @@ def test_tiles_say_what_a_region_says(tmp_path):
 def test_a_page_that_asks_for_what_changed_has_what_a_fresh_one_has(tmp_path):
     rng = np.random.default_rng(1)
     with closing(open_writer(tmp_path)) as writer:
-        answers = Answers(writer, FakeUpkeep(), past_of(writer))
+        answers = answers_of(writer)
         page, sent = Page(answers), 0
         for turn in range(12):
             rows = random_samples(60, seed=turn, half_m=10.0)
@@ -75,7 +75,7 @@ def test_a_page_that_asks_for_what_changed_has_what_a_fresh_one_has(tmp_path):
             sent += len(page.ask().tiles)
             send(writer, [incoming(rows, first_seq=1 + 60 * turn)])
             page.ask()
-            fresh = Page(Answers(writer, FakeUpkeep(), past_of(writer)))
+            fresh = Page(answers_of(writer))
             fresh.ask()
             assert content(page.tiles) == content(fresh.tiles)
         assert not page.ask().tiles, "nothing came in: nothing is sent"
@@ -85,7 +85,7 @@ def test_a_page_that_asks_for_what_changed_has_what_a_fresh_one_has(tmp_path):
 
 def test_a_change_of_the_ground_reaches_the_tiles(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
-        answers = Answers(writer, FakeUpkeep(), past_of(writer))
+        answers = answers_of(writer)
         page = Page(answers)
         strip = np.arange(0, 40, 0.5)
         for turn in range(8):
@@ -108,7 +108,7 @@ def test_a_change_of_the_ground_reaches_the_tiles(tmp_path):
 def test_another_store_or_a_version_that_is_not_there_yet_gets_everything(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(samples(3))])
-        answers = Answers(writer, FakeUpkeep(), past_of(writer))
+        answers = answers_of(writer)
         version = answers.tiles(TilesQuery()).version
         assert not answers.tiles(TilesQuery(version)).whole
         for other in (MapVersion("other", 1, 0), MapVersion(version.store, 2, 0), MapVersion(version.store, 1, 5)):
@@ -120,7 +120,7 @@ def test_tiles_as_of_a_time_are_those_of_that_time(tmp_path):
     early, late = samples(20, c_rr=0.02), samples(20, x_m=30.5, stamp_ns=NOW_NS + 3600 * 10**9)
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(early)])
-        answers = Answers(writer, FakeUpkeep(), past_of(writer))
+        answers = answers_of(writer)
         before = Page(answers)
         before.ask()
         send(writer, [incoming(late, first_seq=21)])
@@ -151,7 +151,7 @@ def test_a_wrong_version_is_refused_by_name(parameters, reason):
 
 def test_an_empty_map_has_no_tiles_and_no_reasons(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
-        answers = Answers(writer, FakeUpkeep(), past_of(writer))
+        answers = answers_of(writer)
         assert answers.tiles(TilesQuery()).tiles == ()
         assert answers.tiles(TilesQuery(as_of_ns=NOW_NS)).tiles == ()
         why = answers.why(WhyQuery(3.5, -2.5))
@@ -163,7 +163,7 @@ def test_reasons_are_those_of_the_cell(tmp_path):
     rows = samples(10, heading_rad=np.pi / 2, distance_m=2.0)
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(rows), incoming(samples(5, x_m=200.0), machine="truck-2")])
-        answers = Answers(writer, FakeUpkeep(), past_of(writer))
+        answers = answers_of(writer)
         why, point = answers.why(WhyQuery(8.5, 8.5)), answers.point(PointQuery(8.5, 8.5))
         for name, value in why.values.items():
             assert value == pytest.approx(point.values[name]), name
@@ -180,7 +180,7 @@ def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
     monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 3000)
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(random_samples(3000, 4, half_m=200.0))])
-        answers = Answers(writer, FakeUpkeep(), past_of(writer))
+        answers = answers_of(writer)
         for as_of_ns in (None, NOW_NS + 1800 * 10**9):
             pieces = [answers.tiles(TilesQuery(as_of_ns=as_of_ns))]
             while (place := pieces[-1].next_place) is not None:

@@ -15,8 +15,8 @@ from protocol.queries.answers import Region
 from protocol.queries.pieces import joined
 from protocol.queries.requests import PieceQuery, RegionQuery, When
 from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow
-from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, past_of, random_samples, send
-from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep
+from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, send
+from tests.unit.mapserver.query.fake_upkeep import answers_of
 
 NAMES = ("resistance", "visits", "resistance_filled", "grade_filled_std")
 ROWS = random_samples(3000, 8, std_m=1.0)
@@ -26,7 +26,7 @@ ROWS = random_samples(3000, 8, std_m=1.0)
 def served(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(ROWS)])
-        yield writer, Answers(writer, FakeUpkeep(), past_of(writer))
+        yield writer, answers_of(writer)
 
 
 def read(answers: Answers, query: RegionQuery) -> list[Region]:

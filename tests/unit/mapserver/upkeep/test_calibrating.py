@@ -6,6 +6,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,12 @@ def calibrating(writer: Writer, *doubtful: str) -> tuple[Calibrating, list[int]]
 def solved(writer: Writer, *doubtful: str) -> Calibration:
     job, _ = calibrating(writer, *doubtful)
     with closing(job):
-        return job.solve()[0]
+        return of_ledgers(job)
+
+
+def of_ledgers(job: Calibrating) -> Calibration:
+    """What the ledgers come to. Since when there may be samples is more or less known, and no matter of theirs."""
+    return replace(job.solve()[0], begins_ns={})
 
 
 def test_the_errors_of_machines_are_found(writer):
@@ -87,7 +93,7 @@ def test_followed_live_made_at_a_start_or_from_the_archive_ledgers_are_the_same(
         for share in range(5):
             deliver(writer, share / 5, (share + 1) / 5)
             live.run()
-        result = live.solve()[0]
+        result = of_ledgers(live)
     assert solved(writer) == result
     with SqliteReader(tmp_path / JOURNAL_FILE) as reader:
         half = writer.run(lambda store: store.journalled) // 2
@@ -121,11 +127,13 @@ def test_it_solves_in_site_time(tmp_path):
                 job._due_s = 0.0
                 job.run()
                 job.run()
-            assert [round((now_ns - START_NS) / S) for now_ns in decided] == [10, 75, 140]
+            assert [round((now_ns - START_NS) / S) for now_ns in decided] == [75, 140], (
+                "10 s were there before it began"
+            )
             job._due_s = 1e12  # it has used more than its share of the processor
             send(writer, [incoming(rows[seq - 1 :], seq, "a")])
             job.run()
-            assert len(decided) == 3
+            assert len(decided) == 2
     assert EVERY_NS == 60 * S
 
 
@@ -288,7 +296,6 @@ def test_what_fails_on_its_entry_is_not_counted_twice(writer, monkeypatch):
 def test_a_large_fleet_is_solved_in_groups_that_take_turns(writer, monkeypatch):
     monkeypatch.setattr(calibration, "MOST_MACHINES", 2)
     monkeypatch.setattr(calibration, "MOST_EPOCHS", 4)
-    deliver(writer)
     together: list[set[str]] = []
 
     def note(stays: Mapping[str, Table], *more: Any) -> Calibration:
@@ -296,13 +303,17 @@ def test_a_large_fleet_is_solved_in_groups_that_take_turns(writer, monkeypatch):
         return calibrate(stays, *more)
 
     monkeypatch.setattr(calibrating_module, "calibrate", note)
+    deliver(writer, last=0.1)
     job, _ = calibrating(writer)
     together.clear()
     with closing(job):
-        for _ in range(2):
-            job._solved_ns, job._due_s = 0, 0.0
+        for share in (0.1, 0.4, 0.7):
+            job._due_s = 0.0
             job.run()
-        assert together == [{"a", "c"}, {"b"}]
+            deliver(writer, share, share + 0.3)
+        job._due_s = 0.0
+        job.run()
+        assert together == [{"a", "c"}, {"b"}, {"a", "c"}]
         assert {*job.states()} == set(DRIVES)
         assert {*job.solve()[0].machines} == set(DRIVES)
         assert {ledger.epochs for ledger in job._ledgers.values()} == {2}
@@ -319,3 +330,78 @@ def test_it_says_from_when_on_there_may_be_samples_of_a_machine(writer):
         assert job.solve()[0].begins_ns == dict.fromkeys(DRIVES, 0) | {"d": first_ns}
         send(writer, [incoming(rows[:10], 1, "d", spool_id=8)])
         assert job.solve()[0].begins_ns["d"] == int(rows["stamp_ns"][0]), "and late ones count"
+
+
+# --- wrong clocks, and machines that leave and come back --------------------------------------------------------------
+
+
+def follows(job: Calibrating, writer: Writer, rows: Table, name: str = "a", first_seq: int = 1) -> None:
+    """Samples come in, some 15 s at a time, and the job has its turn after each."""
+    for first in range(0, len(rows), 120):
+        send(writer, [incoming(rows[first : first + 120], first_seq + first, name)])
+        job._due_s = 0.0
+        job.run()
+
+
+@pytest.mark.parametrize("same_machine", [False, True])
+def test_one_clock_that_was_ahead_does_not_stop_the_calibration_of_the_site(tmp_path, same_machine):
+    with closing(open_writer(tmp_path)) as writer:
+        job, decided = calibrating(writer)
+        with closing(job):
+            ahead = drive(LOW, seconds=5, start_s=20 * 3600)
+            follows(job, writer, ahead, "a" if same_machine else "x")
+            rows = drive(LOW, Errors(0.009), seconds=400)
+            follows(job, writer, rows, first_seq=len(ahead) + 1 if same_machine else 1)
+            assert len(decided) >= 5
+            if same_machine:
+                assert {round((now_ns - START_NS) / S) < 400 for now_ns in decided[1:]} == {True}
+
+
+def test_what_a_clock_stamped_that_was_ahead_has_no_part_in_a_solve(tmp_path, monkeypatch):
+    """A machine drives with a clock that is 20 h ahead, and then with one that is right, in both for some epochs."""
+    monkeypatch.setattr(calibration, "MOST_EPOCHS", 1)
+    monkeypatch.setattr("mapserver.fleet.ledger._PENDING_ROWS", 10)
+    with closing(open_writer(tmp_path)) as writer:
+        job, _ = calibrating(writer)
+        with closing(job):
+            right = drive(LOW, Errors(0.012), seconds=300, start_s=3600)
+            send(writer, [incoming(right[:240], 1, "a")])
+            job.run()
+            ahead = drive(LOW, Errors(-0.005), seconds=150, start_s=20 * 3600)
+            follows(job, writer, ahead, first_seq=241)
+            follows(job, writer, right[240:], first_seq=241 + len(ahead))
+            result = job.solve()[0]
+            assert max(one.from_ns for one in result.corrections) <= int(right["stamp_ns"].max())
+            assert result.machines["a"].zero == pytest.approx(0.012, abs=0.002)
+            assert solved(writer).machines["a"].zero == pytest.approx(0.012, abs=0.002), "nor after a start"
+
+
+def test_a_running_server_knows_no_more_of_machines_that_left_than_one_that_is_started(tmp_path, monkeypatch):
+    monkeypatch.setattr(calibration, "MOST_EPOCHS", 20)
+    with closing(open_writer(tmp_path)) as writer:
+        job, _ = calibrating(writer)
+        with closing(job):
+            for name in ("gone", "here"):
+                send(writer, [incoming(drive(LOW, seconds=100), 1, name)])
+            assert {*of_ledgers(job).machines} == {"gone", "here"}
+            assert job._ledgers["here"].epochs == 10
+            later = drive(LOW, Errors(0.006), seconds=200, start_s=30 * 86_400)
+            send(writer, [incoming(later, 201, "here", lost_before=0)])
+            running = of_ledgers(job)
+            assert {*running.machines} == {"here"}
+            assert {*job._ledgers} == {"here"}
+            assert job._ledgers["here"].epochs == 20, "there is room again"
+            assert running == solved(writer)
+
+
+def test_of_a_machine_that_was_away_when_the_server_started_there_may_be_older_samples(writer):
+    deliver(writer, last=0.2)
+    later = drive(LOW, seconds=100, start_s=3 * 86_400)
+    send(writer, [incoming(later, 1, "other")])
+    job, _ = calibrating(writer)
+    with closing(job):
+        assert {*job.solve()[0].begins_ns} == {"other"}, "the others' were days ago"
+        back = drive(LOW, seconds=100, start_s=3 * 86_400 + 400)
+        send(writer, [incoming(back, 1, "a", spool_id=8), incoming(back, 1, "new")])
+        begins_ns = job.solve()[0].begins_ns
+    assert begins_ns == {"a": 0, "other": 0, "new": int(back["stamp_ns"][0])}

@@ -11,6 +11,7 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig, TrustConfig
 from mapserver.ingest.writer import Writer
+from mapserver.journal.facts import Facts
 from mapserver.upkeep import upkeep
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.arrays import Table
@@ -40,17 +41,22 @@ def seen(site: Upkeep) -> dict[str, Any]:
     return next(each for each in site.machines() if each["name"] == "bad")
 
 
+def facts_of(writer: Writer) -> Facts:
+    """What the map is folded with."""
+    return writer.run(lambda store: store.facts)
+
+
 @pytest.mark.slow
 def test_a_broken_machine_is_named_left_out_and_let_in_by_a_person(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(upkeep, "TURN_S", 0.01)
     writer = open_writer(tmp_path / "store", CONFIG)
     with closing(writer), closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
         deliver(writer, SENT)
-        wait_for(lambda: site.facts().excluded == {"bad"})
+        wait_for(lambda: facts_of(writer).excluded == {"bad"})
         row = seen(site)
         assert (row["trusted"], row["by"]) == (False, "audit")  # for its gain, where the audit was there first
         site.calibrate(20.0)
-        before = site.facts().corrections
+        before = facts_of(writer).corrections
         assert {one.machine for one in before.each} == set(SENT) - {"bad"}
         wait_for(lambda: seen(site)["evidence"]["gain"] == pytest.approx(1.0, abs=0.1))  # what is corrected agrees
         assert seen(site)["reasons"] == ["beyond_data_sheet"]
@@ -58,13 +64,13 @@ def test_a_broken_machine_is_named_left_out_and_let_in_by_a_person(tmp_path: Pat
         row = site.trust("bad", True, "its torque is corrected", 20.0)
         assert (row["trusted"], row["by"], row["contradicts"]) == (True, "person", True)
         site.calibrate(20.0)
-        own = [one for one in site.facts().corrections.each if one.machine == "bad"]
-        others = [one for one in site.facts().corrections.each if one.machine != "bad"]
+        own = [one for one in facts_of(writer).corrections.each if one.machine == "bad"]
+        others = [one for one in facts_of(writer).corrections.each if one.machine != "bad"]
         assert others == list(before.each)  # in the map, but still without a say
         assert own[0].scale == pytest.approx(GAIN / (1 + GAIN), abs=0.02)
         read = writer.run(lambda store: store.grid.counts())
         assert read.folded == sum(map(len, SENT.values()))
-        right = site.facts().corrections.applied(SENT["bad"], ("bad",), np.zeros(len(SENT["bad"]), np.int64))
+        right = facts_of(writer).corrections.applied(SENT["bad"], ("bad",), np.zeros(len(SENT["bad"]), np.int64))
         true = drive(RAMP, Errors(), seed=99)
         assert abs(np.median(right["c_rr"] - true["c_rr"])) < 0.003
     again = open_writer(tmp_path / "store", CONFIG)

@@ -138,7 +138,7 @@ def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
         row = site.upkeep.trust("b", False, "its scale is broken", 20.0)
         assert (row["trusted"], row["by"], row["reason"]) == (False, "person", "its scale is broken")
         assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert site.upkeep.facts().excluded == {"b"}
+        assert site.writer.run(lambda store: store.facts).excluded == {"b"}
         assert site.upkeep.trust("b", True, "repaired", 20.0)["trusted"]
         assert same(site.grid, fold_of(sent, site.config))
 
@@ -175,7 +175,7 @@ def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
     with opened(judge_s=JUDGE_S) as site:
         deliver(site, sent)
-        wait_for(lambda: site.upkeep.facts().excluded == {"c"})
+        wait_for(lambda: site.writer.run(lambda store: store.facts).excluded == {"c"})
         row = site.machine("c")
         assert (row["trusted"], row["by"]) == (False, "audit")
         assert "gain" in row["reason"]
@@ -191,7 +191,7 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
         never = threading.Event()
         for _ in range(4):  # turns in which it could be excluded
             never.wait(JUDGE_S)
-        assert site.upkeep.facts().excluded == frozenset()
+        assert site.writer.run(lambda store: store.facts).excluded == frozenset()
         assert site.machine("c")["trusted"]
         assert site.machine("c")["reasons"]
 
@@ -199,11 +199,11 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
 def test_a_person_overrules_the_audit_and_hands_back(opened):
     with opened(judge_s=JUDGE_S) as site:
         deliver(site, fleet({"c": 1.6}))
-        wait_for(lambda: site.upkeep.facts().excluded == {"c"})
+        wait_for(lambda: site.writer.run(lambda store: store.facts).excluded == {"c"})
         assert site.upkeep.trust("c", True, "I know better", 20.0)["by"] == "person"
-        assert site.upkeep.facts().excluded == frozenset()
+        assert site.writer.run(lambda store: store.facts).excluded == frozenset()
         assert not site.upkeep.trust("c", None, "", 20.0)["trusted"]
-        assert site.upkeep.facts().excluded == {"c"}
+        assert site.writer.run(lambda store: store.facts).excluded == {"c"}
 
 
 def test_a_machine_that_sent_nothing_is_refused_by_name(opened):

@@ -323,7 +323,9 @@ def test_common_names_never_meet():
 # --- rules -----------------------------------------------------------------------------------------------------------
 
 NAMES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim", "b1": "base"}
-REGISTER = Register(SITE, (), {n: RegisterEntry(r, "1", NOW) for n, r in {**NAMES, "server": "server"}.items()})
+REGISTER = Register(
+    SITE, (), {n: RegisterEntry(r, "1", NOW) for n, r in {**NAMES, "server": "server", "f1": "follower"}.items()}
+)
 
 
 def may(name: str, message: str, key: str, flow: str = "ingress", register: Register = REGISTER) -> bool:
@@ -368,6 +370,15 @@ def may(name: str, message: str, key: str, flow: str = "ingress", register: Regi
         ("declare_queryable", keys.admin_all(SITE), {"server"}),
         ("declare_queryable", keys.ingest(SITE, "loader-1"), {"server"}),
         ("reply", keys.map_query(SITE, "info"), {"server"}),
+        ("query", keys.follower_query(SITE, "f1", "point"), {"loader-1", "loader-2", "guest", "boss"}),
+        ("query", keys.journal(SITE), {"f1"}),
+        ("query", keys.follower_owner(SITE, "f1"), {"f1"}),
+        ("declare_queryable", keys.journal(SITE), {"server"}),
+        ("declare_queryable", keys.follower_queries(SITE, "f1"), {"f1"}),
+        ("declare_queryable", keys.follower_owner(SITE, "f1"), {"f1"}),
+        ("declare_queryable", keys.follower_queries(SITE, "f2"), set()),
+        ("liveliness_token", keys.follower_alive(SITE, "f1"), {"f1"}),
+        ("liveliness_query", keys.followers_alive_all(SITE), {"loader-1", "loader-2", "guest", "boss"}),
         ("liveliness_token", keys.alive(SITE, "loader-1"), {"loader-1"}),
         ("declare_liveliness_subscriber", keys.alive_all(SITE), {"guest", "boss", "server"}),
         ("liveliness_query", keys.alive(SITE, "loader-1"), {"loader-1", "guest", "boss", "server"}),
@@ -394,7 +405,14 @@ def test_every_key_that_exists_is_granted_to_somebody():
         parameters = list(inspect.signature(build).parameters)
         if build.__module__ != keys.__name__ or name.startswith("_") or parameters[:1] != ["site"]:
             continue
-        values = {"site": SITE, "machine": "loader-1", "base": "b1", "query": "info", "command": "trust"}
+        values = {
+            "site": SITE,
+            "machine": "loader-1",
+            "base": "b1",
+            "query": "info",
+            "command": "trust",
+            "follower": "f1",
+        }
         key = build(**{parameter: values[parameter] for parameter in parameters})
         messages = ("put", "query", "declare_subscriber", "liveliness_token", "liveliness_query", "declare_queryable")
         assert any(may(who, message, key) for who in REGISTER.names for message in messages), f"{name}: {key}"

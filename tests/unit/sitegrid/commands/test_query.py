@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,8 +28,9 @@ from protocol.queries.requests import (
 )
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
+from sitegrid.asking import PAST_S
 from sitegrid.cli import main
-from sitegrid.client import PAST_S, Client
+from sitegrid.client import Client
 from sitegrid.commands import query
 from tests.unit.records import STORE, map_info, version
 
@@ -54,6 +56,9 @@ class Session:
 
     def close(self) -> None: ...
 
+    def liveliness(self) -> SimpleNamespace:
+        return SimpleNamespace(get=lambda _, timeout: [])  # no followers
+
     def _answer(self, asked: MapQuery) -> bytes:
         if isinstance(asked, InfoQuery):
             return encode_info(map_info(SITE, stamp_ns=self.now_ns))
@@ -74,7 +79,7 @@ class Session:
 class Reply:
     def __init__(self, data: bytes) -> None:
         self.ok = self.payload = self
-        self.err = None
+        self.err = self.attachment = None
         self.to_bytes = lambda: data
 
 

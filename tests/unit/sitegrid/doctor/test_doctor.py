@@ -29,7 +29,7 @@ from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty
 from protocol.queries.answer_codec import encode_info
-from protocol.queries.answers import MapInfo, SampleCounts
+from protocol.queries.answers import FollowerState, MapInfo, SampleCounts
 from protocol.queries.requests import InfoQuery
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
@@ -117,6 +117,10 @@ def positions(**verdicts: str) -> Finding:
     return check_positions("loader-1", {"pipeline": {"consistency": receivers}})
 
 
+def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> FollowerState:
+    return FollowerState(name, store or INFO.store, 15, 12, 3, behind_s)
+
+
 @pytest.mark.parametrize(
     ("finding", "level", "words"),
     [
@@ -144,6 +148,10 @@ def positions(**verdicts: str) -> Finding:
         (network.check_writers([INFO]), PASS, f"pid 7 on host office, store {INFO.store}"),
         (network.check_writers([INFO, INFO]), FAIL, "2 map servers take samples of this site: pid 7 on host office"),
         (network.check_writers([]), SKIP, "no map server"),
+        (network.check_followers([], INFO), SKIP, "none answers"),
+        (network.check_followers([follower(), follower(name="b")], INFO), PASS, "a, b: at most 0.2 s behind"),
+        (network.check_followers([follower(behind_s=11.0)], INFO), WARN, "a: journal row 12, 3 rows and 11.0 s behind"),
+        (network.check_followers([follower(store="f" * 16)], INFO), FAIL, "a has the map of another store"),
         (network.check_time(INFO), PASS, "no stamp is ahead"),
         (network.check_time(replace(INFO, stamp_ns=NOW_NS, wall_ns=NOW_NS + 10**18)), PASS, "no stamp is ahead"),
         (
@@ -541,7 +549,7 @@ def test_a_running_agent_is_heard(site: Site, capsys):
 def test_people_read_one_line_each(capsys):
     assert main(["doctor", "--endpoint", free_endpoint()]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"-" * 10]
+    assert [line.split()[0] for line in lines] == ["-", "FAIL", *"-" * 11]
     assert lines[1].startswith("FAIL  router        nothing listens at tcp/127.0.0.1:")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from sitegrid.commands.trust import add_decision, decide
+from sitegrid.commands.decisions.trust import add_decision, decide
 from sitegrid.options.groups import add_network
 
 HELP = "exclude all samples of a machine from the map"

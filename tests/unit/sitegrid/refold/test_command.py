@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 import time
 from contextlib import closing
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +18,9 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet import decisions
 from mapserver.fleet.correction import LAST_NS, Correction
-from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
+from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.ingest.store import Incoming, Store
+from mapserver.ingest.store_folder import hold
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import history_rows
@@ -33,12 +36,16 @@ from protocol.site.site_config import KnownGround, SiteConfig, site_toml
 from protocol.site.site_file import load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
-from sitegrid import refold as fold
 from sitegrid.cli import main
+from sitegrid.refold import cluster, command, new_store, work
+from sitegrid.refold.engine import Here
+from sitegrid.refold.sources import joined_decisions
 from tests.journals import history_beside
 from tests.unit.mapserver.data import same_evidence
 
 pytest.importorskip("pyarrow.parquet")
+fsspec = pytest.importorskip("fsspec")
+pytest.importorskip("distributed")
 SITE = SiteConfig("pit", 48.0, 11.0)
 T0 = 1_767_225_600_000_000_000  # 2026-01-01T00:00Z
 S = 10**9
@@ -188,6 +195,21 @@ def test_a_correction_that_was_taken_back_and_given_again_counts(tmp_path: Path)
         with closing(opened(out)) as new:
             assert same_evidence(new.grid, live) == (i < 2)
             assert new.fact == (3 if i < 2 else 2)
+
+
+@pytest.mark.parametrize("order", [*permutations(("one", "other", "stale", "both")), ("one", "stale", "other")])
+def test_a_copy_of_a_history_that_is_behind_brings_nothing_back(order: tuple[str, ...]):
+    """Of two stores, with the archive of the second as it was, and a store that was folded of both and went on."""
+
+    def decided(machine: str, zero: float) -> CalibrationDecision:
+        correction = Correction(machine, 0, LAST_NS, zero, 0.0, 0.0, ())
+        return CalibrationDecision(machine, PERSON, "", T0, (correction,))
+
+    one, other = [decided("a", 0.001)], [decided("b", 0.002), decided("b", 0.005)]
+    histories = {"one": one, "other": other, "stale": other[:1], "both": [*one, *other, decided("b", 0.009)]}
+    counts = CalibrationDecisions(joined_decisions(histories[name] for name in order)).corrections.each
+    newest = 0.009 if "both" in order else 0.005
+    assert [(each.machine, each.zero) for each in counts] == [("a", 0.001), ("b", newest)]
 
 
 def test_decisions_beside_an_archive_are_read_once(tmp_path: Path, monkeypatch):
@@ -376,8 +398,9 @@ def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tm
         assert run(*order, "--out", tmp_path / f"new{i}") == 0
     made = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
     assert made[0] == made[1] == made[2]
-    received = [row[3] for row in made[0]]
-    assert received == sorted(received)
+    parts = [path.name for path in sorted((tmp_path / "new0" / FOLDER).glob("*.parquet"))]
+    assert parts == [path.name for path in sorted((tmp_path / "new2" / FOLDER).glob("*.parquet"))]
+    assert parts == sorted(parts, key=lambda name: name.partition("_")[2]), "hours of reception, as rows go on"
 
 
 def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Path, capsys):
@@ -414,18 +437,17 @@ def test_a_place_that_is_taken_is_refused(store: Path, tmp_path: Path, capsys):
     assert "something is no folder" in refused(capsys, store, "--out", tmp_path / "full" / "something")
     (tmp_path / "empty").mkdir()
     assert run(store, "--out", tmp_path / "empty") == 0
-    (tmp_path / "new.part").mkdir()
-    assert "is left from a fold that was killed" in refused(capsys, store, "--out", tmp_path / "new")
-    assert (tmp_path / "new.part").exists()
 
 
 def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys):
     moved = make_store(tmp_path / "moved", "a", site=replace(SITE, origin_lat_deg=48.1), archived=1)
     named = make_store(tmp_path / "named", "a", site=replace(SITE, name="quarry"))
     out = ("--out", tmp_path / "new")
-    assert f"{moved}: is of site 'pit', frame" in refused(capsys, store, moved, *out)
+    error = refused(capsys, store, moved, *out)
+    assert f"{moved / FOLDER}" in error
+    assert "is of site 'pit', frame" in error
     assert "fold them apart" in refused(capsys, store / FOLDER, moved / FOLDER, *out)
-    assert f"{named}: is of site 'quarry'" in refused(capsys, store, named, *out)
+    assert f"{named / JOURNAL_FILE}, rows 1 to 6: is of site 'quarry'" in refused(capsys, store, named, *out)
     error = refused(capsys, store, "--site-file", moved / "site.toml", *out)
     assert f"{moved}/site.toml: is site 'pit', frame" in error
     assert not (tmp_path / "new").exists()
@@ -493,11 +515,11 @@ def test_progress_is_shown_on_a_terminal(
     store: Path, tmp_path: Path, monkeypatch, *, terminal: bool, as_json: bool, shown: bool
 ):
     seen = []
-    monkeypatch.setattr(fold, "COMMIT_ROWS", 6)
-    monkeypatch.setattr(fold.sys.stderr, "isatty", lambda: terminal)
-    monkeypatch.setattr(fold.Display, "show", lambda _, *what: seen.append(what[:2]))
+    monkeypatch.setattr(Here, "task_samples", 100)
+    monkeypatch.setattr(command.sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.setattr(command.Display, "show", lambda _, *what: seen.append(what[:2]))
     assert run(store, "--out", tmp_path / "new", *(["--json"] if as_json else [])) == 0
-    assert seen == ([(120, 360), (240, 360), (360, 360)] if shown else [])
+    assert seen == ([(60, 360), (120, 360), (360, 360)] if shown else [])
 
 
 def test_every_column_is_carried(store: Path, tmp_path: Path):
@@ -505,3 +527,125 @@ def test_every_column_is_carried(store: Path, tmp_path: Path):
     rows = np.concatenate([r.rows for r in rows_of(tmp_path / "new") if r.machine == "c"])
     for name in COLUMNS:
         assert rows[name].tobytes() == TRACKS["c"][name][:40].tobytes()
+
+
+# --- who does the work, and where archives are -----------------------------------------------------------------------
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("jobs", [2, 50])
+def test_processes_fold_a_store_as_one_does(store: Path, tmp_path: Path, jobs: int):
+    """Also more of them than there are files; the rest of the journal is a part of its own."""
+    assert run(store, "--out", tmp_path / "new", "--jobs", jobs, "--without", "b") == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+    again = opened(tmp_path / "new")
+    assert same_evidence(again.grid, folded("ac"))
+    assert again.snapshot_row == again.journalled == 12
+    again.close()
+
+
+@pytest.mark.parametrize(("word", "problem"), [("0", "0 is not positive"), ("-1", "-1 is not positive"), ("x", "'x'")])
+def test_jobs_that_cannot_be_are_refused(store: Path, tmp_path: Path, capsys, word: str, problem: str):
+    with pytest.raises(SystemExit) as ended:
+        run(store, "--out", tmp_path / "new", "--jobs", word)
+    assert ended.value.code == 2
+    assert problem in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("address", "problem"),
+    [
+        ("tcp://127.0.0.1:1", "'tcp://127.0.0.1:1' is no dask://HOST:PORT"),
+        ("dask://127.0.0.1:1", "no Dask scheduler answers at dask://127.0.0.1:1"),
+        ("dask://127.0.0.1", "no Dask scheduler answers at dask://127.0.0.1;"),
+        ("dask://127.0.0.1:99999", "no Dask scheduler answers"),
+    ],
+)
+def test_a_scheduler_that_is_not_there_is_named(store: Path, tmp_path: Path, capsys, address: str, problem: str):
+    assert problem in refused(capsys, store, "--out", tmp_path / "new", "--engine", address)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_port_that_says_nothing_is_no_scheduler(store: Path, tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setattr(cluster, "CONNECT_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"dask://127.0.0.1:{server.getsockname()[1]}"
+        assert "no Dask scheduler answers" in refused(capsys, store, "--out", tmp_path / "new", "--engine", address)
+
+
+def test_archives_elsewhere_are_folded(store: Path, tmp_path: Path):
+    """In the memory of this process, as an example of all that fsspec reaches; with what was decided about them."""
+    source = make_store(tmp_path / "source", archived=9)
+    live = decide(source)
+    files = fsspec.filesystem("memory")
+    for path in (source / FOLDER).iterdir():
+        files.pipe_file(f"/years/{path.name}", path.read_bytes())
+    try:
+        assert run("memory://years", "--out", tmp_path / "new") == 0
+        names = sorted(files.ls("/years", detail=False))
+        assert run(f"memory:/{names[1]}", "--out", tmp_path / "one") == 0
+    finally:
+        files.rm("/years", recursive=True)
+    with closing(opened(tmp_path / "new")) as new:
+        assert same_evidence(new.grid, live)
+        assert new.fact == 3
+    assert identities(tmp_path / "new") == identities(source)
+    assert len(rows_of(tmp_path / "one")) == 3
+
+
+@pytest.mark.parametrize(
+    ("address", "problem"),
+    [
+        ("s3://bucket/years", "s3://bucket/years: is reached with a library that is not installed: Install s3fs"),
+        ("nowhere://years", "nowhere://years: no store is known as 'nowhere'"),
+        ("memory://nothing", "memory://nothing: no such file or folder"),
+    ],
+)
+def test_an_archive_that_cannot_be_reached_is_one_line(tmp_path: Path, capsys, address: str, problem: str):
+    assert problem in refused(capsys, address, "--out", tmp_path / "new")
+
+
+def test_a_file_elsewhere_that_is_cut_off_is_named(store: Path, tmp_path: Path, capsys):
+    files, path = fsspec.filesystem("memory"), min((store / FOLDER).glob("*.parquet"))
+    files.pipe_file(f"/cut/{path.name}", path.read_bytes()[:-100])
+    try:
+        assert f"memory://cut/{path.name}: is damaged" in refused(capsys, "memory://cut", "--out", tmp_path / "new")
+    finally:
+        files.rm("/cut", recursive=True)
+
+
+def test_a_disk_that_is_full_ends_a_fold_in_one_line(store: Path, tmp_path: Path, capsys, monkeypatch):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    for name in ("whole_file", "seal"):
+        with monkeypatch.context() as disk:
+            disk.setattr(work, name, full)
+            error = refused(capsys, store, "--out", tmp_path / "new")
+            assert "cannot be written: No space left on device" in error
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_done_is_kept_when_a_later_step_fails_and_used_when_the_fold_goes_on(
+    store: Path, tmp_path: Path, capsys, monkeypatch
+):
+    with monkeypatch.context() as disk:
+        disk.setattr(
+            new_store.snapshot, "save", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+        )
+        error = refused(capsys, store, "--out", tmp_path / "new")
+        assert f"what is done is kept in {tmp_path}/new.part, and the same command goes on" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["new.part"]
+    assert "is left from a fold of something else that was killed; remove it" in refused(
+        capsys, make_store(tmp_path / "other", "a"), "--out", tmp_path / "new"
+    )
+    assert run(store, "--out", tmp_path / "new") == 0
+    with closing(opened(tmp_path / "new")) as new:
+        assert same_evidence(new.grid, folded())
+    assert not (tmp_path / "new.part").exists()
+
+
+def test_two_folds_into_one_place_do_not_meet(store: Path, tmp_path: Path, capsys):
+    with hold(tmp_path / "new.part" / "work"):
+        assert "another fold is at work there" in refused(capsys, store, "--out", tmp_path / "new")
+    assert (tmp_path / "new.part").exists()

@@ -69,7 +69,7 @@ def run(machines: int, seconds: float, hours: float) -> Report:
         build(Path(path), samples_of(hours) // BATCH, tail_rows=0)
         endpoint, server = opened.enter_context(served(Path(path), SITE))
         links = [opened.enter_context(session(endpoint)) for _ in range(min(machines, SESSIONS))]
-        fleet = [Machine(f"loader-{i:04d}", links[i % len(links)], _samples(i)) for i in range(machines)]
+        fleet = [Machine(f"loader-{i:04d}", links[i % len(links)], samples(i)) for i in range(machines)]
         settle(server)
         rows = [
             {"load": name, "machines": machines, **_measured(server, fleet, seconds, period_s)}
@@ -78,7 +78,7 @@ def run(machines: int, seconds: float, hours: float) -> Report:
     return {"benchmark": "fleet", "hours": hours, "seconds": seconds, **machine(), "goals": GOALS, "rows": rows}
 
 
-def _samples(seed: int) -> Iterator[Table]:
+def samples(seed: int) -> Iterator[Table]:
     """Batches of one machine, on the day after that of the store."""
     for leg in drive(np.random.default_rng([1, seed])):
         leg["stamp_ns"] += DAY_NS
@@ -88,7 +88,7 @@ def _samples(seed: int) -> Iterator[Table]:
 
 def _measured(server: int, fleet: Sequence[Machine], seconds: float, period_s: float) -> dict[str, float]:
     cpu_s, written, start_s = processor_s(server), _written_bytes(server), time.monotonic()
-    result = _send(fleet, seconds, period_s)
+    result = send(fleet, seconds, period_s)
     took_s = time.monotonic() - start_s
     return {
         "samples_per_s": round(result.samples / took_s, 1),
@@ -100,7 +100,7 @@ def _measured(server: int, fleet: Sequence[Machine], seconds: float, period_s: f
     }
 
 
-def _send(fleet: Sequence[Machine], seconds: float, period_s: float) -> Acknowledgements:
+def send(fleet: Sequence[Machine], seconds: float, period_s: float) -> Acknowledgements:
     """Send for so many seconds, and wait for the last acknowledgements."""
     answers: queue.SimpleQueue[tuple[int, float, Ack | Refused]] = queue.SimpleQueue()
     start_s = time.monotonic()

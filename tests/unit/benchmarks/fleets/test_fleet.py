@@ -5,8 +5,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from benchmarks import fleet
 from benchmarks.__main__ import main
+from benchmarks.fleets import fleet
 from protocol.errors import Refusal
 from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused
@@ -58,8 +58,8 @@ def test_a_machine_that_was_refused_sends_the_same_again(monkeypatch) -> None:
         real(one, number, answers)
 
     monkeypatch.setattr(fleet, "_ask", ask)
-    machines = [fleet.Machine(f"m-{i}", link, fleet._samples(i)) for i in range(2)]  # type: ignore[arg-type]
-    result = fleet._send(machines, 0.05, 0.02)
+    machines = [fleet.Machine(f"m-{i}", link, fleet.samples(i)) for i in range(2)]  # type: ignore[arg-type]
+    result = fleet.send(machines, 0.05, 0.02)
     assert result.refused == 2
     assert result.samples == sum(link.taken.values()) > 0
     assert len(result.ms) * fleet.SAMPLES == result.samples
@@ -72,7 +72,7 @@ def test_a_refusal_that_stays_ends_the_measurement() -> None:
 
 
 def test_machines_drive_on_the_day_after_that_of_the_store_each_on_its_own() -> None:
-    first, again, other = (np.concatenate(list(islice(fleet._samples(i), 60))) for i in (0, 0, 1))
+    first, again, other = (np.concatenate(list(islice(fleet.samples(i), 60))) for i in (0, 0, 1))
     assert first.tobytes() == again.tobytes() != other.tobytes()
     assert (np.diff(first["stamp_ns"]) > 0).all()
     assert first["stamp_ns"][0] >= fleet.DAY_NS + 1_767_225_600_000_000_000

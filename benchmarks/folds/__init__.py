@@ -1,0 +1,1 @@
+"""Archives that are folded by processes and clusters."""

@@ -1,0 +1,1 @@
+"""PostgreSQL servers for benchmarks and tests, and what a journal on them costs."""

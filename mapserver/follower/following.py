@@ -1,0 +1,247 @@
+"""A thread that has a replica follow a journal; what others read of it, and how far behind it is.
+
+A row that was folded may be gone when the journal is looked at again: a store that was restored, a database that failed
+over. It is noticed by the id of the store, the numbers of the last row and event, and the checksum of the last row that
+was folded. Then the map is given up, and folded again.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from mapserver.config import ServerConfig
+from mapserver.evidence import snapshot
+from mapserver.follower.replica import Replica
+from mapserver.ingest.decisions import NewerDecisionError
+from mapserver.ingest.merge_waits import MergeWaits
+from mapserver.journal.facts import Facts
+from mapserver.journal.history import History, read_history
+from mapserver.journal.journal import JournalReader, JournalState
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.refold import fold_history, release_memory
+from mapserver.journal.rows import Selection
+from mapserver.past.anew import FoldedAnew, fold_anew
+from mapserver.past.past import Past
+from protocol.errors import QueryError, Refusal, StoreError
+from protocol.site.site_config import SiteConfig
+
+ASK_S = 1.0  # a notification may be lost: the journal is asked so often all the same
+OPEN_S = 2.0  # a connection lasts so long: another file may have taken the place of the one that it reads
+RETRY_S = 1.0
+Known = Callable[[], tuple[int, float]]
+T = TypeVar("T")
+log = logging.getLogger("mapserver.follower.following")
+
+
+class UnfitError(StoreError):
+    """A journal of another site or frame."""
+
+
+class Following:
+    """A replica and its thread. All but the thread itself is for any thread.
+
+    waits: who waits for a row. past: what maps of the past are read from. ended: why it has given up, empty while it
+    goes on; the process should end.
+    """
+
+    def __init__(
+        self, location: JournalLocation, site: SiteConfig, config: ServerConfig, known: Known | None = None
+    ) -> None:
+        """known: of the journal that this one is a copy of: its last row, and when that was asked for [s]."""
+        self.location, self.site, self.config = location, site, config
+        self.waits = MergeWaits(0)
+        self.past = Past.of_store(location.folder, site.cell_m, config.fold)
+        self.ended = ""
+        self._known = known
+        self._lock = threading.Lock()  # of the replica: held while pages are taken from it, or rows are folded
+        self._replica: Replica | None = None
+        self._checksum: int | None = None  # of the last row that was folded, where that is known
+        self._journalled, self._complete_s = 0, float("-inf")
+        self._problem = ""
+        self._anew: tuple[Facts, Future[FoldedAnew | None]] | None = None
+        self._folds = ThreadPoolExecutor(1, thread_name_prefix="refold")
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="following", daemon=True)
+
+    def start(self) -> None:
+        """Follow from now on."""
+        self._thread.start()
+
+    def run(self, work: Callable[[Replica], T]) -> T:
+        """Have `work` done with the replica as it is; QueryError where there is none."""
+        with self._lock:
+            if self._replica is None:
+                raise QueryError(Refusal.NOT_HERE, "this follower has no map yet; ask the map server")
+            return work(self._replica)
+
+    def behind(self) -> tuple[int, float]:
+        """How many rows the map lacks, and how long ago it had all that was journalled [s]; infinite for never."""
+        replica = self._replica
+        rows = max(0, self._journalled - (replica.merged if replica else 0))
+        return rows, time.monotonic() - self._complete_s if replica else float("inf")
+
+    @property
+    def journalled(self) -> int:
+        """The last row of the journal, as of the last look."""
+        return self._journalled
+
+    def stop(self) -> None:
+        """Have the thread end soon."""
+        self._ending.set()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._folds.shutdown()
+        self.waits.close()
+
+    def _run(self) -> None:
+        while not (self._ending.is_set() or self.ended):
+            try:
+                self._read_for_a_while()
+            except (UnfitError, NewerDecisionError) as error:
+                self.ended = str(error)
+            except (StoreError, OSError) as error:
+                self._name(str(error))
+                self._ending.wait(RETRY_S)
+            except Exception:  # a bug must end the process visibly: a map that stands still is worse than none
+                log.critical("following failed", exc_info=True)
+                self.ended = "the follower has failed; its log says why"
+
+    def _name(self, problem: str) -> None:
+        """Log a problem once, until there is another one or none."""
+        if problem and problem != self._problem:
+            log.warning("cannot follow problem=%r", problem)
+        self._problem = problem
+
+    def _read_for_a_while(self) -> None:
+        if not self.location.exists():
+            raise StoreError(self.location, "is not there yet; it is looked for every second")
+        end_s = time.monotonic() + OPEN_S
+        with self.location.reader() as reader:
+            self._require_fit(reader)
+            state = reader.state()
+            self._look(reader, state)
+            self._name("")
+            while time.monotonic() < end_s and not self._ending.is_set():
+                state = reader.follow(state, ASK_S)
+                self._look(reader, state)
+
+    def _require_fit(self, reader: JournalReader) -> None:
+        if (reader.site, reader.frame) != (self.site.name, self.site.frame):
+            theirs, ours = f"site {reader.site!r}, frame {reader.frame}", f"{self.site.name!r}, {self.site.frame}"
+            raise UnfitError(reader.where, f"is of {theirs}; this follower has {ours}: compare the site files")
+
+    def _look(self, reader: JournalReader, state: JournalState) -> None:
+        """Read what is new."""
+        began_s, replica = time.monotonic(), self._replica
+        last_row, as_of_s = self._known() if self._known else (state.row, began_s)
+        self._journalled = max(state.row, last_row)
+        if replica is None or self._is_gone(reader, state, replica):
+            replica = self._begin(reader, state)
+        if replica is None:
+            return
+        with self._lock:
+            _hear(replica, reader)
+        self._fold(reader, replica, state.row)
+        self._correct(reader, replica)
+        if replica.merged >= last_row:
+            self._complete_s = as_of_s
+        self.waits.advance(replica.merged)
+
+    def _is_gone(self, reader: JournalReader, state: JournalState, replica: Replica) -> bool:
+        """Whether the journal lacks what was read of it."""
+        is_gone = (
+            reader.identity().id != replica.store
+            or state.row < replica.merged
+            or state.event < replica.event
+            or (self._checksum is not None and reader.row_checksum(replica.merged) not in (None, self._checksum))
+        )
+        if is_gone:
+            log.warning("rows are gone: the map is folded again journal=%s row=%d", reader.where, replica.merged)
+        return is_gone
+
+    def _begin(self, reader: JournalReader, state: JournalState) -> Replica | None:
+        """Fold the map from the newest snapshot or checkpoint that is true, without answering meanwhile.
+
+        None where it is to end.
+        """
+        with self._lock:
+            self._replica = None
+        self._complete_s, self._anew, self._checksum = float("-inf"), None, None
+        self.past = Past.of_store(self.location.folder, self.site.cell_m, self.config.fold)  # its index is of rows
+        self.waits.advance(0)
+        replica = Replica(self.site, self.config, reader.identity().id)
+        _hear(replica, reader)
+        facts, site, fold = replica.wanted, self.site, self.config.fold
+        trusted_row = min(state.row, self.location.trusted_row(reader))
+        row, grid = snapshot.load_newest(self.location.folder, trusted_row, site.cell_m, fold, facts.of_evidence())
+        if not row:
+            folded = fold_anew(self.past, reader, facts, self._ending.is_set)
+            if folded is None:
+                return None
+            row, grid = folded.row, folded.grid
+        last = reader.last_row
+        history, selection = History(reader, self.past.archive), Selection.by(facts)
+        if not fold_history(grid, history, row, last, selection, self._ending.is_set):
+            return None
+        release_memory()
+        replica.adopt(grid, last, facts)
+        # The site's now is that of the rows in the map: watermarks are of these, and of some that are folded next.
+        replica.reach((machine, mark.newest_ns) for (machine, _), mark in reader.watermarks().items())
+        self._fold(reader, replica, reader.last_row)
+        self._checksum = reader.row_checksum(replica.merged)
+        with self._lock:
+            self._replica = replica
+        log.info("map folded row=%d fact=%d", replica.merged, facts.number)
+        return replica
+
+    def _fold(self, reader: JournalReader, replica: Replica, until: int) -> None:
+        if replica.merged >= until:
+            return
+        for rows in read_history(History(reader, self.past.archive), replica.merged, until):
+            with self._lock:
+                replica.fold(rows)
+            if replica is self._replica:
+                self.waits.advance(replica.merged)
+            if self._ending.is_set():
+                return
+        self._checksum = reader.row_checksum(replica.merged)
+
+    def _correct(self, reader: JournalReader, replica: Replica) -> None:
+        """Have the map follow decisions: another grid is folded beside it, and takes its place once it has its rows."""
+        if self._anew is None:
+            if replica.wanted != replica.facts:
+                facts = replica.wanted
+                self._anew = facts, self._folds.submit(self._fold_anew, facts)
+            return
+        facts, future = self._anew
+        if not future.done():
+            return
+        folded = future.result()
+        if folded and folded.row > replica.merged:
+            return  # the rows of this one come first
+        self._anew = None
+        if folded is None or facts.number <= replica.facts.number:  # a decision was taken back meanwhile
+            return
+        history, selection = History(reader, self.past.archive), Selection.by(facts)
+        if fold_history(folded.grid, history, folded.row, replica.merged, selection, self._ending.is_set, 1):
+            with self._lock:
+                replica.adopt(folded.grid, replica.merged, facts)
+            log.info("map folded again fact=%d without=%s", facts.number, ",".join(sorted(facts.excluded)))
+        release_memory()
+
+    def _fold_anew(self, facts: Facts) -> FoldedAnew | None:
+        with self.location.reader() as reader:
+            return fold_anew(self.past, reader, facts, self._ending.is_set)
+
+
+def _hear(replica: Replica, reader: JournalReader) -> None:
+    replica.hear(reader.events(after=replica.event), reader.where)

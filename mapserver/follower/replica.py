@@ -1,0 +1,86 @@
+"""The map of one store in a process that reads its journal: grid, facts and events, as far as they were read.
+
+No clock, thread or file: what was read is handed in. On equal rows and facts its grid is the server's, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+import numpy as np
+
+from mapserver.change import change_log
+from mapserver.config import ServerConfig
+from mapserver.evidence.grid import Grid
+from mapserver.ingest.decisions import Decisions
+from mapserver.journal.facts import Facts
+from mapserver.journal.rows import Event, JournalRows, Selection
+from protocol.queries.answers import GroundChange, MapVersion
+from protocol.site.site_config import SiteConfig
+
+
+class Replica:
+    """See `MapState`. store: its id. merged: the last row that is in the grid; event: the number of the last event.
+
+    changes: of the ground, by number.
+    """
+
+    def __init__(self, site: SiteConfig, config: ServerConfig, store: str) -> None:
+        self.site, self.config, self.store = site, config, store
+        self.grid, self.facts = Grid(site.cell_m, config.fold), Facts()
+        self.merged = self.event = 0
+        self.changes: dict[int, GroundChange] = {}
+        self._decisions = Decisions()
+        self._newest_ns: dict[str, int] = {}
+
+    @property
+    def version(self) -> MapVersion:
+        """The version that the map is."""
+        return MapVersion(self.store, self.merged, self.facts.number)
+
+    @property
+    def newest_ns(self) -> int:
+        """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
+        shown = (stamp for name, stamp in self._newest_ns.items() if name not in self.facts.excluded)
+        return max(shown, default=0)
+
+    def machines(self) -> Collection[str]:
+        """Names of all machines that have sent anything."""
+        return self._newest_ns.keys()
+
+    @property
+    def wanted(self) -> Facts:
+        """What all decisions come to: the grid has to be folded again where these are not its facts."""
+        return self._decisions.facts
+
+    def hear(self, events: Iterable[Event], where: str) -> None:
+        """Take further events in their order. StoreError for a decision that only a newer version understands."""
+        heard = list(events)
+        self._decisions.hear(heard, where)
+        for event in heard:
+            if event.kind == change_log.KIND:
+                change = change_log.change_of(event.body)
+                self.changes[change.id] = change
+            self.event = event.id
+        if self.wanted == self.facts:
+            self.facts = self.wanted  # of a higher number
+
+    def fold(self, rows: JournalRows) -> None:
+        """Fold the next rows."""
+        self.grid.fold_all(*rows.without(self.facts.excluded).selected(Selection.by(self.facts)))
+        stamps, ends = rows.samples["stamp_ns"], np.cumsum(rows.lengths)
+        newest_ns = np.maximum.reduceat(stamps, ends - rows.lengths)
+        names = (rows.machines[machine] for machine in rows.machine.tolist())
+        self.reach(zip(names, newest_ns.tolist(), strict=True))
+        self.merged = int(rows.numbers[-1])
+
+    def reach(self, newest_ns: Iterable[tuple[str, int]]) -> None:
+        """Know stamps of machines that are in the map, or would be if these were not excluded."""
+        for name, stamp_ns in newest_ns:
+            self._newest_ns[name] = max(self._newest_ns.get(name, 0), stamp_ns)
+
+    def adopt(self, grid: Grid, row: int, facts: Facts) -> None:
+        """Go on with a grid that has these facts and all rows up to this one."""
+        self.grid, self.merged, self.facts = grid, row, facts
+        if self.wanted == facts:
+            self.facts = self.wanted

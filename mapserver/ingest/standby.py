@@ -1,0 +1,103 @@
+"""A grid that follows the journal that another server writes, so that a take-over finds it warm."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from mapserver.config import ServerConfig
+from mapserver.evidence import snapshot
+from mapserver.evidence.grid import Grid
+from mapserver.ingest.decisions import Decisions
+from mapserver.journal.facts import NO_FACTS, Facts
+from mapserver.journal.history import History, read_history
+from mapserver.journal.journal import JournalQueries, JournalReader, JournalState
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.refold import fold_history, release_memory
+from mapserver.journal.rows import Selection
+from protocol.errors import StoreError
+from protocol.site.site_config import SiteConfig
+
+log = logging.getLogger("mapserver.ingest.standby")
+_NOTHING = JournalState(0, 0, 0)
+
+
+class Standby:
+    """The map of a journal that another server writes. row: the last one in the grid."""
+
+    def __init__(
+        self, location: JournalLocation, site: SiteConfig, config: ServerConfig, check: Callable[[bool], object]
+    ) -> None:
+        """check: is called before each wait, with whether the grid is warm; what it raises ends the wait."""
+        self._location, self._site, self._config, self._check = location, site, config, check
+        self._reader: JournalReader | None = None
+        self._known = _NOTHING
+        self._problem = ""
+        self._begin(NO_FACTS)
+
+    def follow(self, timeout_s: float) -> None:
+        """Wait for more rows for so long at most, and have them in the grid."""
+        began_s = time.monotonic()
+        self._check(self._known != _NOTHING)
+        try:
+            reader = self._opened()
+            state = reader.follow(self._known, timeout_s)
+            if state != self._known:
+                self._take(reader, state)
+            self._problem = ""
+        except StoreError as error:  # the database is away, as while its replica is promoted
+            if str(error) != self._problem:
+                log.warning("standby cannot read problem=%r", str(error))
+            self._problem = str(error)
+            time.sleep(max(0.0, timeout_s - (time.monotonic() - began_s)))
+
+    def grid_for(self, journal: JournalQueries, facts: Facts) -> tuple[int, Grid] | None:
+        """The grid and its last row, if the journal has the rows that it was made of, and these facts."""
+        if facts != self._facts or not self.row or not self._is_in(journal, journal.last_row):
+            return None
+        return self.row, self._grid
+
+    def close(self) -> None:
+        """Close the reader."""
+        if self._reader:
+            self._reader.close()
+
+    def _opened(self) -> JournalReader:
+        if self._reader is None:
+            reader = self._location.reader()
+            reader.check()  # here, where nobody waits for it
+            self._reader = reader
+        return self._reader
+
+    def _begin(self, facts: Facts) -> None:
+        self.row, self._checksum, self._facts = 0, 0, facts
+        self._grid = Grid(self._site.cell_m, self._config.fold)
+
+    def _take(self, reader: JournalReader, state: JournalState) -> None:
+        facts = Decisions.of_journal(reader).facts if state.event != self._known.event else self._facts
+        if facts != self._facts or (state.epoch != self._known.epoch and not self._is_in(reader, state.row)):
+            log.info("standby folds again row=%d fact=%d", state.row, facts.number)
+            self._begin(facts)
+        history, selection = History(reader, self._location.archive), Selection.by(facts)
+        if not self.row:
+            self._load(reader, facts)
+            fold_history(self._grid, history, self.row, state.row, selection)
+            release_memory()
+        else:
+            for rows in read_history(history, self.row, state.row, selection):
+                self._grid.fold_all(*rows.selected(selection))
+        self.row, self._known = state.row, state
+        self._checksum = reader.row_checksum(state.row) or 0
+
+    def _load(self, reader: JournalReader, facts: Facts) -> None:
+        """Begin with a snapshot of this server's folder, if it is of this journal."""
+        folder, last_row = self._location.folder, self._location.trusted_row(reader)
+        config = self._config.fold
+        self.row, self._grid = snapshot.load_newest(folder, last_row, self._site.cell_m, config, facts.of_evidence())
+
+    def _is_in(self, journal: JournalQueries, last_row: int) -> bool:
+        """Whether the journal still has the last row of the grid, and not another one of its number."""
+        return self.row <= last_row and (
+            self.row <= journal.archived_row or journal.row_checksum(self.row) == self._checksum
+        )

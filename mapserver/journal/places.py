@@ -1,0 +1,106 @@
+"""Places of files beside those of this host: any store that fsspec reaches, by its address, as `s3://bucket/folder`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from importlib import import_module
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from protocol.errors import ConfigError, StoreError
+
+
+@dataclass(frozen=True, order=True)
+class Place:
+    """A file or a folder; what it is asked has the names and the meaning that `pathlib.Path` gives them.
+
+    StoreError where its store cannot be reached, FileNotFoundError for a file that is not there.
+    """
+
+    url: str
+
+    @property
+    def name(self) -> str:
+        """The last part of its address."""
+        return self.url.rpartition("/")[2]
+
+    @property
+    def stem(self) -> str:
+        """The name without its suffix."""
+        return self.name.rpartition(".")[0] or self.name
+
+    @property
+    def parent(self) -> Place:
+        """The folder that it lies in."""
+        return Place(self.url.rpartition("/")[0])
+
+    def __truediv__(self, name: str) -> Place:
+        return Place(f"{self.url}/{name}")
+
+    def __str__(self) -> str:
+        return self.url
+
+    def exists(self) -> bool:
+        """Whether there is such a file or folder."""
+        with self._reached() as store:
+            return bool(store.exists(self.url))
+
+    def is_dir(self) -> bool:
+        """Whether it is a folder."""
+        with self._reached() as store:
+            return bool(store.isdir(self.url))
+
+    def glob(self, pattern: str) -> list[Place]:
+        """Files of a folder whose names match."""
+        with self._reached() as store:
+            names = (str(path).rstrip("/").rpartition("/")[2] for path in store.ls(self.url, detail=False))
+            return [self / name for name in names if fnmatch(name, pattern)]
+
+    def open(self, mode: str) -> BinaryIO:
+        """Open it for reading."""
+        with self._reached() as store:
+            file: BinaryIO = store.open(self.url, mode)
+            return file
+
+    def read_text(self, encoding: str) -> str:
+        """All of a file."""
+        with self._reached() as store:
+            return bytes(store.cat_file(self.url)).decode(encoding)
+
+    @contextmanager
+    def _reached(self) -> Iterator[Any]:
+        """The store that it is in; every kind of store has errors of its own, which become one."""
+        try:
+            yield filesystem(self.url)
+        except (FileNotFoundError, UnicodeDecodeError, ConfigError):
+            raise
+        except Exception as error:
+            raise StoreError(self.url, f"cannot be read: {error or type(error).__name__}") from None
+
+
+def place(text: str) -> Path | Place:
+    """Parse a path of this host, or the address of another place; ConfigError where no library reaches that."""
+    if "://" not in text:
+        return Path(text)
+    filesystem(text)
+    return Place(text.rstrip("/"))
+
+
+def filesystem(url: str) -> Any:
+    """The store of an address, as fsspec reaches it."""
+    try:
+        fsspec = import_module("fsspec")
+    except ModuleNotFoundError:
+        raise ConfigError(url, "fsspec is not installed: pip install '.[cluster]'") from None
+    kind = url.partition("://")[0]
+    try:
+        return fsspec.url_to_fs(url)[0]
+    except ImportError as error:  # fsspec knows what each store needs
+        raise ConfigError(url, f"is reached with a library that is not installed: {error}") from None
+    except ValueError:
+        raise ConfigError(
+            url, f"no store is known as {kind!r}; {', '.join(('s3', 'gs', 'abfs', 'file'))} are"
+        ) from None

@@ -1,0 +1,69 @@
+"""Connections to PostgreSQL as a journal needs them, and what its errors say in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import psycopg
+from psycopg import conninfo
+
+from protocol.errors import ConfigError, StoreError
+
+Connection = psycopg.Connection[tuple[Any, ...]]
+SCHEMA = "sitegrid"  # the database's schema with the tables
+MISSING = ("3D000", "3F000", "42P01")  # SQLSTATEs: no such database, schema, table
+REPLICAS = """SELECT current_setting('synchronous_standby_names') <> '',
+(SELECT count(*) FROM pg_stat_replication)"""
+# A server that is gone is noticed after three to four seconds, whatever it was doing then.
+DEFAULTS = {
+    "connect_timeout": "3",
+    "keepalives_idle": "1",
+    "keepalives_interval": "1",
+    "keepalives_count": "2",
+    "tcp_user_timeout": "3000",
+}
+
+
+def shown(url: str) -> str:
+    """A URL for people: without its password. ConfigError where it is none."""
+    try:
+        parts = conninfo.conninfo_to_dict(url)
+    except psycopg.Error as error:
+        raise ConfigError("--journal", f"is no PostgreSQL URL: {line(error)}") from None
+    host, port = (str(parts.get(name) or "") for name in ("host", "port"))
+    user = f"{parts['user']}@" if parts.get("user") else ""
+    places = zip(host.split(","), (port.split(",") * (host.count(",") + 1))[: host.count(",") + 1], strict=True)
+    hosts = ",".join(f"{name}:{number}" if number else name for name, number in places)
+    return f"postgresql://{user}{hosts}/{parts.get('dbname') or ''}"
+
+
+def connect(url: str, role: str, **more: str) -> Connection:
+    """Open a connection; psycopg.Error says why not. role: what the database shows of it."""
+    given = conninfo.conninfo_to_dict(url)
+    settings = {**DEFAULTS, "application_name": f"sitegrid {role}", **given, **more}
+    db = psycopg.connect("", autocommit=True, prepare_threshold=None, **settings)  # type: ignore[arg-type]
+    db.execute(f"SET search_path = {SCHEMA}; SET standard_conforming_strings = on")
+    return db
+
+
+def replica_of(*, synchronous: bool, replicas: int) -> str:
+    """What stands behind a database's disk, by what REPLICAS answers."""
+    return "synchronous" if synchronous else "asynchronous" if replicas else "none"
+
+
+def line(error: psycopg.Error) -> str:
+    """What the database says, as one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@contextmanager
+def readable(where: str) -> Iterator[None]:
+    """Have what the database says be a StoreError."""
+    try:
+        yield
+    except psycopg.Error as error:
+        if error.sqlstate in MISSING:
+            raise StoreError(where, f"holds no journal: {line(error)}; a server makes it when it starts") from None
+        raise StoreError(where, f"cannot be read: {line(error)}") from None

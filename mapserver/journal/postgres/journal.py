@@ -1,0 +1,314 @@
+"""The writer of a journal in PostgreSQL. Rows, watermarks and the line that numbers them are one transaction.
+
+A commit is one message: what it writes is gathered in memory until then. It names the epoch and the last row that this
+writer knows, and fails where the journal has others: a writer that has lost its lock without a word acknowledges
+nothing. Where its answer is lost it is not known whether it happened; then the lock and a new epoch are taken, which
+waits for a commit that is still under way, and the journal says. It is one module because a transaction, and what
+to do when its answer is lost, are about the same few values.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import psycopg
+
+from mapserver.journal.journal import ROWS_AT_ONCE, FencedError, UnwrittenError
+from mapserver.journal.postgres import MARK_FILE
+from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
+from mapserver.journal.postgres.connection import Connection, connect
+from mapserver.journal.postgres.mark import CHECKSUM, EPOCH, STORE, traces_of, trusted_by
+from mapserver.journal.postgres.reader import CHANNEL, SCHEMA, TABLES, PostgresQueries
+from mapserver.journal.postgres.session import HANGS_S, WriterSession
+from mapserver.journal.postgres.statements import insert
+from mapserver.journal.progress import Progress
+from mapserver.journal.records import checksum_of
+from mapserver.journal.rows import SpoolKey, Watermark
+from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
+from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, new_meta, watermark_line
+from protocol.disk.high_water_mark import HighWaterMark
+from protocol.errors import StoreError
+from protocol.files import make_private
+
+LOOK_S = 0.1  # between two looks whether the lock is free
+_PUT = (
+    "ON CONFLICT (machine, spool_id) DO UPDATE SET"
+    " seq = excluded.seq, lost = excluded.lost, newest_ns = excluded.newest_ns, crc32 = excluded.crc32"
+)
+log = logging.getLogger("mapserver.journal.postgres.journal")
+
+
+class PostgresJournal(TableWriter, PostgresQueries):
+    """See `Journal`. Reads on a session of its own."""
+
+    def __init__(
+        self,
+        url: str,
+        folder: Path,
+        site: str,
+        frame: str,
+        descends: Iterable[str] = (),
+        waiting: Callable[[float], None] | None = None,
+    ) -> None:
+        """folder: of the server, for its mark. waiting: is called for so many seconds while another one writes.
+
+        Without `waiting`, StoreError where another one writes.
+        """
+        super().__init__(url)
+        self.fenced, self.epoch = "", 0
+        self._row = self._newest = self._committed = 0
+        self._rows: list[tuple[int, bytes]] = []
+        self._extents: list[Line] = []
+        self._puts: dict[SpoolKey, Watermark] = {}
+        self._before: dict[SpoolKey, Watermark | None] = {}
+        self._progress = Progress({})
+        with ExitStack() as opened:
+            self._session = WriterSession(url, self.where, self._on_loss)
+            opened.callback(self._close_sessions)
+            waited = self._take_lock(waiting)
+            self._create_or_check(site, frame, descends)
+            try:
+                make_private(folder / MARK_FILE)
+                self._mark = HighWaterMark(folder / MARK_FILE)
+            except OSError as error:
+                raise StoreError(folder / MARK_FILE, f"cannot be used: {error.strerror}") from None
+            opened.callback(self._mark.close)
+            self._take_epoch(self._mark.values.get(EPOCH, 0))
+            self._return_to_disk()
+            if not waited:  # a standby has looked before
+                self.check()
+            self._require_folder(folder)
+            self._compare()
+            opened.pop_all()
+
+    @property
+    def last_row(self) -> int:
+        """The last row, also of the open transaction."""
+        return self._row
+
+    @property
+    def replica(self) -> str:
+        """See `Journal`: as of some seconds ago."""
+        return self._session.replica
+
+    def begin(self) -> None:
+        """See `Journal`. Where the session was lost, another one takes the lock and a new epoch."""
+        if self.fenced:
+            raise FencedError(self.where, self.fenced)
+        if self._session.lost:
+            self._open_again()
+
+    def put_watermark(self, machine: str, spool_id: int, watermark: Watermark) -> None:
+        """See `Journal`."""
+        key = (machine, spool_id)
+        if key not in self._puts:
+            self._before[key] = self._progress.known(key)
+        self._puts[key] = watermark
+        self._progress.put(machine, spool_id, watermark)
+
+    def commit(self) -> None:
+        """See `Journal`."""
+        if not self._puts:
+            return
+        puts = [watermark_line(*key, watermark) for key, watermark in self._puts.items()]
+        self._run(
+            self._advance(self._row, self._newest),
+            insert("journal", self._rows),
+            insert("extent", self._extents),
+            insert("watermark", puts, _PUT),
+        )
+        self._committed = self._row
+        changed = {spool_name(*key): watermark.seq for key, watermark in self._puts.items()}
+        if self._rows:
+            changed |= {ROW: self._row, CHECKSUM: checksum_of(self._rows[-1][1])}
+        self._forget_puts()
+        self._mark.write(changed)
+
+    def rollback(self) -> None:
+        """See `Journal`: what is on disk beyond what was known, is so once `begin` has opened the journal again."""
+        if self._puts:
+            known = self._progress.watermarks() | {key: mark for key, mark in self._before.items() if mark}
+            self._progress = Progress({key: known[key] for key in known if self._before.get(key, True)})
+        self._row = self._committed
+        self._forget_puts()
+
+    def append_events(self, events: Iterable[PlainEvent]) -> int:
+        """See `Journal`."""
+        self.begin()
+        lines = event_lines(events, self._newest)
+        if lines:
+            number = lines[-1][0]
+            self._run(self._advance(self._row, number), insert("events", lines))
+            self._newest = number
+            self._mark.write({EVENT: number})
+        return self._newest
+
+    def forget(self, until: int, most: int = ROWS_AT_ONCE) -> int:
+        """See `Journal`."""
+        self.begin()
+        archived = self.archived_row
+        last = max(archived, min(until, archived + most, self._row))
+        self._run(
+            self._advance(self._row, self._newest),
+            f"DELETE FROM journal WHERE row <= {last}",  # noqa: S608 # a number
+            f"DELETE FROM extent WHERE row <= {last}",  # noqa: S608
+            f"UPDATE head SET archived_row = {last}",  # noqa: S608
+        )
+        return last
+
+    def shrink(self) -> int:
+        """See `Journal`: PostgreSQL does so by itself."""
+        return 0
+
+    def close(self) -> None:
+        """See `Journal`."""
+        self._close_sessions()
+        self._mark.close()
+
+    def _insert(self, row: int, record: bytes, extent: Line) -> None:
+        self._rows.append((row, record))
+        self._extents.append(extent)
+        self._row = row
+
+    def _advance(self, row: int, event: int) -> str:
+        """The statement that every transaction begins with: it fails unless this writer's is the newest state."""
+        return f"SELECT advance({self.epoch}, {self._committed}, {row}, {self._newest}, {event})"
+
+    def _run(self, *statements: str) -> None:
+        try:
+            self._session.run("; ".join(filter(None, (*statements, f"NOTIFY {CHANNEL}"))).encode())
+        except FencedError as error:
+            self.fenced = error.problem
+            raise
+
+    def _forget_puts(self) -> None:
+        self._rows, self._extents, self._puts, self._before = [], [], {}, {}
+
+    def _take_lock(self, waiting: Callable[[float], None] | None) -> bool:
+        """Wait until no other session has the lock, also while the database is away; whether that took any time.
+
+        Who may not wait waits for as long as the database needs to notice that the last holder is gone.
+        """
+        waited, end_s = False, time.monotonic() + 2 * HANGS_S
+        while True:
+            with suppress(UnwrittenError):
+                if self._session.lost:
+                    self._session = WriterSession(self._url, self.where, self._on_loss)
+                if self._session.take_lock():
+                    return waited
+            if waiting is None and time.monotonic() > end_s:
+                problem = self._session.lost or "another server is writing this journal; stop it first"
+                raise StoreError(self.where, problem)
+            (waiting or time.sleep)(LOOK_S)
+            waited = waiting is not None
+
+    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
+        """Make the tables where there are none; nobody else does so meanwhile, since the lock is taken."""
+        ((exists,),) = self._session.run(f"SELECT to_regclass('{NAMESPACE}.meta') IS NOT NULL")
+        if not exists:
+            meta = list(new_meta(SCHEMA, site, frame, descends).items())
+            head = "INSERT INTO head VALUES (true, 0, 0, 0, 0)"
+            self._session.run(f"CREATE SCHEMA IF NOT EXISTS {NAMESPACE}; {TABLES} {head}; {insert('meta', meta)}")
+        self._require_meta(site, frame)
+
+    def _take_epoch(self, known: int) -> None:
+        """Become the newest writer, which waits for a commit of the last one that is under way.
+
+        known: an epoch that there was, which a database from a backup may not know.
+        """
+        query = f"UPDATE head SET epoch = GREATEST(epoch, {known}) + 1 RETURNING epoch"  # noqa: S608 # a number
+        ((self.epoch,),) = self._session.run(query)
+        log.info("journal taken epoch=%d", self.epoch)
+
+    def _open_again(self) -> None:
+        """Go on after the session was lost, if no other server has written meanwhile; else it is tried again later."""
+        self._close_sessions()
+        try:
+            self._session = WriterSession(self._url, self.where, self._on_loss)
+            self._take_again()
+        except FencedError:
+            raise
+        except StoreError as error:
+            self._session.close()
+            log.warning("journal not open yet problem=%r", str(error))
+            raise UnwrittenError(self.where, "the journal's database is away, or its lock is not free yet") from None
+
+    def _take_again(self) -> None:
+        is_free = self._session.take_lock()
+        ((epoch,),) = self._session.run("SELECT epoch FROM head")
+        if epoch > self.epoch:
+            self._fence(self._taken_over(epoch))
+        if not is_free:
+            raise StoreError(self.where, "the last session still has its lock")
+        known = self._mark.values
+        if epoch == self.epoch and int(self.identity().id, 16) == known.get(STORE):
+            self._take_epoch(epoch)
+        state, checksum = super().state(), self.row_checksum(self._committed)
+        same = state.row >= self._committed and checksum in (known.get(CHECKSUM) if self._committed else None, None)
+        if state.epoch != self.epoch or not same:
+            self._fence(
+                "it is another journal than before, or lacks rows that were acknowledged; start this server again"
+            )
+        if state.event != self._newest:
+            self._fence("a decision was committed whose answer was lost")
+        self._return_to_disk()
+        self._note_mark()
+
+    def _taken_over(self, epoch: int) -> str:
+        return f"another server has taken over the journal, with epoch {epoch} after {self.epoch}"
+
+    def _fence(self, why: str) -> None:
+        self.fenced = why
+        self._session.close()
+        raise FencedError(self.where, why)
+
+    def _on_loss(self) -> None:
+        """Look whether another server has taken over: the writer itself may have nothing to do."""
+        with suppress(psycopg.Error), connect(self._url, "lost", target_session_attrs="read-write") as db:
+            ((epoch,),) = db.execute("SELECT epoch FROM head").fetchall()
+            if epoch > self.epoch and self._session.lost:
+                self.fenced = self._taken_over(epoch)
+
+    def _return_to_disk(self) -> None:
+        self._progress = Progress(self._load_watermarks())
+        state = super().state()
+        self._row = self._committed = state.row
+        self._newest = state.event
+        self._forget_puts()
+
+    def _require_folder(self, folder: Path) -> None:
+        """StoreError where the folder has the snapshots of another journal."""
+        store = self._mark.values.get(STORE, 0)
+        if store and f"{store:016x}" != self.identity().id:
+            problem = (
+                f"belongs to journal {store:016x}, and {self.where} is {self.identity().id}; choose another --store"
+            )
+            raise StoreError(folder, problem)
+        self.trusted_row = trusted_by(self._mark.values, self)
+
+    def _compare(self) -> None:
+        """Compare what there is with the mark, and name what is missing."""
+        present = marked(self._row, self._newest, self.watermarks())
+        if shortfall := compare(traces_of(self._mark.values, self._mark.path), present):
+            self.note_shortfall(shortfall)
+        self._note_mark()
+
+    def _note_mark(self) -> None:
+        present = marked(self._row, self._newest, self.watermarks())
+        store, checksum = int(self.identity().id, 16), self.row_checksum(self._row) or 0
+        with suppress(OSError):  # it stays behind, which is no alarm, or is compared again
+            self._mark.replace({**present, STORE: store, EPOCH: self.epoch, CHECKSUM: checksum})
+
+    def _close_sessions(self) -> None:
+        self._session.close()
+        if self._db is not None:
+            self._db.close()
+
+    def _connected(self) -> Connection:
+        if self._db is None or self._db.closed:
+            self._db = connect(self._url, "writer's reads", target_session_attrs="read-write")
+        return self._db

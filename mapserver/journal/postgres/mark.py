@@ -1,0 +1,44 @@
+"""The mark in a server's folder: how far it knows the journal to have been, and which one that was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from mapserver.journal.journal import JournalQueries
+from mapserver.journal.postgres import MARK_FILE
+from mapserver.journal.shortfall import ROW
+from protocol.disk.high_water_mark import read_mark
+from protocol.disk.traces import Traces
+from protocol.disk.write_ahead_log import LogScan
+from protocol.errors import StoreError
+
+STORE, EPOCH, CHECKSUM = "store", "epoch", "checksum"  # beside what every mark has: of the journal, its writer, its row
+
+
+def traces_in(folder: Path) -> Traces:
+    """What a server's folder says of how far the journal once was; StoreError where that cannot be read."""
+    path = folder / MARK_FILE
+    try:
+        return traces_of(read_mark(path), path)
+    except OSError as error:
+        raise StoreError(path, f"cannot be read: {error.strerror}") from None
+
+
+def trusted_row(folder: Path, journal: JournalQueries) -> int:
+    """See `Journal.trusted_row`."""
+    return trusted_by(read_mark(folder / MARK_FILE), journal)
+
+
+def trusted_by(values: Mapping[str, int], journal: JournalQueries) -> int:
+    """See `Journal.trusted_row`, by the values of a mark."""
+    row, store = values.get(ROW, 0), values.get(STORE, 0)
+    is_there = f"{store:016x}" == journal.identity().id and row <= journal.last_row
+    is_same = is_there and (row <= journal.archived_row or journal.row_checksum(row) == values.get(CHECKSUM))
+    return row if is_same else 0
+
+
+def traces_of(values: Mapping[str, int], path: Path) -> Traces:
+    """What a mark tells that is about losses."""
+    mark = {name: n for name, n in values.items() if name not in (STORE, EPOCH, CHECKSUM)}
+    return Traces(mark, LogScan(), path, b"")

@@ -1,0 +1,199 @@
+"""The tables of a journal in PostgreSQL, and what can be read of them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
+from typing import Any, Self
+
+import psycopg
+
+from mapserver.journal.journal import ROWS_AT_ONCE, JournalState
+from mapserver.journal.postgres import connection
+from mapserver.journal.postgres.connection import REPLICAS, Connection, connect, readable, replica_of, shown
+from mapserver.journal.queries import BYTES_AT_ONCE, TableQueries, size_of
+from mapserver.journal.rows import Selection
+from protocol.errors import StoreError
+
+SCHEMA = 1
+CHANNEL = "sitegrid_journal"  # of notifications, one per database
+# `head` has one line, which every commit changes: rows are numbered by it, so that they are dense and in the order of
+# their commits. Numbers of a sequence are not, and whoever asks for what follows the last one he has seen loses rows.
+TABLES = """
+CREATE TABLE meta (key text PRIMARY KEY, value text NOT NULL);
+CREATE TABLE head (
+    single boolean PRIMARY KEY DEFAULT true CHECK (single),
+    epoch bigint NOT NULL, last_row bigint NOT NULL, last_event bigint NOT NULL, archived_row bigint NOT NULL
+) WITH (fillfactor = 10);
+CREATE TABLE journal (row bigint PRIMARY KEY, record bytea NOT NULL);
+ALTER TABLE journal ALTER record SET STORAGE EXTERNAL;
+CREATE TABLE watermark (
+    machine text, spool_id bytea,
+    seq bigint NOT NULL, lost bigint NOT NULL, newest_ns bigint NOT NULL, crc32 bigint NOT NULL,
+    PRIMARY KEY (machine, spool_id)
+);
+CREATE TABLE extent (
+    row bigint PRIMARY KEY, first_stamp_ns bigint NOT NULL, last_stamp_ns bigint NOT NULL,
+    west_m float8 NOT NULL, south_m float8 NOT NULL, east_m float8 NOT NULL, north_m float8 NOT NULL,
+    crc32 bigint NOT NULL
+);
+CREATE TABLE events (
+    id bigint PRIMARY KEY, kind text NOT NULL, stamp_ns bigint NOT NULL, body text NOT NULL, crc32 bigint NOT NULL
+);
+CREATE FUNCTION advance(mine bigint, from_row bigint, to_row bigint, from_event bigint, to_event bigint)
+RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    UPDATE head SET last_row = to_row, last_event = to_event
+    WHERE epoch = mine AND last_row = from_row AND last_event = from_event;
+    IF NOT FOUND THEN
+        RAISE EXCEPTION 'another writer has this journal' USING ERRCODE = 'SG001';
+    END IF;
+END $$;
+"""
+_READ_ALL = "SELECT row, record FROM journal WHERE row > %(after)s AND row <= %(until)s ORDER BY row LIMIT %(most)s"
+_READ_SOME = """SELECT row, record FROM extent LEFT JOIN journal USING (row)
+WHERE extent.last_stamp_ns >= %(from_ns)s AND extent.first_stamp_ns <= %(to_ns)s
+    AND west_m <= %(east_m)s AND east_m >= %(west_m)s AND south_m <= %(north_m)s AND north_m >= %(south_m)s
+    AND row > %(after)s AND row <= %(until)s ORDER BY row LIMIT %(most)s"""
+_EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
+_LOOK_S = 1.0  # a notification may be lost, as one of a server that has ended meanwhile
+_LOOK_AGAIN_S = 0.05  # at a replica, which has no notifications
+
+
+class PostgresQueries(TableQueries):
+    """What can be read of a journal on a connection of its own, which is opened again once it was lost."""
+
+    schema = SCHEMA
+
+    def __init__(self, url: str) -> None:
+        self._url, self._where = url, shown(url)
+        self._db: Connection | None = None
+
+    @property
+    def where(self) -> str:
+        """The URL, without its password."""
+        return self._where
+
+    @property
+    def last_row(self) -> int:
+        """See `JournalQueries`."""
+        return self.state().row
+
+    @property
+    def archived_row(self) -> int:
+        """See `JournalQueries`."""
+        return self._number("SELECT archived_row FROM head")
+
+    @property
+    def replica(self) -> str:
+        """See `JournalQueries`."""
+        ((synchronous, replicas),) = self._query(REPLICAS)
+        return replica_of(synchronous=synchronous, replicas=replicas)
+
+    def state(self) -> JournalState:
+        """See `JournalQueries`."""
+        rows = self._query("SELECT epoch, last_row, last_event FROM head")
+        if not rows:
+            raise self._damaged("the table head")
+        return JournalState(*rows[0])
+
+    def _last_event(self) -> int:
+        return self.state().event
+
+    def _query(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        with readable(self._where):
+            return self._connected().execute(query.replace("?", "%s"), values, binary=True).fetchall()
+
+    def _connected(self) -> Connection:
+        """The connection; a new one where the last one was lost."""
+        if self._db is None or self._db.closed:
+            self._db = connect(self._url, "reader")
+        return self._db
+
+    @contextmanager
+    def _one_state(self) -> Iterator[None]:
+        with readable(self._where):
+            self._connected().execute("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY")
+        try:
+            yield
+        finally:
+            with suppress(psycopg.Error, StoreError):  # a connection that is lost has ended it
+                self._connected().execute("ROLLBACK")
+
+    def _piece(self, after: int, until: int, selection: Selection) -> tuple[list[int], list[Any], bool]:
+        """See `TableQueries`."""
+        values: dict[str, float] = {"after": after, "until": until, "most": ROWS_AT_ONCE}
+        query = _READ_ALL
+        if not selection.everywhere:
+            box = asdict(selection.bounds) if selection.bounds else _EVERYWHERE
+            query, values = _READ_SOME, {**values, **box, "from_ns": selection.from_ns, "to_ns": selection.to_ns}
+        numbers: list[int] = []
+        records: list[Any] = []
+        size, is_end = 0, False
+        while size < BYTES_AT_ONCE and not is_end:
+            with readable(self._where):
+                part = self._connected().execute(query, values, binary=True).fetchall()
+            numbers += [row for row, _ in part]
+            records += [record for _, record in part]
+            size += size_of([record for _, record in part])
+            is_end = len(part) < ROWS_AT_ONCE
+            values["after"] = numbers[-1] if numbers else after
+        return numbers, records, is_end
+
+
+def exists(url: str) -> bool:
+    """Whether a database has a journal; StoreError where that cannot be asked."""
+    where = shown(url)
+    with readable(where), connect(url, "look") as db:
+        return bool(db.execute(f"SELECT to_regclass('{connection.SCHEMA}.meta') IS NOT NULL").fetchall()[0][0])
+
+
+class PostgresReader(PostgresQueries):
+    """See `JournalReader`: of the server that writes, or of one of its replicas."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self._listens: Connection | None = None
+        try:
+            meta = self._meta()
+        except StoreError:
+            self.close()
+            raise
+        self.site, self.frame = meta.get("site", ""), meta.get("frame", "")
+
+    def follow(self, known: JournalState, timeout_s: float) -> JournalState:
+        """See `JournalReader`: waits for a notification, and looks by itself once a second."""
+        end_s = time.monotonic() + timeout_s
+        with readable(self._where):
+            notified = self._listen()
+            while (state := self.state()) == known and (left_s := end_s - time.monotonic()) > 0:
+                if notified:
+                    list(self._connected().notifies(timeout=min(left_s, _LOOK_S), stop_after=1))
+                else:
+                    time.sleep(min(left_s, _LOOK_AGAIN_S))
+        return state
+
+    def _listen(self) -> bool:
+        """Whether notifications come; those before this are passed over, since the state is looked at after it."""
+        db = self._connected()
+        if self._listens is not db:
+            ((is_replica,),) = db.execute("SELECT pg_is_in_recovery()").fetchall()
+            if is_replica:
+                return False
+            db.execute(f"LISTEN {CHANNEL}")
+            self._listens = db
+        return True
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._db is not None:
+            self._db.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,89 @@
+"""The map of the process that writes, as queries are answered from it; and the commands, which it alone obeys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from mapserver.ingest.writer import Writer
+from mapserver.past.past import Past
+from mapserver.query.source import MapState
+from mapserver.upkeep.upkeep import Upkeep
+from protocol.queries import answer_codec as codec
+from protocol.queries.answers import GroundChange, ServerAlive
+from protocol.queries.calibration import CalibrationAnswer, encode_calibration
+from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, parse_command
+from protocol.queries.origin import SERVER, Origin
+
+T = TypeVar("T")
+
+
+class ServerSource:
+    """See `MapSource`."""
+
+    def __init__(self, writer: Writer, upkeep: Upkeep, past: Past) -> None:
+        self._writer, self._upkeep, self.past = writer, upkeep, past
+        self.site, self.config, self.location, self.waits = writer.site, writer.config, writer.location, writer.waits
+
+    def run(self, work: Callable[[MapState], T]) -> T:
+        """Have `work` done by the thread that owns the store."""
+        return self._writer.run(work)
+
+    def changes(self, after: int) -> list[GroundChange]:
+        """See `Upkeep`."""
+        return self._upkeep.changes(after)
+
+    def machines(self) -> list[dict[str, Any]]:
+        """See `Upkeep`."""
+        return self._upkeep.machines()
+
+    def calibration(self) -> CalibrationAnswer:
+        """See `Upkeep`."""
+        return self._upkeep.calibration()
+
+    def info(self) -> dict[str, Any]:
+        """See `Writer`."""
+        return self._writer.info()
+
+    def alive(self) -> ServerAlive:
+        """See `Writer`."""
+        return self._writer.alive()
+
+    def origin(self) -> Origin:
+        """The server: a batch is in its map before it is acknowledged."""
+        return SERVER
+
+    def count(self, what: str) -> None:
+        """See `Writer`."""
+        self._writer.count(what)
+
+
+class Commands:
+    """Carries out commands. info: all that an answer of `info` has."""
+
+    def __init__(self, writer: Writer, upkeep: Upkeep, info: Callable[[], Mapping[str, Any]]) -> None:
+        self._writer, self._upkeep, self._info = writer, upkeep, info
+
+    def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
+        """Parse and carry out one command; QueryError says what is wrong with it."""
+        command = parse_command(name, parameters)
+        if isinstance(command, AcceptCommand):
+            self._writer.run(lambda store: store.accept(command.store, command.reason))
+            return codec.encode_info(self._info())
+        if isinstance(command, CalibrateCommand):
+            return encode_calibration(self._calibrate(command))
+        return codec.encode_machine(self._trust(command))
+
+    def _trust(self, command: TrustCommand) -> dict[str, Any]:
+        """What is known of the machine once the command counts, and the version of the map that it counts in."""
+        row = self._upkeep.trust(command.machine, command.trusted, command.reason, command.wait_s)
+        version = self._writer.run(lambda store: store.version)
+        return {**row, "store": version.store, "merged": version.row, "fact": version.fact}
+
+    def _calibrate(self, command: CalibrateCommand) -> CalibrationAnswer:
+        """What is known of all machines once the command counts."""
+        if command.machine:
+            self._upkeep.correct(command)
+        else:
+            self._upkeep.calibrate(command.wait_s)
+        return self._upkeep.calibration()

@@ -1,0 +1,232 @@
+"""Whom a client asks: a follower of the site for what is read from the map, else its map server; each question of one.
+
+Plain queryables on one key all work on every question, and of those that are complete Zenoh asks one, always the same
+(docs/decisions/0049-followers.md). So each follower answers on keys of its own, and shows a liveliness token as long as
+it does. A client stays with one follower: what it reads never goes back in time because another one is behind.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+
+import zenoh
+
+from protocol.errors import ConfigError, LinkError, QueryError, Refusal
+from protocol.queries import requests
+from protocol.queries.answer_codec import decode_alive, decode_error
+from protocol.queries.answers import FollowerState, ServerAlive
+from protocol.queries.origin import SERVER, Origin, decode_origin
+from protocol.queries.parameters import selector_of, text_of
+from protocol.wire import keys
+
+# Nobody answers, at once: the server starts again, or has just connected (Zenoh issue 2767). It may answer in a moment.
+AGAIN_S = 0.1
+PAST_S = 120.0  # how much longer an answer may take that has to be folded from the journal
+LOOK_S = 1.0  # between two looks for followers, each 0.1 ms of the router
+LOOK_WAIT_S = 1.0
+AVOID_S = 10.0  # a follower that did not answer: after the lease of its link its token is gone
+FOLLOWERS_TRIED = 2  # for one question, before the server is asked: each may take half of the time that is left
+FOLLOWER_WAIT_S = 1.0  # for a row, at a follower that lacks it: one that follows has it after 0.5 s
+TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
+# Refusals that are about who was asked, not about the question.
+ELSEWHERE = (Refusal.AFTER_TIMEOUT, Refusal.NOT_HERE, Refusal.OVERLOADED, Refusal.STORE, "internal")
+READ = (requests.PointQuery, requests.RegionQuery, requests.TilesQuery, requests.WhyQuery, requests.HistoryQuery)
+# A follower has these a moment later than the server, whose events tell of them: it is asked where no server is.
+SERVER_FIRST = (requests.InfoQuery, requests.ChangesQuery)
+
+
+@dataclass(frozen=True)
+class Answered:
+    """An answer, and who gave it."""
+
+    data: bytes
+    origin: Origin
+
+
+class _Silence(Enum):
+    """No answer. NOBODY: there was none to take the question, or who had it has ended."""
+
+    NOBODY = auto()
+    TIMED_OUT = auto()
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A question to one process. follower: its name, empty for the server."""
+
+    key: str
+    parameters: Mapping[str, str]
+    follower: str = ""
+
+    @property
+    def selector(self) -> zenoh.Selector:
+        return zenoh.Selector(self.key, selector_of(self.parameters)) if self.parameters else zenoh.Selector(self.key)
+
+
+class Followers:
+    """Followers of a site that answer, in the order in which this client asks them."""
+
+    def __init__(self, session: zenoh.Session, site: str) -> None:
+        self._session, self._site = session, site
+        self._client = secrets.token_bytes(8)
+        self._names: list[str] = []
+        self._look_s = 0.0  # the time of the next look
+        self._avoided: dict[str, float] = {}  # until when
+
+    def in_order(self) -> list[str]:
+        """Names, the first to be asked first."""
+        now_s = time.monotonic()
+        if now_s >= self._look_s:
+            self._names, self._look_s = preferred(self._client, self.look()), time.monotonic() + LOOK_S
+        return [name for name in self._names if self._avoided.get(name, 0.0) <= now_s]
+
+    def look(self) -> set[str]:
+        """Names of those whose tokens are there."""
+        replies = self._session.liveliness().get(keys.followers_alive_all(self._site), timeout=LOOK_WAIT_S)
+        return {name for reply in replies if reply.ok is not None and (name := _name(str(reply.ok.key_expr)))}
+
+    def avoid(self, name: str) -> None:
+        """Ask others for a while, and look again who is there."""
+        self._avoided[name] = time.monotonic() + AVOID_S
+        self._look_s = 0.0
+
+
+def preferred(client: bytes, names: set[str]) -> list[str]:
+    """Names in the order of one client (rendezvous hashing): each is the first one of equally many clients.
+
+    One that comes or goes changes nothing between the others.
+    """
+    return sorted(names, key=lambda name: hashlib.blake2b(client + name.encode(), digest_size=8).digest())
+
+
+class Asker:
+    """Asks followers and map server of one site; see `Client` for what is raised."""
+
+    def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float) -> None:
+        self._session, self._endpoint, self._site, self._timeout_s = session, endpoint, site, timeout_s
+        self._followers = Followers(session, site)
+
+    def ask(self, query: requests.MapQuery, *, at: Origin | None = None) -> Answered:
+        """Ask the map. at: of whoever gave an earlier answer, which has what this one goes on with."""
+        wait_s = query.fresh.wait_s if query.fresh.after else 0.0
+        wait_s += PAST_S if requests.reads_past(query) else 0.0
+        if at and at.follower:
+            return self._of_follower(query, at.follower)
+        return self._get(query, wait_s)
+
+    def followers(self) -> list[FollowerState]:
+        """Followers whose tokens are there and that answer, by name."""
+        states = []
+        for name in sorted(self._followers.look()):  # one by one: routers let no wildcard pass to a name
+            key = keys.follower_query(self._site, name, requests.AliveQuery.name)
+            answered = self._once(_Attempt(key, {}, name), self._timeout_s / 2)
+            if isinstance(answered, Answered):
+                states.append(_state(decode_alive(answered.data), answered.origin))
+        return states
+
+    def command(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
+        """Have the server carry out a command."""
+        return self._until_answered(lambda: iter((_Attempt(key, parameters),)), wait_s).data
+
+    def _of_follower(self, query: requests.MapQuery, follower: str) -> Answered:
+        """Ask one follower and nobody else: `expired` where it is gone."""
+        attempt = self._attempt(query, follower)
+        outcome = self._once(attempt, self._timeout_s)
+        if isinstance(outcome, Answered):
+            return outcome
+        self._followers.avoid(follower)
+        if isinstance(outcome, QueryError) and outcome.reason not in ELSEWHERE:
+            raise outcome
+        raise QueryError(Refusal.EXPIRED, f"follower {follower} does not answer any more: ask again from the beginning")
+
+    def _get(self, query: requests.MapQuery, wait_s: float) -> Answered:
+        server = _Attempt(keys.map_query(self._site, query.name), requests.encode_query(query))
+
+        def attempts() -> Iterator[_Attempt]:
+            if isinstance(query, SERVER_FIRST):
+                yield server
+            if isinstance(query, READ + SERVER_FIRST):
+                for name in self._followers.in_order()[:FOLLOWERS_TRIED]:
+                    yield self._attempt(query, name)
+            if not isinstance(query, SERVER_FIRST):
+                yield server
+
+        return self._until_answered(attempts, wait_s)
+
+    def _attempt(self, query: requests.MapQuery, follower: str) -> _Attempt:
+        parameters = requests.encode_query(query)
+        if query.fresh.after:
+            parameters["wait"] = text_of(min(query.fresh.wait_s, FOLLOWER_WAIT_S))
+        return _Attempt(keys.follower_query(self._site, follower, query.name), parameters, follower)
+
+    def _until_answered(self, attempts: Callable[[], Iterator[_Attempt]], wait_s: float) -> Answered:
+        """Make one attempt after the other until one is answered, for as long as nobody holds the question."""
+        held_s, timed_out = time.monotonic(), False  # until when somebody held it
+        refusal: QueryError | None = None
+        end_s = held_s + self._timeout_s + wait_s
+        while (now_s := time.monotonic()) < min(end_s, held_s + self._timeout_s):
+            for attempt in attempts():
+                asked_s = time.monotonic()
+                left_s = max(end_s - asked_s, AGAIN_S)
+                outcome = self._once(attempt, left_s / 2 if attempt.follower else left_s)
+                if isinstance(outcome, Answered):
+                    return outcome
+                if isinstance(outcome, QueryError):
+                    self._go_on(attempt, outcome, end_s - time.monotonic())
+                    held_s, refusal = time.monotonic(), outcome
+                elif attempt.follower:
+                    self._followers.avoid(attempt.follower)
+                else:
+                    timed_out = outcome is _Silence.TIMED_OUT
+                    held_s = time.monotonic() if time.monotonic() > asked_s + AGAIN_S else held_s
+            time.sleep(max(0.0, AGAIN_S - (time.monotonic() - now_s)))
+        raise refusal or self._no_answer(timed_out=timed_out)
+
+    def _go_on(self, attempt: _Attempt, refusal: QueryError, left_s: float) -> None:
+        """Raise a refusal, unless another attempt may be answered: elsewhere, or here in a moment."""
+        if attempt.follower and refusal.reason in ELSEWHERE:
+            return
+        if attempt.follower or not 0 < refusal.retry_after_s < left_s - AGAIN_S:
+            raise refusal
+        time.sleep(refusal.retry_after_s)
+
+    def _once(self, attempt: _Attempt, timeout_s: float) -> Answered | QueryError | _Silence:
+        outcome: Answered | QueryError | _Silence = _Silence.NOBODY
+        for reply in self._session.get(attempt.selector, timeout=timeout_s):
+            if reply.ok is not None:
+                return Answered(reply.ok.payload.to_bytes(), _origin(reply.ok.attachment))
+            if reply.err is not None:
+                text = reply.err.payload.to_bytes()
+                outcome = _Silence.TIMED_OUT if text == TIMED_OUT else decode_error(text)
+        return outcome
+
+    def _no_answer(self, *, timed_out: bool) -> LinkError:
+        site = self._site
+        problem = f"no map server answers for site {site!r}: start one with `sitegrid server`, or check the name"
+        if timed_out:
+            problem = f"the map server of site {site!r} did not answer in time: it hangs, or has too much to do"
+        if self._endpoint.startswith("tls/"):
+            problem += "; or these keys may not ask this (see docs/security.md)"
+        return LinkError(self._endpoint, problem)
+
+
+def _origin(attachment: zenoh.ZBytes | None) -> Origin:
+    return decode_origin(attachment.to_bytes()) if attachment else SERVER
+
+
+def _state(alive: ServerAlive, origin: Origin) -> FollowerState:
+    lag = (origin.behind_rows, origin.behind_s)
+    return FollowerState(origin.follower, alive.store, alive.journalled, alive.merged, *lag)
+
+
+def _name(key: str) -> str:
+    """The follower whose token this is, empty for what is none."""
+    try:
+        return keys.follower_of(key)
+    except ConfigError:
+        return ""

@@ -1,0 +1,161 @@
+"""Copies of a live store: made, looked through, and put back.
+
+A backup is a store's folder without its caches: the journal as it was at one commit, the files of the archive up to the
+row where that begins, and the files that say which site it is. It is made beside its place, and gets its name once it
+is whole and has been read back.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapserver.ingest.decisions import calibrations
+from mapserver.ingest.losses import lacking
+from mapserver.ingest.store_folder import hold, is_in_use
+from mapserver.journal import archived_decisions
+from mapserver.journal.history import History, read_history
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
+from mapserver.journal.rows import SpoolKey, Watermark
+from protocol.errors import ConfigError, StoreError
+from protocol.files import sync_folder
+
+BESIDE = ("site.toml", "server.toml")  # copied where they are in the store
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What was looked through, all of it: rows with their samples, events, files of the archive, and spools."""
+
+    store: str
+    rows: int
+    samples: int
+    lost: int
+    events: int
+    archive_files: int
+    spools: int
+    machines: int
+    newest_ns: int
+
+
+def backup(store: Path, out: Path) -> Examined:
+    """Copy a store, also while its server writes, and read the copy back; StoreError, ConfigError."""
+    with _making(store, out) as (source, part):
+        with source.file_reader() as journal:
+            journal.copy_to(part / JOURNAL_FILE)
+        with JournalLocation(part).reader() as copied:  # what moves to the archive from now on is in the copy
+            archived, decisions = copied.archived_row, calibrations(copied)
+            identity = copied.identity().id
+        _copy_archive(source, part, archived)
+        if archived and decisions:
+            archived_decisions.save(JournalLocation(part).archive.folder, identity, decisions)
+        return _examined(JournalLocation(part), live=False)
+
+
+def restore(copy: Path, store: Path) -> Examined:
+    """Make a store of a backup; the backup is read through before, and the store after."""
+    if is_in_use(copy):
+        raise ConfigError(copy, "is the store of a server that runs, and no backup; make one of it: sitegrid backup")
+    verify(copy)
+    with _making(copy, store) as (source, part):
+        with source.file_reader() as journal:
+            journal.copy_to(part / JOURNAL_FILE)
+            archived = journal.archived_row
+        _copy_archive(source, part, archived)
+        if (decisions := source.archive.folder / archived_decisions.FILE).exists():
+            shutil.copy2(decisions, part / source.archive.folder.name)
+        return _examined(JournalLocation(part), live=False)
+
+
+def verify(store: Path) -> Examined:
+    """Read all of a store or a backup; StoreError names the first thing that is not as it was written."""
+    location = _journal_of(store)
+    if shortfall := lacking(location):
+        raise StoreError(location, f"lacks what was acknowledged: {shortfall}")
+    return _examined(location, live=is_in_use(store))
+
+
+def _examined(location: JournalLocation, *, live: bool) -> Examined:
+    """Read all. live: batches come in meanwhile, so that rows and watermarks are not compared."""
+    rows, samples, reached = 0, Counter[SpoolKey](), Counter[SpoolKey]()
+    with location.file_reader() as journal:
+        journal.require_sound()
+        journal.check()
+        watermarks, events, last_row = journal.watermarks(), journal.events(), journal.last_row
+        calibrations(journal)
+        for some in read_history(History(journal, location.archive), until=last_row):
+            rows += len(some)
+            columns = (some.machine, some.spool_ids, some.first_seqs, some.lengths)
+            for machine, spool_id, first, n in zip(*(column.tolist() for column in columns), strict=True):
+                spool = some.machines[machine], spool_id
+                samples[spool] += n
+                reached[spool] = max(reached[spool], first + n - 1)
+        identity, files = journal.identity().id, list(location.archive.cover(journal.archived_row))
+    archived_decisions.load(location.archive.folder)
+    for spool in () if live else samples.keys() | watermarks.keys():
+        mark = watermarks.get(spool, Watermark())
+        if reached[spool] > mark.seq or samples[spool] != mark.seq - mark.lost:
+            problem = f"has other samples of {spool[0]}, spool {spool[1]:016x}, than its watermark says"
+            raise StoreError(location, f"{problem}; restore a backup")
+    lost = sum(mark.lost for mark in watermarks.values())
+    newest_ns = max((mark.newest_ns for mark in watermarks.values()), default=0)
+    machines = len({name for name, _ in watermarks})
+    counts = (rows, samples.total(), lost, len(events), len(files), len(watermarks), machines)
+    return Examined(identity, *counts, newest_ns)
+
+
+def _journal_of(store: Path) -> JournalLocation:
+    location = JournalLocation(store)
+    if not location.exists():
+        raise ConfigError(store, f"holds no {JOURNAL_FILE}; a journal in PostgreSQL is backed up by pg_dump")
+    return location
+
+
+@contextmanager
+def _making(source: Path, out: Path) -> Iterator[tuple[JournalLocation, Path]]:
+    """A folder beside its place, which gets its name in the end; after an error it is gone."""
+    location, out = _journal_of(source), out.absolute()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(out, "exists and is not empty; choose another --out")
+    part = out.with_name(f"{out.name}.part")
+    if is_in_use(part):
+        raise ConfigError(part, "another copy is being made there; wait for it, or choose another --out")
+    try:
+        if part.exists():
+            shutil.rmtree(part)  # of one that was killed
+        with hold(part):
+            yield location, part
+        for name in BESIDE:
+            if (source / name).is_file():
+                shutil.copy2(source / name, part / name)
+        sync_folder(part)
+        part.replace(out)
+        sync_folder(out.parent)
+    except OSError as error:
+        raise StoreError(out, f"cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)  # nothing, where it has its name
+
+
+def _copy_archive(source: JournalLocation, part: Path, until: int) -> None:
+    """Copy the files with rows up to this one; they never change."""
+    if until:
+        folder = JournalLocation(part).archive.folder
+        folder.mkdir()
+        for path in source.archive.cover(until):
+            shutil.copy2(path, folder / path.name)
+        sync_folder(folder)
+
+
+def lines(store: Path, examined: Examined) -> list[str]:
+    """What was looked through, for people."""
+    e = examined
+    return [
+        f"{store}: store {e.store}, all as it was written",
+        f"  {e.rows} journal rows with {e.samples} samples of {e.machines} machines, {e.lost} declared lost",
+        f"  {e.archive_files} files of the archive, {e.events} events, {e.spools} watermarks",
+    ]

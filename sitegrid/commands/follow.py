@@ -1,0 +1,83 @@
+"""`sitegrid follow`: a process that follows the journal of a site and answers queries of its map."""
+
+from __future__ import annotations
+
+import re
+import socket
+import time
+from argparse import ArgumentParser, Namespace
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+from protocol.config import from_table
+from protocol.errors import ConfigError, LinkError
+from protocol.files import load_toml
+from protocol.site.site_file import load_site
+from protocol.wire.keys import check_name
+from protocol.wire.session import open_session, use_many_threads
+from sitegrid.options.groups import add_network
+from sitegrid.options.outputs import FOLDER
+from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
+from sitegrid.security.join import join
+
+HELP = "follow a site's journal and answer queries of its map, so that the server need not"
+EXTRA = "server"
+TEND_S = 0.5
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add = parser.add_argument
+    add_network(parser)
+    add("--site-file", type=Path, required=True, help="site file of the server: name, origin, cells")
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--store", type=Path, help="the server's store on this host, which is only read")
+    where.add_argument("--copy", type=FOLDER, help="folder for a copy of the journal, where the server is elsewhere")
+    add("--journal", metavar="URL", default="", help="the server's database, postgresql://..., beside its --store")
+    add("--config", type=Path, help="the server's file with options (config/server.toml)")
+    add("--name", help="name of this follower, another one for each (default the name of this host)")
+
+
+def run(arguments: Namespace) -> int:
+    """Follow until stopped."""
+    from mapserver.config import ServerConfig
+    from mapserver.follower.copying import Copying
+    from mapserver.follower.follower import Follower
+    from mapserver.journal.location import JournalLocation
+    from mapserver.server import warm_up
+
+    if arguments.copy and arguments.journal:
+        raise ConfigError(
+            "--journal", "a copy is made of the server's journal, wherever that is: leave one of both out"
+        )
+    stop = stop_flag()
+    use_many_threads()
+    return_large_blocks()
+    site = load_site(arguments.site_file)
+    table = load_toml(arguments.config) if arguments.config else {}
+    config = from_table(ServerConfig, table, str(arguments.config))
+    name = check_name(arguments.name or _host(), "--name")
+    with ExitStack() as opened:
+        warm_up(config)
+        joined = join(arguments.endpoint, arguments.keys, 30.0, role="follower", name=name, site=site.name)
+        session = opened.enter_context(closing(open_session(joined)))
+        if arguments.copy:
+            journal: JournalLocation | Copying = Copying(session, site, arguments.copy)
+        else:
+            journal = JournalLocation(arguments.store, arguments.journal)
+        follower = opened.enter_context(closing(Follower(session, name, journal, site, config, time.time_ns)))
+        is_ready = False
+        while not stop.wait(TEND_S):
+            if follower.ended:
+                raise LinkError(f"follower {name}", f"{follower.ended}; this one ends")
+            follower.tend()
+            if follower.is_shown and not is_ready:
+                is_ready = True
+                folder = str(arguments.store or arguments.copy)
+                say({"ready": "follow", "site": site.name, "name": name, "store": folder})
+    return 0
+
+
+def _host() -> str:
+    """The name of this host as one of a follower."""
+    return re.sub(r"[^a-z0-9_-]+", "-", socket.gethostname().lower()).strip("-_")[:63] or "follower"

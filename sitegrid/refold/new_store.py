@@ -1,0 +1,121 @@
+"""The new store of a fold, made in a folder beside its place: what a fold that was killed left there is used again."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mapserver.config import ServerConfig
+from mapserver.evidence import snapshot
+from mapserver.evidence.grid_state import GridState
+from mapserver.fleet.decisions import CalibrationDecision
+from mapserver.ingest.decisions import plain
+from mapserver.ingest.store import Store
+from mapserver.ingest.store_folder import hold, is_in_use
+from mapserver.journal.archive import FOLDER, file_name
+from mapserver.journal.facts import Facts
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.rows import SpoolKey, Watermark
+from protocol.errors import ConfigError, SitegridError, StoreError
+from protocol.files import sync_folder, write_whole
+from protocol.site.site_config import SiteConfig
+from sitegrid.refold.work import STORE_FILE, PartWork
+
+WORK = "work"  # folder in that of the store, as long as it is in the making: see work.py
+
+
+@dataclass(frozen=True)
+class NewStore:
+    """A store in the making. id: its own; rows: the last one of its archive."""
+
+    folder: Path
+    id: str
+    site: SiteConfig
+    rows: int
+
+    @property
+    def work(self) -> Path:
+        """Where tasks write."""
+        return self.folder / WORK
+
+    def take_samples(self, files: Iterable[tuple[PartWork, Path]]) -> None:
+        """Have the samples of each part as a file of the archive."""
+        archive = self.folder / FOLDER
+        archive.mkdir(exist_ok=True)
+        for part, path in files:
+            path.rename(archive / file_name(part.first_ns, part.row, part.row + part.rows - 1))
+        sync_folder(archive)
+
+    def save_map(self, state: GridState, config: ServerConfig, facts: Facts) -> None:
+        """Write the snapshot that the store starts from."""
+        snapshot.save(self.folder, self.rows, state, self.site.cell_m, config.fold, facts.of_evidence())
+
+    def fill_journal(self, watermarks: Mapping[SpoolKey, Watermark], decisions: Sequence[CalibrationDecision]) -> None:
+        """Have the journal go on after the archive, with the decisions about the samples in it."""
+        with closing(JournalLocation(self.folder).open_file(self.site.name, self.site.frame)) as journal:
+            if not journal.last_row:
+                journal.follow_archive(self.rows, watermarks)
+            if not journal.events():
+                journal.append_events(map(plain, decisions))
+            if (journal.last_row, journal.watermarks()) != (self.rows, watermarks):
+                raise _of_another(self.folder)
+
+    def finish(self, out: Path, texts: Mapping[str, str], config: ServerConfig) -> dict[str, Any]:
+        """Open the store as a server does, and put it in its place; texts: further files. Returns its `info`."""
+        for name, text in texts.items():
+            write_whole(self.folder / name, text.encode())
+        with closing(Store(JournalLocation(self.folder), self.site, config, time.time_ns)) as store:
+            info = store.info()
+        shutil.rmtree(self.work)
+        self.folder.replace(out)
+        sync_folder(out.parent)
+        return info
+
+
+@contextmanager
+def making(folder: Path, site: SiteConfig, descends: tuple[str, ...], rows: int) -> Iterator[NewStore]:
+    """Make a store in a folder, or go on with it; after an error nothing is left, or what the same command can use."""
+    if is_in_use(folder / WORK):
+        raise ConfigError(folder, "another fold is at work there; wait for it, or choose another --out")
+    try:
+        with hold(folder / WORK):
+            yield NewStore(folder, _identity(folder, site, descends), site, rows)
+    except (SitegridError, OSError) as error:
+        problem = str(error)
+        if isinstance(error, OSError):
+            problem = f"{folder}: cannot be written: {error.strerror or error}"
+        if _is_useful(folder):
+            problem = f"{problem}; what is done is kept in {folder}, and the same command goes on"
+        raise SitegridError(problem) from None
+    finally:
+        if folder.exists() and not _is_useful(folder):
+            shutil.rmtree(folder)
+
+
+def _identity(folder: Path, site: SiteConfig, descends: tuple[str, ...]) -> str:
+    """Id of the new store: that of an empty journal, which is made now or was made by the fold that was killed."""
+    try:
+        with closing(JournalLocation(folder).open_file(site.name, site.frame, descends)) as journal:
+            identity = journal.identity()
+    except StoreError:
+        if not _is_useful(folder):
+            raise
+        raise _of_another(folder) from None
+    if identity.descends != descends:
+        raise _of_another(folder)
+    write_whole(folder / WORK / STORE_FILE, identity.id.encode())
+    return identity.id
+
+
+def _of_another(folder: Path) -> ConfigError:
+    return ConfigError(folder, "is left from a fold of something else that was killed; remove it")
+
+
+def _is_useful(folder: Path) -> bool:
+    """Whether a fold that goes on would find work that is done."""
+    return any((folder / WORK).glob("evidence-*"))

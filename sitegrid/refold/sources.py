@@ -1,0 +1,136 @@
+"""What is folded, as the command line names it: files, folders of them, stores; their parts, site and decisions."""
+
+from __future__ import annotations
+
+import socket
+from argparse import Namespace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
+from pathlib import Path
+
+from mapserver.config import ServerConfig
+from mapserver.fleet.decisions import CalibrationDecision
+from mapserver.ingest.decisions import calibrations
+from mapserver.ingest.losses import lacking
+from mapserver.ingest.store import ACCEPTED
+from mapserver.journal import archived_decisions
+from mapserver.journal.archive_file import ArchiveFile
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
+from mapserver.journal.places import Place
+from mapserver.journal.rows import SpoolKey, Watermark
+from protocol.config import from_table
+from protocol.errors import ConfigError, StoreError
+from protocol.files import load_toml
+from protocol.site.site_config import SiteConfig
+from protocol.site.site_file import load_site
+from sitegrid.refold.contents import Contents
+from sitegrid.refold.parts import SLICE_ROWS, FilePart, JournalPart, Part
+
+SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
+
+
+@dataclass(frozen=True)
+class Source:
+    """One archive that was named. stores: ids of those whose samples these are, or whose place that store took."""
+
+    path: Path | Place
+    parts: tuple[Part, ...]
+    decisions: Sequence[CalibrationDecision]
+    stores: tuple[str, ...] = ()
+    site: SiteConfig | None = None
+    watermarks: Mapping[SpoolKey, Watermark] = field(default_factory=dict)
+
+
+def source(path: Path | Place) -> Source:
+    """What a Parquet file, a folder of them or a store holds; nothing of its samples is read yet."""
+    path = path.absolute() if isinstance(path, Path) else path
+    if isinstance(path, Path) and JournalLocation(path).exists():
+        return _store(path)
+    if not path.exists():
+        raise ConfigError(path, "no such file or folder")
+    files: list[Path | Place] = [path]
+    if path.is_dir():
+        files = sorted(path.glob("*.parquet"), key=str)
+    if not files:
+        raise ConfigError(path, f"holds neither Parquet files nor a {JOURNAL_FILE}")
+    return Source(path, tuple(map(FilePart, files)), archived_decisions.load(files[0].parent))
+
+
+def _store(path: Path) -> Source:
+    location = JournalLocation(path)
+    if shortfall := lacking(location):
+        advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
+        raise StoreError(location, f"{shortfall}; {advice}")
+    with location.reader() as journal:
+        last, archived = journal.last_row, journal.archived_row
+        files = location.archive.cover(archived)
+        slices = range(archived, last, SLICE_ROWS)
+        host, cut = socket.gethostname(), [(after, min(after + SLICE_ROWS, last)) for after in slices]
+        rest = (JournalPart(location, after, until, host) for after, until in cut)
+        identity, accepted = journal.identity(), (event.body["store"] for event in journal.events(ACCEPTED))
+        stores = (identity.id, *identity.descends, *accepted)
+        parts: tuple[Part, ...] = (*map(FilePart, files), *rest)
+        return Source(path, parts, calibrations(journal), stores, _site_of(path), journal.watermarks())
+
+
+def _site_of(store: Path) -> SiteConfig | None:
+    """The site as a store knows it: a file of its own, or the header of its newest archive."""
+    if (store / SITE_FILE).exists():
+        return load_site(store / SITE_FILE)
+    paths = JournalLocation(store).archive.paths()
+    return ArchiveFile(paths[-1]).header.site if paths else None
+
+
+def chosen_site(sources: Sequence[Source], contents: Sequence[Contents], arguments: Namespace) -> SiteConfig:
+    """The one site of all parts, with what the options change."""
+    first = contents[0]
+    given = load_site(arguments.site_file) if arguments.site_file else None
+    known = [*(source.site for source in sources), *(each.origin.site for each in contents)]
+    site = given or next((site for site in known if site), None)
+    if not site:
+        raise ConfigError(first.part, "does not say where its site is; give --site-file")
+    if (site.name, site.frame) != (first.origin.name, first.origin.frame):
+        problem = f"is site {site.name!r}, frame {site.frame}, the archives are of {first.origin.name!r}"
+        raise ConfigError(arguments.site_file or SITE_FILE, f"{problem}, frame {first.origin.frame}")
+    try:
+        return replace(site, cell_m=arguments.cell or site.cell_m)
+    except ValueError as error:
+        raise ConfigError("--cell", str(error)) from None
+
+
+def chosen_config(sources: Sequence[Source], arguments: Namespace) -> tuple[ServerConfig, str]:
+    """The server's options and their text: from --config, else from the first store that has its own."""
+    kept = (each.path / CONFIG_FILE for each in sources if each.watermarks and isinstance(each.path, Path))
+    path = arguments.config or next((file for file in kept if file.exists()), None)
+    if not path:
+        return ServerConfig(), "# Every option has its default.\n"
+    return from_table(ServerConfig, load_toml(path), str(path)), path.read_text(encoding="utf-8")
+
+
+def joined_decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
+    """Those of all sources, each history once; of one that another holds, as of a store and its archive, what goes on.
+
+    A decision that was made twice counts twice: who corrects, takes that back, and corrects again, has corrected.
+    """
+    out: list[CalibrationDecision] = []
+    taken: list[Sequence[CalibrationDecision]] = []
+    for history in histories:
+        if history not in taken:
+            out += history[max((_held(history, other) for other in taken), default=0) :]
+            taken.append(history)
+    return out
+
+
+def _held(history: Sequence[CalibrationDecision], other: Sequence[CalibrationDecision]) -> int:
+    """How much of a history another one holds, from its beginning on; in that of a fold of both it comes later."""
+    starts = (i for i, decision in enumerate(other) if history and history[0] == decision)
+    runs = (takewhile(lambda pair: pair[0] == pair[1], zip(history, other[i:], strict=False)) for i in starts)
+    return max((sum(1 for _ in run) for run in runs), default=0)
+
+
+def descent(sources: Sequence[Source], contents: Sequence[Contents]) -> Iterator[str]:
+    """Ids of all stores that the new one is made from, each once."""
+    own = {part: each.origin.stores for each in contents for part in [each.part]}
+    named = (store for each in sources for store in (*each.stores, *(s for part in each.parts for s in own[part])))
+    yield from dict.fromkeys(named)

@@ -1,0 +1,249 @@
+"""`sitegrid fold` by processes and by a Dask cluster: the same store, also where these are killed in the middle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapserver.journal.archive import write_file
+from mapserver.journal.rows import JournalRow
+from protocol.site.site_config import SiteConfig
+from sitegrid.cli import main
+from sitegrid.process.children import wait_until
+from sitegrid.refold import cluster as clusters
+from sitegrid.refold.cluster import Cluster
+from tests.unit.sitegrid.refold.archives import SITE, STORE, T0, S, samples
+
+pytest.importorskip("pyarrow.parquet")
+distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.processes
+FILES, WAIT_S = 12, 120.0
+MOST_FOLDS = 8  # until a worker dies in one
+# The command with smaller tasks, so that there are many of them.
+FOLD = (
+    "import sys; from sitegrid.refold.engine import Processes as P; P.task_samples = 1; from sitegrid.cli import main; "
+)
+FOLD += "sys.exit(main(sys.argv[1:]))"
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve files of two machines."""
+    folder = tmp_path_factory.mktemp("archive") / "archive"
+    write(folder, SITE, range(FILES))
+    return folder
+
+
+def write(folder: Path, site: SiteConfig, numbers: range) -> None:
+    for number in numbers:
+        rng = np.random.default_rng(number)
+        rows = [
+            JournalRow(2 * number + i + 1, name, 7, 20_000 * number + 1, samples(rng, 20_000), T0 + number * 3600 * S)
+            for i, name in enumerate("ab")
+        ]
+        write_file(folder, STORE, site, ((row, row.received_ns) for row in rows))
+
+
+@pytest.fixture(scope="module")
+def expected(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What one process makes of it."""
+    out = tmp_path_factory.mktemp("expected") / "store"
+    assert main(["fold", str(archive), "--out", str(out), "--json"]) == 0
+    return contents(out)
+
+
+def contents(store: Path) -> dict[str, str]:
+    """Hashes of all that does not have the store's random id in it, and the names of the others."""
+    files = {path for path in store.rglob("*") if path.is_file() and path.name not in ("lock", "journal.db-mark")}
+    hashed = (path.suffix in (".npz", ".toml") for path in files)
+    return {
+        str(path.relative_to(store)): hashlib.sha256(path.read_bytes()).hexdigest() if hash_it else ""
+        for path, hash_it in zip(files, hashed, strict=True)
+    }
+
+
+def started(*words: object) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", FOLD, "fold", *map(str, words), "--json"], stdout=subprocess.PIPE)
+
+
+def children_of(pid: int) -> set[int]:
+    """Processes that a process has started; Python's tracker of resources is one."""
+    try:
+        return {int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()}
+    except FileNotFoundError:
+        return set()
+
+
+def evidence(out: Path) -> list[Path]:
+    return list(out.with_name(f"{out.name}.part").glob("work/evidence-*"))
+
+
+@pytest.mark.slow
+def test_processes_make_the_same_store(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
+    seen: set[int] = set()
+    out = tmp_path / "out"
+    with started(archive, "--out", out, "--jobs", 2) as fold:
+        wait_until(lambda: fold.poll() is not None or not seen.update(children_of(fold.pid)), WAIT_S, "a look")
+        while fold.poll() is None:
+            seen |= children_of(fold.pid)
+    assert fold.returncode == 0
+    assert len(seen - {fold.pid}) >= 2, "processes of their own"
+    assert contents(out) == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.slow
+def test_a_fold_that_is_killed_goes_on(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with started(archive, "--out", out, "--jobs", 2) as fold:
+        wait_until(lambda: len(evidence(out)) >= 3, WAIT_S, "some tasks")
+        workers = children_of(fold.pid)
+        fold.kill()
+    assert workers
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers), WAIT_S, "the end of its processes")
+    assert not out.exists()
+    before = {path: path.stat().st_ino for path in evidence(out)}
+    assert 3 <= len(before) < FILES
+    with started(archive, "--out", out, "--jobs", 2) as fold:
+        wait_until(lambda: len(evidence(out)) > len(before), WAIT_S, "more tasks")
+        assert {path: path.stat().st_ino for path in before} == before, "what was done is not done again"
+        assert fold.wait(WAIT_S) == 0
+    assert contents(out) == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.slow
+def test_processes_that_are_killed_are_replaced(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with started(archive, "--out", out, "--jobs", 2) as fold:
+        wait_until(lambda: len(evidence(out)) >= 2, WAIT_S, "some tasks")
+        killed = children_of(fold.pid)
+        for pid in killed:
+            os.kill(pid, signal.SIGKILL)
+        assert fold.wait(WAIT_S) == 0
+    assert killed
+    assert contents(out) == expected
+
+
+def test_a_damaged_file_in_the_middle_ends_the_fold_and_leaves_nothing(archive: Path, tmp_path: Path, capsys) -> None:
+    shutil.copytree(archive, tmp_path / "archive")
+    damaged = sorted((tmp_path / "archive").iterdir())[5]
+    damaged.write_bytes(damaged.read_bytes()[:-1000])
+    assert main(["fold", str(tmp_path / "archive"), "--out", str(tmp_path / "out"), "--jobs", "2"]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"{damaged}: is damaged" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["archive"]
+
+
+# --- a cluster -------------------------------------------------------------------------------------------------------
+
+
+class Deaths(distributed.diagnostics.plugin.SchedulerPlugin):
+    """Counts workers that leave a scheduler."""
+
+    count = 0
+
+    def remove_worker(self, *_: object, **__: object) -> None:
+        """As the scheduler calls it."""
+        self.count += 1
+
+
+@pytest.fixture
+def dask(monkeypatch: pytest.MonkeyPatch) -> Iterator[distributed.LocalCluster]:
+    """A scheduler and two workers, each a process with a nanny."""
+    monkeypatch.setattr(Cluster, "task_samples", 1)
+    options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": 50}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **options) as cluster:
+        yield cluster
+
+
+def address(cluster: distributed.LocalCluster) -> str:
+    return str(cluster.scheduler_address).replace("tcp://", "dask://")
+
+
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_store(archive: Path, expected: dict[str, str], tmp_path: Path, dask) -> None:
+    with distributed.Client(dask) as client:
+        pids = set(client.run(os.getpid).values())
+    assert len(pids - {os.getpid()}) == 2
+    assert main(["fold", str(archive), "--out", str(tmp_path / "out"), "--engine", address(dask), "--json"]) == 0
+    assert contents(tmp_path / "out") == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["graceful", "segfault"])
+def test_a_cluster_whose_workers_die_makes_the_same_store(
+    archive: Path, expected: dict[str, str], tmp_path: Path, dask, mode: str
+) -> None:
+    from distributed.chaos import KillWorker
+
+    deaths = Deaths()
+    dask.scheduler.add_plugin(deaths)
+    dask.adapt(minimum=2, maximum=2, interval="1 s")  # a nanny may end with its worker
+    with distributed.Client(dask) as client:
+        client.register_plugin(KillWorker(4.0, mode))  # less, and they die while they start, which ends a nanny
+    for number in range(MOST_FOLDS):
+        out, before = tmp_path / str(number), deaths.count
+        assert main(["fold", str(archive), "--out", str(out), "--engine", address(dask), "--json"]) == 0
+        assert contents(out) == expected
+        if died := deaths.count - before:
+            break
+    assert died, "workers died during a fold"
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_all_its_workers_is_named(
+    archive: Path, tmp_path: Path, dask, monkeypatch, capsys
+) -> None:
+    """By `sys.exit` a worker takes its nanny along, and none comes in its place."""
+    from distributed.chaos import KillWorker
+
+    monkeypatch.setattr(clusters, "ALONE_S", 3.0)
+    with distributed.Client(dask) as client:
+        client.register_plugin(KillWorker(0.4, "sys.exit"))
+    assert main(["fold", str(archive), "--out", str(tmp_path / "out"), "--engine", address(dask)]) == 1
+    error = capsys.readouterr().err
+    assert "workers" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_is_named_and_the_fold_goes_on_without_it(
+    archive: Path, expected: dict[str, str], tmp_path: Path
+) -> None:
+    """A scheduler and workers as processes of their own; the first is killed."""
+    out, port_file = tmp_path / "out", tmp_path / "scheduler.json"
+    command = [sys.executable, "-c", "from distributed.cli.dask_scheduler import main; main()"]
+    command += ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0", "--no-dashboard"]
+    worker = [sys.executable, "-c", "from distributed.cli.dask_worker import main; main()", "--no-dashboard"]
+    worker += ["--scheduler-file", str(port_file), "--nthreads", "1", "--local-directory", str(tmp_path / "scratch")]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([*command, "--scheduler-file", str(port_file)], **quiet) as scheduler:
+        wait_until(port_file.exists, WAIT_S, "a scheduler")
+        place = json.loads(port_file.read_text())["address"].replace("tcp://", "dask://")
+        with subprocess.Popen([*worker, "--death-timeout", "20"], **quiet) as one:
+            words = ["fold", str(archive), "--out", str(out), "--engine", place]
+            code = FOLD.replace("engine import Processes", "cluster import Cluster")
+            with subprocess.Popen([sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True) as fold:
+                wait_until(lambda: len(evidence(out)) >= 2 or fold.poll() is not None, WAIT_S, "some tasks")
+                scheduler.kill()
+                _, error = fold.communicate(timeout=WAIT_S)
+            one.terminate()
+    assert fold.returncode == 1
+    assert "is gone; what is done is kept in" in error
+    assert error.count("\n") == 1
+    assert evidence(out)
+    with started(archive, "--out", out, "--jobs", 2) as again:
+        assert again.wait(WAIT_S) == 0
+    assert contents(out) == expected

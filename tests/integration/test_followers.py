@@ -1,0 +1,300 @@
+"""Followers as real processes: the server's map bit for bit, each query worked once, also while one dies."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from protocol.errors import LinkError, QueryError
+from protocol.queries.answer_codec import decode_info, decode_point
+from protocol.queries.answers import MapVersion
+from protocol.queries.map_tiles import decode_tiles
+from protocol.queries.origin import decode_origin
+from protocol.site.site_file import load_site
+from protocol.wire import keys
+from protocol.wire.codec import decode_reply, encode_batch
+from protocol.wire.messages import Ack, SampleBatch
+from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from sim.config import SimConfig
+from sitegrid import Client
+from sitegrid.process.children import Child, Children, wait_until
+from tests.integration.site_run import READY_S, SiteRun, kill
+from tests.unit.mapserver.data import random_samples
+
+pytestmark = pytest.mark.processes
+
+WHOLE = "bounds=-80,-80,80,80;layers=resistance,grade_east,visits,age_s"
+QUIET = "[store]\narchive_after_h = 0.0\n[trust]\nexclude = false\n[calibration]\nautomatic = false\n"
+
+
+class Followed(SiteRun):
+    """Router and server with followers, and a session that sends samples."""
+
+    def start_follower(self, name: str, *options: str | Path, ready: bool = True) -> Child:
+        words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--name", name)
+        config = ("--config", self.folder / "server.toml")
+        where = () if "--copy" in options else ("--store", self.folder / "store")
+        child = self.children.start(name, "follow", *words, *config, *where, *options)
+        if ready:
+            assert child.expect("ready", READY_S)["name"] == name
+        return child
+
+    def serve(self) -> Child:
+        (self.folder / "server.toml").write_text(QUIET)
+        return self.start_server("--config", str(self.folder / "server.toml"))
+
+
+class Sender:
+    """Sends batches of random samples, one spool each."""
+
+    def __init__(self, run: Followed) -> None:
+        self.session = open_session(SessionConfig(run.endpoint))
+        self._site, self._spool = load_site(run.site_file), 0
+
+    def send(self, machine: str = "a", n: int = 50) -> int:
+        """Returns the row that acknowledges the batch."""
+        self._spool += 1
+        rows = random_samples(n, self._spool)
+        batch = encode_batch(SampleBatch(machine, self._spool, 1, rows, self._site.frame))
+        replies: list[zenoh.Reply] = []
+        key = keys.ingest(self._site.name, machine)
+
+        def is_answered() -> bool:  # nobody may be known to a router yet that has just been joined
+            replies[:] = self.session.get(key, payload=batch, timeout=20.0)
+            return bool(replies)
+
+        wait_until(is_answered, 10.0, "the server takes batches")
+        ack = decode_reply(replies[0].ok.payload.to_bytes())
+        assert isinstance(ack, Ack)
+        return ack.row
+
+    def ask(self, key: str, parameters: str) -> zenoh.Sample:
+        (reply,) = self.session.get(f"{key}?{parameters}", timeout=20.0)
+        assert reply.ok is not None, reply.err.payload.to_bytes()
+        return reply.ok
+
+
+@pytest.fixture
+def run(tmp_path: Path, children: Children) -> Followed:
+    sim = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
+    site = Followed(tmp_path, children, free_endpoint(), sim)
+    site.start_router()
+    return site
+
+
+@pytest.fixture
+def sender(run: Followed) -> Iterator[Sender]:
+    one = Sender(run)
+    with closing(one.session):
+        yield one
+
+
+def region(sender: Sender, run: Followed, follower: str, row: int) -> bytes:
+    ask = f"{WHOLE};after={row};wait=20"
+    if not follower:
+        return sender.ask(keys.map_query(run.site, "region"), ask).payload.to_bytes()
+    return sender.ask(keys.follower_query(run.site, follower, "region"), ask).payload.to_bytes()
+
+
+def tiles(sender: Sender, run: Followed, follower: str) -> dict[tuple[int, int], tuple[int, bytes]]:
+    key = keys.follower_query(run.site, follower, "tiles") if follower else keys.map_query(run.site, "tiles")
+    answer = decode_tiles(sender.ask(key, "").payload.to_bytes())
+    return {(tile.x, tile.y): (tile.newest_ns, tile.planes) for tile in answer.tiles}
+
+
+def version_of(client: Client, sender: Sender, run: Followed, follower: str) -> MapVersion:
+    return decode_tiles(sender.ask(keys.follower_query(run.site, follower, "tiles"), "").payload.to_bytes()).version
+
+
+def test_two_followers_have_the_map_of_the_server_through_distrust_and_correction(run: Followed, sender: Sender):
+    server = run.serve()
+    for machine in "abcabc":
+        sender.send(machine)
+    near, far = run.start_follower("near"), run.start_follower("far", "--copy", run.folder / "copy")  # of the journal
+    followers = [near, far]
+    pids = f"server pid {server.pid}, followers pids {[one.pid for one in followers]}"
+    with run.connect() as client:
+
+        def all_equal(row: int) -> None:
+            version = client.info(after=row)
+            for name in ("near", "far"):
+                wait_until(
+                    lambda name=name: (
+                        version_of(client, sender, run, name) == MapVersion(version.store, version.merged, version.fact)
+                    ),
+                    20.0,
+                    f"{name} follows; {pids}",
+                )
+            maps = [region(sender, run, name, row) for name in ("", "near", "far")]
+            assert maps[0] == maps[1] == maps[2], pids  # all of the answer, to the byte
+            drawn = [tiles(sender, run, name) for name in ("", "near", "far")]
+            assert drawn[0] == drawn[1] == drawn[2], pids
+
+        all_equal(sender.send("a"))
+        client.distrust("b", "drifts")
+        all_equal(sender.send("b"))
+        client.correct("a", "measured on a ramp", zero=0.01)
+        all_equal(sender.send("a"))
+        client.trust("b", "repaired")
+        all_equal(sender.send("c"))
+        # ... and of the past, and what is read from the journal alone
+        past = client.point(1.0, 1.0, as_of_ns=client.info().stamp_ns)
+        assert client.origin.follower in ("near", "far"), pids
+        key = keys.map_query(run.site, "point")
+        assert past.version.row == decode_point_row(sender, key, past.stamp_ns)
+
+
+def decode_point_row(sender: Sender, key: str, stamp_ns: int) -> int:
+    return decode_point(sender.ask(key, f"x=1;y=1;as_of={stamp_ns}").payload.to_bytes()).version.row
+
+
+def answered(client: Client, sender: Sender, run: Followed, *followers: str) -> list[int]:
+    """How many queries each process has answered: the server, then followers."""
+    infos = [client.info()]
+    for name in followers:
+        data = sender.ask(keys.follower_query(run.site, name, "info"), "").payload.to_bytes()
+        infos.append(decode_info(data))
+    return [info.counters.get("queries_answered", 0) for info in infos]
+
+
+def test_each_query_is_worked_by_one_process_and_by_another_while_one_dies(run: Followed, sender: Sender):
+    server = run.serve()
+    sender.send()
+    near, far = run.start_follower("near"), run.start_follower("far")
+    pids = f"server pid {server.pid}, near pid {near.pid}, far pid {far.pid}"
+    clients = [run.connect() for _ in range(8)]
+    try:
+        before = answered(clients[0], sender, run, "near", "far")
+        asked, origins = 0, dict[Client, str]()
+        for client in clients:
+            for _ in range(25):
+                client.point(1.0, 1.0)
+                asked += 1
+            origins[client] = client.origin.follower
+        after = answered(clients[0], sender, run, "near", "far")
+        done = [now - then for now, then in zip(after, before, strict=True)]
+        assert sum(done) - 3 == asked, pids  # and the three questions that count
+        assert done[0] == 1, pids  # the server none but that
+        assert set(origins.values()) <= {"near", "far"}
+        # One is stopped with a query in work, and killed: the client gets its answer from the other.
+        victim = next((client for client in clients if origins[client] == "near"), clients[0])
+        name = origins[victim]
+        child, other = (near, "far") if name == "near" else (far, "near")
+        child.send(signal.SIGSTOP)
+        got: list[float] = []
+
+        def ask() -> None:
+            began_s = time.monotonic()
+            victim.point(1.0, 1.0)
+            got.append(time.monotonic() - began_s)
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        thread.join(0.3)
+        assert not got, pids  # it is held by a process that does nothing
+        kill(child)
+        thread.join(20.0)
+        assert got, pids
+        assert got[0] < 4.0, pids
+        assert victim.origin.follower == other, pids
+        for client in clients:
+            client.point(1.0, 1.0)
+            assert client.origin.follower == other, pids
+    finally:
+        for client in clients:
+            client.close()
+
+
+def test_the_map_is_read_while_the_server_is_away_and_after_it_is_back(run: Followed, sender: Sender):
+    server = run.serve()
+    row = sender.send()
+    follower = run.start_follower("near")
+    with run.connect() as client:
+        kill(server)
+        began_s = time.monotonic()
+        point = client.point(1.0, 1.0, after=row)
+        assert point.version.row == row
+        assert client.info().server.pid == follower.pid
+        assert time.monotonic() - began_s < 5.0
+        with pytest.raises(LinkError, match="no map server"):
+            Client(client.session, run.endpoint, run.site, timeout_s=0.5).machines()
+        again = run.serve()
+        later = sender.send()
+        assert later > row, f"server pid {again.pid}, follower pid {follower.pid}"
+        # What it lacks within its second the server is asked for: `after` means what it always meant.
+        assert client.point(1.0, 1.0, after=later).version.row >= later
+        wait_until(lambda: client.point(1.0, 1.0, after=later) and client.origin.follower == "near", 10.0, "followed")
+
+
+def test_a_follower_that_lacks_a_row_refuses_and_the_server_is_asked(run: Followed, sender: Sender):
+    run.serve()
+    sender.send()
+    follower = run.start_follower("near")
+    with run.connect() as client:
+        client.point(1.0, 1.0)
+        assert client.origin.follower == "near"
+        assert client.origin.behind_s < 5.0
+        with pytest.raises(QueryError, match=r"row 99 is not merged after 1\.5 s") as refused:
+            client.point(1.0, 1.0, after=99, wait_s=1.5)  # who says so last is the server
+        assert refused.value.reason == "after_timeout"
+        assert client.info().counters["refused_query_after_timeout"] == 1, f"follower pid {follower.pid}"
+
+
+def test_followers_are_listed_with_how_far_behind_they_are(run: Followed, sender: Sender):
+    run.serve()
+    row = sender.send()
+    follower = run.start_follower("near")
+    with run.connect() as client:
+        (one,) = client.followers()
+        assert (one.name, one.merged, one.behind_rows) == ("near", row, 0)
+        assert 0 <= one.behind_s < 5
+    words = ("query", "--endpoint", run.endpoint, "--site", run.site, "followers")
+    command = [sys.executable, "-m", "sitegrid.cli", *words]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=READY_S, check=True).stdout
+    assert shown.startswith(f"near: journal row {row}, 0 rows"), f"follower pid {follower.pid}"
+
+
+def test_a_second_follower_of_a_name_ends_and_says_which_is_the_first(run: Followed, sender: Sender):
+    run.serve()
+    first = run.start_follower("near")
+    second = run.start_follower("near", ready=False)
+    assert second.wait(READY_S) == 1
+    assert first.code is None
+    assert f"another follower has this name, pid {first.pid}" in (run.folder / "near.log").read_text()
+
+
+def test_a_follower_of_another_site_ends_with_a_line(run: Followed, tmp_path: Path):
+    run.serve()
+    other = tmp_path / "other.toml"
+    other.write_text(run.site_file.read_text().replace(f'"{run.site}"', '"elsewhere"'))
+    words = ("--endpoint", run.endpoint, "--site-file", str(other), "--store", str(run.folder / "store"))
+    command = [sys.executable, "-m", "sitegrid.cli", "follow", *words, "--name", "near"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=READY_S, check=False)
+    assert ended.returncode == 1
+    assert "compare the site files" in ended.stderr
+    assert ended.stderr.strip().count("\n") == 0
+
+
+def test_answers_say_who_gave_them_and_how_far_behind(run: Followed, sender: Sender):
+    run.serve()
+    sender.send()
+    run.start_follower("near")
+    for key, who in (
+        (keys.map_query(run.site, "point"), ""),
+        (keys.follower_query(run.site, "near", "point"), "near"),
+    ):
+        sample = sender.ask(key, "x=1;y=1")
+        origin = decode_origin(sample.attachment.to_bytes())
+        assert (origin.follower, origin.behind_rows) == (who, 0)
+        assert 0 <= origin.behind_s < 5
+    assert np.isfinite(origin.behind_s)

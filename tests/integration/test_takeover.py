@@ -1,0 +1,71 @@
+"""A second server takes over, as processes: the whole of it by `python -m tests.takeover --count 200`."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from benchmarks.postgres import server
+from benchmarks.postgres.server import Database
+from sitegrid import connect
+from sitegrid.process.children import Children, wait_until
+from tests.takeover.site import FENCED, SITE, TakeOverSite, cut_answer, kill, round_of, stop, terminate
+
+pytestmark = pytest.mark.processes
+
+
+def test_a_standby_takes_over_and_nothing_is_lost_double_or_acknowledged_under_an_old_epoch(
+    tmp_path: Path, database: Database
+) -> None:
+    with Children(tmp_path) as children:
+        site = TakeOverSite(tmp_path, children, database)
+        site.start()
+        rounds = []
+        for fault in (kill, stop, cut_answer, terminate):
+            serving = site.active.child.pid
+            rounds.append(round_of(site, fault))
+            if fault in (kill, stop):
+                assert site.active.child.pid not in (serving, os.getpid())
+        with connect(site.endpoint, SITE.name) as client:
+            info = client.info()
+        for sender in site.senders:
+            sender.end()
+        verdict = site.verdict()
+    assert verdict.is_clean, verdict
+    assert verdict.acknowledged > 20
+    epochs = [one["epoch"] for one in rounds]
+    assert epochs == sorted(set(epochs)), "each round has a new writer"
+    assert site.exit_codes[str(FENCED)] >= 1, "the stopped one, once it went on"
+    assert site.exit_codes["-9"] == 1
+    assert set(site.exit_codes) <= {str(FENCED), "-9"}, "none ends for another reason"
+    assert info.epoch >= epochs[-1]
+    assert {ack.store for ack in site.acknowledged()} == {info.store}
+
+
+def test_a_server_goes_on_at_the_promoted_replica_when_its_database_is_killed(tmp_path: Path) -> None:
+    with server.cluster() as primary, server.replica(primary, "b") as replica, Children(tmp_path) as children:
+        primary.sql("ALTER SYSTEM SET synchronous_standby_names = 'b'")
+        primary.sql("SELECT pg_reload_conf()")
+        in_step = "SELECT sync_state FROM pg_stat_replication"
+        wait_until(lambda: primary.sql(in_step) == [("sync",)], 30.0, "the replica is synchronous")
+        site = TakeOverSite(tmp_path, children, primary.new_database(), hosts=(primary, replica))
+        site.start()
+        site.wait_for_acknowledgements(20)
+        epoch, began_s = site.epoch(), time.time()
+        primary.stop(signal.SIGKILL)
+        replica.promote()
+        replica.sql("ALTER SYSTEM RESET synchronous_standby_names")  # alone from now on: a person says so
+        replica.sql("SELECT pg_reload_conf()")
+        took_s = site.wait_for_acknowledgements(beyond=epoch) - began_s
+        site.wait_for_acknowledgements(20)
+        for sender in site.senders:
+            sender.end()
+        site.database = Database(replica, site.database.name)
+        verdict = site.verdict()
+    print(f"first acknowledgement {took_s:.2f} s after the kill; {verdict}")
+    assert verdict.is_clean, verdict
+    assert took_s < 10.0

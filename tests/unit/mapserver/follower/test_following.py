@@ -1,0 +1,332 @@
+"""A follower of a real journal: equal to the server bit for bit, whatever happens to the journal."""
+
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapserver.change import change_log
+from mapserver.follower import following as module
+from mapserver.follower.following import Following
+from mapserver.ingest.store import Store
+from mapserver.ingest.writer import Writer
+from mapserver.journal.archive import archive
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.sqlite.reader import SqliteReader
+from mapserver.trust.decisions import PERSON, TrustDecision
+from mapserver.upkeep.refolding import Refolding
+from protocol.errors import QueryError, Refusal
+from protocol.queries.answers import GroundChange, MapVersion
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    WAIT_S,
+    incoming,
+    now_ns,
+    open_writer,
+    past_of,
+    random_samples,
+    same,
+    send,
+    wait_for,
+)
+
+pytestmark = pytest.mark.slow  # a writer and a follower each, and waits of theirs
+
+
+@contextmanager
+def following(folder: Path, site=SITE, config=CONFIG) -> Iterator[Following]:
+    one = Following(JournalLocation(folder), site, config)
+    one.start()
+    with closing(one):
+        yield one
+
+
+@pytest.mark.parametrize("folder", ["store", "elsewhere"])
+def test_a_follower_of_a_journal_in_postgresql_is_told_of_rows(tmp_path, database, folder):
+    location = JournalLocation(tmp_path / "store", database.url)
+    with closing(Writer(Store(location, SITE, CONFIG, now_ns))) as writer:
+        deliver(writer, 1)
+        writer.run(lambda store: store.save_snapshot())
+        deliver(writer, 2)
+        one = Following(JournalLocation(tmp_path / folder, database.url), SITE, CONFIG)
+        one.start()
+        with closing(one):
+            catches_up(one, writer)
+            for seed in (3, 4, 5):
+                deliver(writer, seed, machine="b")
+                catches_up(one, writer)
+            decided = writer.run(lambda store: store.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)))
+            wait_for(lambda: version(one).fact == decided.number)
+            assert one.run(lambda replica: replica.facts.excluded) == {"b"}
+
+
+def version(one: Following) -> MapVersion | None:
+    try:
+        return one.run(lambda replica: replica.version)
+    except QueryError:
+        return None
+
+
+def catches_up(one: Following, writer: Writer) -> None:
+    """Wait until both have the same version of the map, then compare all that there is of it."""
+    wait_for(lambda: version(one) == writer.run(lambda store: store.version))
+    ours, theirs = one.run(lambda replica: replica.grid), writer.run(lambda store: store.grid)
+    assert one.run(lambda replica: writer.run(lambda store: same(replica.grid, store.grid)))
+    assert ours is not theirs
+    assert one.run(lambda replica: replica.newest_ns) == writer.run(lambda store: store.newest_ns)
+    assert set(one.run(lambda replica: replica.machines())) == set(writer.run(lambda store: store.machines()))
+
+
+def deliver(writer: Writer, seed: int, n: int = 40, machine: str = "a", first_seq: int = 1) -> None:
+    send(writer, [incoming(random_samples(n, seed), first_seq, machine, spool_id=1 + seed)])
+
+
+def test_a_follower_has_the_map_of_the_server_bit_for_bit_from_its_start_and_as_rows_come_in(tmp_path):
+    with closing(open_writer(tmp_path)) as writer:
+        for seed in range(5):
+            deliver(writer, seed, machine="ab"[seed % 2])
+        with following(tmp_path) as one:
+            catches_up(one, writer)
+            for seed in range(5, 12):
+                deliver(writer, seed, machine="abc"[seed % 3])
+                catches_up(one, writer)
+            rows, seconds = one.behind()
+            assert rows == 0
+            assert 0 <= seconds < 5
+
+
+def test_a_follower_that_is_started_before_the_server_waits_for_it(tmp_path):
+    with following(tmp_path / "store") as one:
+        with pytest.raises(QueryError) as refused:
+            one.run(lambda replica: replica.version)
+        assert refused.value.reason == Refusal.NOT_HERE
+        assert one.behind() == (0, float("inf"))
+        with closing(open_writer(tmp_path / "store")) as writer:
+            deliver(writer, 1)
+            catches_up(one, writer)
+
+
+def test_a_follower_goes_on_while_the_server_starts_again(tmp_path):
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+        writer.close()
+        assert one.run(lambda replica: replica.merged) == 1
+        with closing(open_writer(tmp_path)) as again:
+            deliver(again, 2)
+            catches_up(one, again)
+
+
+def test_decisions_and_corrections_in_mid_run_make_the_same_map(tmp_path):
+    with closing(open_writer(tmp_path)) as writer, closing(Refolding(writer, past_of(writer))) as refolding:
+        for seed in range(4):
+            deliver(writer, seed, machine="abc"[seed % 3])
+        with following(tmp_path) as one:
+            catches_up(one, writer)
+            whole = one.run(lambda replica: replica.grid.counts().folded)
+            refolding.wait(refolding.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)), WAIT_S)
+            catches_up(one, writer)
+            assert one.run(lambda replica: replica.facts.excluded) == {"b"}
+            assert one.run(lambda replica: replica.grid.counts().folded) < whole
+            deliver(writer, 9, machine="b")  # what is not in the map counts in no time
+            deliver(writer, 10, machine="c")
+            catches_up(one, writer)
+            refolding.wait(refolding.decide(TrustDecision("b", True, PERSON, "repaired", NOW_NS)), WAIT_S)
+            catches_up(one, writer)
+
+
+def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_path, monkeypatch):
+    may_go_on, folds, fold_anew = threading.Event(), list[int](), module.fold_anew
+
+    def held(past, reader, facts, stopped):
+        folds.append(facts.number)
+        if facts.number == 1:
+            assert may_go_on.wait(WAIT_S)
+        return fold_anew(past, reader, facts, stopped)
+
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1, machine="b")
+        catches_up(one, writer)
+        monkeypatch.setattr(module, "fold_anew", held)
+        for trusted in (False, True):
+            writer.run(lambda store, t=trusted: store.decide(TrustDecision("b", t, PERSON, "drawn", NOW_NS)))
+            wait_for(lambda n=1 + trusted: one.run(lambda replica: replica.event) == n)
+            wait_for(lambda: folds == [1])
+        assert version(one).fact == 2  # the map has what decisions come to
+        may_go_on.set()
+        wait_for(lambda: one._anew is None)
+        assert version(one).fact == 2
+        assert one.run(lambda replica: replica.facts.excluded) == frozenset()
+        catches_up(one, writer)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 60), st.booleans()), min_size=1, max_size=12),
+    st.integers(0, 12),
+)
+def test_any_course_of_rows_and_decisions_makes_the_same_map(tmp_path_factory, course, begins):
+    folder = tmp_path_factory.mktemp("store")
+    with closing(open_writer(folder)) as writer, closing(Refolding(writer, past_of(writer))) as refolding:
+        one = Following(JournalLocation(folder), SITE, CONFIG)
+        with closing(one):
+            for number, (machine, n, decides) in enumerate(course):
+                if number == min(begins, len(course) - 1):
+                    one.start()
+                deliver(writer, number, n, machine)
+                if decides:
+                    trusted = writer.run(lambda store, machine=machine: machine in store.facts.excluded)
+                    decision = TrustDecision(machine, trusted, PERSON, "drawn", NOW_NS)
+                    refolding.wait(refolding.decide(decision), WAIT_S)
+            catches_up(one, writer)
+
+
+def test_a_journal_that_was_restored_from_a_backup_is_noticed_and_folded_again(tmp_path):
+    with closing(open_writer(tmp_path / "store")) as writer:
+        deliver(writer, 1)
+    shutil.copytree(tmp_path / "store", tmp_path / "backup")
+    with closing(open_writer(tmp_path / "store")) as writer:
+        for seed in (2, 3):
+            deliver(writer, seed)
+        with following(tmp_path / "store") as one:
+            catches_up(one, writer)
+            writer.close()
+            shutil.rmtree(tmp_path / "store")
+            (tmp_path / "backup").rename(tmp_path / "store")
+            wait_for(lambda: (version(one) or MapVersion("", 9, 0)).row == 1)
+            with closing(open_writer(tmp_path / "store")) as again:
+                deliver(again, 4, machine="b")  # other rows under the same numbers
+                deliver(again, 5, machine="b")
+                deliver(again, 6, machine="b")
+                catches_up(one, again)
+
+
+def test_other_rows_under_the_same_numbers_are_noticed_by_a_checksum(tmp_path, caplog):
+    for name, seeds in (("one", (1, 2, 3)), ("other", (1, 4, 5, 6))):
+        with closing(open_writer(tmp_path / name)) as writer:
+            for seed in seeds[:1]:
+                deliver(writer, seed)
+        if name == "one":
+            shutil.copytree(tmp_path / "one", tmp_path / "other")
+        with closing(open_writer(tmp_path / name)) as writer:
+            for seed in seeds[1:]:
+                deliver(writer, seed)
+    with following(tmp_path / "one") as one:
+        wait_for(lambda: (version(one) or MapVersion("", 0, 0)).row == 3)
+        (tmp_path / "one").rename(tmp_path / "gone")
+        (tmp_path / "other").rename(tmp_path / "one")
+        with closing(open_writer(tmp_path / "one")) as writer:
+            catches_up(one, writer)  # four rows: it has not lost any by number
+        assert "rows are gone" in caplog.text
+
+
+def test_rows_that_are_forgotten_below_the_follower_or_above_it_are_read_from_the_archive(tmp_path):
+    with closing(open_writer(tmp_path)) as writer:
+        for seed in range(6):
+            deliver(writer, seed)
+
+        def move(before: int) -> None:
+            location = JournalLocation(tmp_path)
+            with location.reader() as reader:
+                files = archive(
+                    location.archive.folder, reader, SITE, NOW_NS + 10**15, lambda until: forget(until), NOW_NS
+                )
+                assert list(files) or before
+
+        def forget(until: int) -> int:
+            return writer.run(lambda store: store.journal.forget(until))
+
+        move(0)
+        with following(tmp_path) as one:  # it begins without the rows of the journal, and without a snapshot
+            catches_up(one, writer)
+            deliver(writer, 7)
+            catches_up(one, writer)
+            move(1)
+            deliver(writer, 8)
+            catches_up(one, writer)
+
+
+def test_it_begins_with_the_snapshot_of_the_server(tmp_path, monkeypatch):
+    with closing(open_writer(tmp_path)) as writer:
+        for seed in range(4):
+            deliver(writer, seed)
+        writer.run(lambda store: store.save_snapshot())
+        deliver(writer, 5)
+        folded, fold_history = list[int](), module.fold_history
+
+        def noted(grid, history, after, *more) -> bool:
+            folded.append(after)
+            return fold_history(grid, history, after, *more)
+
+        monkeypatch.setattr(module, "fold_history", noted)
+        with following(tmp_path) as one:
+            catches_up(one, writer)
+        assert folded == [4]
+
+
+@pytest.mark.parametrize(
+    ("site", "problem"), [(replace(SITE, name="quarry"), "quarry"), (replace(SITE, origin_lat_deg=49.0), "frame")]
+)
+def test_a_journal_of_another_site_or_frame_ends_it(tmp_path, site, problem):
+    open_writer(tmp_path).close()
+    with following(tmp_path, site) as one:
+        wait_for(lambda: one.ended)
+        assert problem in one.ended
+        assert "compare the site files" in one.ended
+
+
+def test_a_decision_of_a_newer_version_ends_it(tmp_path):
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+        body = {"version": 99, "machine": "a"}
+        writer.run(lambda store: store.journal.append_event("calibration", NOW_NS, body))
+        wait_for(lambda: one.ended)
+        assert "open it with that version" in one.ended
+
+
+def test_a_damaged_row_is_named_and_the_map_says_how_far_behind_it_is(tmp_path, caplog):
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+
+        def damage(store) -> None:
+            store.journal._db.execute("INSERT INTO journal VALUES (2, x'00')")
+            store.journal._db.execute("INSERT INTO extent SELECT 2, 1, 1, 0, 0, 1, 1, 0")
+
+        writer.run(damage)
+        wait_for(lambda: one.behind()[0] == 1 and "journal row 2" in caplog.text)
+        assert not one.ended
+        assert version(one).row == 1
+        writer.run(lambda store: store.journal._db.execute("DELETE FROM journal WHERE row = 2"))
+        writer.run(lambda store: store.journal._db.execute("DELETE FROM extent WHERE row = 2"))
+
+
+def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):
+    def lost(self, known, timeout_s):  # the notification; the time-out is not
+        wait_for(lambda: True)
+        return self.state()
+
+    monkeypatch.setattr(SqliteReader, "follow", lost)
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+        deliver(writer, 2)
+        catches_up(one, writer)
+
+
+def test_changes_of_the_ground_come_with_the_events(tmp_path):
+    change = GroundChange(1, 1, 2, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, 0.5)
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        for cells in (4, 9):
+            grown = replace(change, cells=cells)
+            writer.run(lambda store, g=grown: store.journal.append_event(change_log.KIND, 2, asdict(g)))
+        wait_for(lambda: version(one) and one.run(lambda replica: replica.changes) == {1: replace(change, cells=9)})

@@ -1,0 +1,387 @@
+"""A journal in PostgreSQL beyond the contract: what it refuses, how its lock is lost, what a restore leaves."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+
+from benchmarks.postgres import server
+from benchmarks.postgres.server import Cluster, Database
+from mapserver.evidence import snapshot
+from mapserver.evidence.grid import Grid
+from mapserver.ingest.standby import Standby
+from mapserver.ingest.store import Store
+from mapserver.journal.history import history_rows
+from mapserver.journal.journal import FencedError, UnwrittenError
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.postgres import session
+from mapserver.journal.postgres.connection import shown
+from mapserver.journal.postgres.session import WriterSession
+from mapserver.trust.decisions import PERSON, TrustDecision
+from protocol.errors import ConfigError, Refusal, SitegridError, StoreError
+from protocol.wire.messages import Ack, Refused
+from tests.pooler import SwappingPooler
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, random_samples, same, wait_for
+
+YEAR_NS = 365 * 86400 * 10**9
+
+
+def place(folder: Path, database: Database) -> JournalLocation:
+    return JournalLocation(folder, database.url)
+
+
+def open_store(folder: Path, database: Database, standby: Standby | None = None, clock_ns: int = NOW_NS) -> Store:
+    return Store(place(folder, database), SITE, CONFIG, lambda: clock_ns, standby=standby)
+
+
+def send(store: Store, first: int, count: int = 5, machine: str = "a") -> Ack | Refused:
+    return store.commit([incoming(random_samples(count, first), first, machine)])[0]
+
+
+def hang(store: Store) -> None:
+    """Have the holder of the lock say nothing any more, as a process does that is stopped."""
+    store.journal._session._ending.set()
+
+
+# --- what is refused, in one line -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("url", "problem"),
+    [
+        ("postgresql://127.0.0.1:1/x", "cannot be read: connection.*refused"),
+        ("postgresql://[", "--journal: is no PostgreSQL URL"),
+        ("postgresql://host/db?nonsense=1", "--journal: is no PostgreSQL URL"),
+    ],
+)
+def test_a_url_that_leads_nowhere_is_one_line(tmp_path, url, problem):
+    with pytest.raises(SitegridError, match=problem) as caught:
+        JournalLocation(tmp_path, url).exists()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_database_that_does_not_exist_is_one_line(tmp_path, postgres_cluster):
+    with pytest.raises(StoreError, match='database "nothing" does not exist') as caught:
+        JournalLocation(tmp_path, postgres_cluster.url("nothing")).store_id()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_password_is_never_shown():
+    url = "postgresql://me:secret@one,two:5433/map?target_session_attrs=any"
+    assert shown(url) == "postgresql://me@one,two:5433/map"
+
+
+@pytest.mark.slow
+def test_a_wrong_password_is_one_line(tmp_path):
+    with server.cluster() as cluster:
+        cluster.sql("ALTER USER postgres PASSWORD 'right'")
+        hba = cluster.data / "pg_hba.conf"
+        hba.write_text("host all all 127.0.0.1/32 scram-sha-256\n")
+        with psycopg.connect(cluster.url()) as db:
+            db.execute("SELECT pg_reload_conf()")
+        wait_for(lambda: refuses(cluster.url()))
+        wrong = cluster.url().replace("postgres@", "postgres:wrong@")
+        with pytest.raises(StoreError, match="password authentication failed") as caught:
+            JournalLocation(tmp_path, wrong).exists()
+        assert "wrong" not in str(caught.value)
+
+
+def refuses(url: str) -> bool:
+    try:
+        psycopg.connect(url).close()
+    except psycopg.OperationalError:
+        return True
+    return False
+
+
+def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("mapserver.journal.postgres.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    for name in ("connection", "journal", "mark", "reader"):
+        monkeypatch.delattr(f"mapserver.journal.postgres.{name}", raising=False)
+    with pytest.raises(ConfigError, match=r"pip install 'sitegrid\[postgres\]'"):
+        JournalLocation(tmp_path, "postgresql://localhost/x").exists()
+
+
+@pytest.mark.slow
+def test_a_database_that_may_lose_commits_is_refused(tmp_path):
+    with server.cluster() as cluster:
+        database = cluster.new_database()
+        for name in ("fsync", "full_page_writes"):
+            cluster.sql(f"ALTER SYSTEM SET {name} = off")
+            cluster.sql("SELECT pg_reload_conf()")
+            wait_for(lambda name=name: cluster.sql(f"SHOW {name}") == [("off",)])
+            with pytest.raises(StoreError, match=f"{name} = off.*turn it on"):
+                open_store(tmp_path, database)
+            cluster.sql(f"ALTER SYSTEM RESET {name}")
+            cluster.sql("SELECT pg_reload_conf()")
+            wait_for(lambda name=name: cluster.sql(f"SHOW {name}") == [("on",)])
+        open_store(tmp_path, database).close()
+
+
+def test_commits_are_synchronous_whatever_the_database_says(tmp_path, database):
+    database.sql(f"ALTER DATABASE {database.name} SET synchronous_commit = off")
+    with closing(open_store(tmp_path, database)) as store:
+        assert store.journal._session.run("SHOW synchronous_commit") == [("on",)]
+
+
+def test_a_pooler_is_refused_and_a_session_that_is_swapped_loses_the_lock(tmp_path, database):
+    database_url = database.url
+    with closing(SwappingPooler(database.cluster.port)) as pooler:
+        url = database_url.replace(str(database.cluster.port), str(pooler.port))
+        with pytest.raises(StoreError, match=r"pooler.*PostgreSQL's own address"):
+            Store(JournalLocation(tmp_path, url), SITE, CONFIG, now_ns)
+    with closing(SwappingPooler(database.cluster.port, honest=True)) as pooler:
+        pooler.swaps = False  # while the server starts, it looks like the real one
+        url = database_url.replace(str(database.cluster.port), str(pooler.port))
+        with closing(Store(JournalLocation(tmp_path, url), SITE, CONFIG, now_ns)) as store:
+            assert isinstance(send(store, 1), Ack)
+            pooler.swaps = True
+            wait_for(lambda: "swapped" in store.journal._session.lost)
+
+
+def test_a_folder_is_of_one_journal(tmp_path, database, postgres_cluster):
+    open_store(tmp_path / "one", database).close()
+    other = postgres_cluster.new_database()
+    with pytest.raises(StoreError, match=r"belongs to journal .* choose another --store"):
+        open_store(tmp_path / "one", other)
+    with pytest.raises(ConfigError, match="give its --journal"):
+        Store(JournalLocation(tmp_path / "one"), SITE, CONFIG, now_ns)
+    Store(JournalLocation(tmp_path / "two"), SITE, CONFIG, now_ns).close()
+    with pytest.raises(ConfigError, match=r"journal\.db of its own"):
+        open_store(tmp_path / "two", database)
+
+
+# --- the lock ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_holder_that_says_nothing_loses_the_lock_by_itself(tmp_path, database):
+    with closing(open_store(tmp_path / "one", database)) as first:
+        assert send(first, 1).epoch == 1
+        hang(first)
+        began_s = time.monotonic()
+        with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
+            second = open_store(tmp_path / "two", database, standby)
+        assert time.monotonic() - began_s < session.HANGS_S + 5.0
+        with closing(second):
+            assert isinstance(send(first, 6), Refused), "its session is gone, and it does not know yet"
+            with pytest.raises(FencedError, match="another server has taken over the journal, with epoch 2 after 1"):
+                send(first, 6)
+            answer = send(second, 6)
+            assert (answer.watermark, answer.epoch) == (10, 2)
+            assert same(second.grid, folded_by(second))
+
+
+def folded_by(store: Store) -> Any:
+    grid = Grid(SITE.cell_m, CONFIG.fold)
+    for row in history_rows(store.history):
+        grid.fold(row.rows, row.machine)
+    return grid
+
+
+def test_a_holder_that_stops_in_the_middle_of_a_message_loses_the_lock(tmp_path, database):
+    open_store(tmp_path, database).close()
+    holder = WriterSession(database.url, "here")
+    assert holder.take_lock()
+    holder._ending.set()
+    message = b"Q" + (1000).to_bytes(4, "big") + b"SELECT 1, "  # of which the rest never comes
+    with socket.socket(fileno=holder._db.fileno()) as link:
+        link.sendall(message)
+        with closing(WriterSession(database.url, "there")) as other:
+            wait_for(other.take_lock)
+        link.detach()
+    holder.close()
+
+
+def test_a_holder_that_works_keeps_the_lock(tmp_path, database):
+    with closing(open_store(tmp_path, database)) as store:
+        end_s = time.monotonic() + 2 * session.HANGS_S
+        with closing(WriterSession(database.url, "there")) as other:
+            wait_for(lambda: other.take_lock() or time.monotonic() > end_s)
+        assert not store.journal._session.lost
+        assert send(store, 1).epoch == 1
+
+
+def test_a_writer_without_its_lock_cannot_commit(tmp_path, database):
+    """The epoch alone fences it: its session stands, as behind a pooler."""
+    with closing(open_store(tmp_path, database)) as store:
+        database.sql("UPDATE sitegrid.head SET epoch = epoch + 1")
+        with pytest.raises(FencedError):
+            send(store, 1)
+        assert store.journal.fenced
+        assert database.sql("SELECT count(*) FROM sitegrid.journal") == [(0,)]
+
+
+@pytest.mark.parametrize("end", [Database.end_writer, Database.end_all])
+def test_a_server_goes_on_after_its_sessions_were_ended(tmp_path, database, end):
+    with closing(open_store(tmp_path, database)) as store:
+        assert send(store, 1).epoch == 1
+        end(database)
+        answers = [send(store, 6), send(store, 6)]
+        assert isinstance(answers[0], Refused)
+        assert (answers[1].epoch, answers[1].watermark) == (2, 10)
+        assert same(store.grid, folded_by(store))
+
+
+def test_a_second_server_is_refused_where_it_may_not_wait(tmp_path, database):
+    with closing(open_store(tmp_path / "one", database)), pytest.raises(StoreError, match="another server is writing"):
+        open_store(tmp_path / "two", database)
+
+
+def test_a_standby_follows_rows_and_decisions(tmp_path, database):
+    standby = Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)
+    with closing(open_store(tmp_path / "one", database)) as store, closing(standby):
+        for first in (1, 6):
+            send(store, first)
+            send(store, first, machine="b")
+        standby.follow(5.0)
+        row, grid = standby.grid_for(store.journal, store.facts)
+        assert row == 4
+        assert same(grid, store.grid)
+        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        standby.follow(5.0)
+        assert standby.grid_for(store.journal, store.facts) is None, "the grid of other facts"
+        _, grid = standby.grid_for(store.journal, facts)
+        assert grid.folded == 10
+
+
+def test_a_standby_whose_clock_is_a_year_ahead_takes_over(tmp_path, database):
+    with closing(open_store(tmp_path / "one", database)) as store:
+        send(store, 1)
+    with closing(open_store(tmp_path / "two", database, clock_ns=NOW_NS + YEAR_NS)) as other:
+        assert (send(other, 6).watermark, other.journal.epoch) == (10, 2)
+
+
+def test_a_standby_whose_clock_is_a_year_behind_says_so_and_takes_nothing_until_it_is_right(tmp_path, database):
+    with closing(open_store(tmp_path / "one", database)) as store:
+        send(store, 1)
+    with closing(open_store(tmp_path / "two", database, clock_ns=NOW_NS - YEAR_NS)) as other:
+        assert send(other, 6).reason == Refusal.SERVER_CLOCK
+    with closing(open_store(tmp_path / "two", database)) as other:
+        assert send(other, 6).watermark == 10
+
+
+# --- what a backup leaves ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def restored(tmp_path: Path, database: Database) -> Iterator[Database]:
+    """A database that lacks two of three batches which server `one` acknowledged; `two` wrote others since."""
+    with closing(open_store(tmp_path / "one", database)) as store:
+        send(store, 1)
+    cluster = database.cluster
+    cluster.sql(f"CREATE DATABASE backup_{database.name} TEMPLATE {database.name}")
+    with closing(open_store(tmp_path / "one", database)) as store:
+        send(store, 6)
+        send(store, 11)
+        store.save_snapshot()
+    cluster.sql(f"DROP DATABASE {database.name}")
+    cluster.sql(f"ALTER DATABASE backup_{database.name} RENAME TO {database.name}")
+    return database
+
+
+def test_rows_that_a_restore_takes_away_are_named_and_asked_for_again(tmp_path, restored):
+    with closing(open_store(tmp_path / "one", restored)) as store:
+        assert "10 acknowledged samples of a are gone" in str(store.shortfalls[0])
+        assert store.journal.epoch == 3, "beyond the epoch that the backup does not know"
+        assert snapshot.rows_on_disk(tmp_path / "one") == []
+        assert same(store.grid, folded_by(store))
+        assert send(store, 6).watermark == 10
+
+
+def test_a_snapshot_of_rows_that_went_another_course_is_not_used(tmp_path, restored):
+    with closing(open_store(tmp_path / "two", restored)) as store:
+        for first in (1, 6, 11):
+            send(store, first, machine="b")
+    with closing(open_store(tmp_path / "one", restored)) as store:
+        assert store.journalled == 4, "more rows than the snapshot of the third has"
+        assert same(store.grid, folded_by(store))
+
+
+def test_a_server_that_runs_while_its_database_is_restored_ends(tmp_path, database):
+    cluster = database.cluster
+    open_store(tmp_path, database).close()
+    cluster.sql(f"CREATE DATABASE backup_{database.name} TEMPLATE {database.name}")
+    with closing(open_store(tmp_path, database)) as store:
+        send(store, 1)
+        cluster.sql(f"DROP DATABASE {database.name} WITH (FORCE)")
+        cluster.sql(f"ALTER DATABASE backup_{database.name} RENAME TO {database.name}")
+        wait_for(lambda: store.journal._session.lost)
+        with pytest.raises(FencedError, match="lacks rows that were acknowledged"):
+            send(store, 6)
+
+
+def test_a_long_dump_holds_nobody_up(tmp_path, database):
+    with closing(open_store(tmp_path, database)) as store, place(tmp_path, database).reader() as reader:
+        send(store, 1)
+        with psycopg.connect(database.url) as dump:
+            dump.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
+            assert dump.execute("SELECT count(*) FROM sitegrid.journal").fetchone() == (1,)
+            assert isinstance(send(store, 6), Ack)
+            assert store.journal.forget(1) == 1
+            assert reader.follow(reader.state(), 0.0).row == 2
+            assert [row.row for row in reader.read(1)] == [2]
+            assert dump.execute("SELECT count(*) FROM sitegrid.journal").fetchone() == (1,), "its own time"
+
+
+# --- replicas ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pair() -> Iterator[tuple[Cluster, Cluster]]:
+    """A primary and its synchronous replica."""
+    with server.cluster() as primary, server.replica(primary, "b") as replica:
+        primary.sql("ALTER SYSTEM SET synchronous_standby_names = 'b'")
+        primary.sql("SELECT pg_reload_conf()")
+        wait_for(lambda: primary.sql("SELECT sync_state FROM pg_stat_replication") == [("sync",)])
+        yield primary, replica
+
+
+@pytest.mark.slow
+def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_acknowledges_nothing(tmp_path, pair):
+    primary, replica = pair
+    database = primary.new_database()
+    both = f"postgresql://postgres@127.0.0.1:{primary.port},127.0.0.1:{replica.port}/{database.name}"
+    first = Store(JournalLocation(tmp_path / "one", database.url), SITE, CONFIG, now_ns)
+    assert first.info()["replica"] == "synchronous"
+    acknowledged = [send(first, k).watermark for k in (1, 6, 11)]
+    known = f"SELECT 1 FROM pg_database WHERE datname = '{database.name}'"
+    wait_for(lambda: replica.sql(known) and JournalLocation(tmp_path, replica.url(database.name)).exists())
+    with JournalLocation(tmp_path / "two", replica.url(database.name)).reader() as follower:
+        wait_for(lambda: follower.last_row == 3)
+        assert follower.follow(follower.state(), 0.1).row == 3, "a replica has no notifications"
+
+    replica.promote()  # while the old primary lives, and a server writes to it
+    answers: list[Ack | Refused] = []
+    writing = threading.Thread(target=lambda: answers.append(send(first, 16)), daemon=True)
+    writing.start()
+    began_s = time.monotonic()
+    replica.sql("ALTER SYSTEM RESET synchronous_standby_names")  # it is alone now, which a person decides
+    replica.sql("SELECT pg_reload_conf()")
+    wait_for(lambda: replica.sql("SHOW synchronous_standby_names") == [("",)])
+    second = Store(JournalLocation(tmp_path / "two", replica.url(database.name)), SITE, CONFIG, now_ns)
+    with closing(second):
+        assert second.journal.replica == "none"
+        assert [row.first_seq for row in second.journal.read()] == [1, 6, 11]
+        assert second.journal.watermark("a", 7).seq == acknowledged[-1]
+        answer = send(second, 16)
+        assert (answer.watermark, answer.epoch) == (20, 2)
+    assert time.monotonic() - began_s < 10.0
+    assert not answers, "the old primary waits for a replica that does not come"
+    primary.stop()
+    writing.join(20.0)
+    assert [type(answer) for answer in answers] == [Refused]
+    first.journal._url = both  # as its operator gave it, where there are two
+    with pytest.raises((FencedError, UnwrittenError)):
+        first.journal.begin()
+    first.close()

@@ -1,0 +1,125 @@
+"""Each sample is folded once, whichever archives have it; one that differs is named; rows are cut where they must."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
+from protocol.errors import SitegridError, StoreError
+from sitegrid.refold.contents import by_spool
+from sitegrid.refold.engine import Here
+from sitegrid.refold.plan import Plan, plan
+from sitegrid.refold.work import FoldTask, PartWork, fold_parts
+from tests.unit.sitegrid.refold.archives import T0, S, fold_in, samples, write
+
+pytest.importorskip("pyarrow.parquet")
+ENGINE = Here(1)
+
+
+def kept_of(planned: Plan) -> list[tuple[str, int, int]]:
+    """Every kept sample, as often as it is kept."""
+    return [
+        (*spool, seq)
+        for each in planned.contents
+        for spool, intervals in each.intervals.items()
+        for first, last in intervals
+        for seq in range(first, last + 1)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_each_sample_is_kept_once_however_archives_overlap(seed: int, tmp_path: Path) -> None:
+    """Archives that have stretches of the same spools, in batches that were cut otherwise."""
+    rng = np.random.default_rng(seed)
+    drives = {(name, spool): samples(rng, 60) for name in "ab" for spool in (1, 2**64 - 1)}
+    parts, have = [], set()
+    for number in range(int(rng.integers(2, 6))):
+        rows: list[JournalRow] = []
+        for (name, spool), drive in drives.items():
+            first, end = sorted(rng.integers(0, 61, 2).tolist())
+            while first < end:
+                until = min(end, first + int(rng.integers(1, 20)))
+                received = T0 + int(rng.integers(100)) * S
+                rows.append(JournalRow(len(rows) + 1, name, spool, first + 1, drive[first:until], received))
+                have |= {(name, spool, seq) for seq in range(first + 1, until + 1)}
+                first = until
+        if rows:
+            parts.append(write(tmp_path / str(number), rows))
+    planned = plan(parts, ALL, ENGINE)
+    kept = kept_of(planned)
+    assert len(kept) == len(set(kept))
+    assert set(kept) == have
+    assert sum(each.samples for each in planned.contents) == len(have) == planned.kept.total()
+    again = plan(parts[::-1], ALL, ENGINE)
+    assert [(c.part, c.intervals) for c in again.contents] == [(c.part, c.intervals) for c in planned.contents]
+    row = 1
+    for each, taken in zip(planned.contents, planned.taken, strict=True):  # what is planned is what is folded
+        work = PartWork(each.part, "", each.first_ns, row, each.rows, each.samples, tuple(taken.items()))
+        if each.rows:
+            fold_parts(FoldTask(fold_in(tmp_path / "work"), (work,), 1))
+        row += each.rows
+
+
+def test_a_sample_with_another_content_is_named_and_nothing_is_planned(tmp_path: Path) -> None:
+    rows = samples(np.random.default_rng(1), 50)
+    changed = rows.copy()
+    changed["c_rr"][30] += 0.001
+    one = write(tmp_path / "one", [JournalRow(1, "a", 7, 1, rows, T0)])
+    other = write(tmp_path / "other", [JournalRow(1, "a", 7, 11, changed[10:40], T0 + S)])
+    with pytest.raises(StoreError) as caught:
+        plan([other, one], ALL, ENGINE)
+    expected = f"{other}: sample 31 of a, spool {7:016x}, is another in a further archive ({one})"
+    assert str(caught.value).startswith(expected)
+    assert plan([one, other], Selection(without=frozenset("a")), ENGINE).kept.total() == 0
+
+
+def test_a_file_that_holds_a_sample_twice_is_named(tmp_path: Path) -> None:
+    rows = samples(np.random.default_rng(1), 20)
+    both = [JournalRow(1, "a", 7, 1, rows, T0), JournalRow(2, "a", 7, 11, rows[10:], T0)]
+    with pytest.raises(SitegridError, match="holds sample 11 of a, spool 0000000000000007, twice"):
+        plan([write(tmp_path / "one", both)], ALL, ENGINE)
+
+
+def test_a_file_that_is_named_twice_is_not_compared(tmp_path: Path, monkeypatch) -> None:
+    part = write(tmp_path / "one", [JournalRow(1, "a", 7, 1, samples(np.random.default_rng(1), 20), T0)])
+    monkeypatch.setattr("sitegrid.refold.plan.compare", lambda _: pytest.fail("the same file was read again"))
+    planned = plan([part, part], ALL, ENGINE)
+    assert (planned.kept.total(), planned.excluded["twice"]) == (20, 20)
+
+
+def numbered(rows: JournalRows) -> dict[tuple[object, int], bytes]:
+    """Bytes of samples by their identity."""
+    spools = ((spool, seqs, at) for spool, seqs, at in by_spool(rows))
+    return {
+        (spool, seq): rows.samples[i].tobytes()
+        for spool, seqs, at in spools
+        for seq, i in zip(seqs.tolist(), at, strict=True)
+    }
+
+
+def order_of(rows: JournalRows) -> list[int]:
+    """Where samples are in the table, in the order of `numbered`."""
+    return [i for _, _, at in by_spool(rows) for i in at.tolist()]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_cut_keeps_identity_and_bytes_of_what_is_kept(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = JournalRows.joined(
+        [
+            JournalRow(
+                n, f"m{rng.integers(3)}", int(rng.integers(2)), 100 * n, samples(rng, int(rng.integers(1, 9))), n
+            )
+            for n in range(1, 12)
+        ]
+    )
+    kept = rng.random(len(rows.samples)) < rng.choice([0.1, 0.5, 0.9, 1.0])
+    cut = rows.cut(kept, 50)
+    everything = zip(numbered(rows).items(), order_of(rows), strict=True)
+    assert numbered(cut) == {name: data for (name, data), at in everything if kept[at]}
+    assert len(cut) == rows.pieces(kept).sum()
+    assert cut.numbers.tolist() == list(range(50, 50 + len(cut)))
+    assert {row.received_ns for row in cut} <= {row.received_ns for row in rows}
