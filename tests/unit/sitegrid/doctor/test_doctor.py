@@ -27,7 +27,7 @@ from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.location import JournalLocation
 from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
-from protocol.machine.samples import SAMPLE_DTYPE, empty
+from protocol.machine.samples import empty
 from protocol.queries.answer_codec import encode_info
 from protocol.queries.answers import FollowerState, MapInfo, SampleCounts
 from protocol.queries.requests import InfoQuery
