@@ -23,6 +23,8 @@ ROUNDS = 8  # of pruning: what it leaves after that is drawn as it is
 # A cell of a line was driven along where the 5 x 5 cells around it have so many metres along it: a fifth of one pass.
 DRIVEN_M = 1.0
 DRIVEN_SHARE = 0.7  # of an edge's cells, for the edge to be one
+# A road ends where there is so much of what was driven so many cells farther in: half of the 5 x 5 cells is beyond.
+END_SHARE, INWARD = 0.45, 8
 TANGENT = 4  # cells to each side that the direction of a line is taken from
 
 
@@ -57,7 +59,8 @@ def _superfluous(places: Ints, metres: Ints, traced: Chains, raster_m: float) ->
     if not len(cells):
         return gone
     length_m = _lengths(places, cells, ends, raster_m)
-    driven = _driven(places, metres, cells, ends)
+    along = _along(places, metres, cells, ends)
+    driven = along >= DRIVEN_M * WEIGHT_UNITS_PER_M
     first, last = cells[ends[:-1]], cells[ends[1:] - 1]
     free = (degree[first] == 1).astype(np.int64) + (degree[last] == 1)
     share = np.add.reduceat(driven, ends[:-1]) / np.diff(ends)
@@ -68,17 +71,17 @@ def _superfluous(places: Ints, metres: Ints, traced: Chains, raster_m: float) ->
     # Ends that nobody drove: the blur makes lines longer than they are.
     for at, begins in ((ends[:-1], True), (ends[1:] - 1, False)):
         loose = np.flatnonzero(degree[cells[at]] == 1)
-        _trim(driven, cells, ends, loose, begins, gone)
+        _trim(along, cells, ends, loose, begins, gone)
     return gone
 
 
 @numba.njit(cache=True, nogil=True)
-def _trim(driven: AnyArray, cells: AnyArray, ends: AnyArray, loose: AnyArray, begins: bool, gone: AnyArray) -> None:  # noqa: FBT001
-    """Take cells that were not driven off the dead ends of some chains."""
+def _trim(along: AnyArray, cells: AnyArray, ends: AnyArray, loose: AnyArray, begins: bool, gone: AnyArray) -> None:  # noqa: FBT001
+    """Take cells off the dead ends of some chains, until there is about half of what is driven farther in."""
     for chain in loose:
         step = 1 if begins else -1
         at = ends[chain] if begins else ends[chain + 1] - 1
-        while ends[chain] <= at < ends[chain + 1] and not driven[at]:
+        while ends[chain] <= at + INWARD * step < ends[chain + 1] and along[at] < END_SHARE * along[at + INWARD * step]:
             gone[cells[at]] = True
             at += step
 
@@ -91,8 +94,8 @@ def _lengths(places: Ints, cells: Ints, ends: Ints, raster_m: float) -> Floats:
     return np.asarray(np.add.reduceat(step, ends[:-1]) * raster_m, np.float64)
 
 
-def _driven(places: Ints, metres: Ints, cells: Ints, ends: Ints) -> Bools:
-    """Which cells of chains were driven along, or lie where several lines meet and have no direction of their own."""
+def _along(places: Ints, metres: Ints, cells: Ints, ends: Ints) -> Ints:
+    """Metres driven along the chains around each of their cells, in 1/4096 m."""
     number = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
     at = np.arange(len(cells))
     before = np.maximum(at - TANGENT, ends[:-1][number])
@@ -100,8 +103,7 @@ def _driven(places: Ints, metres: Ints, cells: Ints, ends: Ints) -> Bools:
     rise, run = (places[cells[after]] - places[cells[before]]).T.astype(np.float64)
     axis = np.rint(np.arctan2(rise, run) * AXES / np.pi).astype(np.int64) % AXES
     own = metres[cells]
-    along = sum(own[at, (axis + turn) % AXES] for turn in (-1, 0, 1))
-    return np.asarray(along >= DRIVEN_M * WEIGHT_UNITS_PER_M, np.bool_)
+    return np.asarray(sum(own[at, (axis + turn) % AXES] for turn in (-1, 0, 1)), np.int64)
 
 
 def _lines(places: Ints, traced: Chains, raster_m: float) -> Network:

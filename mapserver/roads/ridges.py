@@ -19,7 +19,7 @@ AXES = ev.SECTORS // 2
 ALONG_M, ACROSS_M = 4.0, 1.0  # standard deviations of the blur
 SIDE_M = 3.0  # half the distance of two lanes that stay apart
 SHARE = 0.55  # of the highest response across the line
-LEAST_M = 0.12  # response, in metres per square metre: half of what one pass gives where its position is known to 1 m
+LEAST_M = 0.05  # response, in metres per square metre: less than one pass gives in a bend between two axes
 _UNITS = 1 << 10  # of the blur's weights
 _LEAST_WEIGHT = 20  # in these units
 SCALE = 1 << 6  # of 1/4096 m: what the blur sums up, so that thousands of passes fit
@@ -54,9 +54,8 @@ class Blur:
         self.ends: Ints = np.cumsum([0, *map(len, weights)])
         self.offsets: Ints = np.concatenate(offsets)
         self.weights: Ints = np.concatenate(weights)
-        # Twice its own metres and once those of each neighbour are summed up, of a square metre.
         per_m2 = ev.WEIGHT_UNITS_PER_M // SCALE * cell_m**2
-        self.least: Ints = np.array([round(LEAST_M * 2 * total * per_m2) for total in self._sums], np.int64)
+        self.least: Ints = np.array([round(LEAST_M * total * per_m2) for total in self._sums], np.int64)
         side = max(1, round(SIDE_M / cell_m))
         steps = np.array([step for step in range(-side, side + 1) if step])
         turns = np.pi * np.arange(AXES) / AXES
@@ -78,16 +77,12 @@ def ridges(axes: Ints, blur: Blur) -> Bools:
 
 @numba.njit(cache=True, nogil=True)
 def _blurred(axes: Any, offsets: Any, weights: Any, ends: Any, out: Any) -> None:
-    """Blur the metres of each axis, twice its own and once those of either neighbour, along this axis."""
+    """Blur the metres of each axis along it."""
     count, rows, columns = axes.shape
     for axis in range(count):
         for row in range(rows):
             for column in range(columns):
-                metres = (
-                    2 * axes[axis, row, column]
-                    + axes[(axis - 1) % count, row, column]
-                    + axes[(axis + 1) % count, row, column]
-                ) // SCALE
+                metres = axes[axis, row, column] // SCALE
                 if metres == 0:
                     continue
                 for i in range(ends[axis], ends[axis + 1]):
