@@ -72,5 +72,5 @@ def _is_removable(image: Any, y: int, x: int, turn: int) -> bool:
     if pairs < 2 or pairs > 3:
         return False
     if turn == 0:
-        return ((p2 | p3 | (1 - p5)) & p4) == 0
-    return ((p6 | p7 | (1 - p9)) & p8) == 0
+        return bool(((p2 | p3 | (1 - p5)) & p4) == 0)
+    return bool(((p6 | p7 | (1 - p9)) & p8) == 0)
