@@ -11,7 +11,7 @@ import numpy as np
 
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
-from protocol.machine.samples import APPLIED, COLUMNS, SAMPLE_DTYPE, check_samples, empty
+from protocol.machine.samples import COLUMNS, OPTIONAL, SAMPLE_DTYPE, check_samples, empty
 from protocol.site.site_config import NAME
 from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
 
@@ -25,6 +25,7 @@ MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
 MAX_RETRY_S = 3600.0
 _WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
+_STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value in OPTIONAL.items()}
 _NO_ROWS = empty()
 STORE_ID = re.compile(r"[0-9a-f]{16}")
 
@@ -167,7 +168,7 @@ def unpack_batch(data: bytes) -> PackedBatch:
 
 
 def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
-    missing = {name: bytes(n * SAMPLE_DTYPE[name].itemsize) for name in APPLIED if cols.get(name) is None}
+    missing = {name: n * value for name, value in _STAND_IN.items() if cols.get(name) is None}
     columns: tuple[Any, ...] = tuple(map((cols | missing).get, COLUMNS))
     for name, width, data in zip(COLUMNS, _WIDTHS, columns, strict=True):
         if type(data) is not bytes:

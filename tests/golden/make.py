@@ -26,7 +26,7 @@ from protocol.machine.readings import (
     Odometry,
     Torque,
 )
-from protocol.machine.samples import APPLIED, SAMPLE_DTYPE
+from protocol.machine.samples import OPTIONAL, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
 from protocol.queries.calibration import (
@@ -77,29 +77,18 @@ class Golden:
 
 
 def rows() -> np.ndarray:
-    """Return three samples: complete, without a gradient, without a resistance."""
+    """Return four samples: complete, without a gradient, without a resistance, and with neither."""
+    whole = (T0, 12.25, -40.5, 1.5, 0.25, 2.0, 0.5, 2.75, 0.55, 0.02, 1e-5, 0.125, -0.25, 1e-4)
+    level = (T0 + 200_000_000, 12.75, -40.25, 1.5, -0.25, 2.0, 0.5, -2.75, 0.5, 0.25, 1e-5, NAN, NAN, NAN)
+    ahead = (T0 + 400_000_000, 13.25, -40.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, NAN, NAN, 0.0, 0.0, 1e-4)
+    place = (T0 + 600_000_000, 13.75, -39.75, 1.5, 0.25, 2.0, 0.5, 2.75, 0.5, NAN, NAN, NAN, NAN, NAN)
+    calibration = (0.00390625, -0.0625)
     return np.array(
         [
-            (T0, 12.25, -40.5, 1.5, 0.25, 2.0, 0.5, 2.75, 0.55, 0.02, 1e-5, 0.125, -0.25, 1e-4, 0.00390625, -0.0625),
-            (
-                T0 + 200_000_000,
-                12.75,
-                -40.25,
-                1.5,
-                -0.25,
-                2.0,
-                0.5,
-                -2.75,
-                0.5,
-                0.25,
-                1e-5,
-                NAN,
-                NAN,
-                NAN,
-                0.00390625,
-                -0.0625,
-            ),
-            (T0 + 400_000_000, 13.25, -40.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, NAN, NAN, 0.0, 0.0, 1e-4, 0.0, 0.0),
+            (*whole, *calibration, 17_500.0),
+            (*level, *calibration, 44_000.5),
+            (*ahead, 0.0, 0.0, NAN),
+            (*place, *calibration, 17_500.0),
         ],
         SAMPLE_DTYPE,
     )
@@ -298,14 +287,14 @@ NEWER = "batch_newer.bin"  # of a later version of the software: an unknown fiel
 def older_batch() -> bytes:
     """Return BATCH as an agent without a calibration sends it."""
     table = msgpack.unpackb(codec.encode_batch(BATCH))
-    cols = {name: column for name, column in table["cols"].items() if name not in APPLIED}
+    cols = {name: column for name, column in table["cols"].items() if name not in OPTIONAL}
     return bytes(msgpack.packb({**table, "cols": cols}))
 
 
 def newer_batch() -> bytes:
     """Return BATCH as a newer agent might send it."""
     table = msgpack.unpackb(codec.encode_batch(BATCH))
-    table["cols"]["slip"] = np.zeros(3, "<f4").tobytes()
+    table["cols"]["slip"] = np.zeros(len(BATCH.rows), "<f4").tobytes()
     return bytes(msgpack.packb({**table, "firmware": "2.0"}))
 
 

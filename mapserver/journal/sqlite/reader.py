@@ -18,7 +18,7 @@ from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
 from protocol.files import make_private
 
-SCHEMA = 5
+SCHEMA = 6
 TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE journal (

@@ -148,7 +148,7 @@ def test_a_journal_of_another_schema_is_refused_with_what_to_do(tmp_path, schema
     sql(journal, f"UPDATE meta SET value = '{schema}' WHERE key = 'schema'")
     journal.close()
     for opened in (lambda: open_journal(tmp_path), lambda: SqliteReader(journal.path)):
-        with pytest.raises(StoreError, match=f"schema '{schema}', this version knows 5; open it with the version that"):
+        with pytest.raises(StoreError, match=f"schema '{schema}', this version knows 6; open it with the version that"):
             opened()
 
 
