@@ -137,6 +137,11 @@ class Grid:
         """Everything that was ever seen of these blocks, whether it still holds or not."""
         return evidence(self.pages(blocks))
 
+    def last_turns(self, blocks: Iterable[Block]) -> list[int]:
+        """The last turn of this grid in which each of these blocks was folded into, -1 for one without evidence."""
+        self._drain()
+        return [self._turns.get(block, -1) for block in blocks]
+
     def bounds(self) -> tuple[int, int, int, int] | None:
         """First column, first row, end column, end row of all blocks with evidence."""
         self._drain()

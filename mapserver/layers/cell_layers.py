@@ -170,12 +170,12 @@ def weight(cells: CellEvidence) -> Floats:
 
 def age_s(cells: CellEvidence) -> Floats:
     """Time from the newest sample to the site's now [s]; NaN where now is not known."""
-    return _seconds_ago(cells.evidence.newest_ns, cells.now_ns)
+    return seconds_ago(cells.evidence.newest_ns, cells.now_ns)
 
 
 def changed_s(cells: CellEvidence) -> Floats:
     """Time from the ground's last change to the site's now [s]; NaN where there was none or now is not known."""
-    return _seconds_ago(cells.evidence.changed_ns, cells.now_ns)
+    return seconds_ago(cells.evidence.changed_ns, cells.now_ns)
 
 
 LAYERS: dict[str, Layer] = {
@@ -273,6 +273,6 @@ def _class_votes(cells: CellEvidence) -> Floats:
     return votes
 
 
-def _seconds_ago(stamp_ns: AnyArray, now_ns: Ints) -> Floats:
+def seconds_ago(stamp_ns: AnyArray, now_ns: Ints) -> Floats:
     """Time since stamps [s], not below 0; NaN where either is 0, which means not known."""
     return np.where((stamp_ns > 0) & (now_ns > 0), np.maximum(now_ns - stamp_ns, 0) / 1e9, np.nan)

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from mapserver.change.detection import reach_blocks
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
+from mapserver.query.block_layers import BlockLayers, Look
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
 from mapserver.query.roads import RoadMaps
 from mapserver.query.source import MapSource
-from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
+from mapserver.query.views import PastMaps, View, view_now, widened
 from mapserver.query.why import reasons
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
@@ -47,6 +47,7 @@ class Answers:
     def __init__(self, source: MapSource) -> None:
         self._source = source
         self._site, self._config = source.site, source.config
+        self._layers = BlockLayers(self._site.cell_m, self._config)
         self._open = OpenRegions()
         self._tiles = Tiles(source)
         self._roads = RoadMaps(source)
@@ -172,16 +173,21 @@ class Answers:
         return CellWindow(window.column, window.row, 1, 1)
 
     def _reading(self, window: CellWindow, names: tuple[str, ...], when: When) -> Reading:
-        wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
         times = [when.as_of_ns] if when.minus_ns is None else [when.as_of_ns, when.minus_ns]
-        return Reading(window, names, tuple(self._view(wide, as_of_ns) for as_of_ns in times))
+        return Reading(window, names, tuple(self._look(window, names, as_of_ns) for as_of_ns in times))
+
+    def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None) -> Look:
+        if as_of_ns is None:
+            return self._source.run(lambda state: self._layers.look(state, window, names))
+        wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
+        return self._layers.look_at(self._view(wide, as_of_ns))
 
     def _piece(self, reading: Reading, pieces: PieceGrid, number: int, cursor: int) -> Region:
         return replace(self._read(reading, pieces.piece(number)), piece=pieces.place(number, cursor))
 
     def _read(self, reading: Reading, window: CellWindow) -> Region:
         """Layers of a window in that of the reading."""
-        newer, *others = (self._map(view, reading, window) for view in reading.views)
+        newer, *others = (self._map(look, reading.layers, window) for look in reading.looks)
         if not others:
             return newer
         (older,) = others
@@ -189,21 +195,15 @@ class Answers:
         version = replace(newer.version, row=min(newer.merged, older.merged))
         return replace(newer, layers=differences, version=version)
 
-    def _map(self, view: View, reading: Reading, window: CellWindow) -> Region:
-        names = reading.layers
-        wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
-        if window != reading.window:
-            view = view.around(wide, reach_blocks(self._site.cell_m, self._config.change))
-        values = read_cells(view, wide, cell_layers.required(names), self._site.cell_m, self._config)
-        areas = cell_layers.derive_area(names, values, self._site.cell_m, self._config.read)
+    def _map(self, look: Look, names: tuple[str, ...], window: CellWindow) -> Region:
         geometry = self._site.geometry
         return Region(
             x_m=geometry.centres(window.column, window.columns),
             y_m=geometry.centres(window.row, window.rows),
             cell_m=self._site.cell_m,
-            layers={name: cropped(layer, wide, window) for name, layer in areas.items()},
-            version=view.version,
-            stamp_ns=view.stamp_ns,
+            layers=self._layers.read(look, window, names),
+            version=look.version,
+            stamp_ns=look.stamp_ns,
         )
 
     def _view(self, window: CellWindow, as_of_ns: int | None) -> View:

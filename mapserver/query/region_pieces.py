@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
-from mapserver.query.views import View
+from mapserver.query.block_layers import Look
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import Piece
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -29,11 +29,11 @@ RETRY_AFTER_S = 2.0
 
 @dataclass(frozen=True)
 class Reading:
-    """What a region is read from: layers, and the view that they are read from, less another one if there are two."""
+    """What a region is read from: layers, and the map that they are read from, less another one if there are two."""
 
     window: CellWindow
     layers: tuple[str, ...]
-    views: tuple[View, ...]
+    looks: tuple[Look, ...]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,311 @@
+"""Layers of the map as it is, block by block, kept for all queries until what they are derived from is another.
+
+A layer of a cell depends on the pages of its block, and, since a change of the ground is seen with its surroundings, on
+those of the blocks around; a layer of an area on the cells around it besides. The grid numbers its turns and knows the
+last one of each block, so a block is derived again only where something was folded into it or near to it. Layers of
+areas are derived square by square, of some blocks each: the same bits for whoever asks, for whatever window.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from weakref import ReferenceType, ref
+
+import cv2
+import numpy as np
+
+from mapserver.change.detection import reach_blocks
+from mapserver.change.validity import Pages, around, valid_pages
+from mapserver.config import ServerConfig
+from mapserver.evidence.grid import Grid, chunks
+from mapserver.evidence.timeline import Block, evidence
+from mapserver.layers import cell_layers
+from mapserver.layers.gap_filling import AREA_LAYERS
+from mapserver.query.source import MapState
+from mapserver.query.views import View
+from protocol.arrays import AnyArray, Floats, Floats32
+from protocol.queries.answers import MapVersion
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
+
+MOST_KEPT = 98_304  # layers of blocks, 1 KB each: seven layers of a site of 1.9 x 1.9 km that is driven all over
+SQUARE = 4  # blocks: larger squares cost less in all, and more where little came in
+NEVER = -1  # turn of a block without evidence
+# These follow from stamps and the site's now; the stamps are kept.
+TIMED = {"age_s": "newest_ns", "changed_s": "changed_ns"}
+Layers = Mapping[str, AnyArray]  # (256,) each, or of a square
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Layers of one block or square, as of a turn of the grid: the last one of all that they depend on."""
+
+    turn: int
+    layers: Layers
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a window's layers are read from, of one version of the map: layers that are kept, and pages of the others.
+
+    cells, areas: what is kept of blocks and of squares, as of these turns; cell_turns: of all blocks with evidence,
+    area_turns: of all squares that have or are near any. pages: of the blocks whose layers of cells are to be derived,
+    and of those around them.
+    """
+
+    version: MapVersion
+    stamp_ns: int
+    cells: Mapping[Block, Kept]
+    areas: Mapping[Block, Kept]
+    cell_turns: Mapping[Block, int]
+    area_turns: Mapping[Block, int]
+    pages: Pages
+    grid: ReferenceType[Grid] | None = None
+
+
+class BlockLayers:
+    """Layers of one map. `look` on the thread that has the map; `read` on any, as often as wanted."""
+
+    def __init__(self, cell_m: float, config: ServerConfig, most: int = MOST_KEPT) -> None:
+        """most: layers of blocks that are kept."""
+        self._cell_m, self._config, self._most = cell_m, config, most
+        self._reach = reach_blocks(cell_m, config.change)
+        self._lock = threading.Lock()
+        self._cells: OrderedDict[Block, Kept] = OrderedDict()
+        self._areas: OrderedDict[Block, Kept] = OrderedDict()
+        self._count = 0  # layers of blocks in both
+        self._grid: ReferenceType[Grid] | None = None
+        self.used, self.derived = 0, 0  # blocks whose layers were kept, and that had to be derived
+
+    def look(self, state: MapState, window: CellWindow, names: Sequence[str]) -> Look:
+        """What these layers of a window are read from."""
+        grid = state.grid
+        cell_names, area_names = _stored(names), _areas_of(names)
+        margin, inner = self._margin(area_names), _blocks_of(window)
+        squares = _squares_of(inner)
+        wide = _grown(_of_squares(squares) if area_names else inner, margin + self._reach)
+        own = dict(zip(blocks := grid.blocks_in(_cells_of(wide)), grid.last_turns(blocks), strict=True))
+        cell_turns = _spread(own, wide, self._reach)
+        area_turns = _by_square(_spread(cell_turns, wide, margin), squares) if area_names else {}
+        with self._lock:
+            if self._grid is None or self._grid() is not grid:  # a fact, or rows that are gone, bring another one
+                self._cells.clear()
+                self._areas.clear()
+                self._grid, self._count = ref(grid), 0
+            areas = _valid(self._areas, area_turns, area_names)
+            needed = self._around(area_turns.keys() - areas.keys(), area_names)
+            needed_names = (*cell_names, *(_stored(cell_layers.required(area_names)) if needed else ()))
+            wanted = {b: cell_turns[b] for b in own if b in needed or (cell_names and _is_in(b, inner))}
+            cells = _valid(self._cells, wanted, needed_names)
+        missing = wanted.keys() - cells.keys()
+        near = sorted({one for block in missing for one in around(block, self._reach) if one in own})
+        pages = dict(zip(near, grid.pages(near), strict=True))
+        turns = {block: cell_turns[block] for block in own}
+        return Look(state.version, state.newest_ns, cells, areas, turns, area_turns, pages, self._grid)
+
+    def look_at(self, view: View) -> Look:
+        """The same of a view, of which nothing is kept: a map of the past."""
+        turns = {block: 0 for block, pages in view.pages.items() if pages}
+        near = {one for block in turns for one in around(block, self._margin(tuple(AREA_LAYERS)))}
+        squares = {(x // SQUARE, y // SQUARE) for x, y in near}
+        return Look(view.version, view.stamp_ns, {}, {}, turns, dict.fromkeys(squares, 0), view.pages)
+
+    def read(self, look: Look, window: CellWindow, names: Sequence[str]) -> dict[str, Floats32]:
+        """Layers (rows, columns) of a window within that of the look."""
+        cell_names, area_names = _stored(names), _areas_of(names)
+        inner = _blocks_of(window)
+        wanted = _within(look.area_turns, _squares_of(inner)) if area_names else {}
+        areas = _valid(look.areas, wanted, area_names)
+        stale = wanted.keys() - areas.keys()
+        needed = self._around(stale, area_names)
+        required = _stored(cell_layers.required(area_names)) if stale else ()
+        blocks = {b: t for b, t in look.cell_turns.items() if b in needed or (cell_names and _is_in(b, inner))}
+        cells = self._cells_of(look, blocks, (*cell_names, *required))
+        made = {square: Kept(wanted[square], self._derive(square, cells, area_names)) for square in sorted(stale)}
+        self._keep(self._areas, look, made)
+        areas |= made
+        out: dict[str, Floats32] = {name: np.full((window.rows, window.columns), np.nan, np.float32) for name in names}
+        for name, layer in out.items():
+            if name in AREA_LAYERS:
+                for (x, y), kept in areas.items():
+                    _place(layer, window, (x * SQUARE, y * SQUARE), kept.layers[name])
+            else:
+                for block in cells:
+                    if _is_in(block, inner):
+                        _place(layer, window, block, _at(cells[block].layers, name, look.stamp_ns))
+        return out
+
+    def _margin(self, names: Sequence[str]) -> int:
+        """How many blocks around one the layers of areas depend on."""
+        return -(-cell_layers.margin_cells(names, self._cell_m, self._config.read) // BLOCK_CELLS)
+
+    def _cells_of(self, look: Look, blocks: Mapping[Block, int], names: Sequence[str]) -> dict[Block, Kept]:
+        """Layers of the cells of these blocks, kept or derived."""
+        cells = _valid(look.cells, blocks, names)
+        missing = [block for block in blocks if block not in cells]
+        near = {one for block in missing for one in around(block, self._reach) if one in look.pages}
+        first = valid_pages({block: look.pages[block] for block in sorted(near)}, self._cell_m, self._config.change)
+        made: dict[Block, Kept] = {}
+        for some in chunks(missing):
+            sums = evidence([look.pages[block] for block in some], [first[block] for block in some])
+            plain = [name for name in dict.fromkeys((*names, "weight")) if name not in TIMED.values()]
+            values: dict[str, AnyArray] = {**cell_layers.read(sums, plain, self._config.read)}
+            for name in set(names).intersection(TIMED.values()):
+                values[name] = np.where(np.isnan(values["weight"]), 0, getattr(sums, name))
+            for i, block in enumerate(some):
+                old = look.cells.get(block)
+                before = old.layers if old and old.turn == blocks[block] else {}
+                made[block] = Kept(blocks[block], {**before, **{name: layer[i] for name, layer in values.items()}})
+        with self._lock:
+            self.used, self.derived = self.used + len(cells), self.derived + len(made)
+        self._keep(self._cells, look, made)
+        return cells | made
+
+    def _around(self, squares: Iterable[Block], names: Sequence[str]) -> set[Block]:
+        """Blocks that layers of areas depend on in these squares."""
+        margin = self._margin(names)
+        return {block for x, y in squares for block in _all_of(_grown(_of_squares((x, y, 1, 1)), margin))}
+
+    def _derive(self, square: Block, cells: Mapping[Block, Kept], names: Sequence[str]) -> Layers:
+        """Layers of an area in one square, from those of its cells and of the cells around."""
+        reach = cell_layers.margin_cells(names, self._cell_m, self._config.read)
+        edge = SQUARE * BLOCK_CELLS
+        wide = CellWindow(square[0] * edge - reach, square[1] * edge - reach, edge + 2 * reach, edge + 2 * reach)
+        shape = (wide.rows, wide.columns)
+        needs = {name: np.full(shape, np.nan, np.float32) for name in cell_layers.required(names)}
+        for near in self._around([square], names):
+            if kept := cells.get(near):
+                for name, layer in needs.items():
+                    _place(layer, wide, near, kept.layers[name])
+        made = cell_layers.derive_area(names, needs, self._cell_m, self._config.read)
+        inside = slice(reach, reach + edge)
+        return {name: np.ascontiguousarray(layer[inside, inside]) for name, layer in made.items()}
+
+    def _keep(self, of: OrderedDict[Block, Kept], look: Look, made: Mapping[Block, Kept]) -> None:
+        """Keep what was derived, unless the map is another one by now; forget what was not used for longest."""
+        with self._lock:
+            if look.grid is None or look.grid is not self._grid:
+                return
+            for block, kept in made.items():
+                old = of.get(block)
+                if old and old.turn > kept.turn:
+                    continue
+                layers = {**old.layers, **kept.layers} if old and old.turn == kept.turn else kept.layers
+                self._count += _size(layers) - (_size(old.layers) if old else 0)
+                of[block] = Kept(kept.turn, layers)
+                of.move_to_end(block)
+            while self._count > self._most:
+                fuller = self._areas if SQUARE**2 * len(self._areas) > len(self._cells) else self._cells
+                self._count -= _size(fuller.popitem(last=False)[1].layers)
+
+
+def _stored(names: Iterable[str]) -> tuple[str, ...]:
+    """Layers of cells as they are kept."""
+    return tuple(dict.fromkeys(TIMED.get(name, name) for name in names if name not in AREA_LAYERS))
+
+
+def _areas_of(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(name for name in names if name in AREA_LAYERS)
+
+
+def _size(layers: Layers) -> int:
+    """In layers of blocks."""
+    return sum(layer.size // BLOCK_CELLS**2 for layer in layers.values())
+
+
+def _at(layers: Layers, name: str, now_ns: int) -> Floats | Floats32:
+    """A layer (256,) as of now."""
+    if name in TIMED:
+        return cell_layers.seconds_ago(layers[TIMED[name]], np.int64(now_ns))
+    return layers[name]
+
+
+def _valid(kept: Mapping[Block, Kept], turns: Mapping[Block, int], names: Sequence[str]) -> dict[Block, Kept]:
+    """What is kept of these blocks as of these turns, with all of these layers; and marked as used."""
+    out = {}
+    for block, turn in turns.items():
+        one = kept.get(block)
+        if one and one.turn == turn and all(name in one.layers for name in names):
+            out[block] = one
+            if isinstance(kept, OrderedDict):
+                kept.move_to_end(block)
+    return out
+
+
+# --- rectangles of blocks or squares: first column, first row, number of columns, of rows ----------------------------
+
+
+Rect = tuple[int, int, int, int]
+
+
+def _parts_of(rect: Rect, edge: int) -> Rect:
+    """What a rectangle touches of larger squares, edge to a side."""
+    left, bottom = rect[0] // edge, rect[1] // edge
+    return left, bottom, (rect[0] + rect[2] - 1) // edge - left + 1, (rect[1] + rect[3] - 1) // edge - bottom + 1
+
+
+def _blocks_of(window: CellWindow) -> Rect:
+    return _parts_of((window.column, window.row, window.columns, window.rows), BLOCK_CELLS)
+
+
+def _squares_of(blocks: Rect) -> Rect:
+    return _parts_of(blocks, SQUARE)
+
+
+def _of_squares(squares: Rect) -> Rect:
+    """Their blocks."""
+    return squares[0] * SQUARE, squares[1] * SQUARE, squares[2] * SQUARE, squares[3] * SQUARE
+
+
+def _cells_of(rect: Rect) -> CellWindow:
+    return CellWindow(*(BLOCK_CELLS * value for value in rect))
+
+
+def _grown(rect: Rect, by: int) -> Rect:
+    return rect[0] - by, rect[1] - by, rect[2] + 2 * by, rect[3] + 2 * by
+
+
+def _is_in(block: Block, rect: Rect) -> bool:
+    return 0 <= block[0] - rect[0] < rect[2] and 0 <= block[1] - rect[1] < rect[3]
+
+
+def _all_of(rect: Rect) -> Iterable[Block]:
+    return product(range(rect[0], rect[0] + rect[2]), range(rect[1], rect[1] + rect[3]))
+
+
+def _within(turns: Mapping[Block, int], rect: Rect) -> dict[Block, int]:
+    return {block: turn for block, turn in turns.items() if _is_in(block, rect)}
+
+
+def _by_square(turns: Mapping[Block, int], squares: Rect) -> dict[Block, int]:
+    """The newest turn in each square, where there is one."""
+    newest: dict[Block, int] = {}
+    for (x, y), turn in turns.items():
+        square = x // SQUARE, y // SQUARE
+        newest[square] = max(turn, newest.get(square, NEVER))
+    return _within(newest, squares)
+
+
+def _spread(turns: Mapping[Block, int], rect: Rect, reach: int) -> dict[Block, int]:
+    """The newest turn of each block of a rectangle and of those around it, where there is one."""
+    image = np.full((rect[3], rect[2]), NEVER, np.float64)
+    for (x, y), turn in turns.items():
+        image[y - rect[1], x - rect[0]] = turn
+    newest = cv2.dilate(image, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8), borderValue=NEVER)
+    rows, columns = np.nonzero(newest > NEVER)
+    places = zip((columns + rect[0]).tolist(), (rows + rect[1]).tolist(), strict=True)
+    return dict(zip(places, newest[rows, columns].astype(int).tolist(), strict=True))
+
+
+def _place(out: Floats32, window: CellWindow, block: Block, values: AnyArray) -> None:
+    """Copy a block's values (256,), or those of a square whose first block it is, into the window."""
+    n = math.isqrt(values.size)
+    column, row = block[0] * BLOCK_CELLS - window.column, block[1] * BLOCK_CELLS - window.row
+    left, top = max(0, -column), max(0, -row)
+    right, bottom = min(n, window.columns - column), min(n, window.rows - row)
+    if left < right and top < bottom:
+        out[row + top : row + bottom, column + left : column + right] = values.reshape(n, n)[top:bottom, left:right]

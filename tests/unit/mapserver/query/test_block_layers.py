@@ -1,0 +1,135 @@
+"""Layers that are kept: what anybody would derive afresh, derived again only where something came in."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from mapserver.evidence.grid import Grid
+from mapserver.ingest.writer import Writer
+from mapserver.layers.cell_layers import LAYERS
+from mapserver.layers.gap_filling import AREA_LAYERS
+from mapserver.query.block_layers import BlockLayers
+from mapserver.query.views import read_cells, view_now
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
+from tests.unit.mapserver.data import CONFIG, SITE, incoming, open_writer, random_samples, samples, send
+
+ALL = (*LAYERS, *AREA_LAYERS)
+WINDOW = CellWindow(-70, -45, 130, 100)
+
+
+def read(kept: BlockLayers, writer: Writer, window: CellWindow = WINDOW, names: tuple[str, ...] = ALL):
+    return kept.read(writer.run(lambda state: kept.look(state, window, names)), window, names)
+
+
+def fresh() -> BlockLayers:
+    return BlockLayers(SITE.cell_m, CONFIG)
+
+
+def same(a, b) -> None:
+    assert a.keys() == b.keys()
+    for name, layer in a.items():
+        np.testing.assert_array_equal(layer, b[name], err_msg=name)
+
+
+@pytest.mark.slow
+def test_whatever_is_kept_equals_what_is_derived_afresh(tmp_path):
+    """Bit for bit, while samples come in here and there, and windows and layers change."""
+    rng = np.random.default_rng(5)
+    kept = fresh()
+    with closing(open_writer(tmp_path)) as writer:
+        for turn in range(12):
+            rows = random_samples(80, seed=turn, half_m=8.0)
+            rows["x_m"] += rng.uniform(-60, 60)
+            rows["y_m"] += rng.uniform(-40, 40)
+            rows["stamp_ns"] += turn * 400 * 10**9
+            send(writer, [incoming(rows, first_seq=1 + 80 * turn)])
+            left, bottom = rng.integers(-80, 20, 2)
+            window = CellWindow(int(left), int(bottom), int(rng.integers(1, 90)), int(rng.integers(1, 90)))
+            names = tuple(rng.choice(ALL, rng.integers(1, 6), replace=False).tolist())
+            same(read(kept, writer, window, names), read(fresh(), writer, window, names))
+        same(read(kept, writer), read(fresh(), writer))
+        cells = writer.run(
+            lambda state: read_cells(view_now(state, WINDOW), WINDOW, tuple(LAYERS), SITE.cell_m, CONFIG)
+        )
+        same(read(kept, writer, names=tuple(LAYERS)), cells)
+    assert kept.used > 20
+
+
+def test_a_cell_has_the_same_bits_in_any_window(tmp_path):
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(random_samples(3000, seed=1))])
+        whole = read(fresh(), writer)
+        for column, row in ((-70, -45), (-33, 7), (0, 0), (-1, -1), (15, 16)):
+            window = CellWindow(column, row, 1, 1)
+            alone = read(fresh(), writer, window)
+            for name, layer in alone.items():
+                cut = whole[name][row - WINDOW.row, column - WINDOW.column]
+                np.testing.assert_array_equal(layer[0, 0], cut, err_msg=name)
+
+
+def test_only_what_lies_near_to_new_samples_is_derived_again(tmp_path):
+    names, wide = ("resistance", "grade_east_filled"), CellWindow(-320, -16, 640, 32)
+    kept = fresh()
+    with closing(open_writer(tmp_path)) as writer:
+        line = samples(600, x_m=np.arange(-300, 300) + 0.5, y_m=0.5, distance_m=4.0)
+        send(writer, [incoming(line)])
+        read(kept, writer, wide, names)
+        first = kept.derived
+        read(kept, writer, wide, names)
+        assert kept.derived == first, "nothing came in"
+        assert first >= 600 // BLOCK_CELLS
+        more = samples(5, x_m=np.arange(5) + 0.5, y_m=0.5, distance_m=4.0)
+        more["stamp_ns"] += 10**12
+        send(writer, [incoming(more, first_seq=601)])
+        read(kept, writer, wide, names)
+        assert 0 < kept.derived - first <= 2 * 9 * 3
+        same(read(kept, writer, wide, names), read(fresh(), writer, wide, names))
+
+
+def test_ages_grow_though_nothing_is_derived_again(tmp_path):
+    names, here, there = ("age_s",), CellWindow(0, 0, 16, 16), 400.0
+    kept = fresh()
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(samples(1, x_m=3.5, y_m=3.5, distance_m=4.0))])
+        before = read(kept, writer, here, names)["age_s"]
+        later = samples(1, x_m=there, y_m=there, distance_m=4.0)
+        later["stamp_ns"] += 60 * 10**9
+        send(writer, [incoming(later, first_seq=2)])
+        derived = kept.derived
+        after = read(kept, writer, here, names)["age_s"]
+        assert kept.derived == derived
+        assert after[3, 3] - before[3, 3] == pytest.approx(60.0)
+        assert np.isnan(after[10, 10])
+
+
+def test_another_grid_begins_anew_and_an_old_look_keeps_nothing(tmp_path):
+    kept, names, window = fresh(), ("resistance", "resistance_filled"), CellWindow(0, 0, 40, 40)
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(random_samples(500, seed=2))])
+        old = writer.run(lambda state: kept.look(state, window, names))
+        expected = read(fresh(), writer, window, names)
+
+        class Other:
+            site, config = SITE, CONFIG
+            grid = Grid(SITE.cell_m, CONFIG.fold)
+            version, newest_ns = old.version, 0
+
+        empty = kept.read(kept.look(Other(), window, names), window, names)  # type: ignore[arg-type]
+        assert np.isnan(empty["resistance_filled"]).all()
+        same(kept.read(old, window, names), expected)
+        assert np.isnan(kept.read(kept.look(Other(), window, names), window, names)["resistance"]).all()  # type: ignore[arg-type]
+
+
+def test_so_much_is_kept_and_no_more(tmp_path):
+    names = ("resistance", "resistance_filled")
+    kept = BlockLayers(SITE.cell_m, CONFIG, most=60)
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(random_samples(3000, seed=1))])
+        for _ in range(3):
+            same(read(kept, writer, names=names), read(fresh(), writer, names=names))
+            assert kept._count <= 60
+            held = [layer for of in (kept._cells, kept._areas) for one in of.values() for layer in one.layers.values()]
+            assert sum(layer.size for layer in held) == kept._count * BLOCK_CELLS**2
