@@ -22,6 +22,7 @@ from protocol.queries.answer_codec import decode_alive, decode_error
 from protocol.queries.answers import FollowerState, ServerAlive
 from protocol.queries.origin import SERVER, Origin, decode_origin
 from protocol.queries.parameters import selector_of, text_of
+from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.wire import keys
 
 # Nobody answers, at once: the server starts again, or has just connected (Zenoh issue 2767). It may answer in a moment.
@@ -36,7 +37,7 @@ TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 # Refusals that are about who was asked, not about the question.
 ELSEWHERE = (Refusal.AFTER_TIMEOUT, Refusal.NOT_HERE, Refusal.OVERLOADED, Refusal.STORE, "internal")
 CELLS = (requests.PointQuery, requests.RegionQuery, requests.TilesQuery, requests.WhyQuery, requests.HistoryQuery)
-READ = (*CELLS, requests.SegmentsQuery, requests.WorklistQuery)
+READ = (*CELLS, requests.SegmentsQuery, requests.WorklistQuery, RouteQuery, WayQuery)
 # A follower has these a moment later than the server, whose events tell of them: it is asked where no server is.
 SERVER_FIRST = (requests.InfoQuery, requests.ChangesQuery)
 

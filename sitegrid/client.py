@@ -26,9 +26,12 @@ from protocol.queries.calibration import CalibrationAnswer, decode_calibration
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command
 from protocol.queries.map_tiles import TilesAnswer, decode_tiles
 from protocol.queries.origin import SERVER, Origin
+from protocol.queries.parameters import Freshness
 from protocol.queries.pieces import Progress, joined
 from protocol.queries.reasons import CellReasons, decode_why
 from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.routing import LOADER, RouteAnswer, RouteMachine, decode_answer
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
@@ -70,7 +73,7 @@ class Client:
         wait_s: float = 10.0,
     ) -> PointAnswer:
         """Layers of the cell at a position in `map`; NaN is unknown."""
-        when, fresh = requests.When(as_of_ns, minus_ns), requests.Freshness(after, wait_s)
+        when, fresh = requests.When(as_of_ns, minus_ns), Freshness(after, wait_s)
         query = requests.PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when)
         return answer_codec.decode_point(self._ask(query))
 
@@ -90,7 +93,7 @@ class Client:
         A large region comes in pieces, all of one version of the map; progress is called with each, as (here, of all).
         """
         box = bounds if isinstance(bounds, Bounds) else Bounds(*(float(v) for v in bounds))
-        when, fresh = requests.When(as_of_ns, minus_ns), requests.Freshness(after, wait_s)
+        when, fresh = requests.When(as_of_ns, minus_ns), Freshness(after, wait_s)
         query = requests.RegionQuery(box, tuple(layers), fresh, when)
         for _ in range(REGION_ATTEMPTS - 1):
             try:
@@ -116,7 +119,7 @@ class Client:
 
         from_ns, to_ns: both included; without them the newest 2000 spans until now. span_s: default one bucket.
         """
-        fresh = requests.Freshness(after, wait_s)
+        fresh = Freshness(after, wait_s)
         query = requests.HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, fresh)
         return answer_codec.decode_history(self._ask(query)).spans
 
@@ -149,7 +152,7 @@ class Client:
         wait_s: float = 10.0,
     ) -> Segments:
         """Roads that the map shows, segment by segment, and what drove on them from one hour to another."""
-        fresh = requests.Freshness(after, wait_s)
+        fresh = Freshness(after, wait_s)
         return decode_segments(self._ask(requests.SegmentsQuery(from_ns, to_ns, as_of_ns, bounds, fresh)))
 
     def worklist(
@@ -169,9 +172,71 @@ class Client:
 
         efficiency: of engine and drive train, for litres of diesel.
         """
-        fresh = requests.Freshness(after, wait_s)
+        fresh = Freshness(after, wait_s)
         query = requests.WorklistQuery(target, efficiency, limit, from_ns, to_ns, as_of_ns, bounds, fresh)
         return decode_worklist(self._ask(query))
+
+    def route(
+        self,
+        line: Sequence[tuple[float, float]],
+        machine: RouteMachine = LOADER,
+        *,
+        stops: tuple[bool, bool] = (True, True),
+        step_m: float = 25.0,
+        unknown: str | float = "dearest",
+        as_of_ns: int | None = None,
+        after: int = 0,
+        wait_s: float = 10.0,
+    ) -> RouteAnswer:
+        """What a drive along a line of places in `map` [m] costs a machine: energy, time, speed, with 90 % intervals.
+
+        stops: whether it stands at the begin and at the end. step_m: of the steps that are answered. unknown: what
+        ground that nobody knows is taken for: "dearest" (the dearest tenth of the known ground around), "refuse", or a
+        rolling resistance coefficient.
+        """
+        fresh = Freshness(after, wait_s)
+        places = tuple((float(x), float(y)) for x, y in line)
+        query = RouteQuery(places, machine, stops, step_m, unknown, as_of_ns, fresh)
+        return decode_answer(self._ask(query))
+
+    def way(
+        self,
+        start: tuple[float, float],
+        end: tuple[float, float],
+        machine: RouteMachine = LOADER,
+        *,
+        cost: str = "energy",
+        max_grade: float = 0.3,
+        margin_m: float = 0.0,
+        avoid: Sequence[tuple[float, float]] = (),
+        stops: tuple[bool, bool] = (True, True),
+        step_m: float = 25.0,
+        unknown: str | float = "dearest",
+        as_of_ns: int | None = None,
+        after: int = 0,
+        wait_s: float = 10.0,
+    ) -> RouteAnswer:
+        """The line from one place to another [m] that costs a machine least, and what it costs.
+
+        cost: "energy" or "time". max_grade: of ground that it is led over [m/m]. margin_m: how far it stays from what
+        it may not be led over, and from the places to avoid, as parked machines. The others: as of `route`.
+        """
+        ends = [(float(x), float(y)) for x, y in (start, end, *avoid)]
+        query = WayQuery(
+            ends[0],
+            ends[1],
+            machine,
+            cost,
+            max_grade,
+            margin_m,
+            tuple(ends[2:]),
+            stops,
+            step_m,
+            unknown,
+            as_of_ns,
+            Freshness(after, wait_s),
+        )
+        return decode_answer(self._ask(query))
 
     def alive(self) -> ServerAlive:
         """Whether the server takes batches: for probes, since it waits for nothing."""
@@ -185,16 +250,16 @@ class Client:
 
     def info(self, *, after: int = 0, wait_s: float = 10.0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
-        return answer_codec.decode_info(self._ask(requests.InfoQuery(requests.Freshness(after, wait_s))))
+        return answer_codec.decode_info(self._ask(requests.InfoQuery(Freshness(after, wait_s))))
 
     def machines(self, *, after: int = 0, wait_s: float = 10.0) -> list[MachineState]:
         """What the server knows of each machine: whether it is trusted, why, and what it sent."""
-        asked = requests.MachinesQuery(requests.Freshness(after, wait_s))
+        asked = requests.MachinesQuery(Freshness(after, wait_s))
         return list(answer_codec.decode_machines(self._ask(asked)).machines)
 
     def calibration(self, *, after: int = 0, wait_s: float = 10.0) -> CalibrationAnswer:
         """What the server takes off the samples of each machine, and what it knows of their calibration."""
-        return decode_calibration(self._ask(requests.CalibrationQuery(requests.Freshness(after, wait_s))))
+        return decode_calibration(self._ask(requests.CalibrationQuery(Freshness(after, wait_s))))
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with an id beyond `after`: when, where, how many cells, from what to what."""

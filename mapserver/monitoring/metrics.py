@@ -128,6 +128,7 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _counter("sitegrid_batches_refused_total", "Batches that were refused.", batches, "reason"),
         _counter("sitegrid_queries_refused_total", "Map queries that were refused.", queries, "reason"),
         _counter("sitegrid_queries_answered_total", "Map queries that were answered.", answered),
+        _counter("sitegrid_layers_total", "Blocks whose layers a query needed.", _layers(counters), "source"),
         _counter("sitegrid_samples_trimmed_total", "Samples that came in once more, and do not count.", trimmed),
         _gauge("sitegrid_journal_rows", "The last row of the journal on disk.", info["journalled"]),
         _gauge("sitegrid_merged_rows", "The last row of the journal that is in the map.", info["merged"]),
@@ -218,6 +219,11 @@ def _filled(family: type[Family], name: str, what: str, values: Values, label: s
 
 
 _gauge, _counter = partial(_filled, GaugeMetricFamily), partial(_filled, CounterMetricFamily)
+
+
+def _layers(counters: Mapping[str, int]) -> dict[str, int]:
+    """How many were kept from an earlier query, and how many were derived."""
+    return {source: counters.get(f"layers_{source}", 0) for source in ("kept", "derived")}
 
 
 def _without(counters: Mapping[str, int], prefix: str) -> dict[str, int]:

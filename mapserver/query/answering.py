@@ -14,6 +14,7 @@ from mapserver.query.block_layers import BlockLayers, Look
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
 from mapserver.query.roads import RoadMaps
+from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource
 from mapserver.query.views import PastMaps, View, view_now, widened
 from mapserver.query.why import reasons
@@ -35,9 +36,13 @@ from protocol.queries.requests import (
     WhyQuery,
 )
 from protocol.queries.roads import encode_segments, encode_worklist
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.routing import encode_answer
 from protocol.site.geometry import Bounds, CellWindow
 
 SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
+# Counters of `info`: blocks whose layers were kept from an earlier query, and that were derived for one.
+LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 
 
@@ -48,6 +53,7 @@ class Answers:
         self._source = source
         self._site, self._config = source.site, source.config
         self._layers = BlockLayers(self._site.cell_m, self._config)
+        self._routes = Routes(source, self._layers, lambda: self._past)
         self._open = OpenRegions()
         self._tiles = Tiles(source)
         self._roads = RoadMaps(source)
@@ -81,12 +87,22 @@ class Answers:
                 return encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
+            case requests.SegmentsQuery() | requests.WorklistQuery() | RouteQuery() | WayQuery():
+                return self._of_roads(query)
+            case _:
+                return self._of_process(query)
+
+    def _of_roads(self, query: requests.RoadQuery | requests.LineQuery) -> bytes:
+        """Answers about roads and about lines over the map."""
+        match query:
             case requests.SegmentsQuery():
                 return encode_segments(self._roads.segments(query))
             case requests.WorklistQuery():
                 return encode_worklist(self._roads.worklist(query))
-            case _:
-                return self._of_process(query)
+            case RouteQuery():
+                return encode_answer(self._routes.route(query))
+            case WayQuery():
+                return encode_answer(self._routes.way(query))
 
     def _of_process(self, query: MapQuery) -> bytes:
         """Answers that are not about cells."""
@@ -105,7 +121,9 @@ class Answers:
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
         names = {"layers": [*cell_layers.LAYERS, *AREA_LAYERS], "boundaries": list(self._config.read.boundaries)}
-        return {**self._source.info(), "checkpoints": self._source.past.checkpoints.state, **names}
+        info = self._source.info()
+        counters = {**info["counters"], LAYERS_KEPT: self._layers.used, LAYERS_DERIVED: self._layers.derived}
+        return {**info, "counters": counters, "checkpoints": self._source.past.checkpoints.state, **names}
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import product
 from weakref import ReferenceType, ref
@@ -33,7 +33,8 @@ from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 MOST_KEPT = 98_304  # layers of blocks, 1 KB each: seven layers of a site of 1.9 x 1.9 km that is driven all over
-SQUARE = 4  # blocks: larger squares cost less in all, and more where little came in
+SQUARE = 4  # blocks to a side: larger squares cost less in all, and more where little came in
+SQUARE_CELLS = SQUARE * BLOCK_CELLS
 NEVER = -1  # turn of a block without evidence
 # These follow from stamps and the site's now; the stamps are kept.
 TIMED = {"age_s": "newest_ns", "changed_s": "changed_ns"}
@@ -83,14 +84,31 @@ class BlockLayers:
 
     def look(self, state: MapState, window: CellWindow, names: Sequence[str]) -> Look:
         """What these layers of a window are read from."""
-        grid = state.grid
-        cell_names, area_names = _stored(names), _areas_of(names)
-        margin, inner = self._margin(area_names), _blocks_of(window)
-        squares = _squares_of(inner)
-        wide = _grown(_of_squares(squares) if area_names else inner, margin + self._reach)
+        area_names, inner = _areas_of(names), _blocks_of(window)
+        return self._look(state, inner, _stored(names), squares_of(window) if area_names else set(), area_names)
+
+    def look_squares(self, state: MapState, squares: Set[Block], names: Sequence[str]) -> Look:
+        """What layers of cells or areas are read from in these squares; not of ages, which are not kept so."""
+        left, bottom = (min(square[axis] for square in squares) for axis in (0, 1))
+        right, top = (max(square[axis] for square in squares) for axis in (0, 1))
+        rect = _of_squares((left, bottom, right - left + 1, top - bottom + 1))
+        return self._look(state, rect, (), squares, tuple(names))
+
+    def _look(
+        self,
+        state: MapState,
+        inner: Rect,
+        cell_names: tuple[str, ...],
+        squares: Set[Block],
+        area_names: tuple[str, ...],
+    ) -> Look:
+        """Layers of cells in a rectangle of blocks, and of areas in squares that touch it."""
+        grid, margin = state.grid, self._margin(area_names)
+        whole = _of_squares(_squares_of(inner)) if squares else inner
+        wide = _grown(whole, margin + self._reach)
         own = dict(zip(blocks := grid.blocks_in(_cells_of(wide)), grid.last_turns(blocks), strict=True))
         cell_turns = _spread(own, wide, self._reach)
-        area_turns = _by_square(_spread(cell_turns, wide, margin), squares) if area_names else {}
+        area_turns = _by_square(_spread(cell_turns, wide, margin), squares) if squares else {}
         with self._lock:
             if self._grid is None or self._grid() is not grid:  # a fact, or rows that are gone, bring another one
                 self._cells.clear()
@@ -98,7 +116,7 @@ class BlockLayers:
                 self._grid, self._count = ref(grid), 0
             areas = _valid(self._areas, area_turns, area_names)
             needed = self._around(area_turns.keys() - areas.keys(), area_names)
-            needed_names = (*cell_names, *(_stored(cell_layers.required(area_names)) if needed else ()))
+            needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
             wanted = {b: cell_turns[b] for b in own if b in needed or (cell_names and _is_in(b, inner))}
             cells = _valid(self._cells, wanted, needed_names)
         missing = wanted.keys() - cells.keys()
@@ -116,28 +134,31 @@ class BlockLayers:
 
     def read(self, look: Look, window: CellWindow, names: Sequence[str]) -> dict[str, Floats32]:
         """Layers (rows, columns) of a window within that of the look."""
-        cell_names, area_names = _stored(names), _areas_of(names)
-        inner = _blocks_of(window)
-        wanted = _within(look.area_turns, _squares_of(inner)) if area_names else {}
-        areas = _valid(look.areas, wanted, area_names)
-        stale = wanted.keys() - areas.keys()
-        needed = self._around(stale, area_names)
-        required = _stored(cell_layers.required(area_names)) if stale else ()
-        blocks = {b: t for b, t in look.cell_turns.items() if b in needed or (cell_names and _is_in(b, inner))}
-        cells = self._cells_of(look, blocks, (*cell_names, *required))
-        made = {square: Kept(wanted[square], self._derive(square, cells, area_names)) for square in sorted(stale)}
-        self._keep(self._areas, look, made)
-        areas |= made
+        cell_names, area_names, inner = _stored(names), _areas_of(names), _blocks_of(window)
+        areas = self.squares(look, squares_of(window), area_names) if area_names else {}
+        blocks = _within(look.cell_turns, inner) if cell_names else {}
+        cells = self._cells_of(look, blocks, cell_names)
         out: dict[str, Floats32] = {name: np.full((window.rows, window.columns), np.nan, np.float32) for name in names}
         for name, layer in out.items():
             if name in AREA_LAYERS:
-                for (x, y), kept in areas.items():
-                    _place(layer, window, (x * SQUARE, y * SQUARE), kept.layers[name])
+                for square, kept in areas.items():
+                    place_square(layer, window, square, kept[name])
             else:
-                for block in cells:
-                    if _is_in(block, inner):
-                        _place(layer, window, block, _at(cells[block].layers, name, look.stamp_ns))
+                for block, of_cells in cells.items():
+                    _place(layer, window, block, _at(of_cells.layers, name, look.stamp_ns))
         return out
+
+    def squares(self, look: Look, squares: Set[Block], names: Sequence[str]) -> dict[Block, Layers]:
+        """Layers (SQUARE_CELLS, SQUARE_CELLS) of those of these squares that have or are near any evidence."""
+        wanted = {square: turn for square, turn in look.area_turns.items() if square in squares}
+        areas = _valid(look.areas, wanted, names)
+        stale = wanted.keys() - areas.keys()
+        needed = self._around(stale, names)
+        blocks = {block: turn for block, turn in look.cell_turns.items() if block in needed}
+        cells = self._cells_of(look, blocks, cell_layers.required(names))
+        made = {square: Kept(wanted[square], self._derive(square, cells, names)) for square in sorted(stale)}
+        self._keep(self._areas, look, made)
+        return {square: kept.layers for square, kept in (areas | made).items()}
 
     def _margin(self, names: Sequence[str]) -> int:
         """How many blocks around one the layers of areas depend on."""
@@ -173,7 +194,7 @@ class BlockLayers:
     def _derive(self, square: Block, cells: Mapping[Block, Kept], names: Sequence[str]) -> Layers:
         """Layers of an area in one square, from those of its cells and of the cells around."""
         reach = cell_layers.margin_cells(names, self._cell_m, self._config.read)
-        edge = SQUARE * BLOCK_CELLS
+        edge = SQUARE_CELLS
         wide = CellWindow(square[0] * edge - reach, square[1] * edge - reach, edge + 2 * reach, edge + 2 * reach)
         shape = (wide.rows, wide.columns)
         needs = {name: np.full(shape, np.nan, np.float32) for name in cell_layers.required(names)}
@@ -220,7 +241,7 @@ def _size(layers: Layers) -> int:
 def _at(layers: Layers, name: str, now_ns: int) -> Floats | Floats32:
     """A layer (256,) as of now."""
     if name in TIMED:
-        return cell_layers.seconds_ago(layers[TIMED[name]], np.int64(now_ns))
+        return cell_layers.seconds_ago(layers[TIMED[name]], np.array(now_ns))
     return layers[name]
 
 
@@ -252,6 +273,11 @@ def _blocks_of(window: CellWindow) -> Rect:
     return _parts_of((window.column, window.row, window.columns, window.rows), BLOCK_CELLS)
 
 
+def squares_of(window: CellWindow) -> set[Block]:
+    """Columns and rows of the squares that a window touches."""
+    return set(_all_of(_squares_of(_blocks_of(window))))
+
+
 def _squares_of(blocks: Rect) -> Rect:
     return _parts_of(blocks, SQUARE)
 
@@ -281,13 +307,14 @@ def _within(turns: Mapping[Block, int], rect: Rect) -> dict[Block, int]:
     return {block: turn for block, turn in turns.items() if _is_in(block, rect)}
 
 
-def _by_square(turns: Mapping[Block, int], squares: Rect) -> dict[Block, int]:
-    """The newest turn in each square, where there is one."""
+def _by_square(turns: Mapping[Block, int], squares: Set[Block]) -> dict[Block, int]:
+    """The newest turn in each of these squares, where there is one."""
     newest: dict[Block, int] = {}
     for (x, y), turn in turns.items():
         square = x // SQUARE, y // SQUARE
-        newest[square] = max(turn, newest.get(square, NEVER))
-    return _within(newest, squares)
+        if square in squares:
+            newest[square] = max(turn, newest.get(square, NEVER))
+    return newest
 
 
 def _spread(turns: Mapping[Block, int], rect: Rect, reach: int) -> dict[Block, int]:
@@ -299,6 +326,11 @@ def _spread(turns: Mapping[Block, int], rect: Rect, reach: int) -> dict[Block, i
     rows, columns = np.nonzero(newest > NEVER)
     places = zip((columns + rect[0]).tolist(), (rows + rect[1]).tolist(), strict=True)
     return dict(zip(places, newest[rows, columns].astype(int).tolist(), strict=True))
+
+
+def place_square(out: Floats32, window: CellWindow, square: Block, values: AnyArray) -> None:
+    """Copy a square's values (64, 64) into a window."""
+    _place(out, window, (square[0] * SQUARE, square[1] * SQUARE), values)
 
 
 def _place(out: Floats32, window: CellWindow, block: Block, values: AnyArray) -> None:

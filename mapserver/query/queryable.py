@@ -18,6 +18,7 @@ from protocol.queries.answer_codec import encode_error
 from protocol.queries.origin import encode_origin
 from protocol.queries.parameters import split_selector
 from protocol.queries.requests import parse_query, reads_past
+from protocol.queries.route_requests import LINE_BYTES, RouteQuery, WayQuery
 from protocol.wire import keys
 
 ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 pieces, or 2000 points
@@ -104,10 +105,11 @@ class MapQueryable:
 
 def question(asked: zenoh.Query) -> tuple[str, dict[str, str]]:
     """Name and parameters. QueryError for what no client sends: what waits is kept in memory."""
-    parameters = str(asked.parameters)
-    if len(parameters) > MAX_QUESTION or asked.payload:
-        raise QueryError(Refusal.TOO_LARGE, f"a query has at most {MAX_QUESTION} bytes of parameters, and no payload")
-    return keys.query_of(str(asked.key_expr)), split_selector(parameters)
+    name, parameters = keys.query_of(str(asked.key_expr)), str(asked.parameters)
+    most = LINE_BYTES if name in (RouteQuery.name, WayQuery.name) else MAX_QUESTION
+    if len(parameters) > most or asked.payload:
+        raise QueryError(Refusal.TOO_LARGE, f"`{name[:40]}` has at most {most} bytes of parameters, and no payload")
+    return name, split_selector(parameters)
 
 
 def _send(asked: zenoh.Query, send: Callable[[], object]) -> None:

@@ -1,4 +1,4 @@
-"""The ground along a line, and over a window: layers of cells as a route reads them.
+"""The ground along a line: layers of cells as a route reads them.
 
 Between the centres of cells values are interpolated, over those of the four around that are known. Ground that is not
 known costs what the dearest tenth of the known ground around costs: at its median, the way would lead through whatever
@@ -12,40 +12,65 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocol.arrays import Floats, Floats32
-from protocol.site.geometry import CellWindow
+from protocol.arrays import AnyArray, Floats, Ints
 
 DEAREST = 90.0  # percentile of the known ground that unknown ground is taken for
+LEAST_SHARE = 0.25  # of the weights of four cells: less is a cell's corner, and no ground under a wheel
+HALF = 2**20
 
 
 @dataclass(frozen=True)
-class Field:
-    """Values (rows, columns) of the cells of a window, NaN where unknown."""
+class Squares:
+    """Layers of square parts of the map, edge cells to a side.
 
-    window: CellWindow
+    places (k, 2): column and row of each square; layers: name -> (k, edge, edge), NaN where unknown.
+    """
+
     cell_m: float
-    values: Floats32 | Floats
+    edge: int
+    places: Ints
+    layers: Mapping[str, AnyArray]
 
-    def at(self, position_m: Floats) -> Floats:
-        """Values (n,) at places (n, 2): bilinear over the known of the four cells around; NaN where none is."""
-        rows, columns = self.values.shape
-        x = position_m[:, 0] / self.cell_m - self.window.column - 0.5
-        y = position_m[:, 1] / self.cell_m - self.window.row - 0.5
-        total, weight = np.zeros(len(position_m)), np.zeros(len(position_m))
-        for dx in (0, 1):
-            for dy in (0, 1):
-                column, row = np.floor(x).astype(int) + dx, np.floor(y).astype(int) + dy
-                inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-                value = self.values[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)].astype(float)
-                share = np.maximum(1 - np.abs(x - column), 0) * np.maximum(1 - np.abs(y - row), 0)
-                known = inside & np.isfinite(value)
-                total += np.where(known, share * np.where(known, value, 0.0), 0.0)
-                weight += np.where(known, share, 0.0)
-        near = weight > 0.25  # less is a cell's corner, and no ground under a wheel
-        return np.where(near, total / np.where(near, weight, 1.0), np.nan)
+    @classmethod
+    def of(cls, cell_m: float, edge: int, squares: Mapping[tuple[int, int], Mapping[str, AnyArray]]) -> Squares:
+        """Of layers (edge, edge) by the place of their square; at least one of them."""
+        places = sorted(squares)
+        names = squares[places[0]].keys()
+        layers = {name: np.stack([squares[place][name] for place in places]) for name in names}
+        return cls(cell_m, edge, np.array(places), layers)
+
+    def at(self, position_m: Floats) -> dict[str, Floats]:
+        """Layers (n,) at places (n, 2): bilinear over the known of the four cells around; NaN where none is."""
+        column, row = (position_m / self.cell_m - 0.5).T
+        out = {name: (np.zeros(len(position_m)), np.zeros(len(position_m))) for name in self.layers}
+        for right in (0, 1):
+            for up in (0, 1):
+                x, y = np.floor(column).astype(int) + right, np.floor(row).astype(int) + up
+                share = np.maximum(1 - np.abs(column - x), 0) * np.maximum(1 - np.abs(row - y), 0)
+                at, inside = self._find(x // self.edge, y // self.edge)
+                for name, (total, weight) in out.items():
+                    value = self.layers[name][at, y % self.edge, x % self.edge].astype(float)
+                    known = inside & np.isfinite(value)
+                    total += np.where(known, share * np.where(known, value, 0.0), 0.0)
+                    weight += np.where(known, share, 0.0)
+        return {
+            name: np.where(weight > LEAST_SHARE, total / np.maximum(weight, LEAST_SHARE), np.nan)
+            for name, (total, weight) in out.items()
+        }
+
+    def _find(self, x: Ints, y: Ints) -> tuple[Ints, AnyArray]:
+        """Index (n,) of the squares at these places, and whether they are there."""
+        keys, wanted = _key(*self.places.T), _key(x, y)
+        order = np.argsort(keys)
+        at = np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)
+        return order[at], keys[order[at]] == wanted
 
 
-def dearest(resistance: Mapping[str, Floats32] | Floats | Floats32) -> float:
+def dearest(resistance: AnyArray) -> float:
     """What unknown ground is taken for [-]: DEAREST of the known; NaN where none is known."""
-    known = np.asarray(resistance)[np.isfinite(resistance)]
+    known = resistance[np.isfinite(resistance)]
     return float(np.percentile(known, DEAREST)) if known.size else float("nan")
+
+
+def _key(x: Ints, y: Ints) -> Ints:
+    return (x + HALF) * (2 * HALF) + (y + HALF)

@@ -219,7 +219,7 @@ def _straighten(
     while at >= 0:
         kept[at] = True
         at = before[at]
-    return best[n - 1]
+    return float(best[n - 1])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -258,7 +258,7 @@ def _piece(
         climbs = resistance[row, column] + east[row, column] * x + north[row, column] * y
         total += (end - at) * (max(climbs, LEAST_COST) if crawl == math.inf else max(climbs / crawl, 1.0))
         if row == to_row and column == to_column:
-            return total * length_m
+            return float(total * length_m)
         at = end
         if abs(next_row - next_column) < 1e-9:
             if not (is_open[row + step_row, column] and is_open[row, column + step_column]):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.routes.drive import SMOOTH_M, Drive, drive, smoothed
-from mapserver.routes.ground import Field, dearest
+from mapserver.routes.drive import Drive, drive, smoothed
+from mapserver.routes.ground import Squares, dearest
 from mapserver.routes.line import Steps, limits, steps
 from protocol.arrays import Bools, Floats
 from protocol.errors import QueryError, Refusal
@@ -19,8 +18,8 @@ LAYERS = (
     "resistance_filled",
     "grade_east_filled",
     "grade_north_filled",
-    "resistance_std",
-    "grade_std",
+    "resistance_filled_std",
+    "grade_filled_std",
     "visits",
     "confidence",
 )
@@ -48,29 +47,26 @@ class Ground:
     unknown: Bools
 
 
-def ground_along(layers: Mapping[str, Field], cut: Steps, unknown_resistance: float | None) -> Ground:
+def ground_along(squares: Squares, cut: Steps, unknown_resistance: float | None) -> Ground:
     """The ground along a line; what is unknown has this resistance, None: that of the dearest tenth of what was read.
 
     QueryError where all is unknown and nothing says what that is to cost.
     """
-    along = {name: layers[name].at(cut.position_m) for name in LAYERS}
+    along = squares.at(cut.position_m)
     east, north = cut.direction.T
     resistance = along["resistance_filled"]
     slope = along["grade_east_filled"] * east + along["grade_north_filled"] * north
     unknown = ~np.isfinite(resistance + slope)
     if unknown_resistance is None:
-        unknown_resistance = dearest(layers["resistance_filled"].values)
+        unknown_resistance = dearest(squares.layers["resistance_filled"])
         if unknown.all() or not np.isfinite(unknown_resistance):
             raise QueryError(Refusal.OUT_OF_RANGE, "nobody has driven near this line yet: say what `unknown` ground is")
     passes = np.sqrt(np.clip(np.nan_to_num(along["visits"], nan=1.0), 1.0, SURE_VISITS))
-    # cells between known ones have values, but no votes of their own that would spread
-    spread = np.where(np.isfinite(along["resistance_std"]), along["resistance_std"], 0.25 * np.nan_to_num(resistance))
-    tilt = np.where(np.isfinite(along["grade_std"]), along["grade_std"], 0.01)
     return Ground(
         resistance=np.where(unknown, unknown_resistance, resistance),
         slope=np.where(unknown, 0.0, slope),
-        resistance_std=np.where(unknown, UNKNOWN_STD * unknown_resistance, spread / passes),
-        slope_std=np.where(unknown, UNKNOWN_SLOPE_STD, tilt / passes),
+        resistance_std=np.where(unknown, UNKNOWN_STD * unknown_resistance, along["resistance_filled_std"] / passes),
+        slope_std=np.where(unknown, UNKNOWN_SLOPE_STD, along["grade_filled_std"] / passes),
         confidence=np.where(unknown, np.nan, along["confidence"]),
         unknown=unknown,
     )
@@ -93,19 +89,25 @@ def mean_std(std: Floats, length_m: Floats) -> float:
 
 def route(
     line_m: Floats,
-    layers: Mapping[str, Field],
+    squares: Squares,
     machine: RouteMachine,
     *,
     stops: tuple[bool, bool] = (True, True),
     step_m: float = 25.0,
     unknown_resistance: float | None = None,
+    refuse_unknown: bool = False,
 ) -> tuple[RouteSteps, RouteTotals]:
-    """What a drive along a line (k, 2) costs. layers: LAYERS, around all of it. stops: at its begin and its end.
+    """What a drive along a line (k, 2) costs. squares: LAYERS, around all of it. stops: at its begin and its end.
 
     step_m: of the steps that are answered. QueryError where the machine's power does not do it, or nothing is known.
     """
     cut = steps(line_m, STEP_M)
-    ground = ground_along(layers, cut, unknown_resistance)
+    ground = ground_along(squares, cut, unknown_resistance)
+    if refuse_unknown and ground.unknown.any():
+        x, y = cut.position_m[int(ground.unknown.argmax())]
+        raise QueryError(
+            Refusal.OUT_OF_RANGE, f"unknown ground at {x:.0f}, {y:.0f} m; without `unknown=refuse` it has a cost"
+        )
     limit = limits(line_m, cut.end_m, machine.lateral_mps2)
     limit[[0, -1]] = np.where(stops, 0.0, limit[[0, -1]])
     resistance, slope = (smoothed(values, STEP_M) for values in (ground.resistance, ground.slope))
@@ -170,8 +172,3 @@ def _by_step(cut: Steps, ground: Ground, done: Drive, step_m: float) -> RouteSte
         time_s=time_s,
         speed_mps=length_m / time_s,
     )
-
-
-def reach_m() -> float:
-    """How far around a line the map is read: what lies beside it says what unknown ground may be like."""
-    return 2 * SMOOTH_M

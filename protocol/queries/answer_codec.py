@@ -34,14 +34,16 @@ _hints = functools.cache(typing.get_type_hints)
 def encode_point(answer: answers.PointAnswer) -> bytes:
     """Answer of `point`."""
     place = {"x_m": answer.x_m, "y_m": answer.y_m}
-    return pack({**place, "values": _plain(answer.values), **_version(answer.version), "stamp_ns": answer.stamp_ns})
+    return pack(
+        {**place, "values": _plain(answer.values), **encode_version(answer.version), "stamp_ns": answer.stamp_ns}
+    )
 
 
 def decode_point(data: bytes) -> answers.PointAnswer:
     """Undo `encode_point`."""
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     x, y, values = take(table, "x_m", float), take(table, "y_m", float), _take_values(table)
-    return answers.PointAnswer(x, y, values, _take_version(table), take(table, "stamp_ns", int))
+    return answers.PointAnswer(x, y, values, decode_version(table), take(table, "stamp_ns", int))
 
 
 def encode_region(region: answers.Region) -> bytes:
@@ -55,7 +57,7 @@ def encode_region(region: answers.Region) -> bytes:
             "columns": len(region.x_m),
             "rows": len(region.y_m),
             "layers": layers,
-            **_version(region.version),
+            **encode_version(region.version),
             "stamp_ns": region.stamp_ns,
             **({"piece": asdict(region.piece)} if region.piece else {}),
         }
@@ -77,7 +79,7 @@ def decode_region(data: bytes) -> answers.Region:
         y_m=south_m + (np.arange(rows) + 0.5) * cell_m,
         cell_m=cell_m,
         layers=layers,
-        version=_take_version(table),
+        version=decode_version(table),
         stamp_ns=take(table, "stamp_ns", int),
         piece=_take_piece(table, columns, rows),
     )
@@ -113,7 +115,7 @@ def encode_history(answer: answers.HistoryAnswer) -> bytes:
     """Answer of `history`."""
     spans = [{"first_ns": s.first_ns, "last_ns": s.last_ns, "values": _plain(s.values)} for s in answer.spans]
     place = {"x_m": answer.x_m, "y_m": answer.y_m}
-    return pack({**place, "spans": spans, **_version(answer.version), "stamp_ns": answer.stamp_ns})
+    return pack({**place, "spans": spans, **encode_version(answer.version), "stamp_ns": answer.stamp_ns})
 
 
 def decode_history(data: bytes) -> answers.HistoryAnswer:
@@ -124,14 +126,16 @@ def decode_history(data: bytes) -> answers.HistoryAnswer:
         for span in _take_tables(table, "spans")
     )
     x, y = take(table, "x_m", float), take(table, "y_m", float)
-    return answers.HistoryAnswer(x, y, spans, _take_version(table), take(table, "stamp_ns", int))
+    return answers.HistoryAnswer(x, y, spans, decode_version(table), take(table, "stamp_ns", int))
 
 
-def _version(version: answers.MapVersion) -> dict[str, Any]:
+def encode_version(version: answers.MapVersion) -> dict[str, Any]:
+    """The fields of an answer that say which map it is true for."""
     return {"store": version.store, "merged": version.row, "fact": version.fact}
 
 
-def _take_version(table: dict[str, Any]) -> answers.MapVersion:
+def decode_version(table: dict[str, Any]) -> answers.MapVersion:
+    """Undo `encode_version`."""
     return answers.MapVersion(take_store(table), take(table, "merged", int), take(table, "fact", int))
 
 
@@ -182,7 +186,7 @@ def decode_info(data: bytes) -> answers.MapInfo:
 
 def encode_machines(machines: Iterable[answers.MachineState | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
     """Answer of `machines`."""
-    return pack({"machines": [_table(machine) for machine in machines], **_version(version)})
+    return pack({"machines": [_table(machine) for machine in machines], **encode_version(version)})
 
 
 def decode_machines(data: bytes) -> answers.MachinesAnswer:
@@ -202,7 +206,7 @@ def decode_machine(data: bytes) -> answers.TrustAnswer:
 
 def encode_changes(changes: Iterable[answers.GroundChange | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
     """Answer of `changes`."""
-    return pack({"changes": [_table(change) for change in changes], **_version(version)})
+    return pack({"changes": [_table(change) for change in changes], **encode_version(version)})
 
 
 def decode_changes(data: bytes) -> answers.ChangesAnswer:
@@ -233,7 +237,7 @@ def take_record(cls: type[T], table: dict[str, Any], name: str) -> T:
 def _take_records(cls: type[T], data: bytes, name: str) -> tuple[tuple[T, ...], answers.MapVersion]:
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     rows: list[Any] = take(table, name, list)
-    return tuple(_value(cls, row, f"{name}[{index}]") for index, row in enumerate(rows)), _take_version(table)
+    return tuple(_value(cls, row, f"{name}[{index}]") for index, row in enumerate(rows)), decode_version(table)
 
 
 def _value(hint: Any, value: Any, field: str) -> Any:

@@ -2,14 +2,27 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from protocol.errors import QueryError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 
+MAX_WAIT_S = 60.0
 MAX_TEXT = 200  # characters of a text that a person writes
 
 Parameters = Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Freshness:
+    """after: answer only once this journal row is merged; wait_s: how long to wait for it."""
+
+    after: int = 0
+    wait_s: float = 10.0
+
+
+ANY_ROW = Freshness()
 
 
 def text_of(number: float) -> str:
@@ -94,3 +107,8 @@ def free_text(parameters: Parameters, name: str) -> str:
     if len(text) > MAX_TEXT or not text.isprintable():
         raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}` must be one line of at most {MAX_TEXT} characters")
     return text
+
+
+def freshness(parameters: Parameters) -> Freshness:
+    """Which row to wait for, and how long."""
+    return Freshness(count(parameters, "after"), seconds(parameters, "wait", 10.0, MAX_WAIT_S))

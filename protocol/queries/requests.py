@@ -10,20 +10,13 @@ from dataclasses import dataclass
 from protocol.errors import QueryError, Refusal
 from protocol.queries import parameters as ps
 from protocol.queries.answers import MapVersion
+from protocol.queries.parameters import ANY_ROW, Freshness
+from protocol.queries.route_requests import ROUTE, WAY, RouteQuery, WayQuery, encode_route, parse_route, parse_way
 from protocol.site.geometry import MAX_CELLS, Bounds
 
-MAX_WAIT_S = 60.0
 MAX_SPANS = 2000  # of one history
 MAX_SPAN_S = 1e9
 MAX_LIMIT = 1000  # stretches of one worklist
-
-
-@dataclass(frozen=True)
-class Freshness:
-    """after: answer only once this journal row is merged; wait_s: how long to wait for it."""
-
-    after: int = 0
-    wait_s: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +37,7 @@ class PointQuery:
     x_m: float
     y_m: float
     layers: tuple[str, ...] = ()
-    fresh: Freshness = Freshness()
+    fresh: Freshness = ANY_ROW
     when: When = NOW
 
     name = "point"
@@ -56,7 +49,7 @@ class RegionQuery:
 
     bounds: Bounds
     layers: tuple[str, ...] = ()
-    fresh: Freshness = Freshness()
+    fresh: Freshness = ANY_ROW
     when: When = NOW
 
     name = "region"
@@ -68,7 +61,7 @@ class PieceQuery:
 
     cursor: int
     number: int
-    fresh = Freshness()
+    fresh = ANY_ROW
 
     name = "piece"
 
@@ -87,7 +80,7 @@ class HistoryQuery:
     from_ns: int | None = None
     to_ns: int | None = None
     span_s: float | None = None
-    fresh: Freshness = Freshness()
+    fresh: Freshness = ANY_ROW
 
     name = "history"
 
@@ -96,7 +89,7 @@ class HistoryQuery:
 class InfoQuery:
     """The state of the map and of its server."""
 
-    fresh: Freshness = Freshness()
+    fresh: Freshness = ANY_ROW
 
     name = "info"
 
@@ -105,7 +98,7 @@ class InfoQuery:
 class AliveQuery:
     """Whether the server takes batches: for probes, since it waits for nothing."""
 
-    fresh = Freshness()
+    fresh = ANY_ROW
 
     name = "alive"
 
@@ -114,7 +107,7 @@ class AliveQuery:
 class MachinesQuery:
     """What the server knows of each machine."""
 
-    fresh: Freshness = Freshness()
+    fresh: Freshness = ANY_ROW
 
     name = "machines"
 
@@ -123,7 +116,7 @@ class MachinesQuery:
 class CalibrationQuery:
     """What is taken off the samples of each machine, and what is known of its calibration."""
 
-    fresh: Freshness = Freshness()
+    fresh: Freshness = ANY_ROW
 
     name = "calibration"
 
@@ -133,7 +126,7 @@ class ChangesQuery:
     """Changes of the ground with a number beyond `after`."""
 
     after: int = 0
-    fresh = Freshness()  # the `after` of this query is not a journal row
+    fresh = ANY_ROW  # the `after` of this query is not a journal row
 
     name = "changes"
 
@@ -148,7 +141,7 @@ class TilesQuery:
     since: MapVersion | None = None
     as_of_ns: int | None = None
     place: tuple[int, int] | None = None
-    fresh = Freshness()
+    fresh = ANY_ROW
 
     name = "tiles"
 
@@ -160,7 +153,7 @@ class WhyQuery:
     x_m: float
     y_m: float
     as_of_ns: int | None = None
-    fresh = Freshness()
+    fresh = ANY_ROW
 
     name = "why"
 
@@ -177,7 +170,7 @@ class SegmentsQuery:
     to_ns: int | None = None
     as_of_ns: int | None = None
     bounds: Bounds | None = None
-    fresh: Freshness = Freshness()
+    fresh: Freshness = ANY_ROW
 
     name = "segments"
 
@@ -196,7 +189,7 @@ class WorklistQuery:
     to_ns: int | None = None
     as_of_ns: int | None = None
     bounds: Bounds | None = None
-    fresh: Freshness = Freshness()
+    fresh: Freshness = ANY_ROW
 
     name = "worklist"
 
@@ -213,7 +206,18 @@ class WorklistQuery:
 
 CellQuery = PointQuery | RegionQuery | PieceQuery | HistoryQuery | WhyQuery
 RoadQuery = SegmentsQuery | WorklistQuery
-MapQuery = CellQuery | RoadQuery | TilesQuery | InfoQuery | AliveQuery | MachinesQuery | CalibrationQuery | ChangesQuery
+LineQuery = RouteQuery | WayQuery
+MapQuery = (
+    CellQuery
+    | RoadQuery
+    | LineQuery
+    | TilesQuery
+    | InfoQuery
+    | AliveQuery
+    | MachinesQuery
+    | CalibrationQuery
+    | ChangesQuery
+)
 
 
 def check_size(columns: int, rows: int) -> None:
@@ -243,6 +247,8 @@ def encode_query(query: MapQuery) -> dict[str, str]:
         parameters = _of_map(query)
     elif isinstance(query, SegmentsQuery | WorklistQuery):
         parameters = _of_roads(query)
+    elif isinstance(query, RouteQuery | WayQuery):
+        parameters = encode_route(query)
     if query.fresh.after:
         parameters |= {"after": str(query.fresh.after), "wait": ps.text_of(query.fresh.wait_s)}
     return parameters
@@ -252,7 +258,7 @@ def reads_past(query: MapQuery) -> bool:
     """Whether the server has to read its journal for a query, which takes a while."""
     if isinstance(query, SegmentsQuery | WorklistQuery):
         return True
-    if isinstance(query, TilesQuery | WhyQuery):
+    if isinstance(query, TilesQuery | WhyQuery | RouteQuery | WayQuery):
         return query.as_of_ns is not None
     if isinstance(query, PointQuery | RegionQuery):
         return query.when != NOW
@@ -309,11 +315,11 @@ def parse_query(name: str, parameters: Mapping[str, str]) -> MapQuery:
 
 
 def _parse_point(parameters: ps.Parameters) -> PointQuery:
-    return PointQuery(*_place(parameters), _layers(parameters), _freshness(parameters), _when(parameters))
+    return PointQuery(*_place(parameters), _layers(parameters), ps.freshness(parameters), _when(parameters))
 
 
 def _parse_region(parameters: ps.Parameters) -> RegionQuery:
-    return RegionQuery(_bounds(parameters), _layers(parameters), _freshness(parameters), _when(parameters))
+    return RegionQuery(_bounds(parameters), _layers(parameters), ps.freshness(parameters), _when(parameters))
 
 
 def _parse_piece(parameters: ps.Parameters) -> PieceQuery:
@@ -327,7 +333,7 @@ def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
         problem = f"parameter `span`: {span_s:g} s is not between 1 and {MAX_SPAN_S:g} s"
         raise QueryError(Refusal.OUT_OF_RANGE, problem)
     x_m, y_m = _place(parameters)
-    return HistoryQuery(x_m, y_m, _layers(parameters), from_ns, to_ns, span_s, _freshness(parameters))
+    return HistoryQuery(x_m, y_m, _layers(parameters), from_ns, to_ns, span_s, ps.freshness(parameters))
 
 
 def _parse_tiles(parameters: ps.Parameters) -> TilesQuery:
@@ -352,7 +358,7 @@ def _parse_why(parameters: ps.Parameters) -> WhyQuery:
 
 def _parse_segments(parameters: ps.Parameters) -> SegmentsQuery:
     bounds = _bounds(parameters) if "bounds" in parameters else None
-    return SegmentsQuery(*_times(parameters), ps.stamp(parameters, "as_of"), bounds, _freshness(parameters))
+    return SegmentsQuery(*_times(parameters), ps.stamp(parameters, "as_of"), bounds, ps.freshness(parameters))
 
 
 def _parse_worklist(parameters: ps.Parameters) -> WorklistQuery:
@@ -371,15 +377,17 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "region": (("bounds", "layers", "as_of", "minus", *_FRESH), _parse_region),
     "piece": (("cursor", "number"), _parse_piece),
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
-    "machines": (_FRESH, lambda parameters: MachinesQuery(_freshness(parameters))),
-    "calibration": (_FRESH, lambda parameters: CalibrationQuery(_freshness(parameters))),
+    "machines": (_FRESH, lambda parameters: MachinesQuery(ps.freshness(parameters))),
+    "calibration": (_FRESH, lambda parameters: CalibrationQuery(ps.freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
     "tiles": (("store", "row", "fact", "as_of", "place"), _parse_tiles),
     "why": (("x", "y", "as_of"), _parse_why),
     "segments": ((*_ROADS, *_FRESH), _parse_segments),
     "worklist": (("target", "efficiency", "limit", *_ROADS, *_FRESH), _parse_worklist),
+    "route": ((*ROUTE, *_FRESH), parse_route),
+    "way": ((*WAY, *_FRESH), parse_way),
     "alive": ((), lambda _: AliveQuery()),
-    "info": (_FRESH, lambda parameters: InfoQuery(_freshness(parameters))),
+    "info": (_FRESH, lambda parameters: InfoQuery(ps.freshness(parameters))),
 }
 
 
@@ -400,10 +408,6 @@ def _layers(parameters: ps.Parameters) -> tuple[str, ...]:
 
 def _when(parameters: ps.Parameters) -> When:
     return When(ps.stamp(parameters, "as_of"), ps.stamp(parameters, "minus"))
-
-
-def _freshness(parameters: ps.Parameters) -> Freshness:
-    return Freshness(ps.count(parameters, "after"), ps.seconds(parameters, "wait", 10.0, MAX_WAIT_S))
 
 
 def _bounds(parameters: ps.Parameters) -> Bounds:

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
 
 from protocol.arrays import Floats
+from protocol.errors import MessageError, Refusal
+from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, decode_version, encode_version, take_record
+from protocol.queries.answers import MapVersion
+from protocol.wire.codec import pack, take, unpack
 
 MAX_MASS_KG = 1e6
 MAX_ROTATING = 2.0
@@ -13,21 +20,21 @@ MAX_ROTATING = 2.0
 
 @dataclass(frozen=True)
 class RouteMachine:
-    """A machine as a route needs it; the defaults are those of a loaded wheel loader.
+    """A machine as a route needs it; the defaults are those of a wheel loader with its bucket full.
 
     mass_kg: with what it carries. speed_mps: its highest. power_w: at the wheels. efficiency: energy at the wheels over
     that of the fuel, 0 to 1. accelerate_mps2, brake_mps2: as it is driven. lateral_mps2: sideways, in curves. rotating:
     mass with what rotates with it over mass. ValueError names a value that is not usable.
     """
 
-    mass_kg: float = 22_000.0
+    mass_kg: float = 22_500.0
     speed_mps: float = 8.0
-    power_w: float = 240_000.0
+    power_w: float = 140_000.0
     efficiency: float = 0.35
     accelerate_mps2: float = 0.8
     brake_mps2: float = 0.5
     lateral_mps2: float = 0.9
-    rotating: float = 1.1
+    rotating: float = 1.07
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -40,6 +47,15 @@ class RouteMachine:
             raise ValueError(f"efficiency: {self.efficiency:g} is over 1")
         if not 1 <= self.rotating <= MAX_ROTATING:
             raise ValueError(f"rotating: {self.rotating:g} is not between 1 and {MAX_ROTATING:g}")
+
+
+LOADER = RouteMachine()
+# By the name of their kind, the first one where none is named: typical ones, as the simulator has them.
+MACHINES = {
+    "loader": LOADER,
+    "truck": RouteMachine(mass_kg=47_000.0, power_w=240_000.0, rotating=1.1),
+    "empty_truck": RouteMachine(mass_kg=22_000.0, power_w=240_000.0, rotating=1.1),
+}
 
 
 @dataclass(frozen=True)
@@ -86,3 +102,47 @@ class RouteTotals:
     time_s: float
     time_low_s: float
     time_high_s: float
+
+
+@dataclass(frozen=True)
+class RouteAnswer:
+    """What a route costs. line_m (k, 2): where it leads. stamp_ns: the site's now, or the time that the map is of."""
+
+    version: MapVersion
+    stamp_ns: int
+    line_m: Floats
+    totals: RouteTotals
+    steps: RouteSteps
+
+    @property
+    def merged(self) -> int:
+        """The last journal row in the map."""
+        return self.version.row
+
+
+def encode_answer(answer: RouteAnswer) -> bytes:
+    """Answer of `route` and `way`: columns as float64 little-endian."""
+    steps = {name: np.ascontiguousarray(values, "<f8").tobytes() for name, values in vars(answer.steps).items()}
+    line = np.ascontiguousarray(answer.line_m, "<f8").tobytes()
+    plain = {"line": line, "totals": asdict(answer.totals), "steps": steps, "stamp_ns": answer.stamp_ns}
+    return pack({**plain, **encode_version(answer.version)})
+
+
+def decode_answer(data: bytes) -> RouteAnswer:
+    """Undo `encode_answer`."""
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    line = _column(table, "line")
+    tables = take(table, "steps", dict)
+    columns = {field.name: _column(tables, field.name) for field in fields(RouteSteps)}
+    if len(line) % 2 or len({len(values) for values in columns.values()}) != 1:
+        raise MessageError(Refusal.COLUMN_LENGTH, "columns of a route differ in length", field="steps")
+    totals = take_record(RouteTotals, table, "totals")
+    version, stamp_ns = decode_version(table), take(table, "stamp_ns", int)
+    return RouteAnswer(version, stamp_ns, line.reshape(-1, 2), totals, RouteSteps(**columns))
+
+
+def _column(table: dict[str, Any], name: str) -> Floats:
+    data: bytes = take(table, name, bytes)
+    if not data or len(data) % 8:
+        raise MessageError(Refusal.COLUMN_LENGTH, f"{len(data)} bytes are no numbers of 8", field=name)
+    return np.frombuffer(data, "<f8")

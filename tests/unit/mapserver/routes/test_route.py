@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from mapserver.routes.ground import Field
+from mapserver.routes.ground import Squares
 from mapserver.routes.route import LAYERS, STEP_M, mean_std, route
 from protocol.arrays import Floats
 from protocol.errors import QueryError
 from protocol.queries.routing import RouteMachine
-from protocol.site.geometry import CellWindow
 from protocol.units import GRAVITY_MPS2
 
 SIZE = 220
@@ -19,16 +18,21 @@ WEIGHT_N = 20_000 * GRAVITY_MPS2
 ROLLING = (False, False)
 
 
-def fields(resistance: Floats | float, east: float = 0.0, north: float = 0.0, std: float = 0.003) -> dict[str, Field]:
+def fields(resistance: Floats | float, east: float = 0.0, north: float = 0.0, std: float = 0.003) -> Squares:
     even = np.zeros((SIZE, SIZE))
     values = {
         "resistance_filled": even + resistance,
         "grade_east_filled": even + east,
         "grade_north_filled": even + north,
     }
-    values |= {"resistance_std": even + std, "grade_std": even + std, "visits": even + 4, "confidence": even + 0.9}
+    values |= {
+        "resistance_filled_std": even + std,
+        "grade_filled_std": even + std,
+        "visits": even + 4,
+        "confidence": even + 0.9,
+    }
     assert set(values) == set(LAYERS)
-    return {name: Field(CellWindow(0, 0, SIZE, SIZE), 1.0, layer) for name, layer in values.items()}
+    return Squares.of(1.0, SIZE, {(0, 0): values})
 
 
 def line(*corners: tuple[float, float]) -> Floats:
@@ -104,7 +108,7 @@ def test_where_nothing_is_known_a_route_has_no_cost_unless_it_is_said() -> None:
 
 def test_a_machine_too_weak_for_a_slope_is_told_where() -> None:
     layers = fields(0.03)
-    layers["grade_east_filled"].values[:, 100:140] = 0.9
+    layers.layers["grade_east_filled"][0, :, 100:140] = 0.9
     weak = RouteMachine(mass_kg=40_000.0, power_w=60_000.0)
     with pytest.raises(QueryError, match=r"cannot climb at (9\d|1\d\d), 50 m: .* % of its weight; more `power`"):
         route(line((10, 50), (200, 50)), layers, weak)

@@ -1,0 +1,166 @@
+"""Routes and ways over maps that samples made: their costs, their lines, and what is refused, by name."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from mapserver.query.answering import Answers
+from protocol.errors import QueryError
+from protocol.queries.requests import encode_query, parse_query
+from protocol.queries.route_requests import REFUSE, TIME, RouteQuery, WayQuery
+from protocol.queries.routing import RouteAnswer, RouteMachine, decode_answer
+from protocol.units import GRAVITY_MPS2
+from tests.unit.mapserver.data import incoming, open_writer, samples, send
+from tests.unit.mapserver.query.fake_upkeep import answers_of
+
+HALF = 60
+SLOW = RouteMachine(mass_kg=20_000.0, speed_mps=2.0)
+WEIGHT_N = 20_000 * GRAVITY_MPS2
+ROLLING = (False, False)
+
+
+def ground(resistance, grade_e=lambda x, y: 0 * x, skipped=lambda x, y: x != x):
+    """A sample in each cell, with the resistance and the slope there."""
+    x, y = (axis.reshape(-1) + 0.5 for axis in np.meshgrid(np.arange(-HALF, HALF), np.arange(-HALF, HALF)))
+    here = ~skipped(x, y)
+    x, y = x[here], y[here]
+    rows = samples(len(x), x_m=x, y_m=y, distance_m=8.0)
+    rows["c_rr"], rows["grade_e"], rows["grade_n"] = resistance(x, y), grade_e(x, y), 0.0
+    return rows
+
+
+def answers_on(tmp_path, rows) -> tuple[closing, Answers]:
+    writer = open_writer(tmp_path)
+    send(writer, [incoming(rows)])
+    return closing(writer), answers_of(writer)
+
+
+def ask(answers: Answers, query: RouteQuery | WayQuery) -> RouteAnswer:
+    """Through the bytes of question and answer."""
+    again = parse_query(query.name, encode_query(query))
+    assert again == query
+    return decode_answer(answers.answer(again))
+
+
+def test_a_route_costs_resistance_and_height_and_says_which_map_it_is_of(tmp_path):
+    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.03 + 0 * x, lambda x, y: 0.01 + 0 * x))
+    with closer:
+        there, back = (
+            ask(answers, RouteQuery(line, SLOW, ROLLING)) for line in (((-50, 3.0), (50, 3.0)), ((50, 3.0), (-50, 3.0)))
+        )
+        assert there.totals.energy_j == pytest.approx(WEIGHT_N * (0.03 + 0.01) * 100, rel=0.02)
+        assert there.totals.energy_j - back.totals.energy_j == pytest.approx(2 * WEIGHT_N, rel=0.02)
+        assert (there.merged, there.totals.unknown) == (1, 0.0)
+        assert there.steps.resistance == pytest.approx(np.full(4, 0.03), rel=0.02)
+        assert there.line_m.tolist() == [[-50, 3], [50, 3]]
+
+
+def test_a_way_leads_around_sand_and_costs_less_than_straight(tmp_path):
+    sand = lambda x, y: (abs(x) < 15) & (y < 25)  # noqa: E731
+    closer, answers = answers_on(tmp_path, ground(lambda x, y: np.where(sand(x, y), 0.25, 0.02)))
+    with closer:
+        ends = (-40.0, 0.0), (40.0, 0.0)
+        way = ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
+        straight = ask(answers, RouteQuery(ends, SLOW, ROLLING))
+        assert way.line_m[[0, -1]].tolist() == [[-40, 0], [40, 0]]
+        assert way.line_m[:, 1].max() > 24
+        assert way.totals.energy_j < 0.5 * straight.totals.energy_j
+        assert way.steps.resistance.max() < 0.1
+        again = ask(answers, RouteQuery(tuple(map(tuple, way.line_m.tolist())), SLOW, ROLLING))
+        assert again.totals.energy_j == pytest.approx(way.totals.energy_j)
+
+
+def test_up_and_down_have_ways_of_their_own(tmp_path):
+    """A steep short cut with brakes downhill, and a detour that rises gently: nobody saves by braking."""
+    steep = lambda x, y: np.where(abs(y) < 20, 0.12, 0.02)  # noqa: E731
+    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x, steep))
+    with closer:
+        up, down = (
+            ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
+            for ends in (((-40.0, 0.0), (40.0, 0.0)), ((40.0, 0.0), (-40.0, 0.0)))
+        )
+        assert abs(up.line_m[:, 1]).max() > 15
+        assert abs(down.line_m[:, 1]).max() < 15
+
+
+def test_unknown_ground_is_dear_refused_or_as_told(tmp_path):
+    gap = lambda x, y: (abs(x) < 10) & (y < 40)  # noqa: E731
+    soils = lambda x, y: np.where(y > 45, 0.08, 0.02)  # noqa: E731
+    closer, answers = answers_on(tmp_path, ground(soils, skipped=gap))
+    with closer:
+        ends = (-30.0, -30.0), (30.0, -30.0)
+        refused = ask(answers, WayQuery(*ends, SLOW, unknown=REFUSE))
+        assert refused.totals.unknown == 0.0
+        assert refused.line_m[:, 1].max() > 34
+        cheap = ask(answers, WayQuery(*ends, SLOW, unknown=0.02))
+        assert len(cheap.line_m) == 2
+        with pytest.raises(QueryError, match=r"unknown ground at -?\d, -30 m; without `unknown=refuse` it has a cost"):
+            ask(answers, RouteQuery(ends, SLOW, unknown=REFUSE))
+        with pytest.raises(QueryError, match="parameter `to`: unknown ground"):
+            ask(answers, WayQuery((-30.0, -30.0), (0.0, 0.0), SLOW, unknown=REFUSE))
+
+
+def test_margins_keep_away_from_parked_machines(tmp_path):
+    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x))
+    with closer:
+        ends, parked = ((-40.0, 0.0), (40.0, 0.0)), ((0.0, 0.0), (10.0, 3.0))
+        way = ask(answers, WayQuery(*ends, SLOW, margin_m=8.0, avoid=parked))
+        along = np.concatenate([np.linspace(a, b, 200) for a, b in zip(way.line_m[:-1], way.line_m[1:], strict=True)])
+        for place in parked:
+            assert np.hypot(*(along - place).T).min() > 7.0
+        with pytest.raises(QueryError, match="parameter `from`: nearer than `margin` to what no way leads over"):
+            ask(answers, WayQuery((1.0, 1.0), ends[1], SLOW, margin_m=8.0, avoid=parked))
+
+
+def test_no_way_says_which_limit_leaves_none(tmp_path):
+    wall = lambda x, y: np.where(abs(x) < 6, 0.25, 0.0)  # noqa: E731
+    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x, wall))
+    with closer:
+        ends = (-40.0, 0.0), (40.0, 0.0)
+        assert ask(answers, WayQuery(*ends, SLOW, unknown=REFUSE)).totals.length_m == pytest.approx(80)
+        with pytest.raises(QueryError, match="no way: `max_grade` leaves none"):
+            ask(answers, WayQuery(*ends, SLOW, max_grade=0.1, unknown=REFUSE))
+        row = tuple((0.0, float(y)) for y in range(-HALF - 10, HALF + 10))
+        with pytest.raises(QueryError, match="no way: `margin` leaves none"):
+            ask(answers, WayQuery(*ends, SLOW, margin_m=5.0, avoid=row, unknown=REFUSE))
+        with pytest.raises(QueryError, match=r"parameter `to`: 25% steep, over `max_grade`"):
+            ask(answers, WayQuery(ends[0], (0.0, 0.0), SLOW, max_grade=0.1))
+
+
+def test_the_fastest_way_is_not_the_cheapest(tmp_path):
+    soils = lambda x, y: np.where(abs(y) < 20, 0.045, 0.02)  # noqa: E731
+    closer, answers = answers_on(tmp_path, ground(soils))
+    with closer:
+        strong = RouteMachine(mass_kg=20_000.0, speed_mps=4.0, power_w=400_000.0)
+        ends = (-50.0, 0.0), (50.0, 0.0)
+        cheapest, fastest = (ask(answers, WayQuery(*ends, strong, cost=cost)) for cost in ("energy", TIME))
+        assert abs(cheapest.line_m[:, 1]).max() > 19
+        assert len(fastest.line_m) == 2
+        assert cheapest.totals.energy_j < fastest.totals.energy_j
+        assert fastest.totals.time_s < cheapest.totals.time_s
+
+
+def test_an_empty_map_knows_no_cost(tmp_path):
+    with closing(open_writer(tmp_path)) as writer:
+        answers = answers_of(writer)
+        for query in (RouteQuery(((0.0, 0.0), (30.0, 0.0))), WayQuery((0.0, 0.0), (30.0, 0.0))):
+            with pytest.raises(QueryError, match="nobody has driven near"):
+                ask(answers, query)
+        told = ask(answers, WayQuery((0.0, 0.0), (30.0, 0.0), SLOW, unknown=0.05, stops=ROLLING))
+        assert told.totals.energy_j == pytest.approx(WEIGHT_N * 0.05 * 30)
+
+
+def test_what_lies_off_the_site_is_refused_by_name(tmp_path):
+    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x))
+    with closer:
+        for name, query in (
+            ("line", RouteQuery(((0.0, 0.0), (90_000.0, 0.0)))),
+            ("to", WayQuery((0.0, 0.0), (90_000.0, 0.0))),
+            ("from", WayQuery((0.0, -90_000.0), (0.0, 0.0))),
+            ("avoid", WayQuery((0.0, 0.0), (9.0, 0.0), avoid=((1e6, 0.0),))),
+        ):
+            with pytest.raises(QueryError, match=f"parameter `{name}`: .* is off the site"):
+                ask(answers, query)
