@@ -46,6 +46,7 @@ from protocol.queries.journal_piece import (
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.origin import Origin, decode_origin, encode_origin
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
+from protocol.queries.routing import RouteAnswer, RouteSteps, RouteTotals, decode_answer, encode_answer
 from protocol.wire import codec, correction_codec
 from protocol.wire.messages import (
     Ack,
@@ -232,6 +233,14 @@ JOURNAL = JournalPiece(
     (RowMessage(17, T0, codec.encode_batch(BATCH)), RowMessage(18, T0 + 1, codec.encode_batch(BATCH))),
     (EventMessage(4, "trust", T0, {"machine": "loader-1", "trusted": False, "by": "person", "reason": "drifts"}),),
 )
+ROUTE = RouteAnswer(
+    version=records.MapVersion(STORE, 17, 3),
+    stamp_ns=T0 + 9,
+    line_m=np.array([[0.0, 0.0], [30.0, 40.0]]),
+    totals=RouteTotals(50.0, 1.5, 0.5, 1e6, 9e5, 1.25e6, 2e5, 4e6, 20.0, 19.5, 21.0),
+    steps=RouteSteps(*(np.array([i + 0.5, i - 0.25]) for i in range(8)), np.array([0.75, np.nan]), *np.ones((5, 2))),
+)
+
 GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
     "batch_lost.bin": Golden(LOST, codec.encode_batch, decode_batch),
@@ -257,6 +266,7 @@ GOLDEN: dict[str, Golden] = {
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
     "why.bin": Golden(WHY, encode_why, decode_why),
+    "route.bin": Golden(ROUTE, encode_answer, decode_answer),
     "calibration.bin": Golden(CALIBRATION, encode_calibration, decode_calibration),
     "piece.bin": Golden(piece(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),

@@ -79,7 +79,7 @@ def test_every_parameter_and_limit_of_a_command_is_documented():
     assert undocumented(commands._WORDS, WIRE) == []
     assert f"at most {parameters.MAX_TEXT} characters" in WIRE
     assert f"More than {requests.MAX_SPANS} spans" in WIRE
-    assert requests.MAX_WAIT_S == commands.MAX_WAIT_S == 60
+    assert parameters.MAX_WAIT_S == commands.MAX_WAIT_S == 60
 
 
 EXAMPLES = re.findall(r"`sitegrid/paper/(map|admin)/(\w+)\?(.*?)`", WIRE)

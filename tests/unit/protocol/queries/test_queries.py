@@ -154,7 +154,7 @@ def test_bounds_of_an_answer_can_be_asked_again():
 @pytest.mark.parametrize(
     ("name", "parameters", "reason", "words"),
     [
-        ("route", {}, Refusal.UNKNOWN_QUERY, "route"),
+        ("weather", {}, Refusal.UNKNOWN_QUERY, "weather"),
         ("point", {"x": "1", "y": "2", "colour": "red"}, Refusal.UNKNOWN_PARAMETER, "colour"),
         ("info", {"layers": "resistance"}, Refusal.UNKNOWN_PARAMETER, "layers"),
         ("region", {"bounds": "0,0,1,1", "x": "1"}, Refusal.UNKNOWN_PARAMETER, "`x`"),
