@@ -23,6 +23,7 @@ from mapserver.roads.trend import trends
 from mapserver.roads.worklist import litres, ranked, seconds
 from protocol.arrays import Ints, Table
 from protocol.errors import QueryError, Refusal, StoreError
+from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries import roads as answers
 from protocol.queries.answers import MapVersion
 from protocol.queries.requests import RoadQuery, SegmentsQuery, WorklistQuery
@@ -55,35 +56,35 @@ class RoadMaps:
 
     def _begin(self, store: str, facts: Facts) -> None:
         """Follow the journal anew."""
-        self._tally, self._followed, self._of = Tally(), 0, (store, facts)
+        self._tally, self._followed, self._segments = Tally(), 0, (store, facts)
 
     def segments(self, query: SegmentsQuery) -> answers.Segments:
         """Roads, and what drove on them."""
-        of = self._read(query)
-        traffic, hours = _traffic(of, query)
-        rows = _Records(of.segments, traffic, losses(traffic, of.segments, 0.0), hours)
-        chosen = _inside(of.segments, query.bounds)
-        version = (of.version.store, of.version.row, of.version.fact, of.stamp_ns)
+        roads = self._read(query)
+        traffic, hours = _traffic(roads, query)
+        rows = _Records(roads.segments, traffic, losses(traffic, roads.segments, 0.0), hours)
+        chosen = _inside(roads.segments, query.bounds)
+        version = (roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns)
         return answers.Segments(*version, hours, traffic.placed, tuple(rows(i) for i in chosen))
 
     def worklist(self, query: WorklistQuery) -> answers.Worklist:
         """Where work pays."""
-        of = self._read(query)
-        traffic, hours = _traffic(of, query)
-        lost = losses(traffic, of.segments, query.target)
+        roads = self._read(query)
+        traffic, hours = _traffic(roads, query)
+        lost = losses(traffic, roads.segments, query.target)
         rows, listed, inside = (
-            _Records(of.segments, traffic, lost, hours),
+            _Records(roads.segments, traffic, lost, hours),
             ranked(lost),
-            _inside(of.segments, query.bounds),
+            _inside(roads.segments, query.bounds),
         )
         work = np.stack([lost.work_j, lost.low_j, lost.high_j]) / max(hours, 1e-9)
         kg = lost.kg.mean(axis=1)
-        out = []
+        out: list[answers.WorklistRow] = []
         for i, rank in zip(listed.order.tolist(), listed.rank.tolist(), strict=True):
             if i in inside and len(out) < query.limit:
                 of_it = (work[:, i] / 3.6e6, litres(work[:, i], query.efficiency), seconds(work[:, i], kg[i]))
                 out.append(answers.WorklistRow(rank, rows(i), *(tuple(values.tolist()) for values in of_it)))
-        version = (of.version.store, of.version.row, of.version.fact, of.stamp_ns)
+        version = (roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns)
         total = float(work[0, sorted(inside)].sum() / 3.6e6)
         return answers.Worklist(*version, hours, query.target, total, tuple(out))
 
@@ -101,7 +102,7 @@ class RoadMaps:
         pages, version, facts, newest_ns = self._source.run(_all)
         if self._made and self._made.version == version:
             return self._made
-        if self._of != (version.store, facts):
+        if self._segments != (version.store, facts):
             self._begin(version.store, facts)
         self._follow(self._tally, facts, newest_ns, self._followed, version.row)
         self._followed = version.row
@@ -114,19 +115,19 @@ class RoadMaps:
         tally = Tally()
         with self._source.location.reader() as reader:
             grid = self._source.past.grid_as_of(reader, as_of_ns, None, facts)
-            stamp_ns = min(as_of_ns, grid.newest_ns or as_of_ns)
-            self._follow(tally, facts, stamp_ns, 0, version.row)
+            self._follow(tally, facts, as_of_ns, 0, version.row, as_of_ns)
         roads = segments(network(Skeletons(self._cell_m).skeleton(_pages(grid))))
         return self._map(roads, tally, version, as_of_ns)
 
-    def _follow(self, tally: Tally, facts: Facts, newest_ns: int, after: int, until: int) -> None:
-        """Take journal rows after < row <= until into a tally, of samples up to a stamp."""
+    def _follow(
+        self, tally: Tally, facts: Facts, newest_ns: int, after: int, until: int, to_ns: int = MAX_STAMP_NS
+    ) -> None:
+        """Take journal rows after < row <= until into a tally, of samples up to `to_ns`."""
         if after >= until:
             return
         begin_ns = max(0, newest_ns - LOOK_BACK_NS) // HOUR_NS * HOUR_NS
-        to = {} if after or tally is self._tally else {"to_ns": newest_ns}
         with self._source.location.reader() as reader:
-            selection = Selection.by(facts, begin_ns, **to)
+            selection = Selection.by(facts, begin_ns, to_ns)
             for samples, names in self._source.past.samples(reader, selection, after, until):
                 sure = is_foldable(samples, self._config.fold)
                 tally.add(samples[sure], names[sure])
@@ -161,21 +162,21 @@ def _require_on_site(bounds: Bounds | None, extent_m: float) -> None:
         raise QueryError(Refusal.OUT_OF_RANGE, problem)
 
 
-def _traffic(of: RoadMap, query: RoadQuery) -> tuple[Ledger, float]:
+def _traffic(roads: RoadMap, query: RoadQuery) -> tuple[Ledger, float]:
     """The ledger of a query's hours, and how many hours with driving these are, the running one in part."""
     from_ns, to_ns = query.from_ns or 0, query.to_ns or 2**62
-    traffic = of.ledgers.ledger(of.tally, HOUR_NS, from_ns // HOUR_NS * HOUR_NS, to_ns)
+    traffic = roads.ledgers.ledger(roads.tally, HOUR_NS, from_ns // HOUR_NS * HOUR_NS, to_ns)
     slots = np.unique(traffic.rows["slot"])
-    ends = np.minimum((slots + 1) * HOUR_NS, max(of.stamp_ns, 1))
+    ends = np.minimum((slots + 1) * HOUR_NS, max(roads.stamp_ns, 1))
     hours = float(np.maximum(ends - slots * HOUR_NS, 0).sum() / HOUR_NS)
     return traffic, hours
 
 
-def _inside(of: Segments, bounds: Bounds | None) -> set[int]:
+def _inside(roads: Segments, bounds: Bounds | None) -> set[int]:
     """Segments whose middle lies in a rectangle."""
     if bounds is None:
-        return set(range(len(of.ids)))
-    middle = of.points[(of.ends[:-1] + of.ends[1:]) // 2] if len(of.ids) else of.points
+        return set(range(len(roads.ids)))
+    middle = roads.points[(roads.ends[:-1] + roads.ends[1:]) // 2] if len(roads.ids) else roads.points
     x, y = middle.T
     within = (x >= bounds.west_m) & (x < bounds.east_m) & (y >= bounds.south_m) & (y < bounds.north_m)
     return set(np.flatnonzero(within).tolist())
@@ -184,20 +185,20 @@ def _inside(of: Segments, bounds: Bounds | None) -> set[int]:
 class _Records:
     """Records of segments, by number."""
 
-    def __init__(self, of: Segments, traffic: Ledger, lost: Losses, hours: float) -> None:
-        self._of, self._lost, self._hours = of, lost, max(hours, 1e-9)
+    def __init__(self, roads: Segments, traffic: Ledger, lost: Losses, hours: float) -> None:
+        self._segments, self._lost, self._hours = roads, lost, max(hours, 1e-9)
         self._trends = trends(traffic)
         machines = traffic.totals()["machines"]
         self._machines: Ints = np.bitwise_count(machines[:, 0] | machines[:, 1]).astype(np.int64)
 
     def __call__(self, i: int) -> answers.RoadSegment:
-        lost, line = self._lost, self._of.line(i)
+        lost, line = self._lost, self._segments.line(i)
         passes = lost.passes[i] / self._hours
         some = np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2)
         return answers.RoadSegment(
-            id=self._of.ids[i],
+            id=self._segments.ids[i],
             line=tuple(tuple(point) for point in some.tolist()),
-            length_m=float(self._of.length_m[i]),
+            length_m=float(self._segments.length_m[i]),
             resistance=_known(lost.c_rr[i]),
             resistance_std=_known(lost.c_std[i]),
             grade=_known(lost.grade[i]),

@@ -85,21 +85,21 @@ def _inside_m(tally: Table, which: Ints, count: int) -> Floats:
 
 def _grouped(keys: Ints, rows: Table) -> Table:
     """Sum what has the same segment, slot and direction."""
-    unique, of = np.unique(keys, axis=0, return_inverse=True)
+    unique, group = np.unique(keys, axis=0, return_inverse=True)
     out = np.zeros(len(unique), LEDGER)
     for index, name in enumerate(KEYS):
         out[name] = unique[:, index]
     for name in PLACED:
-        np.add.at(out[name], of.ravel(), rows[name])
-    np.bitwise_or.at(out["machines"], of.ravel(), rows["machines"])
+        np.add.at(out[name], group.ravel(), rows[name])
+    np.bitwise_or.at(out["machines"], group.ravel(), rows["machines"])
     return out
 
 
-def resistance(of: Ledger) -> Floats:
+def resistance(ledger: Ledger) -> Floats:
     """c_rr (s,) of slices, both directions; gaps of a segment between its neighbours, NaN where it has none at all."""
-    known = of.of_slices("measured").sum(axis=1)
-    c = np.where(known > 0, of.of_slices("c").sum(axis=1) / np.maximum(known, 1) / PER_C, np.nan)
-    return filled(c, of.ends)
+    known = ledger.of_slices("measured").sum(axis=1)
+    c = np.where(known > 0, ledger.of_slices("c").sum(axis=1) / np.maximum(known, 1) / PER_C, np.nan)
+    return filled(c, ledger.ends)
 
 
 def filled(values: Floats, ends: Ints) -> Floats:
