@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from evaluation.fleet.cases import Rows
 from evaluation.fleet.drives import FleetDrive, Scene
 from evaluation.fleet.solving import calibrated, of_machine
-from evaluation.roads.truth import TrueTrack, TrueTraffic, true_tracks, true_traffic
+from evaluation.roads.truth import TrueTrack, TrueTraffic, true_passes, true_tracks, true_traffic
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import corrected
@@ -36,6 +36,8 @@ TOP = 10
 CHANGED = (1.5, 4.0)  # factors of c_rr that a repair is judged by
 UNTOUCHED = 1.1  # less is no change: its share of a segment lies at a border
 SEEN = (2, 3)  # passes after which a repair should be seen
+SHARE_OFF = 0.1  # of metres that go in one direction: more is the wrong direction
+MINUTE_NS = 60_000_000_000
 STEP_M = 0.02  # in a tenth of a second: a machine that moves
 EVERYWHERE = CellWindow(-20_000, -20_000, 40_000, 40_000)
 
@@ -130,13 +132,13 @@ def traffic_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
     metres = ledger.totals()["metres"] / PER_M
     judged: Bools = true.metres.sum(axis=1) > LEAST_PASSES * whole.length_m
     ratio = metres.sum(axis=1)[judged] / true.metres.sum(axis=1)[judged]
-    forward = np.sign(np.diff(metres, axis=1)) == np.sign(np.diff(true.metres, axis=1))
+    share, right = (each[judged, 0] / each[judged].sum(axis=1) for each in (metres, true.metres))
     measured = judged & np.isfinite(known.c_rr) & np.isfinite(true.c_rr)
     off = (known.c_rr - true.c_rr)[measured]
     return {
         "segments": int(judged.sum()),
         "passes_pct": 100.0 * float((np.abs(ratio - 1) < 0.1).mean()),
-        "direction_pct": 100.0 * float(forward[judged].mean()),
+        "direction_pct": 100.0 * float((np.abs(share - right) < SHARE_OFF).mean()),
         "c_pct": 100.0 * float(np.sqrt(np.mean((off / true.c_rr[measured]) ** 2))),
         "c_median_pct": 100.0 * float(np.median(np.abs(off / true.c_rr[measured]))),
         "inside_pct": 100.0 * float((np.abs(off) <= SIGMA_90 * known.c_std[measured]).mean()),
@@ -174,19 +176,20 @@ def repair_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
         kept.add(table, np.full(len(table), name_hash(name), np.uint64))
     passes = kept.passes(ledgers)
     shown, looks = repairs(passes)
-    half_ns, tracks = recorded.half_ns, recorded.tracks.values()
+    half_ns, tracks = recorded.half_ns, tuple(recorded.tracks.values())
     halves = ((0, half_ns), (half_ns, 2**62))
     before, after = (true_traffic(tracks, ledgers, TARGET, *half) for half in halves)
     factor = np.maximum(before.c_rr / after.c_rr, after.c_rr / before.c_rr)
-    half_minute = half_ns // 60_000_000_000
+    half_minute = half_ns // MINUTE_NS
     repaired = np.flatnonzero((factor >= CHANGED[0]) & (factor <= CHANGED[1]))
     seen_by = {each.segment: each.seen for each in reversed(shown) if each.minute >= half_minute - 1}
     needed, judged = [], []
     for segment in repaired.tolist():
-        later = passes.minute[(passes.segment == segment) & (passes.minute >= half_minute)]
-        if len(later) >= SEEN[-1]:
+        later_ns = np.sort(np.concatenate([true_passes(track, ledgers, segment, half_ns) for track in tracks]))
+        if len(later_ns) > SEEN[-1]:
             judged.append(segment)
-            needed.append(int((later <= seen_by[segment]).sum()) if segment in seen_by else 10**6)
+            seen_ns = (seen_by[segment] + 1) * MINUTE_NS if segment in seen_by else half_ns
+            needed.append(int((later_ns < seen_ns).sum()) or len(later_ns) + 1)
     false = [each for each in shown if factor[each.segment] < UNTOUCHED or each.minute < half_minute - 1]
     saved = [
         losses(Ledgers(whole).ledger(tally_of(part).table(), Tally().slot_ns), whole, TARGET).work_j

@@ -70,3 +70,14 @@ def true_traffic(
         np.add.at(slices[1], at.slice[own], step * c_rr)
     with np.errstate(invalid="ignore"):
         return TrueTraffic(metres, mean(slices[1] / slices[0], ends), work)
+
+
+def true_passes(track: TrueTrack, ledgers: Ledgers, segment: int, from_ns: int) -> Ints:
+    """Stamps at which a machine had passed over half of a segment or more, from a stamp on."""
+    later = track.stamp_ns >= from_ns
+    inside = ledgers.place(track.place_m[later], track.heading_rad[later]).segment == segment
+    begins = np.flatnonzero(np.diff(inside.astype(np.int64), prepend=0) == 1)
+    ends = np.flatnonzero(np.diff(inside.astype(np.int64), append=0) == -1)
+    driven = np.cumsum(track.step_m[later])
+    whole = driven[ends] - driven[begins] >= ledgers.segments.length_m[segment] / 2
+    return np.asarray(track.stamp_ns[later][ends[whole]], np.int64)

@@ -40,9 +40,9 @@ def repairs(passes: Passes) -> tuple[list[Repair], int]:
     bounds = np.flatnonzero(np.diff(passes.segment, prepend=-1, append=-1))
     for first, end in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         own = slice(first, end)
-        found_here, looked = _of_segment(passes.c_rr[own], passes.machine[own])
+        changes, looked = _of_segment(passes.c_rr[own], passes.machine[own])
         looks += looked
-        for at, seen, begin, stop in found_here:
+        for at, seen, begin, stop in changes:
             before, after = passes.c_rr[own][begin:at], passes.c_rr[own][at:stop]
             minute, seen_minute = passes.minute[own][[at, seen]].tolist()
             segment = int(passes.segment[first])
