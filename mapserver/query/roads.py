@@ -16,12 +16,14 @@ from mapserver.query.source import MapSource, MapState
 from mapserver.roads.ledger import Ledger, Ledgers
 from mapserver.roads.loss import Losses, losses
 from mapserver.roads.network import network
+from mapserver.roads.passes import MINUTE_NS, PassTally
+from mapserver.roads.repairs import Repair, repairs
 from mapserver.roads.segments import Segments, segments
 from mapserver.roads.skeleton import Pages, Skeletons
 from mapserver.roads.tally import HOUR_NS, Tally, slot
 from mapserver.roads.trend import trends
 from mapserver.roads.worklist import litres, ranked, seconds
-from protocol.arrays import Ints, Table
+from protocol.arrays import Floats, Ints, Table
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries import roads as answers
@@ -40,8 +42,16 @@ class RoadMap:
     segments: Segments
     ledgers: Ledgers
     tally: Table
+    changes: tuple[Repair, ...]
     version: MapVersion
     stamp_ns: int
+
+
+class _Traffic:
+    """What drove, in sums by hour and by pass."""
+
+    def __init__(self) -> None:
+        self.tally, self.passes = Tally(), PassTally()
 
 
 class RoadMaps:
@@ -56,7 +66,7 @@ class RoadMaps:
 
     def _begin(self, store: str, facts: Facts) -> None:
         """Follow the journal anew."""
-        self._tally, self._followed, self._segments = Tally(), 0, (store, facts)
+        self._traffic, self._followed, self._with = _Traffic(), 0, (store, facts)
 
     def segments(self, query: SegmentsQuery) -> answers.Segments:
         """Roads, and what drove on them."""
@@ -71,7 +81,9 @@ class RoadMaps:
         """Where work pays."""
         roads = self._read(query)
         traffic, hours = _traffic(roads, query)
-        lost = losses(traffic, roads.segments, query.target)
+        before, after = _levels(roads)
+        lost = losses(traffic, roads.segments, query.target, after)
+        saved_j = losses(traffic, roads.segments, query.target, before).work_j - lost.work_j
         rows, listed, inside = (
             _Records(roads.segments, traffic, lost, hours),
             ranked(lost),
@@ -86,7 +98,20 @@ class RoadMaps:
                 out.append(answers.WorklistRow(rank, rows(i), *(tuple(values.tolist()) for values in of_it)))
         version = (roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns)
         total = float(work[0, sorted(inside)].sum() / 3.6e6)
-        return answers.Worklist(*version, hours, query.target, total, tuple(out))
+        changes = [
+            answers.RoadChange(
+                roads.segments.ids[change.segment],
+                rows(change.segment).line,
+                change.minute * MINUTE_NS,
+                (change.seen + 1) * MINUTE_NS,
+                change.before,
+                change.after,
+                float(saved_j[change.segment] / max(hours, 1e-9) / 3.6e6),
+            )
+            for change in roads.changes
+            if change.segment in inside
+        ]
+        return answers.Worklist(*version, hours, query.target, total, tuple(out), tuple(changes))
 
     def _read(self, query: RoadQuery) -> RoadMap:
         _require_on_site(query.bounds, self._source.site.extent_m)
@@ -102,27 +127,27 @@ class RoadMaps:
         pages, version, facts, newest_ns = self._source.run(_all)
         if self._made and self._made.version == version:
             return self._made
-        if self._segments != (version.store, facts):
+        if self._with != (version.store, facts):
             self._begin(version.store, facts)
-        self._follow(self._tally, facts, newest_ns, self._followed, version.row)
+        self._follow(self._traffic, facts, newest_ns, self._followed, version.row)
         self._followed = version.row
         roads = segments(network(self._skeletons.skeleton(pages)))
-        self._made = self._map(roads, self._tally, version, newest_ns)
+        self._made = self._map(roads, self._traffic, version, newest_ns)
         return self._made
 
     def _as_of(self, as_of_ns: int) -> RoadMap:
         version, facts = self._source.run(lambda state: (state.version, state.facts))
-        tally = Tally()
+        traffic = _Traffic()
         with self._source.location.reader() as reader:
             grid = self._source.past.grid_as_of(reader, as_of_ns, None, facts)
-            self._follow(tally, facts, as_of_ns, 0, version.row, as_of_ns)
+            self._follow(traffic, facts, as_of_ns, 0, version.row, as_of_ns)
         roads = segments(network(Skeletons(self._cell_m).skeleton(_pages(grid))))
-        return self._map(roads, tally, version, as_of_ns)
+        return self._map(roads, traffic, version, as_of_ns)
 
     def _follow(
-        self, tally: Tally, facts: Facts, newest_ns: int, after: int, until: int, to_ns: int = MAX_STAMP_NS
+        self, traffic: _Traffic, facts: Facts, newest_ns: int, after: int, until: int, to_ns: int = MAX_STAMP_NS
     ) -> None:
-        """Take journal rows after < row <= until into a tally, of samples up to `to_ns`."""
+        """Take journal rows after < row <= until into the traffic, of samples up to `to_ns`."""
         if after >= until:
             return
         begin_ns = max(0, newest_ns - LOOK_BACK_NS) // HOUR_NS * HOUR_NS
@@ -130,14 +155,17 @@ class RoadMaps:
             selection = Selection.by(facts, begin_ns, to_ns)
             for samples, names in self._source.past.samples(reader, selection, after, until):
                 sure = is_foldable(samples, self._config.fold)
-                tally.add(samples[sure], names[sure])
+                traffic.tally.add(samples[sure], names[sure])
+                traffic.passes.add(samples[sure], names[sure])
 
-    def _map(self, roads: Segments, tally: Tally, version: MapVersion, stamp_ns: int) -> RoadMap:
+    def _map(self, roads: Segments, traffic: _Traffic, version: MapVersion, stamp_ns: int) -> RoadMap:
         """Put together; the look back is cut here, where it does not depend on when the journal was followed."""
-        table = tally.table()
+        table, ledgers = traffic.tally.table(), Ledgers(roads)
         first = max(0, stamp_ns - LOOK_BACK_NS) // HOUR_NS
         table = table[slot(table["key"]) >= first]
-        return RoadMap(roads, Ledgers(roads), table, version, stamp_ns)
+        changes, _ = repairs(traffic.passes.passes(ledgers, first * HOUR_NS))
+        newest_first = tuple(sorted(changes, key=lambda change: (-change.seen, change.segment)))
+        return RoadMap(roads, ledgers, table, newest_first, version, stamp_ns)
 
 
 def _all(state: MapState) -> tuple[Pages, MapVersion, Facts, int]:
@@ -170,6 +198,14 @@ def _traffic(roads: RoadMap, query: RoadQuery) -> tuple[Ledger, float]:
     ends = np.minimum((slots + 1) * HOUR_NS, max(roads.stamp_ns, 1))
     hours = float(np.maximum(ends - slots * HOUR_NS, 0).sum() / HOUR_NS)
     return traffic, hours
+
+
+def _levels(roads: RoadMap) -> tuple[Floats, Floats]:
+    """c_rr of segments (k,) before and after their last change, NaN where there was none."""
+    before, after = np.full((2, len(roads.segments.ids)), np.nan)
+    for change in reversed(roads.changes):  # the newest last
+        before[change.segment], after[change.segment] = change.before, change.after
+    return before, after
 
 
 def _inside(roads: Segments, bounds: Bounds | None) -> set[int]:

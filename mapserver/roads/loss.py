@@ -45,8 +45,11 @@ class Losses:
     passes: Floats
 
 
-def losses(ledger: Ledger, segments: Segments, target: float) -> Losses:
-    """What was lost on each segment against ground of a target c_rr."""
+def losses(ledger: Ledger, segments: Segments, target: float, level: Floats | None = None) -> Losses:
+    """What was lost on each segment against ground of a target c_rr.
+
+    level (k,): c_rr of segments in place of what was measured, which was before or after a repair; NaN for the others.
+    """
     owner = np.repeat(np.arange(len(segments.ids)), np.diff(ledger.ends))
     metres, weighed, kg_m = (ledger.of_slices(name).astype(np.float64) / PER_M for name in ("metres", "weighed", "kg"))
     known_kg = kg_m.sum() / weighed.sum() if weighed.any() else GUESSED_KG
@@ -55,6 +58,9 @@ def losses(ledger: Ledger, segments: Segments, target: float) -> Losses:
     segment_kg = np.where(_by_segment(weighed, ledger.ends) > 0, segment_kg, known_kg)
     kg = np.where(weighed > 0, kg_m / np.maximum(weighed, 1e-9), segment_kg[owner])
     c, slope = resistance(ledger), _slope(ledger, segments, owner)
+    if level is not None:
+        share = level / mean(c, ledger.ends)
+        c = c * np.where(np.isfinite(share) & (share > 0), share, 1.0)[owner]
     load = kg * metres * GRAVITY_MPS2  # of all passes, newton metres per unit of c_rr
     std = _std(ledger)
     slopes = np.stack([slope, -slope], axis=1)

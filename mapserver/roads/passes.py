@@ -17,6 +17,7 @@ from mapserver.roads.segments import LATTICE_M
 from mapserver.roads.tally import PER_C, PER_M, Tally
 from protocol.arrays import Floats, Ints, Table
 
+MINUTE_NS = VISIT_NS
 MINUTES = 3 * 24 * 60  # with driving, of each machine, that are remembered
 ONE_PASS = 1.3  # of a segment's length: more in two minutes are two passes
 LEAST_M = 8.0  # measured on a segment, for a pass to say what its c_rr is
@@ -42,14 +43,14 @@ class PassTally:
     def add(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Add samples (n,) as `Tally.add`."""
         for name in np.unique(names).tolist():
-            own = self._machines.setdefault(name, Tally(VISIT_NS, MINUTES, LATTICE_M / 2))
+            own = self._machines.setdefault(name, Tally(MINUTE_NS, MINUTES, LATTICE_M / 2))
             own.add(rows[names == name], names[names == name])
 
-    def passes(self, ledgers: Ledgers) -> Passes:
-        """All passes over these segments of which c_rr is known."""
+    def passes(self, ledgers: Ledgers, from_ns: int = 0) -> Passes:
+        """All passes over these segments, from a time on, of which c_rr is known."""
         parts = []
         for number, (_, tally) in enumerate(sorted(self._machines.items())):
-            ledger = ledgers.ledger(tally.table(), tally.slot_ns, cell_m=tally.cell_m)
+            ledger = ledgers.ledger(tally.table(), tally.slot_ns, from_ns, cell_m=tally.cell_m)
             rows = _joined(ledger.rows, ledgers.segments.length_m)
             rows = rows[rows["measured"] >= LEAST_M * PER_M]
             c_rr = rows["c"] / (rows["measured"] * float(PER_C))

@@ -196,7 +196,7 @@ def _segments(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answe
 def _worklist(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     answer = client.worklist(arguments.target, **_road_times(client, arguments))
     total = f"{answer.total_kwh_ph:.2f} kWh/h lost on all roads against a resistance of {answer.target:g}"
-    if not answer.rows:
+    if not answer.rows and not answer.changes:
         return answer, [f"{total}: no stretch is worse for sure"]
     head = ["", "stretch", "around", "kWh/h", "low..high", "l/h", "s/h", "resistance", "+-", "a day", "machines"]
     rows = (
@@ -216,6 +216,11 @@ def _worklist(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answe
     lines = [f"{total}, traffic of {answer.hours:.2f} h", *_table(head, rows)]
     if any(row.segment.guessed for row in answer.rows):
         lines.append("no machine stated its mass on some of them: what is lost there is a guess")
+    lines += [
+        f"{utc_text(one.first_ns)} {one.id}: resistance {_value(one.before)} -> {_value(one.after)}, "
+        f"saves {one.saved_kwh_ph:.2f} kWh/h"
+        for one in answer.changes
+    ]
     return answer, lines
 
 

@@ -47,6 +47,7 @@ from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encod
 from protocol.queries.origin import Origin, decode_origin, encode_origin
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
 from protocol.queries.roads import (
+    RoadChange,
     RoadSegment,
     Segments,
     Worklist,
@@ -259,6 +260,7 @@ WORKLIST = Worklist(
     0.02,
     4.5,
     (WorklistRow(1, STRETCH, (3.5, 3.25, 3.75), (1.0, 0.75, 1.25), (48.0, 45.0, 51.0)),),
+    (RoadChange("3_-2_ne", STRETCH.line, T0, T0 + 60 * 10**9, 0.0625, 0.03125, 2.5),),
 )
 JOURNAL = JournalPiece(
     STORE,

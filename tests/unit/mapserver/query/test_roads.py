@@ -190,3 +190,27 @@ def test_traffic_of_one_stamp_is_no_division_by_nothing(tmp_path):
         send(opened, [incoming(rows)])
         answer = worklist(answers_of(opened))
     assert all(np.isfinite(row.kwh_ph).all() for row in answer.rows)
+
+
+def test_a_repair_is_told_and_counts(tmp_path):
+    bad = {name: passes(LINE, 4, 0.06, seed=i, after_s=30.0 * i) for i, name in enumerate("ab")}
+    good = {name: passes(LINE, 2, 0.02, seed=i, after_s=600.0 + 30.0 * i) for i, name in enumerate("ab", 7)}
+    with closing(open_writer(tmp_path)) as opened:
+        for machine, rows in bad.items():
+            send(opened, [incoming(rows, machine=machine)])
+        answers = answers_of(opened)
+        before = worklist(answers, target=0.03)
+        assert before.rows
+        assert before.changes == ()
+        for machine, rows in good.items():
+            send(opened, [incoming(rows, 1 + len(bad[machine]), machine=machine)])
+        after = worklist(answers, target=0.03)
+        then = worklist(answers, target=0.03, as_of_ns=int(max(rows["stamp_ns"].max() for rows in bad.values())))
+    assert after.rows == ()
+    assert {change.id for change in after.changes} == {row.segment.id for row in before.rows}
+    for change in after.changes:
+        assert (change.before, change.after) == (pytest.approx(0.06, rel=0.1), pytest.approx(0.02, rel=0.1))
+        assert START_NS + 500 * 10**9 < change.first_ns < change.seen_ns
+        assert change.saved_kwh_ph > 0
+    assert then.changes == ()
+    assert [row.segment.id for row in then.rows] == [row.segment.id for row in before.rows]
