@@ -77,7 +77,7 @@ def _colour(one: RoadSegment, target: float) -> Colour:
 def _pixels(axes: Axes, line: Floats, height: int) -> Ints:
     x = (line[:, 0] - axes.bounds.west_m) * axes.px_per_m
     y = height - (line[:, 1] - axes.bounds.south_m) * axes.px_per_m
-    return np.rint(np.stack([x, y], axis=1)).astype(np.int32)  # type: ignore[return-value]
+    return np.rint(np.stack([x, y], axis=1)).astype(np.int32)
 
 
 def _line(ground: Image, axes: Axes, one: RoadSegment, colour: Colour, thick: int) -> None:
