@@ -92,13 +92,17 @@ def _inside_m(tally: Table, which: Ints, count: int) -> Floats:
 
 def _grouped(keys: Ints, rows: Table) -> Table:
     """Sum what has the same segment, slot and direction."""
-    unique, group = np.unique(keys, axis=0, return_inverse=True)
-    out = np.zeros(len(unique), LEDGER)
+    out, order = np.zeros(0, LEDGER), np.lexsort(keys.T[::-1])
+    if not len(rows):
+        return out
+    keys, rows = keys[order], rows[order]
+    first = np.flatnonzero(np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1)))
+    out = np.zeros(len(first), LEDGER)
     for index, name in enumerate(KEYS):
-        out[name] = unique[:, index]
+        out[name] = keys[first, index]
     for name in PLACED:
-        np.add.at(out[name], group.ravel(), rows[name])
-    np.bitwise_or.at(out["machines"], group.ravel(), rows["machines"])
+        out[name] = np.add.reduceat(rows[name], first)
+    out["machines"] = np.bitwise_or.reduceat(rows["machines"], first)
     return out
 
 

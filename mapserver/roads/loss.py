@@ -22,7 +22,7 @@ SIGMA_90 = 1.645
 # balance of forces leaves out the wind and the tyres.
 ZERO_STD, MODEL_SHARE = 0.003, 0.06
 CORRELATED_M = 10.0  # errors of one pass are alike over so much of the way
-GAP_SHARE = 0.35  # of its own spread, and of c_rr, by which a slice that nobody measured is off
+GAP_SHARE = 0.35  # of c_rr, by which a slice that nobody measured is off
 
 
 @dataclass(frozen=True)
