@@ -11,7 +11,7 @@ COPY evaluation evaluation
 COPY benchmarks benchmarks
 COPY sitegrid sitegrid
 RUN /venv/bin/pip install --no-cache-dir --disable-pip-version-check \
-    --constraint constraints.txt ".[agent,server,sim,export,security]"
+    --constraint constraints.txt ".[agent,server,postgres,sim,export,security]"
 
 FROM python:3.11-slim
 RUN useradd --uid 10001 --create-home sitegrid \

@@ -14,6 +14,7 @@ from benchmarks.fleets import fleet, follow
 from benchmarks.folds import archive
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
+from benchmarks.scaling import sizes
 from benchmarks.web import pages as web
 
 
@@ -80,6 +81,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         web.run,
         "the web server: what open pages cost, how soon they show what came in, tiles for other tools",
         {"hours": HOURS, "seconds": 20.0},
+    ),
+    "sizes": (
+        sizes.run,
+        "bytes per sample on a link, in journal and archive, and what an agent's link carries",
+        {"samples": 60_000, "seconds": 60.0},
     ),
     "sim": (sim.run, "simulated time of small and large fleets, sensors on", {"runs": 5, "seconds": 20.0}),
     "filter": (

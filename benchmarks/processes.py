@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -49,19 +49,32 @@ def process(*words: str) -> Iterator[int]:
 
 
 @contextmanager
-def served(folder: Path, site: SiteConfig, options: str = OPTIONS) -> Iterator[tuple[str, int]]:
-    """A router, and a map server with a store in the folder; gives the router's endpoint and the server's process id.
+def routed() -> Iterator[tuple[str, int]]:
+    """A router; gives its endpoint and its process id."""
+    endpoint = free_endpoint()
+    with process("sitegrid.cli", "router", "--listen", endpoint) as pid:
+        yield endpoint, pid
 
-    options: of the server's configuration file.
+
+@contextmanager
+def serving(endpoint: str, folder: Path, site: SiteConfig, options: str = OPTIONS) -> Iterator[int]:
+    """A map server with a store in the folder, at a router; gives its process id.
+
+    options: of its configuration file.
     """
     site_file, config = folder / "site.toml", folder / "server.toml"
     site_file.write_text("\n".join(toml_lines(asdict(site))))
     config.write_text(options)
-    with ExitStack() as opened:
-        endpoint = free_endpoint()
-        opened.enter_context(process("sitegrid.cli", "router", "--listen", endpoint))
-        where = ("--endpoint", endpoint, "--site-file", str(site_file), "--store", str(folder), "--config", str(config))
-        yield endpoint, opened.enter_context(process("sitegrid.cli", "server", *where))
+    where = ("--endpoint", endpoint, "--site-file", str(site_file), "--store", str(folder), "--config", str(config))
+    with process("sitegrid.cli", "server", *where) as pid:
+        yield pid
+
+
+@contextmanager
+def served(folder: Path, site: SiteConfig, options: str = OPTIONS) -> Iterator[tuple[str, int]]:
+    """Both; gives the router's endpoint and the server's process id."""
+    with routed() as (endpoint, _), serving(endpoint, folder, site, options) as pid:
+        yield endpoint, pid
 
 
 @contextmanager

@@ -69,7 +69,8 @@ class Server:
         """
         self._sign = sign
         with ExitStack() as opened:
-            self._claim = claim = WriterClaim(ingest, site.name, location.store_id(), shared=location.is_shared)
+            store = location.prepared_id(site.name, site.frame)
+            self._claim = claim = WriterClaim(ingest, site.name, store, shared=location.is_shared)
             opened.callback(self._claim.close)
             self._claim.acquire(take_over=take_over)
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from benchmarks.measure import Report, machine
+from benchmarks.measure import Report, machine, memory_mb
 from benchmarks.merge_restart import SITE, build
 from benchmarks.merge_work import BATCH, DAY_NS, drive, samples_of
-from benchmarks.processes import processor_s, served, session, settle
+from benchmarks.processes import processor_s, routed, serving, session, settle
 from protocol.arrays import Table
 from protocol.errors import Refusal
 from protocol.wire import keys
@@ -63,16 +63,17 @@ def run(machines: int, seconds: float, hours: float) -> Report:
 
     Rows: load (paced: a batch per machine and second; saturated: the next as soon as one is acknowledged), samples per
     second that were acknowledged, batches that were refused, milliseconds until a batch is acknowledged, processor
-    time of the server, and what it has written to disk.
+    time of server and router, the most memory that each had so far, and what the server has written to disk.
     """
     with tempfile.TemporaryDirectory() as path, ExitStack() as opened:
         build(Path(path), samples_of(hours) // BATCH, tail_rows=0)
-        endpoint, server = opened.enter_context(served(Path(path), SITE))
+        endpoint, router = opened.enter_context(routed())
+        server = opened.enter_context(serving(endpoint, Path(path), SITE))
         links = [opened.enter_context(session(endpoint)) for _ in range(min(machines, SESSIONS))]
         fleet = [Machine(f"loader-{i:04d}", links[i % len(links)], samples(i)) for i in range(machines)]
         settle(server)
         rows = [
-            {"load": name, "machines": machines, **_measured(server, fleet, seconds, period_s)}
+            {"load": name, "machines": machines, **_measured(server, router, fleet, seconds, period_s)}
             for name, period_s in (("paced", PERIOD_S), ("saturated", 0.0))
         ]
     return {"benchmark": "fleet", "hours": hours, "seconds": seconds, **machine(), "goals": GOALS, "rows": rows}
@@ -86,16 +87,21 @@ def samples(seed: int) -> Iterator[Table]:
             yield leg[first : first + SAMPLES]
 
 
-def _measured(server: int, fleet: Sequence[Machine], seconds: float, period_s: float) -> dict[str, float]:
-    cpu_s, written, start_s = processor_s(server), _written_bytes(server), time.monotonic()
+def _measured(server: int, router: int, fleet: Sequence[Machine], seconds: float, period_s: float) -> dict[str, float]:
+    before = [processor_s(pid) for pid in (server, router)]
+    written, start_s = _written_bytes(server), time.monotonic()
     result = send(fleet, seconds, period_s)
     took_s = time.monotonic() - start_s
+    cores = [(processor_s(pid) - cpu_s) / took_s for pid, cpu_s in zip((server, router), before, strict=True)]
     return {
         "samples_per_s": round(result.samples / took_s, 1),
         "refused": result.refused,
         "ack_ms_p50": round(float(np.percentile(result.ms, 50)), 1),
         "ack_ms_p99": round(float(np.percentile(result.ms, 99)), 1),
-        "server_cores": round((processor_s(server) - cpu_s) / took_s, 3),
+        "server_cores": round(cores[0], 3),
+        "router_cores": round(cores[1], 3),
+        "server_mb": round(memory_mb("VmHWM", server)),
+        "router_mb": round(memory_mb("VmHWM", router)),
         "disk_mb_per_s": round((_written_bytes(server) - written) / took_s / 1e6, 2),
     }
 

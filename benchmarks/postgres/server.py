@@ -10,7 +10,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +103,7 @@ class Cluster:
         words = [str(self._bin / "postgres"), "-D", str(self.data)]
         words += [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
         log = (self.folder / "log").open("ab")
-        self._process = subprocess.Popen(words, stdout=log, stderr=log, cwd=self.folder, **_as_user())  # noqa: S603
+        self._process = subprocess.Popen(words, stdout=log, stderr=log, cwd=self.folder, **as_user())  # noqa: S603
         log.close()
         end_s = time.monotonic() + START_S
         while True:
@@ -150,8 +150,8 @@ class Cluster:
 
     def _run(self, name: str, *words: object) -> None:
         command = [str(self._bin / name), *map(str, words)]
-        as_user = _as_user()
-        done = subprocess.run(command, capture_output=True, cwd=self.folder, check=False, text=True, **as_user)  # noqa: S603
+        options = as_user()
+        done = subprocess.run(command, capture_output=True, cwd=self.folder, check=False, text=True, **options)  # noqa: S603
         if done.returncode:
             raise RuntimeError(f"{name}: {done.stderr[-2000:]}")
 
@@ -192,7 +192,7 @@ def cluster_folder() -> Iterator[Path]:
         yield folder
 
 
-def _as_user() -> Mapping[str, Any]:
+def as_user() -> dict[str, Any]:
     """Options of a child process that must not run as root."""
     if os.geteuid():
         return {}

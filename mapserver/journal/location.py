@@ -87,6 +87,16 @@ class JournalLocation:
         with self.reader() as reader:
             return reader.identity().id
 
+    def prepared_id(self, site: str, frame: str) -> str:
+        """As `store_id`, before a server waits for its turn; one that is shared is made where there is none.
+
+        Servers that start at once on a new database know by its id that they have one journal.
+        """
+        if self.url:
+            self._require_one()
+            _postgres().journal.prepare(self.url, site, frame)
+        return self.store_id()
+
     def trusted_row(self, journal: JournalQueries) -> int:
         """What the folder has of rows up to this one is of the journal; see `Journal`. Before it is opened to write."""
         return int(_postgres().mark.trusted_row(self.folder, journal)) if self.url else journal.last_row

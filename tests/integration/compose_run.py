@@ -1,6 +1,7 @@
 """compose.yaml without an engine: its commands as local processes, in its order, with its health checks.
 
-A service's host name becomes a free port on loopback, a volume a folder, the image's working directory the project.
+A service's host name becomes a free port on loopback, a volume a folder, the image's working directory the project. Of
+PostgreSQL's image the programs of this host are run, after what its entry point does.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
+from benchmarks.postgres.server import binaries
 from protocol.wire.session import free_endpoint
 from sitegrid.process.children import Child, Children, ProcessError
+from tests.integration.compose_database import DATABASE, DatabaseServer
 
 _ENV = re.compile(r"^ENV (?P<pairs>(?:.*\\\n)*.*)$", re.MULTILINE)
 CHECK_S = 0.5  # between two health checks, in place of the file's own
@@ -28,6 +31,14 @@ def load(path: Path) -> dict[str, Any]:
     """The services of a compose file."""
     services: dict[str, Any] = YAML(typ="safe").load(path.read_text())["services"]
     return services
+
+
+def needed(services: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """Those that `docker compose up NAMES` starts, with all that they depend on; without names, all without profile."""
+    wanted = set(names or (name for name, service in services.items() if not service.get("profiles")))
+    while more := {other for name in wanted for other in services[name].get("depends_on", {})} - wanted:
+        wanted |= more
+    return {name: service for name, service in services.items() if name in wanted}
 
 
 def image_environment(dockerfile: Path) -> dict[str, str]:
@@ -40,13 +51,15 @@ def image_environment(dockerfile: Path) -> dict[str, str]:
 class ComposeRun:
     """The services of one file, started one after the other as it says.
 
-    ports: of this host, by those inside; health: codes of each service's checks, newest last.
+    ports: of this host, by those inside; health: codes of each service's checks, newest last. databases: folder that
+    another user may use, where there are any.
     """
 
     services: Mapping[str, Any]
     folder: Path
     children: Children
-    started: dict[str, Child] = field(default_factory=dict)
+    databases: Path | None = None
+    started: dict[str, Child | DatabaseServer] = field(default_factory=dict)
     health: dict[str, list[int]] = field(default_factory=dict)
     ports: dict[str, int] = field(default_factory=dict)
 
@@ -67,7 +80,8 @@ class ComposeRun:
         health = self.services[name]["healthcheck"]
         kind, program, *rest = health["test"]
         assert kind == "CMD", "no shell is in the way"
-        first = {"python": [sys.executable], "sitegrid": [sys.executable, "-m", "sitegrid.cli"]}[program]
+        programs = {"python": [sys.executable], "sitegrid": [sys.executable, "-m", "sitegrid.cli"]}
+        first = programs.get(program) or [str(binaries() / program)]
         command = [*first, *self.words(name, rest)]
         try:
             done = subprocess.run(command, capture_output=True, timeout=_seconds(health["timeout"]), check=False)
@@ -81,6 +95,14 @@ class ComposeRun:
         """End all, those first that depend on others; their exit codes."""
         return {name: child.stop() for name, child in reversed(self.started.items())}
 
+    def start_again(self, name: str) -> Child | DatabaseServer:
+        """As an engine does with a service that has ended and may start again."""
+        assert self.services[name]["restart"] == "unless-stopped"
+        assert self.started[name].code is not None
+        del self.started[name]
+        self._start(name)
+        return self.started[name]
+
     def _start(self, name: str) -> None:
         if name in self.started:
             return
@@ -91,8 +113,24 @@ class ComposeRun:
                 self._wait_healthy(other)
             else:
                 assert rule["condition"] == "service_started"
+        if service["image"].startswith(DATABASE):
+            self.started[name] = self._database(name, service)
+            return
         assert "environment" not in service, "it would have to be set here"
         self.started[name] = self.children.start(name, *self.words(name, service["command"]))
+
+    def _database(self, name: str, service: Mapping[str, Any]) -> DatabaseServer:
+        assert self.databases, "a folder for them is needed"
+        environment = {key: self._here(name, value) for key, value in service["environment"].items()}
+        files = {target: source for source, target in _volumes(service) if source.startswith("./")}
+        made = DatabaseServer(self.databases / name, environment, {t: Path(s) for t, s in files.items()})
+        self.children.callback(made.stop)
+        if "entrypoint" in service:
+            made.enter([*service["entrypoint"], *self.words(name, service["command"])])
+        else:
+            made.initialise()
+            made.run(self.words(name, service["command"]))
+        return made
 
     def _wait_healthy(self, name: str) -> None:
         """Fails as an engine would: after so many retries once the time to start is over."""
@@ -105,20 +143,30 @@ class ComposeRun:
             time.sleep(CHECK_S)
 
     def _here(self, name: str, word: str) -> str:
-        for volume in self.services[name].get("volumes", []):
-            source, target = volume.split(":")
-            place = self.folder / "volumes" / source
+        of_database = self.services[name]["image"].startswith(DATABASE)
+        for source, target in _volumes(self.services[name]):
+            if source.startswith("./") or not (word == target or word.startswith(f"{target}/")):
+                continue
+            place = self.databases / name if of_database and self.databases else self.folder / "volumes" / source
             place.mkdir(parents=True, exist_ok=True)
-            if word == target or word.startswith(f"{target}/"):
-                return str(place) + word[len(target) :]
-        word = re.sub(rf"\b({'|'.join(self.services)}|0\.0\.0\.0)(?=:\d)", "127.0.0.1", word)
+            return str(place) + word[len(target) :]
+        names = "|".join(self.services)
+        word = re.sub(
+            rf"\b({names}|0\.0\.0\.0)(?=:\d)|(?<=host=)({names})\b|(?<=listen_addresses=)\*", "127.0.0.1", word
+        )
         return re.sub(r"\d+", lambda match: str(self.ports.get(match[0], match[0])), word)
 
 
 def listened_on(services: Mapping[str, Any]) -> set[str]:
     """Ports that services listen on."""
     words = [word for service in services.values() for word in service["command"]]
-    return {match[1] for word in words if (match := re.fullmatch(r"(?:tcp/)?0\.0\.0\.0:(\d+)", word))}
+    published = [port.rsplit(":", 1)[1] for service in services.values() for port in service.get("ports", [])]
+    return {match[1] for word in words if (match := re.fullmatch(r"(?:tcp/)?0\.0\.0\.0:(\d+)", word))} | set(published)
+
+
+def _volumes(service: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Where a volume or a file comes from, and where it is inside."""
+    return [(volume.split(":")[0], volume.split(":")[1]) for volume in service.get("volumes", [])]
 
 
 def free_port() -> int:

@@ -31,7 +31,7 @@ def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
     monkeypatch.chdir(root)
     for name, value in compose_run.image_environment(root / "Dockerfile").items():
         monkeypatch.setenv(name, value.replace("/tmp/", f"{tmp_path}/tmp/"))
-    services = compose_run.load(root / "compose.yaml")
+    services = compose_run.needed(compose_run.load(root / "compose.yaml"))
     services["sim"]["command"] += ["--speed", "4"]  # samples come after the smoother's lag of a minute and a half
     run = compose_run.ComposeRun(services, tmp_path, children)
     run.up()
@@ -58,7 +58,7 @@ def test_a_health_check_fails_without_its_service(
     tmp_path: Path, children: Children, root: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(root)
-    run = compose_run.ComposeRun(compose_run.load(root / "compose.yaml"), tmp_path, children)
+    run = compose_run.ComposeRun(compose_run.needed(compose_run.load(root / "compose.yaml")), tmp_path, children)
     assert not run.check("router")
     assert not run.check("server")
 
@@ -67,7 +67,7 @@ def test_a_service_that_ends_at_once_is_not_waited_for(
     tmp_path: Path, children: Children, root: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(root)
-    services = compose_run.load(root / "compose.yaml")
+    services = compose_run.needed(compose_run.load(root / "compose.yaml"))
     services["router"]["command"].remove("--insecure")
     services["router"]["command"][2] = "tcp/256.0.0.1:7447"
     run = compose_run.ComposeRun(services, tmp_path, children)

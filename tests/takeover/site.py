@@ -144,34 +144,10 @@ class TakeOverSite:
         self.add_standby()
 
     def verdict(self) -> Verdict:
-        """Compare audit files with the rows, by SQL of this module alone."""
-        rows = self.database.sql("SELECT row, record FROM sitegrid.journal ORDER BY row")
-        there: Counter[tuple[str, int]] = Counter()
-        for number, record in rows:
-            assert zlib.crc32(record[:-4]) == int.from_bytes(record[-4:], "little")
-            row, _, _, first_seq, name_bytes = _HEAD.unpack_from(record)
-            assert row == number
-            machine = record[_HEAD.size : _HEAD.size + name_bytes].decode()
-            if machine not in self.machines:
-                continue
-            samples = (len(record) - _HEAD.size - name_bytes - 4) // SAMPLE_DTYPE.itemsize
-            there.update((machine, first_seq + k) for k in range(samples))
-        lines = [line for path in self.folder.glob("*.audit") for line in path.read_text().splitlines()]
-        acks = [Acknowledged(**json.loads(line)) for line in lines]
-        acks.sort(key=lambda ack: ack.at_s)
-        reached = {
-            name: max((ack.watermark for ack in acks if ack.machine == name), default=0) for name in self.machines
-        }
-        lost = sum((machine, seq) not in there for machine, until in reached.items() for seq in range(1, until + 1))
-        most = {machine: max((seq for name, seq in there if name == machine), default=0) for machine in self.machines}
-        missing = sum((machine, seq) not in there for machine, until in most.items() for seq in range(1, until + 1))
-        gaps = [number for number, _ in rows] != list(range(1, len(rows) + 1))
-        double = sum(count - 1 for count in there.values())
-        old, newest = 0, 0
-        for ack in acks:
-            old += ack.epoch < newest
-            newest = max(newest, ack.epoch)
-        return Verdict(len(acks), len(rows), lost, double, missing + gaps, old, newest)
+        """Compare audit files with the rows."""
+        return verdict(
+            self.folder, self.machines, self.database.sql("SELECT row, record FROM sitegrid.journal ORDER BY row")
+        )
 
     def _server(self) -> Server:
         self._made += 1
@@ -183,6 +159,34 @@ class TakeOverSite:
         words = ("--endpoint", self.endpoint, "--site-file", self.folder / "site.toml")
         words += ("--store", self.folder / name, "--journal", url)
         return Server(name, proxy, self._children.start(name, "server", *words))
+
+
+def verdict(folder: Path, machines: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> Verdict:
+    """Compare audit files with the rows of the database: number and record, read by this module alone."""
+    there: Counter[tuple[str, int]] = Counter()
+    for number, record in rows:
+        assert zlib.crc32(record[:-4]) == int.from_bytes(record[-4:], "little")
+        row, _, _, first_seq, name_bytes = _HEAD.unpack_from(record)
+        assert row == number
+        machine = record[_HEAD.size : _HEAD.size + name_bytes].decode()
+        if machine not in machines:
+            continue
+        samples = (len(record) - _HEAD.size - name_bytes - 4) // SAMPLE_DTYPE.itemsize
+        there.update((machine, first_seq + k) for k in range(samples))
+    lines = [line for path in folder.glob("*.audit") for line in path.read_text().splitlines()]
+    acks = [Acknowledged(**json.loads(line)) for line in lines]
+    acks.sort(key=lambda ack: ack.at_s)
+    reached = {name: max((ack.watermark for ack in acks if ack.machine == name), default=0) for name in machines}
+    lost = sum((machine, seq) not in there for machine, until in reached.items() for seq in range(1, until + 1))
+    most = {machine: max((seq for name, seq in there if name == machine), default=0) for machine in machines}
+    missing = sum((machine, seq) not in there for machine, until in most.items() for seq in range(1, until + 1))
+    gaps = [number for number, _ in rows] != list(range(1, len(rows) + 1))
+    double = sum(count - 1 for count in there.values())
+    old, newest = 0, 0
+    for ack in acks:
+        old += ack.epoch < newest
+        newest = max(newest, ack.epoch)
+    return Verdict(len(acks), len(rows), lost, double, missing + gaps, old, newest)
 
 
 # --- faults ----------------------------------------------------------------------------------------------------------

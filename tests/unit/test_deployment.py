@@ -11,6 +11,7 @@ import pytest
 
 from protocol.site.site_file import load_site
 from sitegrid.process.lifetime import END_S
+from tests.integration import compose_run
 from tests.paths import ROOT
 
 COMPOSE, DOCKERFILE = ROOT / "compose.yaml", ROOT / "Dockerfile"
@@ -26,13 +27,17 @@ def tool(name: str) -> str:
 
 
 def services() -> dict:
-    yaml = pytest.importorskip("ruamel.yaml", reason="comes with check-jsonschema")
-    return yaml.YAML(typ="safe").load(COMPOSE.read_text())["services"]
+    pytest.importorskip("ruamel.yaml", reason="comes with check-jsonschema")
+    return compose_run.load(COMPOSE)
+
+
+def is_database(service: dict) -> bool:
+    return service["image"].startswith("postgres:")
 
 
 def commands() -> list[list[str]]:
     """The words after `sitegrid` of every command and health check."""
-    commands = [list(service["command"]) for service in services().values()]
+    commands = [list(service["command"]) for service in services().values() if not is_database(service)]
     checks = [service["healthcheck"]["test"] for service in services().values() if "healthcheck" in service]
     return commands + [list(test[2:]) for test in checks if test[1] == "sitegrid"]
 
@@ -53,7 +58,7 @@ def test_every_command_is_one_that_the_parser_takes():
 
     parser = sitegrid.door.build_parser()
     words = commands()
-    assert len(words) == len(services()) + 1
+    assert len(words) == len(services()) - 2 + 3, "less the databases, and with three health checks"
     for line in words:
         parser.parse_args(line)  # a usage error exits, and fails the test
 
@@ -90,10 +95,34 @@ def test_agents_and_simulator_mean_the_same_machines_and_site():
 
 def test_services_restart_and_need_no_privileges():
     for name, service in services().items():
-        assert service["restart"] == "unless-stopped", name
+        assert service["restart"] == ("no" if is_database(service) else "unless-stopped"), name
         assert service["cap_drop"] == ["ALL"], name
         assert service["read_only"] is True, name
     assert re.search(r"^USER (?!root)", DOCKERFILE.read_text(), re.MULTILINE)
+
+
+def test_a_primary_that_died_never_comes_back_by_itself():
+    """Its replica may have been promoted meanwhile."""
+    assert {name for name, service in services().items() if service["restart"] == "no"} == {"db-a", "db-b"}
+
+
+def test_profile_ha_has_two_servers_of_one_journal_and_not_the_one_without_database():
+    started = compose_run.needed(services(), "sim", "follower")
+    assert set(started) == {"router", "db-a", "db-b", "server-a", "server-b", "follower", "sim", *MACHINES}
+    lines = [started[name]["command"] for name in ("server-a", "server-b", "follower")]
+    journals = {line[line.index("--journal") + 1] for line in lines}
+    assert len(journals) == 1
+    assert [started[name]["volumes"] for name in ("server-a", "server-b")] == [["map-a:/data"], ["map-b:/data"]]
+    assert set(compose_run.needed(services())) == {"router", "server", "sim", *MACHINES}, "without the profile"
+
+
+def test_the_journal_of_profile_ha_is_at_both_databases_and_goes_to_the_one_that_takes_commits():
+    line = services()["server-a"]["command"]
+    url = line[line.index("--journal") + 1]
+    assert url.endswith("?target_session_attrs=read-write")
+    for name in ("db-a", "db-b"):
+        words = services()[name]["command"]
+        assert f"{name}:{words[words.index('-p') + 1]}" in url
 
 
 def test_only_this_host_gets_in_while_there_are_no_keys():

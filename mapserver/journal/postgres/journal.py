@@ -12,24 +12,24 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 import psycopg
 
 from mapserver.journal.journal import ROWS_AT_ONCE, FencedError, UnwrittenError
 from mapserver.journal.postgres import MARK_FILE
-from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
-from mapserver.journal.postgres.connection import Connection, connect
+from mapserver.journal.postgres.connection import Connection, connect, shown
 from mapserver.journal.postgres.mark import CHECKSUM, EPOCH, STORE, traces_of, trusted_by
-from mapserver.journal.postgres.reader import CHANNEL, SCHEMA, TABLES, PostgresQueries
+from mapserver.journal.postgres.reader import PostgresQueries
 from mapserver.journal.postgres.session import HANGS_S, WriterSession
 from mapserver.journal.postgres.statements import insert
+from mapserver.journal.postgres.tables import CHANNEL, creation
 from mapserver.journal.progress import Progress
 from mapserver.journal.records import checksum_of
 from mapserver.journal.rows import SpoolKey, Watermark
 from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
-from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, new_meta, watermark_line
+from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, watermark_line
 from protocol.disk.high_water_mark import HighWaterMark
 from protocol.errors import StoreError
 from protocol.files import make_private
@@ -40,6 +40,12 @@ _PUT = (
     " seq = excluded.seq, lost = excluded.lost, newest_ns = excluded.newest_ns, crc32 = excluded.crc32"
 )
 log = logging.getLogger("mapserver.journal.postgres.journal")
+
+
+def prepare(url: str, site: str, frame: str) -> None:
+    """Make the tables where there are none, before anybody is the writer; StoreError where it is no usable journal."""
+    with closing(WriterSession(url, shown(url))) as session:
+        session.run(creation(site, frame))
 
 
 class PostgresJournal(TableWriter, PostgresQueries):
@@ -207,12 +213,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
             waited = waiting is not None
 
     def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
-        """Make the tables where there are none; nobody else does so meanwhile, since the lock is taken."""
-        ((exists,),) = self._session.run(f"SELECT to_regclass('{NAMESPACE}.meta') IS NOT NULL")
-        if not exists:
-            meta = list(new_meta(SCHEMA, site, frame, descends).items())
-            head = "INSERT INTO head VALUES (true, 0, 0, 0, 0)"
-            self._session.run(f"CREATE SCHEMA IF NOT EXISTS {NAMESPACE}; {TABLES} {head}; {insert('meta', meta)}")
+        self._session.run(creation(site, frame, descends))
         self._require_meta(site, frame)
 
     def _take_epoch(self, known: int) -> None:

@@ -1,4 +1,4 @@
-"""The tables of a journal in PostgreSQL, and what can be read of them."""
+"""What can be read of a journal in PostgreSQL."""
 
 from __future__ import annotations
 
@@ -14,45 +14,11 @@ import psycopg
 from mapserver.journal.journal import ROWS_AT_ONCE, JournalState
 from mapserver.journal.postgres import connection
 from mapserver.journal.postgres.connection import REPLICAS, Connection, connect, readable, replica_of, shown
+from mapserver.journal.postgres.tables import CHANNEL, SCHEMA
 from mapserver.journal.queries import BYTES_AT_ONCE, TableQueries, size_of
 from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
 
-SCHEMA = 1
-CHANNEL = "sitegrid_journal"  # of notifications, one per database
-# `head` has one line, which every commit changes: rows are numbered by it, so that they are dense and in the order of
-# their commits. Numbers of a sequence are not, and whoever asks for what follows the last one he has seen loses rows.
-TABLES = """
-CREATE TABLE meta (key text PRIMARY KEY, value text NOT NULL);
-CREATE TABLE head (
-    single boolean PRIMARY KEY DEFAULT true CHECK (single),
-    epoch bigint NOT NULL, last_row bigint NOT NULL, last_event bigint NOT NULL, archived_row bigint NOT NULL
-) WITH (fillfactor = 10);
-CREATE TABLE journal (row bigint PRIMARY KEY, record bytea NOT NULL);
-ALTER TABLE journal ALTER record SET STORAGE EXTERNAL;
-CREATE TABLE watermark (
-    machine text, spool_id bytea,
-    seq bigint NOT NULL, lost bigint NOT NULL, newest_ns bigint NOT NULL, crc32 bigint NOT NULL,
-    PRIMARY KEY (machine, spool_id)
-);
-CREATE TABLE extent (
-    row bigint PRIMARY KEY, first_stamp_ns bigint NOT NULL, last_stamp_ns bigint NOT NULL,
-    west_m float8 NOT NULL, south_m float8 NOT NULL, east_m float8 NOT NULL, north_m float8 NOT NULL,
-    crc32 bigint NOT NULL
-);
-CREATE TABLE events (
-    id bigint PRIMARY KEY, kind text NOT NULL, stamp_ns bigint NOT NULL, body text NOT NULL, crc32 bigint NOT NULL
-);
-CREATE FUNCTION advance(mine bigint, from_row bigint, to_row bigint, from_event bigint, to_event bigint)
-RETURNS void LANGUAGE plpgsql AS $$
-BEGIN
-    UPDATE head SET last_row = to_row, last_event = to_event
-    WHERE epoch = mine AND last_row = from_row AND last_event = from_event;
-    IF NOT FOUND THEN
-        RAISE EXCEPTION 'another writer has this journal' USING ERRCODE = 'SG001';
-    END IF;
-END $$;
-"""
 _READ_ALL = "SELECT row, record FROM journal WHERE row > %(after)s AND row <= %(until)s ORDER BY row LIMIT %(most)s"
 _READ_SOME = """SELECT row, record FROM extent LEFT JOIN journal USING (row)
 WHERE extent.last_stamp_ns >= %(from_ns)s AND extent.first_stamp_ns <= %(to_ns)s

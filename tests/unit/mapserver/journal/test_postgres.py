@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -231,6 +232,18 @@ def test_a_server_goes_on_after_its_sessions_were_ended(tmp_path, database, end)
         assert isinstance(answers[0], Refused)
         assert (answers[1].epoch, answers[1].watermark) == (2, 10)
         assert same(store.grid, folded_by(store))
+
+
+def test_servers_that_start_at_once_on_an_empty_database_have_one_journal(tmp_path, database):
+    """Each knows its id before it asks who else serves the site: else the later one would take it for another."""
+    places = [place(tmp_path / str(n), database) for n in range(8)]
+    with ThreadPoolExecutor(len(places)) as threads:
+        ids = list(threads.map(lambda one: one.prepared_id(SITE.name, SITE.frame), places))
+    assert ids == [places[0].store_id()] * len(places)
+    assert len(ids[0]) == 16
+    assert database.sql("SELECT epoch, last_row FROM sitegrid.head") == [(0, 0)]
+    with closing(open_store(tmp_path / "0", database)) as store:
+        assert send(store, 1).epoch == 1
 
 
 def test_a_second_server_is_refused_where_it_may_not_wait(tmp_path, database):

@@ -1,0 +1,61 @@
+"""The tables of a journal in PostgreSQL, and how they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
+from mapserver.journal.postgres.statements import insert
+from mapserver.journal.writing import new_meta
+
+MAKING = 0x517E62D2  # an advisory lock for as long as tables are made
+SCHEMA = 1
+CHANNEL = "sitegrid_journal"  # of notifications, one per database
+# `head` has one line, which every commit changes: rows are numbered by it, so that they are dense and in the order of
+# their commits. Numbers of a sequence are not, and whoever asks for what follows the last one he has seen loses rows.
+TABLES = """
+CREATE TABLE meta (key text PRIMARY KEY, value text NOT NULL);
+CREATE TABLE head (
+    single boolean PRIMARY KEY DEFAULT true CHECK (single),
+    epoch bigint NOT NULL, last_row bigint NOT NULL, last_event bigint NOT NULL, archived_row bigint NOT NULL
+) WITH (fillfactor = 10);
+CREATE TABLE journal (row bigint PRIMARY KEY, record bytea NOT NULL);
+ALTER TABLE journal ALTER record SET STORAGE EXTERNAL;
+CREATE TABLE watermark (
+    machine text, spool_id bytea,
+    seq bigint NOT NULL, lost bigint NOT NULL, newest_ns bigint NOT NULL, crc32 bigint NOT NULL,
+    PRIMARY KEY (machine, spool_id)
+);
+CREATE TABLE extent (
+    row bigint PRIMARY KEY, first_stamp_ns bigint NOT NULL, last_stamp_ns bigint NOT NULL,
+    west_m float8 NOT NULL, south_m float8 NOT NULL, east_m float8 NOT NULL, north_m float8 NOT NULL,
+    crc32 bigint NOT NULL
+);
+CREATE TABLE events (
+    id bigint PRIMARY KEY, kind text NOT NULL, stamp_ns bigint NOT NULL, body text NOT NULL, crc32 bigint NOT NULL
+);
+CREATE FUNCTION advance(mine bigint, from_row bigint, to_row bigint, from_event bigint, to_event bigint)
+RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    UPDATE head SET last_row = to_row, last_event = to_event
+    WHERE epoch = mine AND last_row = from_row AND last_event = from_event;
+    IF NOT FOUND THEN
+        RAISE EXCEPTION 'another writer has this journal' USING ERRCODE = 'SG001';
+    END IF;
+END $$;
+"""
+
+
+def creation(site: str, frame: str, descends: Iterable[str] = ()) -> str:
+    """A statement that makes the tables where there are none; of several servers that run it at once, one does."""
+    meta = insert("meta", list(new_meta(SCHEMA, site, frame, descends).items()))
+    return f"""DO $making$
+BEGIN
+    PERFORM pg_advisory_xact_lock({MAKING});
+    IF to_regclass('{NAMESPACE}.meta') IS NULL THEN
+        CREATE SCHEMA IF NOT EXISTS {NAMESPACE};
+        {TABLES}
+        INSERT INTO head VALUES (true, 0, 0, 0, 0);
+        {meta};
+    END IF;
+END $making$"""  # noqa: S608 # constants, and literals
