@@ -1,4 +1,7 @@
-"""The Python client of the map. It needs the base install only."""
+"""The Python client of the map. It needs the base install only.
+
+It is one module because it is one class: all that a program may ask.
+"""
 
 from __future__ import annotations
 

@@ -16,13 +16,16 @@ from mapserver.query.source import MapSource, MapState
 from mapserver.roads.ledger import Ledger, Ledgers
 from mapserver.roads.loss import Losses, losses
 from mapserver.roads.network import network
+from mapserver.roads.passes import MINUTE_NS, PassTally
+from mapserver.roads.repairs import Repair, repairs
 from mapserver.roads.segments import Segments, segments
 from mapserver.roads.skeleton import Pages, Skeletons
 from mapserver.roads.tally import HOUR_NS, Tally, slot
 from mapserver.roads.trend import trends
 from mapserver.roads.worklist import litres, ranked, seconds
-from protocol.arrays import Ints, Table
+from protocol.arrays import Floats, Ints, Table
 from protocol.errors import QueryError, Refusal, StoreError
+from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries import roads as answers
 from protocol.queries.answers import MapVersion
 from protocol.queries.requests import RoadQuery, SegmentsQuery, WorklistQuery
@@ -39,8 +42,16 @@ class RoadMap:
     segments: Segments
     ledgers: Ledgers
     tally: Table
+    changes: tuple[Repair, ...]
     version: MapVersion
     stamp_ns: int
+
+
+class _Traffic:
+    """What drove, in sums by hour and by pass."""
+
+    def __init__(self) -> None:
+        self.tally, self.passes = Tally(), PassTally()
 
 
 class RoadMaps:
@@ -55,37 +66,52 @@ class RoadMaps:
 
     def _begin(self, store: str, facts: Facts) -> None:
         """Follow the journal anew."""
-        self._tally, self._followed, self._of = Tally(), 0, (store, facts)
+        self._traffic, self._followed, self._with = _Traffic(), 0, (store, facts)
 
     def segments(self, query: SegmentsQuery) -> answers.Segments:
         """Roads, and what drove on them."""
-        of = self._read(query)
-        traffic, hours = _traffic(of, query)
-        rows = _Records(of.segments, traffic, losses(traffic, of.segments, 0.0), hours)
-        chosen = _inside(of.segments, query.bounds)
-        version = (of.version.store, of.version.row, of.version.fact, of.stamp_ns)
+        roads = self._read(query)
+        traffic, hours = _traffic(roads, query)
+        rows = _Records(roads.segments, traffic, losses(traffic, roads.segments, 0.0), hours)
+        chosen = _inside(roads.segments, query.bounds)
+        version = (roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns)
         return answers.Segments(*version, hours, traffic.placed, tuple(rows(i) for i in chosen))
 
     def worklist(self, query: WorklistQuery) -> answers.Worklist:
         """Where work pays."""
-        of = self._read(query)
-        traffic, hours = _traffic(of, query)
-        lost = losses(traffic, of.segments, query.target)
+        roads = self._read(query)
+        traffic, hours = _traffic(roads, query)
+        before, after = _levels(roads)
+        lost = losses(traffic, roads.segments, query.target, after)
+        saved_j = losses(traffic, roads.segments, query.target, before).work_j - lost.work_j
         rows, listed, inside = (
-            _Records(of.segments, traffic, lost, hours),
+            _Records(roads.segments, traffic, lost, hours),
             ranked(lost),
-            _inside(of.segments, query.bounds),
+            _inside(roads.segments, query.bounds),
         )
         work = np.stack([lost.work_j, lost.low_j, lost.high_j]) / max(hours, 1e-9)
         kg = lost.kg.mean(axis=1)
-        out = []
+        out: list[answers.WorklistRow] = []
         for i, rank in zip(listed.order.tolist(), listed.rank.tolist(), strict=True):
             if i in inside and len(out) < query.limit:
                 of_it = (work[:, i] / 3.6e6, litres(work[:, i], query.efficiency), seconds(work[:, i], kg[i]))
                 out.append(answers.WorklistRow(rank, rows(i), *(tuple(values.tolist()) for values in of_it)))
-        version = (of.version.store, of.version.row, of.version.fact, of.stamp_ns)
+        version = (roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns)
         total = float(work[0, sorted(inside)].sum() / 3.6e6)
-        return answers.Worklist(*version, hours, query.target, total, tuple(out))
+        changes = [
+            answers.RoadChange(
+                roads.segments.ids[change.segment],
+                rows(change.segment).line,
+                change.minute * MINUTE_NS,
+                (change.seen + 1) * MINUTE_NS,
+                change.before,
+                change.after,
+                float(saved_j[change.segment] / max(hours, 1e-9) / 3.6e6),
+            )
+            for change in roads.changes
+            if change.segment in inside
+        ]
+        return answers.Worklist(*version, hours, query.target, total, tuple(out), tuple(changes))
 
     def _read(self, query: RoadQuery) -> RoadMap:
         _require_on_site(query.bounds, self._source.site.extent_m)
@@ -101,42 +127,45 @@ class RoadMaps:
         pages, version, facts, newest_ns = self._source.run(_all)
         if self._made and self._made.version == version:
             return self._made
-        if self._of != (version.store, facts):
+        if self._with != (version.store, facts):
             self._begin(version.store, facts)
-        self._follow(self._tally, facts, newest_ns, self._followed, version.row)
+        self._follow(self._traffic, facts, newest_ns, self._followed, version.row)
         self._followed = version.row
         roads = segments(network(self._skeletons.skeleton(pages)))
-        self._made = self._map(roads, self._tally, version, newest_ns)
+        self._made = self._map(roads, self._traffic, version, newest_ns)
         return self._made
 
     def _as_of(self, as_of_ns: int) -> RoadMap:
         version, facts = self._source.run(lambda state: (state.version, state.facts))
-        tally = Tally()
+        traffic = _Traffic()
         with self._source.location.reader() as reader:
             grid = self._source.past.grid_as_of(reader, as_of_ns, None, facts)
-            stamp_ns = min(as_of_ns, grid.newest_ns or as_of_ns)
-            self._follow(tally, facts, stamp_ns, 0, version.row)
+            self._follow(traffic, facts, as_of_ns, 0, version.row, as_of_ns)
         roads = segments(network(Skeletons(self._cell_m).skeleton(_pages(grid))))
-        return self._map(roads, tally, version, as_of_ns)
+        return self._map(roads, traffic, version, as_of_ns)
 
-    def _follow(self, tally: Tally, facts: Facts, newest_ns: int, after: int, until: int) -> None:
-        """Take journal rows after < row <= until into a tally, of samples up to a stamp."""
+    def _follow(
+        self, traffic: _Traffic, facts: Facts, newest_ns: int, after: int, until: int, to_ns: int = MAX_STAMP_NS
+    ) -> None:
+        """Take journal rows after < row <= until into the traffic, of samples up to `to_ns`."""
         if after >= until:
             return
         begin_ns = max(0, newest_ns - LOOK_BACK_NS) // HOUR_NS * HOUR_NS
-        to = {} if after or tally is self._tally else {"to_ns": newest_ns}
         with self._source.location.reader() as reader:
-            selection = Selection.by(facts, begin_ns, **to)
+            selection = Selection.by(facts, begin_ns, to_ns)
             for samples, names in self._source.past.samples(reader, selection, after, until):
                 sure = is_foldable(samples, self._config.fold)
-                tally.add(samples[sure], names[sure])
+                traffic.tally.add(samples[sure], names[sure])
+                traffic.passes.add(samples[sure], names[sure])
 
-    def _map(self, roads: Segments, tally: Tally, version: MapVersion, stamp_ns: int) -> RoadMap:
+    def _map(self, roads: Segments, traffic: _Traffic, version: MapVersion, stamp_ns: int) -> RoadMap:
         """Put together; the look back is cut here, where it does not depend on when the journal was followed."""
-        table = tally.table()
+        table, ledgers = traffic.tally.table(), Ledgers(roads)
         first = max(0, stamp_ns - LOOK_BACK_NS) // HOUR_NS
         table = table[slot(table["key"]) >= first]
-        return RoadMap(roads, Ledgers(roads), table, version, stamp_ns)
+        changes, _ = repairs(traffic.passes.passes(ledgers, first * HOUR_NS))
+        newest_first = tuple(sorted(changes, key=lambda change: (-change.seen, change.segment)))
+        return RoadMap(roads, ledgers, table, newest_first, version, stamp_ns)
 
 
 def _all(state: MapState) -> tuple[Pages, MapVersion, Facts, int]:
@@ -161,21 +190,29 @@ def _require_on_site(bounds: Bounds | None, extent_m: float) -> None:
         raise QueryError(Refusal.OUT_OF_RANGE, problem)
 
 
-def _traffic(of: RoadMap, query: RoadQuery) -> tuple[Ledger, float]:
+def _traffic(roads: RoadMap, query: RoadQuery) -> tuple[Ledger, float]:
     """The ledger of a query's hours, and how many hours with driving these are, the running one in part."""
     from_ns, to_ns = query.from_ns or 0, query.to_ns or 2**62
-    traffic = of.ledgers.ledger(of.tally, HOUR_NS, from_ns // HOUR_NS * HOUR_NS, to_ns)
+    traffic = roads.ledgers.ledger(roads.tally, HOUR_NS, from_ns // HOUR_NS * HOUR_NS, to_ns)
     slots = np.unique(traffic.rows["slot"])
-    ends = np.minimum((slots + 1) * HOUR_NS, max(of.stamp_ns, 1))
+    ends = np.minimum((slots + 1) * HOUR_NS, max(roads.stamp_ns, 1))
     hours = float(np.maximum(ends - slots * HOUR_NS, 0).sum() / HOUR_NS)
     return traffic, hours
 
 
-def _inside(of: Segments, bounds: Bounds | None) -> set[int]:
+def _levels(roads: RoadMap) -> tuple[Floats, Floats]:
+    """c_rr of segments (k,) before and after their last change, NaN where there was none."""
+    before, after = np.full((2, len(roads.segments.ids)), np.nan)
+    for change in reversed(roads.changes):  # the newest last
+        before[change.segment], after[change.segment] = change.before, change.after
+    return before, after
+
+
+def _inside(roads: Segments, bounds: Bounds | None) -> set[int]:
     """Segments whose middle lies in a rectangle."""
     if bounds is None:
-        return set(range(len(of.ids)))
-    middle = of.points[(of.ends[:-1] + of.ends[1:]) // 2] if len(of.ids) else of.points
+        return set(range(len(roads.ids)))
+    middle = roads.points[(roads.ends[:-1] + roads.ends[1:]) // 2] if len(roads.ids) else roads.points
     x, y = middle.T
     within = (x >= bounds.west_m) & (x < bounds.east_m) & (y >= bounds.south_m) & (y < bounds.north_m)
     return set(np.flatnonzero(within).tolist())
@@ -184,20 +221,20 @@ def _inside(of: Segments, bounds: Bounds | None) -> set[int]:
 class _Records:
     """Records of segments, by number."""
 
-    def __init__(self, of: Segments, traffic: Ledger, lost: Losses, hours: float) -> None:
-        self._of, self._lost, self._hours = of, lost, max(hours, 1e-9)
+    def __init__(self, roads: Segments, traffic: Ledger, lost: Losses, hours: float) -> None:
+        self._segments, self._lost, self._hours = roads, lost, max(hours, 1e-9)
         self._trends = trends(traffic)
         machines = traffic.totals()["machines"]
         self._machines: Ints = np.bitwise_count(machines[:, 0] | machines[:, 1]).astype(np.int64)
 
     def __call__(self, i: int) -> answers.RoadSegment:
-        lost, line = self._lost, self._of.line(i)
+        lost, line = self._lost, self._segments.line(i)
         passes = lost.passes[i] / self._hours
         some = np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2)
         return answers.RoadSegment(
-            id=self._of.ids[i],
+            id=self._segments.ids[i],
             line=tuple(tuple(point) for point in some.tolist()),
-            length_m=float(self._of.length_m[i]),
+            length_m=float(self._segments.length_m[i]),
             resistance=_known(lost.c_rr[i]),
             resistance_std=_known(lost.c_std[i]),
             grade=_known(lost.grade[i]),

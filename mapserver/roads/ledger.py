@@ -12,7 +12,7 @@ import numpy as np
 
 from mapserver.roads.placing import Placing
 from mapserver.roads.segments import Segments
-from mapserver.roads.tally import PER_C, PER_M, SUMS, corner_m, heading_rad, place, slot
+from mapserver.roads.tally import CELL_M, PER_C, PER_M, SUMS, corner_m, heading_rad, place, slot
 from protocol.arrays import AnyArray, Floats, Ints, Table
 
 DIRECTIONS = 2
@@ -52,27 +52,34 @@ class Ledger:
 
 
 class Ledgers:
-    """Makes ledgers of the same segments. A place belongs to the same segment in all of them."""
+    """Makes ledgers of the same segments. A place belongs to the same segment in all of them.
+
+    slices, place: as of `Placing`.
+    """
 
     def __init__(self, segments: Segments) -> None:
         self.segments = segments
-        self._placing = Placing(segments)
+        placing = Placing(segments)
+        self.slices, self.place = placing.slices, placing.place
 
-    def ledger(self, tally: Table, slot_ns: int, from_ns: int = 0, to_ns: int = 2**62) -> Ledger:
+    def ledger(
+        self, tally: Table, slot_ns: int, from_ns: int = 0, to_ns: int = 2**62, cell_m: float = CELL_M
+    ) -> Ledger:
         """Sum up rows of TALLY, of slots that begin in from_ns <= time < to_ns."""
         begins = slot(tally["key"]) * slot_ns
         tally = tally[(begins >= from_ns) & (begins < to_ns)]
         numbers, which = np.unique(place(tally["key"]), return_inverse=True)
-        placed = self._placing.place(corner_m(numbers) + _inside_m(tally, which, len(numbers)), heading_rad(numbers))
+        places_m = corner_m(numbers, cell_m) + _inside_m(tally, which, len(numbers))
+        placed = self.place(places_m, heading_rad(numbers))
         segment, inner, direction = (part[which] for part in placed)
         own = segment >= 0
         rows, kept = tally[own], np.stack([segment, slot(tally["key"]), direction], axis=1)[own]
-        slices = np.zeros((len(PLACED), int(self._placing.slices[-1]), DIRECTIONS), np.int64)
+        slices = np.zeros((len(PLACED), int(self.slices[-1]), DIRECTIONS), np.int64)
         for sums, name in zip(slices, PLACED, strict=True):
             np.add.at(sums, (inner[own], direction[own]), rows[name])
         total = int(tally["metres"].sum())
         share = int(rows["metres"].sum()) / total if total else 1.0
-        return Ledger(_grouped(kept, rows), slices, self._placing.slices, slot_ns, share)
+        return Ledger(_grouped(kept, rows), slices, self.slices, slot_ns, share)
 
 
 def _inside_m(tally: Table, which: Ints, count: int) -> Floats:
@@ -85,21 +92,25 @@ def _inside_m(tally: Table, which: Ints, count: int) -> Floats:
 
 def _grouped(keys: Ints, rows: Table) -> Table:
     """Sum what has the same segment, slot and direction."""
-    unique, of = np.unique(keys, axis=0, return_inverse=True)
-    out = np.zeros(len(unique), LEDGER)
+    out, order = np.zeros(0, LEDGER), np.lexsort(keys.T[::-1])
+    if not len(rows):
+        return out
+    keys, rows = keys[order], rows[order]
+    first = np.flatnonzero(np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1)))
+    out = np.zeros(len(first), LEDGER)
     for index, name in enumerate(KEYS):
-        out[name] = unique[:, index]
+        out[name] = keys[first, index]
     for name in PLACED:
-        np.add.at(out[name], of.ravel(), rows[name])
-    np.bitwise_or.at(out["machines"], of.ravel(), rows["machines"])
+        out[name] = np.add.reduceat(rows[name], first)
+    out["machines"] = np.bitwise_or.reduceat(rows["machines"], first)
     return out
 
 
-def resistance(of: Ledger) -> Floats:
+def resistance(ledger: Ledger) -> Floats:
     """c_rr (s,) of slices, both directions; gaps of a segment between its neighbours, NaN where it has none at all."""
-    known = of.of_slices("measured").sum(axis=1)
-    c = np.where(known > 0, of.of_slices("c").sum(axis=1) / np.maximum(known, 1) / PER_C, np.nan)
-    return filled(c, of.ends)
+    known = ledger.of_slices("measured").sum(axis=1)
+    c = np.where(known > 0, ledger.of_slices("c").sum(axis=1) / np.maximum(known, 1) / PER_C, np.nan)
+    return filled(c, ledger.ends)
 
 
 def filled(values: Floats, ends: Ints) -> Floats:

@@ -120,8 +120,8 @@ def _lines(places: Ints, traced: Chains, raster_m: float) -> Network:
     xy = places[cells][:, ::-1] + 0.5
     for at, joins in ((ends[:-1], first), (ends[1:] - 1, last)):
         some = degree[joins] > 2
-        of = group[joins[some]]
-        xy[at[some]] = centre[of] / count[of, None] + 0.5
+        joint = group[joins[some]]
+        xy[at[some]] = centre[joint] / count[joint, None] + 0.5
     of_cell = np.repeat(kept, np.diff(ends))
     lengths = np.diff(ends)[kept]
     nodes = np.stack([group[first], group[last]], axis=1)[kept]

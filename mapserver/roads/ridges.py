@@ -27,12 +27,12 @@ SCALE = 1 << 6  # of 1/4096 m: what the blur sums up, so that thousands of passe
 
 @numba.njit(cache=True, nogil=True)
 def add_axes(votes: Any, first_plane: int, cells: int, counts: Any) -> None:
-    """Add packed votes (place in the lower 16 bits, count above) of headings to counts (AXES, cells)."""
+    """Add packed votes (place in the lower 16 bits, count above) of headings to counts (cells, AXES)."""
     for vote in votes:
         place, count = np.int64(vote & np.uint64(0xFFFF)), np.int64(vote >> np.uint64(16))
         sector = place // cells - first_plane
         if 0 <= sector < 2 * AXES:
-            counts[sector % AXES, place % cells] += count
+            counts[place % cells, sector % AXES] += count
 
 
 class Blur:
@@ -67,48 +67,61 @@ class Blur:
 
 
 def ridges(axes: Ints, blur: Blur) -> Bools:
-    """Which cells (rows, columns) lie on a road. axes: (AXES, rows, columns) in 1/4096 m, driven along each."""
+    """Which cells (rows, columns) lie on a road. axes: (rows, columns, AXES) in 1/4096 m, driven along each."""
     response = np.zeros(axes.shape, np.int64)
-    _blurred(axes, blur.offsets, blur.weights, blur.ends, response)
-    out = np.zeros(axes.shape[1:], np.bool_)
-    _outstanding(response, blur.least, blur.across, out)
+    touched, out = (np.zeros(axes.shape[:2], np.bool_) for _ in range(2))
+    _blurred(axes, blur.offsets, blur.weights, blur.ends, response, touched)
+    _outstanding(response, touched, blur.least, blur.across, out)
     return out
 
 
 @numba.njit(cache=True, nogil=True)
-def _blurred(axes: Any, offsets: Any, weights: Any, ends: Any, out: Any) -> None:
-    """Blur the metres of each axis along it."""
-    count, rows, columns = axes.shape
-    for axis in range(count):
-        for row in range(rows):
-            for column in range(columns):
-                metres = axes[axis, row, column] // SCALE
+def _blurred(axes: Any, offsets: Any, weights: Any, ends: Any, out: Any, touched: Any) -> None:
+    """Blur the metres of each axis along it, and mark the cells that this reaches."""
+    rows, columns, count = axes.shape
+    for row in range(rows):
+        for column in range(columns):
+            for axis in range(count):
+                metres = axes[row, column, axis] // SCALE
                 if metres == 0:
                     continue
                 for i in range(ends[axis], ends[axis + 1]):
                     y, x = row + offsets[i, 0], column + offsets[i, 1]
                     if 0 <= y < rows and 0 <= x < columns:
-                        out[axis, y, x] += metres * weights[i]
+                        out[y, x, axis] += metres * weights[i]
+                        touched[y, x] = True
 
 
 @numba.njit(cache=True, nogil=True)
-def _outstanding(response: Any, least: Any, across: Any, out: Any) -> None:
+def _outstanding(response: Any, touched: Any, least: Any, across: Any, out: Any) -> None:
     """Mark cells whose response in some axis is no less than its neighbour axes', nor than a share of those beside."""
-    count, rows, columns = response.shape
+    rows, columns, count = response.shape
     for row in range(rows):
         for column in range(columns):
+            if not touched[row, column]:
+                continue
             for axis in range(count):
-                own = response[axis, row, column]
+                own = response[row, column, axis]
                 if own < least[axis]:
                     continue
-                if own < response[(axis - 1) % count, row, column] or own < response[(axis + 1) % count, row, column]:
+                if own < response[row, column, axis - 1] or own < response[row, column, (axis + 1) % count]:
                     continue
-                highest = own
-                for step in range(across.shape[1]):
-                    y, x = row + across[axis, step, 0], column + across[axis, step, 1]
-                    if 0 <= y < rows and 0 <= x < columns:
-                        for turn in range(-1, 2):  # between two lanes, an axis askew takes a little of both
-                            highest = max(highest, response[(axis + turn) % count, y, x])
-                if own >= SHARE * highest:
+                if own >= SHARE * _highest(response, row, column, axis, across):
                     out[row, column] = True
                     break
+
+
+@numba.njit(cache=True, nogil=True)
+def _highest(response: Any, row: int, column: int, axis: int, across: Any) -> int:
+    """Highest response on a line across an axis, of it and its neighbours.
+
+    Between two lanes, an axis askew takes a little of both, and would stand out.
+    """
+    rows, columns, count = response.shape
+    highest = response[row, column, axis]
+    for step in range(across.shape[1]):
+        y, x = row + across[axis, step, 0], column + across[axis, step, 1]
+        if 0 <= y < rows and 0 <= x < columns:
+            for turn in range(-1, 2):
+                highest = max(highest, response[y, x, (axis + turn) % count])
+    return int(highest)

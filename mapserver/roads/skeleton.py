@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.timeline import Block, TimedPage, packed_votes
+from mapserver.evidence.timeline import Block, TimedPage, TimedPages, packed_votes
 from mapserver.roads.ridges import AXES, Blur, add_axes, ridges
 from mapserver.roads.thinning import REACH, thinned
 from protocol.arrays import Ints
@@ -73,11 +73,14 @@ class Skeletons:
             return
         self.made += 1
         n = count * BLOCK_CELLS
-        cells = np.zeros((AXES, n, n), np.int64)
+        cells = np.zeros((n, n, AXES), np.int64)
         for (x, y), block_pages in near.items():
             row, column = (y - first_y) * BLOCK_CELLS, (x - first_x) * BLOCK_CELLS
-            cells[:, row : row + BLOCK_CELLS, column : column + BLOCK_CELLS] = axis_metres(block_pages)
-        axes, row, column = _joined(cells, first_y * BLOCK_CELLS, first_x * BLOCK_CELLS, self._join)
+            at, metres = axis_metres(block_pages)
+            cells[row + at[:, 0], column + at[:, 1], at[:, 2]] = metres
+        axes, row, column = cells, first_y * BLOCK_CELLS, first_x * BLOCK_CELLS
+        if self._join > 1:
+            axes, row, column = _joined(axes, row, column, self._join)
         rows, columns = np.nonzero(thinned(ridges(axes, self._blur)))
         places = np.stack([rows + row, columns + column], axis=1)
         begin = np.array([tile[1], tile[0]]) * TILE_BLOCKS * BLOCK_CELLS
@@ -86,11 +89,19 @@ class Skeletons:
         self._tiles[tile] = key, places[own], metres
 
 
-def axis_metres(pages: Sequence[TimedPage]) -> Ints:
-    """Metres driven along each axis, (AXES, 16, 16) in 1/4096 m, of all pages of a block."""
-    counts = np.zeros((AXES, ev.CELLS), np.int64)
+def axis_metres(pages: Sequence[TimedPage]) -> tuple[Ints, Ints]:
+    """Where in a block machines drove: (n, 3) row, column and axis, and metres (n,) in 1/4096 m, of all pages."""
+    if isinstance(pages, TimedPages) and axis_metres in pages.derived:
+        known: tuple[Ints, Ints] = pages.derived[axis_metres]
+        return known
+    counts = np.zeros((ev.CELLS, AXES), np.int64)
     add_axes(packed_votes(pages)[0], ev.HEADING.start, ev.CELLS, counts)
-    return counts.reshape(AXES, BLOCK_CELLS, BLOCK_CELLS)
+    cells = counts.reshape(BLOCK_CELLS, BLOCK_CELLS, AXES)
+    at = np.argwhere(cells)
+    metres = at.astype(np.int16), cells[tuple(at.T)]
+    if isinstance(pages, TimedPages):
+        pages.derived[axis_metres] = metres  # few cells of a block are on a road
+    return metres  # type: ignore[return-value]
 
 
 def _is_same(one: object, other: object) -> bool:
@@ -100,7 +111,7 @@ def _is_same(one: object, other: object) -> bool:
 def _joined(cells: Ints, row: int, column: int, join: int) -> tuple[Ints, int, int]:
     """Sum squares of cells whose numbers have the same quotient; also the first row and column of what comes out."""
     out, firsts = cells, []
-    for axis, first in ((1, row), (2, column)):
+    for axis, first in ((0, row), (1, column)):
         number = (first + np.arange(cells.shape[axis])) // join
         out = np.add.reduceat(out, np.flatnonzero(np.diff(number, prepend=number[0] - 1)), axis=axis)
         firsts.append(int(number[0]))
@@ -110,8 +121,8 @@ def _joined(cells: Ints, row: int, column: int, join: int) -> tuple[Ints, int, i
 def _around(axes: Ints, rows: Ints, columns: Ints) -> Ints:
     """Metres in the 5 x 5 cells around some cells, (n, AXES); these lie well inside."""
     steps = range(-NEAR, NEAR + 1)
-    total = np.zeros((AXES, len(rows)), np.int64)
+    total = np.zeros((len(rows), AXES), np.int64)
     for dy in steps:
         for dx in steps:
-            total += axes[:, rows + dy, columns + dx]
-    return total.T
+            total += axes[rows + dy, columns + dx]
+    return total

@@ -23,7 +23,7 @@ PER_M = 1000  # metres, and places in the cell
 PER_C = 100_000  # c_rr and gradient
 _C2_SHIFT = 100  # squares are in units of this over PER_C squared, so that sums of any hour fit
 _AXIS_BITS, _SECTOR_BITS = 17, 4  # sites reach 100 km from their origin
-_HALF = 1 << (_AXIS_BITS - 1)
+_HALF = 1 << (_AXIS_BITS - 1)  # with 25 bits left for slots, of a minute or more
 _SLOT_SHIFT = 2 * _AXIS_BITS + _SECTOR_BITS
 _PENDING_ROWS = 16_384  # merged at once: merging costs a sort of everything
 
@@ -37,15 +37,16 @@ _SECTOR_RAD = 2 * np.pi / SECTORS
 class Tally:
     """Sums of some machines over spans of time. slots: how many spans with driving it remembers, the newest ones."""
 
-    def __init__(self, slot_ns: int = HOUR_NS, slots: int = HOURS) -> None:
-        self.slot_ns, self._slots = slot_ns, slots
+    def __init__(self, slot_ns: int = HOUR_NS, slots: int = HOURS, cell_m: float = CELL_M) -> None:
+        """cell_m: edge of the cells, a whole part of the lattice's."""
+        self.slot_ns, self.cell_m, self._slots = slot_ns, cell_m, slots
         self._table: Table = np.zeros(0, TALLY)
         self._pending: list[Table] = []
         self._waiting = 0
 
     def add(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Add samples (n,), corrected, whose position is sure enough to vote; names (n,): hashes of their machines'."""
-        new = tally(rows, names, self.slot_ns)
+        new = tally(rows, names, self.slot_ns, self.cell_m)
         self._pending.append(new)
         self._waiting += len(new)
         if self._waiting > max(_PENDING_ROWS, len(self._table) // 4):
@@ -65,10 +66,10 @@ class Tally:
         return self._table
 
 
-def tally(rows: Table, names: NDArray[np.uint64], slot_ns: int) -> Table:
+def tally(rows: Table, names: NDArray[np.uint64], slot_ns: int, cell_m: float = CELL_M) -> Table:
     """The tally of samples (n,) of machines whose names have these hashes (n,)."""
     out = np.zeros(len(rows), TALLY)
-    return summed(out[: _measure(rows, names, CELL_M, slot_ns, out)])
+    return summed(out[: _measure(rows, names, cell_m, slot_ns, out)])
 
 
 def summed(rows: Table) -> Table:
@@ -95,11 +96,11 @@ def place(keys: Ints) -> Ints:
     return keys & ((1 << _SLOT_SHIFT) - 1)
 
 
-def corner_m(keys: Ints) -> Floats:
-    """South-west corner (n, 2) of cells [m]."""
+def corner_m(keys: Ints, cell_m: float) -> Floats:
+    """South-west corner (n, 2) of cells of this size [m]."""
     column = ((keys >> _SECTOR_BITS) & ((1 << _AXIS_BITS) - 1)) - _HALF
     row = ((keys >> (_SECTOR_BITS + _AXIS_BITS)) & ((1 << _AXIS_BITS) - 1)) - _HALF
-    return np.asarray(np.stack([column, row], axis=1) * CELL_M, np.float64)
+    return np.asarray(np.stack([column, row], axis=1) * cell_m, np.float64)
 
 
 def heading_rad(keys: Ints) -> Floats:

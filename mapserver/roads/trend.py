@@ -14,14 +14,14 @@ TREND_DAYS = 3  # with measurements; fewer are weather
 DAY_NS = 24 * HOUR_NS
 
 
-def trends(of: Ledger) -> Floats:
+def trends(ledger: Ledger) -> Floats:
     """Change of c_rr per day (k,), by Theil and Sen over days with measurements; NaN where there are less than three.
 
     The median of the slopes between all pairs of days: one day of rain is no trend.
     """
-    rows = of.rows[of.rows["measured"] > 0]
-    out = np.full(len(of.ends) - 1, np.nan)
-    day = rows["slot"] * of.slot_ns // DAY_NS
+    rows = ledger.rows[ledger.rows["measured"] > 0]
+    out = np.full(len(ledger.ends) - 1, np.nan)
+    day = rows["slot"] * ledger.slot_ns // DAY_NS
     keys, which = np.unique(np.stack([rows["segment"], day], axis=1), axis=0, return_inverse=True)
     sums = np.zeros((2, len(keys)), np.int64)
     for own, name in zip(sums, ("c", "measured"), strict=True):

@@ -64,8 +64,29 @@ class WorklistRow:
 
 
 @dataclass(frozen=True)
+class RoadChange:
+    """A stretch whose ground changed: repaired, or become worse, as two passes in a row showed.
+
+    id, line: as of its segment. first_ns: of the first pass that saw it, to the minute; seen_ns: when that was sure.
+    before, after: resistance. saved_kwh_ph: less lost an hour at the target, with the same traffic; below 0 where it
+    is worse.
+    """
+
+    id: str
+    line: Line
+    first_ns: int
+    seen_ns: int
+    before: float
+    after: float
+    saved_kwh_ph: float
+
+
+@dataclass(frozen=True)
 class Worklist:
-    """Where work on roads pays. total_kwh_ph: of all stretches, in the list or not."""
+    """Where work on roads pays, as the ground is since its last change.
+
+    total_kwh_ph: of all stretches, in the list or not. changes: the newest first.
+    """
 
     store: str
     merged: int
@@ -75,6 +96,7 @@ class Worklist:
     target: float
     total_kwh_ph: float
     rows: tuple[WorklistRow, ...]
+    changes: tuple[RoadChange, ...]
 
 
 def encode_segments(answer: Segments) -> bytes:

@@ -46,6 +46,17 @@ from protocol.queries.journal_piece import (
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.origin import Origin, decode_origin, encode_origin
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
+from protocol.queries.roads import (
+    RoadChange,
+    RoadSegment,
+    Segments,
+    Worklist,
+    WorklistRow,
+    decode_segments,
+    decode_worklist,
+    encode_segments,
+    encode_worklist,
+)
 from protocol.queries.routing import RouteAnswer, RouteSteps, RouteTotals, decode_answer, encode_answer
 from protocol.wire import codec, correction_codec
 from protocol.wire.messages import (
@@ -225,6 +236,33 @@ WHY = CellReasons(
 ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 OVERLOADED = QueryError(Refusal.OVERLOADED, "the server has too many queries to answer", 2.5)
 
+STRETCH = RoadSegment(
+    id="3_-2_ne",
+    line=((75.5, -49.5), (80.25, -44.0), (93.0, -31.5)),
+    length_m=25.5,
+    resistance=0.0625,
+    resistance_std=0.0025,
+    grade=-0.03125,
+    trend=0.001,
+    unmeasured=0.25,
+    passes_ph=(12.5, 0.5),
+    tonnes_ph=(550.0, 8.75),
+    guessed=False,
+    machines=4,
+)
+SPUR = replace(STRETCH, id="4_-2_e.1", resistance=None, resistance_std=None, grade=None, trend=None, guessed=True)
+ROADS = Segments(STORE, 17, 3, T0, 1.5, 0.984375, (STRETCH, SPUR))
+WORKLIST = Worklist(
+    STORE,
+    17,
+    3,
+    T0,
+    1.5,
+    0.02,
+    4.5,
+    (WorklistRow(1, STRETCH, (3.5, 3.25, 3.75), (1.0, 0.75, 1.25), (48.0, 45.0, 51.0)),),
+    (RoadChange("3_-2_ne", STRETCH.line, T0, T0 + 60 * 10**9, 0.0625, 0.03125, 2.5),),
+)
 JOURNAL = JournalPiece(
     STORE,
     ("fedcba9876543210",),
@@ -267,6 +305,8 @@ GOLDEN: dict[str, Golden] = {
     "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
     "why.bin": Golden(WHY, encode_why, decode_why),
     "route.bin": Golden(ROUTE, encode_answer, decode_answer),
+    "segments.bin": Golden(ROADS, encode_segments, decode_segments),
+    "worklist.bin": Golden(WORKLIST, encode_worklist, decode_worklist),
     "calibration.bin": Golden(CALIBRATION, encode_calibration, decode_calibration),
     "piece.bin": Golden(piece(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),

@@ -24,9 +24,9 @@ SPEED_MPS = 5.0
 def along(corners: Iterable[tuple[float, float]]) -> Floats:
     """Points of a line, STEP_M apart."""
     line = np.array(list(corners), float)
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    at = np.arange(0.0, way[-1], STEP_M)
-    return np.stack([np.interp(at, way, line[:, axis]) for axis in (0, 1)], axis=1)
+    driven_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    at = np.arange(0.0, driven_m[-1], STEP_M)
+    return np.stack([np.interp(at, driven_m, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def ring(centre: tuple[float, float], radius_m: float) -> Floats:

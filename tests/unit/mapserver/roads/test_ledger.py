@@ -85,39 +85,39 @@ def test_the_oldest_hours_are_forgotten_whatever_the_order():
 
 
 def test_there_and_back_are_told_apart():
-    of, segments = ledger_of(passes(LINE, 4), passes(BACK, 2, seed=1))
-    passed = of.totals()["metres"] / PER_M / segments.length_m[:, None]
+    ledger, segments = ledger_of(passes(LINE, 4), passes(BACK, 2, seed=1))
+    passed = ledger.totals()["metres"] / PER_M / segments.length_m[:, None]
     inner = slice(1, -1)
     assert passed[inner, 0] == pytest.approx(4.0, rel=0.06)
     assert passed[inner, 1] == pytest.approx(2.0, rel=0.06)
-    assert of.placed == 1.0
+    assert ledger.placed == 1.0
 
 
 def test_a_machine_in_reverse_drives_the_other_way():
     rows = passes(LINE, 4)
     rows["speed_mps"] *= -1
-    of, _ = ledger_of(rows)
-    metres = of.totals()["metres"]
+    ledger, _ = ledger_of(rows)
+    metres = ledger.totals()["metres"]
     assert metres[:, 0].sum() == 0
     assert metres[:, 1].sum() > 0
 
 
 def test_hours_are_apart_and_can_be_chosen():
     first, later = passes(LINE, 2), passes(LINE, 3, seed=1, after_s=7200.0)
-    of, _ = ledger_of(first, later)
-    hours = np.unique(of.rows["slot"])
+    ledger, _ = ledger_of(first, later)
+    hours = np.unique(ledger.rows["slot"])
     assert len(hours) >= 2
     split = (START_NS // HOUR_NS + 2) * HOUR_NS
     early, _ = ledger_of(first, later, to_ns=split)
     late, _ = ledger_of(first, later, from_ns=split)
-    assert early.rows["metres"].sum() + late.rows["metres"].sum() == of.rows["metres"].sum()
+    assert early.rows["metres"].sum() + late.rows["metres"].sum() == ledger.rows["metres"].sum()
     assert early.rows["metres"].sum() == np.rint(first["distance_m"].astype(float) * PER_M).sum()
 
 
 def test_a_crossing_keeps_its_roads_apart():
     across = along([(100, -40), (100, 60)])
-    of, segments = ledger_of(passes(LINE, 6, mass_kg=10_000.0), passes(across, 6, seed=1, mass_kg=80_000.0))
-    totals = of.totals()
+    ledger, segments = ledger_of(passes(LINE, 6, mass_kg=10_000.0), passes(across, 6, seed=1, mass_kg=80_000.0))
+    totals = ledger.totals()
     kg = totals["kg"].sum(axis=1) / totals["weighed"].sum(axis=1)
     east = np.abs(segments.ahead[:, 0]) > 0.9
     assert kg[east] == pytest.approx(10_000, rel=0.1)
@@ -127,8 +127,8 @@ def test_a_crossing_keeps_its_roads_apart():
 def test_two_soils_have_their_own_resistance():
     rows = passes(LINE, 8)
     rows["c_rr"] += np.where(rows["x_m"] > 110.0, 0.04, 0.0).astype(np.float32)
-    of, segments = ledger_of(rows)
-    c = losses(of, segments, 0.02).c_rr
+    ledger, segments = ledger_of(rows)
+    c = losses(ledger, segments, 0.02).c_rr
     middle = np.array([segments.line(i)[:, 0].mean() for i in range(len(c))])
     assert c[middle < 95] == pytest.approx(0.02, abs=0.001)
     assert c[middle > 130] == pytest.approx(0.06, abs=0.001)
@@ -140,9 +140,9 @@ def test_the_mean_is_over_places_not_over_what_was_measured():
     rows["c_rr"][bad] = 0.08
     rows["c_rr"][bad & (np.arange(len(rows)) % 8 > 0)] = np.nan
     rows["c_rr_var"][np.isnan(rows["c_rr"])] = np.nan
-    of, segments = ledger_of(rows)
+    ledger, segments = ledger_of(rows)
     at = segments.ids.index("4_0_e")
-    assert losses(of, segments, 0.02).c_rr[at] == pytest.approx(0.056, rel=0.1)
+    assert losses(ledger, segments, 0.02).c_rr[at] == pytest.approx(0.056, rel=0.1)
 
 
 def test_gaps_are_filled_from_both_sides():
@@ -150,22 +150,22 @@ def test_gaps_are_filled_from_both_sides():
     rows["c_rr"] = np.where(rows["x_m"] < 110, 0.02, 0.04)
     gap = (rows["x_m"] > 101) & (rows["x_m"] < 119)
     rows["c_rr"][gap] = rows["c_rr_var"][gap] = np.nan
-    of, segments = ledger_of(rows)
-    assert losses(of, segments, 0.02).unmeasured.max() > 0.3
-    c = resistance(of)
+    ledger, segments = ledger_of(rows)
+    assert losses(ledger, segments, 0.02).unmeasured.max() > 0.3
+    c = resistance(ledger)
     assert np.isfinite(c).all()
     assert ((c > 0.0195) & (c < 0.0405)).all()
 
 
 def test_work_lost_is_mass_times_gravity_times_way_times_excess():
-    of, segments = ledger_of(passes(LINE, 10, c_rr=0.05))
-    lost = losses(of, segments, 0.02)
-    metres = of.totals()["metres"].sum() / PER_M
+    ledger, segments = ledger_of(passes(LINE, 10, c_rr=0.05))
+    lost = losses(ledger, segments, 0.02)
+    metres = ledger.totals()["metres"].sum() / PER_M
     assert lost.work_j.sum() == pytest.approx(40_000 * GRAVITY_MPS2 * metres * 0.03, rel=0.01)
     assert (lost.low_j < lost.work_j).all()
     assert (lost.work_j < lost.high_j).all()
     assert not lost.guessed.any()
-    assert losses(of, segments, 0.08).work_j.sum() == 0.0
+    assert losses(ledger, segments, 0.08).work_j.sum() == 0.0
 
 
 def test_a_descent_that_brakes_anyway_costs_nothing():
@@ -180,8 +180,8 @@ def test_a_descent_that_brakes_anyway_costs_nothing():
 
 
 def test_without_a_mass_it_is_guessed_and_said():
-    of, segments = ledger_of(passes(LINE, 4, c_rr=0.05, mass_kg=np.nan))
-    lost = losses(of, segments, 0.02)
+    ledger, segments = ledger_of(passes(LINE, 4, c_rr=0.05, mass_kg=np.nan))
+    lost = losses(ledger, segments, 0.02)
     assert lost.guessed.all()
     assert (lost.work_j > 0).all()
 
@@ -189,19 +189,19 @@ def test_without_a_mass_it_is_guessed_and_said():
 def test_samples_without_resistance_are_traffic_and_nothing_more():
     rows = passes(LINE, 4)
     rows["c_rr"] = rows["c_rr_var"] = np.nan
-    of, segments = ledger_of(rows)
-    lost = losses(of, segments, 0.02)
+    ledger, segments = ledger_of(rows)
+    lost = losses(ledger, segments, 0.02)
     assert np.isnan(lost.c_rr).all()
     assert (lost.work_j == 0).all()
     assert lost.passes[1:-1, 0] == pytest.approx(4.0, rel=0.06)
 
 
 def test_an_empty_map_has_an_empty_ledger():
-    of, segments = ledger_of()
-    assert len(of.rows) == 0
-    lost = losses(of, segments, 0.02)
+    ledger, segments = ledger_of()
+    assert len(ledger.rows) == 0
+    lost = losses(ledger, segments, 0.02)
     assert lost.work_j.shape == (0,)
-    assert trends(of).shape == (0,)
+    assert trends(ledger).shape == (0,)
 
 
 def test_a_trend_needs_three_days():

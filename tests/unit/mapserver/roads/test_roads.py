@@ -15,19 +15,19 @@ from tests.unit.mapserver.roads.drives import EVERYWHERE, along, grid_of, passes
 END_M = 3.5  # a road ends within so much of where machines turned round
 
 
-def off_m(line: Floats, found: Segments) -> float:
+def off_m(line: Floats, shown: Segments) -> float:
     """How far points of a line are from the roads at most."""
-    return float(max(np.hypot(*(found.points - place).T).min() for place in line))
+    return float(max(np.hypot(*(shown.points - place).T).min() for place in line))
 
 
-def beyond_m(line: Floats, found: Segments) -> float:
+def beyond_m(line: Floats, shown: Segments) -> float:
     """How far the roads are from a line at most."""
-    return float(max(np.hypot(*(line - place).T).min() for place in found.points))
+    return float(max(np.hypot(*(line - place).T).min() for place in shown.points))
 
 
-def degrees(found: Segments) -> Counter[int]:
+def degrees(shown: Segments) -> Counter[int]:
     """How many nodes there are of each degree."""
-    return Counter(Counter(found.nodes[found.nodes >= 0].tolist()).values())
+    return Counter(Counter(shown.nodes[shown.nodes >= 0].tolist()).values())
 
 
 def same(one: Segments, other: Segments) -> bool:
@@ -38,20 +38,20 @@ def same(one: Segments, other: Segments) -> bool:
 
 
 def test_an_empty_map_has_no_roads():
-    found = roads()
-    assert (found.ids, len(found.points), found.ahead.shape, found.nodes.shape) == ((), 0, (0, 2), (0, 2))
+    shown = roads()
+    assert (shown.ids, len(shown.points), shown.ahead.shape, shown.nodes.shape) == ((), 0, (0, 2), (0, 2))
 
 
 def test_a_straight_road_is_cut_at_the_lattice():
     line = along([(10, 10), (210, 10)])
-    found = roads(passes(line))
-    assert found.ids == tuple(f"{column}_0_e" for column in range(9))
-    assert off_m(line, found) < 2.0
-    assert beyond_m(line, found) < END_M
-    cuts = np.array([found.line(i)[0, 0] for i in range(1, 9)])
+    shown = roads(passes(line))
+    assert shown.ids == tuple(f"{column}_0_e" for column in range(9))
+    assert off_m(line, shown) < 2.0
+    assert beyond_m(line, shown) < END_M
+    cuts = np.array([shown.line(i)[0, 0] for i in range(1, 9)])
     np.testing.assert_allclose(cuts % LATTICE_M, 0.5)  # the first cell of the next one
-    assert (found.length_m >= SLIVER_M).all()
-    np.testing.assert_allclose(found.ahead, [(1.0, 0.0)] * 9, atol=0.05)
+    assert (shown.length_m >= SLIVER_M).all()
+    np.testing.assert_allclose(shown.ahead, [(1.0, 0.0)] * 9, atol=0.05)
 
 
 def test_one_pass_is_a_road():
@@ -61,42 +61,42 @@ def test_one_pass_is_a_road():
 
 def test_a_one_way_ring_is_closed():
     line = ring((100, 100), 40)
-    found = roads(passes(line))
-    assert off_m(line, found) < 2.0
-    assert beyond_m(line, found) < 2.0
-    assert not degrees(found)
-    assert found.length_m.sum() == pytest.approx(2 * np.pi * 40, rel=0.02)
-    ends = Counter(tuple(point) for i in range(len(found.ids)) for point in found.line(i)[[0, -1]].tolist())
+    shown = roads(passes(line))
+    assert off_m(line, shown) < 2.0
+    assert beyond_m(line, shown) < 2.0
+    assert not degrees(shown)
+    assert shown.length_m.sum() == pytest.approx(2 * np.pi * 40, rel=0.02)
+    ends = Counter(tuple(point) for i in range(len(shown.ids)) for point in shown.line(i)[[0, -1]].tolist())
     assert set(ends.values()) == {2}  # each segment goes on in another one
 
 
 def test_a_loop_with_corners_is_closed():
     line = along([(20, 20), (220, 20), (220, 120), (20, 120), (20, 20)])
-    found = roads(passes(line))
-    assert off_m(line, found) < 3.0
-    assert not degrees(found)
+    shown = roads(passes(line))
+    assert off_m(line, shown) < 3.0
+    assert not degrees(shown)
 
 
 def test_a_crossing_is_crossed():
-    found = roads(passes(along([(20, 50), (180, 50)])), passes(along([(100, 0), (100, 100)]), seed=1))
-    assert degrees(found) == {1: 4, 4: 1}
+    shown = roads(passes(along([(20, 50), (180, 50)])), passes(along([(100, 0), (100, 100)]), seed=1))
+    assert degrees(shown) == {1: 4, 4: 1}
 
 
 def test_a_way_that_is_seldom_driven_crosses_one_that_is_driven_much():
-    found = roads(passes(along([(20, 50), (180, 50)]), 60), passes(along([(100, 0), (100, 100)]), 2, seed=1))
-    assert degrees(found) == {1: 4, 4: 1}
+    shown = roads(passes(along([(20, 50), (180, 50)]), 60), passes(along([(100, 0), (100, 100)]), 2, seed=1))
+    assert degrees(shown) == {1: 4, 4: 1}
 
 
 def test_the_y_of_a_loader_has_four_arms():
     legs = ([(20, 50), (80, 50)], [(80, 50), (50, 50), (50, 20)], [(50, 20), (50, 80)])
-    found = roads(*(passes(along(leg), seed=i) for i, leg in enumerate(legs)))
-    assert degrees(found) == {1: 4, 4: 1}
+    shown = roads(*(passes(along(leg), seed=i) for i, leg in enumerate(legs)))
+    assert degrees(shown) == {1: 4, 4: 1}
 
 
 def test_a_fork_hangs_together():
     line = [(20, 50), (100, 50)]
-    found = roads(passes(along([*line, (180, 80)])), passes(along([*line, (180, 20)]), seed=1))
-    assert degrees(found) == {1: 3, 3: 1}
+    shown = roads(passes(along([*line, (180, 80)])), passes(along([*line, (180, 20)]), seed=1))
+    assert degrees(shown) == {1: 3, 3: 1}
 
 
 @pytest.mark.parametrize("weak", [3, 10])
@@ -104,11 +104,11 @@ def test_a_fork_hangs_together():
 def test_lanes_six_metres_apart_stay_apart(weak, turn):
     c, s = np.cos(turn), np.sin(turn)
     there, back = (along(line) @ np.array([(c, s), (-s, c)]) for line in ([(20, 50), (180, 50)], [(180, 56), (20, 56)]))
-    found = roads(passes(there, 40), passes(back, weak, seed=1))
-    assert degrees(found) == {1: 4}
-    assert off_m(np.concatenate([there, back]), found) < 2.0
-    assert beyond_m(np.concatenate([there, back]), found) < END_M
-    assert len(set(found.ids)) == len(found.ids)
+    shown = roads(passes(there, 40), passes(back, weak, seed=1))
+    assert degrees(shown) == {1: 4}
+    assert off_m(np.concatenate([there, back]), shown) < 2.0
+    assert beyond_m(np.concatenate([there, back]), shown) < END_M
+    assert len(set(shown.ids)) == len(shown.ids)
 
 
 def test_names_do_not_depend_on_order_or_batches():
