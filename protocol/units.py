@@ -3,6 +3,7 @@
 import math
 
 GRAVITY_MPS2 = 9.80665  # standard gravity (ISO 80000-3)
+DIESEL_J_PER_L = 35.8e6  # lower heating value
 
 # unit -> {suffix of a field: factor from the unit to what the suffix means}
 _UNITS: dict[str, dict[str, float]] = {

@@ -199,8 +199,7 @@ class Client:
         """
         fresh = Freshness(after, wait_s)
         places = tuple((float(x), float(y)) for x, y in line)
-        query = RouteQuery(places, machine, stops, step_m, unknown, as_of_ns, fresh)
-        return decode_answer(self._ask(query))
+        return self.drive(RouteQuery(places, machine, stops, step_m, unknown, as_of_ns, fresh))
 
     def way(
         self,
@@ -239,6 +238,10 @@ class Client:
             as_of_ns,
             Freshness(after, wait_s),
         )
+        return self.drive(query)
+
+    def drive(self, query: RouteQuery | WayQuery) -> RouteAnswer:
+        """What a drive costs, of a query that is made already."""
         return decode_answer(self._ask(query))
 
     def alive(self) -> ServerAlive:

@@ -8,8 +8,8 @@ import numpy as np
 
 from mapserver.roads.loss import Losses
 from protocol.arrays import Floats, Ints
+from protocol.units import DIESEL_J_PER_L
 
-DIESEL_J_PER_L = 35.8e6
 # Of a hauler at full power, over its mass: what work takes longer costs at this rate. Assumed; a loaded truck has 5, an
 # empty one 11.
 ENGINE_W_PER_KG = 6.0

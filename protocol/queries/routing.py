@@ -12,6 +12,7 @@ from protocol.arrays import Floats
 from protocol.errors import MessageError, Refusal
 from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, decode_version, encode_version, take_record
 from protocol.queries.answers import MapVersion
+from protocol.units import DIESEL_J_PER_L
 from protocol.wire.codec import pack, take, unpack
 
 MAX_MASS_KG = 1e6
@@ -102,6 +103,11 @@ class RouteTotals:
     time_s: float
     time_low_s: float
     time_high_s: float
+
+    @property
+    def litres(self) -> float:
+        """Of diesel, with so much energy."""
+        return self.fuel_j / DIESEL_J_PER_L
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 import re
 import time
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,12 @@ from protocol.files import whole_file
 from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, Region
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
 from protocol.queries.explanations import calibrated, why
+from protocol.queries.parameters import Freshness, text_of
 from protocol.queries.pieces import Progress
+from protocol.queries.requests import parse_query
 from protocol.queries.roads import RoadSegment
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.routing import RouteAnswer
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.outputs import OutputFile
@@ -65,6 +70,12 @@ def add_options(parser: ArgumentParser) -> None:
         hours = ("from", "traffic of the hours from this time on"), ("to", "traffic of the hours before this time")
         _add_times(roads, *hours, ("as-of", "the map as of this time"))
     roads.add_argument("--target", type=positive, default=0.02, help="rolling resistance of good ground (default 0.02)")
+    route = _add_query(queries, _route, "what a drive along a line costs a machine: energy and time")
+    route.add_argument("line", type=float, nargs="+", metavar="X_M Y_M", help="places of the line, in metres")
+    _add_drive(route)
+    way = _add_query(queries, _way, "the line from one place to another that costs least")
+    _add_numbers(way, "from_x_m", "from_y_m", "to_x_m", "to_y_m")
+    _add_drive(way)
     _add_query(queries, _machines, "state of each machine: samples, trust, reasons")
     _add_query(queries, _calibration, "what is taken off the samples of each machine")
     changes = _add_query(queries, _changes, "list of ground changes: place and time")
@@ -83,6 +94,22 @@ def _add_query(queries: Subparsers, ask: Ask, summary: str) -> ArgumentParser:
 def _add_numbers(query: ArgumentParser, *names: str) -> None:
     for name in names:
         query.add_argument(name, type=float)
+
+
+def _add_drive(query: ArgumentParser) -> None:
+    examples = (
+        "machine=truck, mass=30000, speed=6, unknown=refuse, step=50; of a way cost=time, margin=5, max_grade=0.1"
+    )
+    option = f"anything that docs/protocol.md (Routes) lists, as {examples}; may be repeated"
+    query.add_argument("--set", action="append", type=_named, default=[], metavar="NAME=VALUE", help=option)
+    _add_times(query, ("as-of", "the map as of this time"))
+
+
+def _named(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE")
+    return name, value
 
 
 def _add_when(query: ArgumentParser) -> None:
@@ -142,7 +169,7 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     return table, lines
 
 
-def _version(answer: PointAnswer | Region) -> dict[str, Any]:
+def _version(answer: PointAnswer | Region | RouteAnswer) -> dict[str, Any]:
     version = answer.version
     return {"store": version.store, "merged": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
 
@@ -318,6 +345,59 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
         ),
         *(f"  {name}: {count}" for name, count in sorted(info.counters.items())),
     ]
+
+
+def _route(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
+    return _driven(client, arguments, "route", {"line": _numbers(arguments.line)})
+
+
+def _way(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
+    ends = {name: _numbers([getattr(arguments, f"{name}_{axis}_m") for axis in "xy"]) for name in ("from", "to")}
+    return _driven(client, arguments, "way", ends)
+
+
+def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str, str]) -> Answer:
+    """What a drive costs, in a line of totals and a table of steps."""
+    times = {key: str(stamp) for key, stamp in _stamps(client, as_of=arguments.as_of_time).items() if stamp}
+    query = parse_query(name, {**places, **dict(arguments.set), **{k.removesuffix("_ns"): v for k, v in times.items()}})
+    assert isinstance(query, RouteQuery | WayQuery)
+    answer = client.drive(replace(query, fresh=Freshness(arguments.after)))
+    of, steps = answer.totals, answer.steps
+    corners = (
+        []
+        if name == "route"
+        else [f"{len(answer.line_m)} places: " + " ".join(f"{x:.0f},{y:.0f}" for x, y in answer.line_m)]
+    )
+    kwh = f"{of.energy_j / 3.6e6:.2f} kWh ({of.energy_low_j / 3.6e6:.2f}..{of.energy_high_j / 3.6e6:.2f})"
+    taken = f"{of.time_s:.0f} s ({of.time_low_s:.0f}..{of.time_high_s:.0f})"
+    lines = [
+        f"{of.length_m:.0f} m, {of.lift_m:+.1f} m up, {of.unknown:.0%} unknown",
+        f"{kwh}, {of.litres:.2f} l of diesel, {of.braked_j / 3.6e6:.2f} kWh braked, {taken}",
+        *corners,
+    ]
+    head = ["m", "from", "resistance", "+-", "slope %", "unknown", "kWh", "braked", "s", "km/h"]
+    rows = [
+        [
+            f"{steps.way_m[i]:.0f}",
+            f"{steps.x_m[i]:.0f},{steps.y_m[i]:.0f}",
+            f"{steps.resistance[i]:.4f}",
+            f"{steps.resistance_std[i]:.4f}",
+            f"{100 * steps.slope[i]:+.1f}",
+            f"{steps.unknown[i]:.0%}",
+            f"{steps.energy_j[i] / 3.6e6:.3f}",
+            f"{steps.braked_j[i] / 3.6e6:.3f}",
+            f"{steps.time_s[i]:.1f}",
+            f"{3.6 * steps.speed_mps[i]:.1f}",
+        ]
+        for i in range(len(steps.way_m))
+    ]
+    columns = {name: column.tolist() for name, column in vars(steps).items()}
+    table = {"line": answer.line_m.tolist(), "totals": asdict(of), "steps": columns, **_version(answer)}
+    return table, [*lines, *_table(head, rows)]
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return ",".join(text_of(value) for value in values)
 
 
 def _followers(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:

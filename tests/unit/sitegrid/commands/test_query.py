@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,6 +30,8 @@ from protocol.queries.requests import (
     parse_query,
 )
 from protocol.queries.roads import Segments, Worklist, encode_segments, encode_worklist
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.routing import MACHINES
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
 from sitegrid.asking import PAST_S
@@ -74,6 +77,8 @@ class Session:
             return encode_history(HistoryAnswer(0.5, 1.5, () if asked.x_m < 0 else spans, version(17, 3), T0))
         if isinstance(asked, SegmentsQuery | WorklistQuery):
             return (GOLDEN / f"{asked.name}.bin").read_bytes() if asked.from_ns is None else self._no_roads(asked)
+        if isinstance(asked, RouteQuery | WayQuery):
+            return (GOLDEN / "route.bin").read_bytes()
         assert isinstance(asked, PointQuery | RegionQuery)
         stamp_ns = asked.when.as_of_ns or self.now_ns
         if isinstance(asked, PointQuery):
@@ -146,6 +151,45 @@ def test_a_worklist_is_a_table_with_what_changed_below(session: Session, capsys)
     assert json.loads(capsys.readouterr().out)["rows"][0]["segment"]["id"] == "3_-2_ne"
     assert main(["query", "worklist", "--from", str(T0)]) == 0
     assert "no stretch is worse for sure" in capsys.readouterr().out
+
+
+def test_a_route_is_its_totals_and_a_table_of_steps(session: Session, capsys):
+    words = ["query", "--after", "3", "route", "0", "0", "30", "40", "--set", "machine=truck", "--set", "mass=30000"]
+    assert main([*words, "--set", "unknown=refuse", "--as-of", str(T0)]) == 0
+    truck = replace(MACHINES["truck"], mass_kg=30_000.0)
+    line = ((0.0, 0.0), (30.0, 40.0))
+    assert session.asked[-1] == RouteQuery(line, truck, unknown="refuse", as_of_ns=T0, fresh=Freshness(3))
+    length, cost, names, first, last = capsys.readouterr().out.splitlines()
+    assert length == "50 m, +1.5 m up, 50% unknown"
+    assert cost == "0.28 kWh (0.25..0.35), 0.11 l of diesel, 0.06 kWh braked, 20 s (20..21)"
+    assert names.split()[:4] == ["m", "from", "resistance", "+-"]
+    assert (first.split()[0], last.split()[1]) == ("0", "3,4")
+    assert main(["query", "route", "0", "0", "30", "40", "--json"]) == 0
+    table = json.loads(capsys.readouterr().out)
+    assert table["totals"]["energy_j"] == 1e6
+    assert table["steps"]["confidence"] == [0.75, None]
+
+
+def test_a_way_names_its_places(session: Session, capsys):
+    assert main(["query", "way", "0", "-5", "30", "40", "--set", "cost=time", "--set", "avoid=3,4,5,6"]) == 0
+    assert session.asked[-1] == WayQuery((0.0, -5.0), (30.0, 40.0), cost="time", avoid=((3.0, 4.0), (5.0, 6.0)))
+    assert "2 places: 0,0 30,40" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["route", "1", "2"], "parameter `line`: 1 places; a line has at least two"),
+        (["route", "1", "2", "3"], "parameter `line`: 3 numbers"),
+        (["route", "1", "2", "3", "4", "--set", "mass=-1"], "parameter `mass`: -1 is not positive"),
+        (["route", "1", "2", "3", "4", "--set", "colour=red"], "parameter `colour` is not known"),
+        (["way", "1", "2", "1", "2"], "parameter `to`: the same place as `from`"),
+    ],
+)
+def test_a_drive_that_cannot_be_is_refused_before_anybody_is_asked(session: Session, capsys, words, problem):
+    assert main(["query", *words]) == 1
+    assert problem in capsys.readouterr().err
+    assert session.asked == []
 
 
 def test_segments_are_a_table(session: Session, capsys):
