@@ -41,12 +41,13 @@ class ArchivedError(StoreError):
 class UnwrittenError(StoreError):
     """A transaction failed, as on a full disk: after `rollback` the journal is as it is on disk, and goes on.
 
-    problem: what the database says, without where it is.
+    problem: what the database says, without where it is. unsure: it may have been committed all the same, since the
+    answer is lost.
     """
 
-    def __init__(self, where: object, problem: str) -> None:
+    def __init__(self, where: object, problem: str, *, unsure: bool = False) -> None:
         super().__init__(where, problem)
-        self.problem = problem
+        self.problem, self.unsure = problem, unsure
 
 
 class FencedError(UnwrittenError):

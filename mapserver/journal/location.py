@@ -49,12 +49,13 @@ class JournalLocation:
         return _postgres().reader.exists(self.url) if self.url else self._file.is_file()
 
     def open(
-        self, site: str, frame: str, descends: Iterable[str] = (), waiting: Callable[[float], None] | None = None
+        self, site: str, frame: str, descends: Iterable[str] = (), waiting: Callable[[float], bool] | None = None
     ) -> Journal:
         """Become its writer, and make it where there is none; StoreError says why not.
 
         descends: ids of the stores that a new one is made from. waiting: is called, for so many seconds, again and
-        again while another server writes a journal that is shared; without it, that is an error.
+        again while another server writes a journal that is shared, and says whether it has checked the journal
+        meanwhile (`JournalQueries.check`); without it, that is an error.
         """
         self._require_one()
         if self.url:
@@ -88,13 +89,13 @@ class JournalLocation:
             return reader.identity().id
 
     def prepared_id(self, site: str, frame: str) -> str:
-        """As `store_id`, before a server waits for its turn; one that is shared is made where there is none.
+        """As `store_id`, before a server waits for its turn; one that is shared is made where there never was one.
 
         Servers that start at once on a new database know by its id that they have one journal.
         """
         if self.url:
             self._require_one()
-            _postgres().journal.prepare(self.url, site, frame)
+            _postgres().journal.prepare(self.url, self.folder, site, frame)
         return self.store_id()
 
     def trusted_row(self, journal: JournalQueries) -> int:
