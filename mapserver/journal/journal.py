@@ -153,6 +153,16 @@ class JournalReader(JournalQueries, Protocol):
         """Close it."""
 
 
+class Waiting(Protocol):
+    """What a server does while another one writes its journal."""
+
+    def follow(self, timeout_s: float) -> None:
+        """Do it for so long; what it raises ends the wait."""
+
+    def has_checked(self, journal: JournalQueries) -> bool:
+        """Whether that was done meanwhile which `JournalQueries.check` does, and need not be done again."""
+
+
 class Journal(JournalQueries, Protocol):
     """One writer's connection to the journal of one site.
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mapserver.journal.archive import FOLDER, Archive
-from mapserver.journal.journal import Journal, JournalQueries, JournalReader
+from mapserver.journal.journal import Journal, JournalQueries, JournalReader, Waiting
 from mapserver.journal.postgres import MARK_FILE
 from mapserver.journal.rows import StoreIdentity
 from mapserver.journal.sqlite.journal import SqliteJournal
@@ -49,13 +49,12 @@ class JournalLocation:
         return _postgres().reader.exists(self.url) if self.url else self._file.is_file()
 
     def open(
-        self, site: str, frame: str, descends: Iterable[str] = (), waiting: Callable[[float], bool] | None = None
+        self, site: str, frame: str, descends: Iterable[str] = (), waiting: Waiting | None = None
     ) -> Journal:
         """Become its writer, and make it where there is none; StoreError says why not.
 
-        descends: ids of the stores that a new one is made from. waiting: is called, for so many seconds, again and
-        again while another server writes a journal that is shared, and says whether it has checked the journal
-        meanwhile (`JournalQueries.check`); without it, that is an error.
+        descends: ids of the stores that a new one is made from. waiting: what to do, again and again, while another
+        server writes a journal that is shared; without it, that is an error.
         """
         self._require_one()
         if self.url:

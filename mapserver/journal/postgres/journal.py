@@ -12,13 +12,13 @@ from __future__ import annotations
 import logging
 import secrets
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 import psycopg
 
-from mapserver.journal.journal import ROWS_AT_ONCE, FencedError, UnwrittenError
+from mapserver.journal.journal import ROWS_AT_ONCE, FencedError, UnwrittenError, Waiting
 from mapserver.journal.postgres import MARK_FILE
 from mapserver.journal.postgres.connection import SCHEMA, Connection, connect, shown
 from mapserver.journal.postgres.mark import CHECKSUM, EPOCH, STORE, known_store, store_in, traces_of, trusted_by
@@ -66,7 +66,7 @@ def _is_there(session: WriterSession) -> bool:
 
 
 def _gone(where: str, was: str, or_else: str) -> StoreError:
-    return StoreError(where, f"holds no journal any more, and {was}; restore the database from a backup, or {or_else}")
+    return StoreError(where, f"holds no journal, and {was}; restore the database from a backup, or {or_else}")
 
 
 class PostgresJournal(TableWriter, PostgresQueries):
@@ -79,11 +79,11 @@ class PostgresJournal(TableWriter, PostgresQueries):
         site: str,
         frame: str,
         descends: Iterable[str] = (),
-        waiting: Callable[[float], bool] | None = None,
+        waiting: Waiting | None = None,
     ) -> None:
-        """folder: of the server, for its mark. waiting: is called for so many seconds while another one writes.
+        """folder: of the server, for its mark. waiting: what to do while another one writes.
 
-        It says whether the journal was checked meanwhile. Without `waiting`, StoreError where another one writes.
+        Without `waiting`, StoreError where another one writes.
         """
         super().__init__(url)
         self.fenced, self.epoch = "", 0
@@ -207,14 +207,14 @@ class PostgresJournal(TableWriter, PostgresQueries):
     def _forget_puts(self) -> None:
         self._rows, self._extents, self._puts, self._before = [], [], {}, {}
 
-    def _take_turn(self, waiting: Callable[[float], bool] | None) -> bool:
+    def _take_turn(self, waiting: Waiting | None) -> bool:
         """Become the writer; False where the session was lost over it, for who may wait to try again."""
-        is_checked = self._take_lock(waiting)
+        self._take_lock(waiting)
         try:
             self._require_same()
             self._take_epoch(self._mark.values.get(EPOCH, 0))
             self._return_to_disk()
-            if not is_checked:
+            if not (waiting and waiting.has_checked(self)):
                 self.check()
             self.trusted_row = trusted_by(self._mark.values, self)
             self._compare()
@@ -226,23 +226,23 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self.fenced = ""
         return self.epoch > 0
 
-    def _take_lock(self, waiting: Callable[[float], bool] | None) -> bool:
-        """Wait until no other session has the lock, also while the database is away; whether the journal is checked.
+    def _take_lock(self, waiting: Waiting | None) -> None:
+        """Wait until no other session has the lock, also while the database is away.
 
         Who may not wait waits for as long as the database needs to notice that the last holder is gone.
         """
-        is_checked, end_s = False, time.monotonic() + 2 * HANGS_S
+        end_s = time.monotonic() + 2 * HANGS_S
         while True:
             with suppress(UnwrittenError):
                 if self._session.lost:
                     self._close_sessions()
                     self._session = WriterSession(self._url, self.where, self._on_loss)
                 if self._session.take_lock():
-                    return is_checked
+                    return
             if waiting is None and time.monotonic() > end_s:
                 problem = self._session.lost or "another server is writing this journal; stop it first"
                 raise StoreError(self.where, problem)
-            is_checked = bool((waiting or time.sleep)(LOOK_S))
+            (waiting.follow if waiting else time.sleep)(LOOK_S)
 
     def _require(self, folder: Path, site: str, frame: str) -> None:
         """StoreError unless it is this site's and the folder's, which is this journal's from now on."""
