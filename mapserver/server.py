@@ -70,8 +70,8 @@ class Server:
         self._sign = sign
         with ExitStack() as opened:
             store = location.prepared_id(site.name, site.frame)
-            words = {"shared": location.is_shared, "known_epoch": location.epoch}
-            self._claim = claim = WriterClaim(ingest, site.name, store, **words)
+            shared, known_epoch = location.is_shared, location.epoch
+            self._claim = claim = WriterClaim(ingest, site.name, store, shared=shared, known_epoch=known_epoch)
             opened.callback(self._claim.close)
             self._claim.acquire(take_over=take_over)
 

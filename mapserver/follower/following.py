@@ -1,8 +1,9 @@
 """A thread that has a replica follow a journal; what others read of it, and how far behind it is.
 
 A row that was folded may be gone when the journal is looked at again: a store that was restored, a database that failed
-over. It is noticed by the id of the store, the numbers of the last row and event, and the checksum of the last row that
-was folded. Then the map is given up, and folded again.
+over. It is noticed by the id of the store, the numbers of the last row and event, an epoch that is lower than before,
+and the checksum of the last row that was folded, in the journal or in the archive. Then the map is given up, and
+folded again.
 """
 
 from __future__ import annotations
@@ -61,6 +62,8 @@ class Following:
         self._lock = threading.Lock()  # of the replica: held while pages are taken from it, or rows are folded
         self._replica: Replica | None = None
         self._checksum: int | None = None  # of the last row that was folded, where that is known
+        self._epoch = 0  # the newest one that was seen
+        self._compared: object = None  # where the last row was in the archive when it was compared
         self._journalled, self._complete_s = 0, float("-inf")
         self._problem = ""
         self._anew: tuple[Facts, Future[FoldedAnew | None]] | None = None
@@ -162,11 +165,33 @@ class Following:
             reader.identity().id != replica.store
             or state.row < replica.merged
             or state.event < replica.event
-            or (self._checksum is not None and reader.row_checksum(replica.merged) not in (None, self._checksum))
+            or state.epoch < self._epoch
+            or self._is_another_row(reader, replica.merged)
         )
+        self._epoch = state.epoch
         if is_gone:
             log.warning("rows are gone: the map is folded again journal=%s row=%d", reader.where, replica.merged)
         return is_gone
+
+    def _is_another_row(self, reader: JournalReader, row: int) -> bool:
+        """Whether the last row that was folded is not the one that is there."""
+        checksum = reader.row_checksum(row)
+        if checksum is None and row and self._checksum is not None:
+            checksum = self._archived_checksum(reader, row)
+        return self._checksum is not None and checksum not in (None, self._checksum)
+
+    def _archived_checksum(self, reader: JournalReader, row: int) -> int | None:
+        """Of a row in the archive, which is read once; None where nothing new can be said."""
+        archive = self.location.archive  # with no file open: another one may have taken the place of one
+        try:
+            (file,) = archive.cover(row, row - 1)
+            stat = file.stat()
+            if (seen := (row, file, stat.st_ino, stat.st_mtime_ns)) == self._compared:
+                return None
+            checksum, self._compared = History(reader, archive).row_checksum(row), seen
+        except (StoreError, OSError):  # who needs the file says so
+            return None
+        return checksum
 
     def _begin(self, reader: JournalReader, state: JournalState) -> Replica | None:
         """Fold the map from the newest snapshot or checkpoint that is true, without answering meanwhile.
@@ -175,7 +200,7 @@ class Following:
         """
         with self._lock:
             self._replica = None
-        self._complete_s, self._anew, self._checksum = float("-inf"), None, None
+        self._complete_s, self._anew, self._checksum, self._epoch = float("-inf"), None, None, state.epoch
         self.past = Past.of_store(self.location.folder, self.site.cell_m, self.config.fold)  # its index is of rows
         self.waits.advance(0)
         replica = Replica(self.site, self.config, reader.identity().id)
@@ -197,7 +222,7 @@ class Following:
         # The site's now is that of the rows in the map: watermarks are of these, and of some that are folded next.
         replica.reach((machine, mark.newest_ns) for (machine, _), mark in reader.watermarks().items())
         self._fold(reader, replica, reader.last_row)
-        self._checksum = reader.row_checksum(replica.merged)
+        self._checksum = history.row_checksum(replica.merged)
         with self._lock:
             self._replica = replica
         log.info("map folded row=%d fact=%d", replica.merged, facts.number)
@@ -213,7 +238,7 @@ class Following:
                 self.waits.advance(replica.merged)
             if self._ending.is_set():
                 return
-        self._checksum = reader.row_checksum(replica.merged)
+        self._checksum = History(reader, self.past.archive).row_checksum(replica.merged)
 
     def _correct(self, reader: JournalReader, replica: Replica) -> None:
         """Have the map follow decisions: another grid is folded beside it, and takes its place once it has its rows."""

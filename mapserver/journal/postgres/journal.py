@@ -326,8 +326,9 @@ class PostgresJournal(TableWriter, PostgresQueries):
             return
         with suppress(psycopg.Error), connect(self._url, "lost", target_session_attrs="read-write") as db:
             ((epoch, writer),) = db.execute(_WHOSE).fetchall()
-            if self._session.lost and self._is_taken_over(epoch, writer):
+            if self._is_taken_over(epoch, writer):
                 self.fenced = self._taken_over(epoch)
+                self._session.cut()
 
     def _return_to_disk(self) -> None:
         self._progress = Progress(self._load_watermarks())
