@@ -48,9 +48,7 @@ class JournalLocation:
         """Whether there is one."""
         return _postgres().reader.exists(self.url) if self.url else self._file.is_file()
 
-    def open(
-        self, site: str, frame: str, descends: Iterable[str] = (), waiting: Waiting | None = None
-    ) -> Journal:
+    def open(self, site: str, frame: str, descends: Iterable[str] = (), waiting: Waiting | None = None) -> Journal:
         """Become its writer, and make it where there is none; StoreError says why not.
 
         descends: ids of the stores that a new one is made from. waiting: what to do, again and again, while another

@@ -61,7 +61,7 @@ def _prepare(
 
 
 def _is_there(session: WriterSession) -> bool:
-    ((there,),) = session.run(f"SELECT to_regclass('{SCHEMA}.meta') IS NOT NULL")  # noqa: S608 # a constant
+    ((there,),) = session.run(f"SELECT to_regclass('{SCHEMA}.meta') IS NOT NULL")  # a constant
     return bool(there)
 
 

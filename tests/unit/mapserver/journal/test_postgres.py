@@ -330,10 +330,12 @@ def test_a_decision_whose_answer_is_lost_is_not_called_refused(tmp_path, databas
     writer = Writer(open_store(tmp_path, database))
     with closing(writer), closing(Refolding(writer, past_of(writer))) as refolding:
         LostAnswer(writer._store.journal._session, "INSERT INTO events")
-        with pytest.raises(QueryError, match="not known whether the decision is kept.*ask for") as caught:
+        with pytest.raises(QueryError, match=r"not known whether the decision is kept.*ask for") as caught:
             refolding.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
         assert caught.value.reason == Refusal.AFTER_TIMEOUT
-        with pytest.raises(QueryError, match="is not written: a decision was committed whose answer was lost") as caught:
+        with pytest.raises(
+            QueryError, match="is not written: a decision was committed whose answer was lost"
+        ) as caught:
             refolding.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
         assert caught.value.reason == Refusal.NOT_WRITER
     with closing(open_store(tmp_path, database)) as store:
@@ -500,10 +502,10 @@ def test_a_standby_of_a_database_that_is_made_anew_ends_and_leaves_it_empty(tmp_
         second.join()
         assert second.error or second.store, "it may have been faster than the database was gone"
     for folder in ("one", "two"):  # as supervisors start them again
-        with pytest.raises(StoreError, match="holds no journal, and .* restore the database from a backup") as caught:
+        with pytest.raises(StoreError, match=r"holds no journal, and .* restore the database from a backup") as caught:
             place(tmp_path / folder, database).prepared_id(SITE.name, SITE.frame)
         assert "\n" not in str(caught.value)
-        with pytest.raises(StoreError, match="holds no journal, and .* restore the database from a backup"):
+        with pytest.raises(StoreError, match=r"holds no journal, and .* restore the database from a backup"):
             open_store(tmp_path / folder, database)
     assert database.sql("SELECT to_regnamespace('sitegrid')") == [(None,)]
     cluster.sql(f"DROP DATABASE {name} WITH (FORCE)")
