@@ -1,8 +1,9 @@
 """A thread that has a replica follow a journal; what others read of it, and how far behind it is.
 
 A row that was folded may be gone when the journal is looked at again: a store that was restored, a database that failed
-over. It is noticed by the id of the store, and by numbers and checksums of the last row and event that were read. Then
-the map is given up, and folded again. A replica of a database that is behind another one has not lost anything.
+over. It is noticed by the id of the store, by numbers and checksums of the last row, in the journal or in the archive,
+and the last event, and by an epoch that is lower than before. Then the map is given up, and folded again. A replica of a
+database that is behind another one has not lost anything.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class Following:
         self._known = known
         self._lock = threading.Lock()  # of the replica: held while pages are taken from it, or rows are folded
         self._replica: Replica | None = None
-        self._epoch = 0  # as of the last look
+        self._epoch = 0  # the newest one that was seen
+        self._compared: object = None  # where the last row was in the archive when it was compared
         self._journalled, self._complete_s = 0, float("-inf")
         self._problem = ""
         self._anew: tuple[Facts, Future[FoldedAnew | None]] | None = None
@@ -145,7 +147,7 @@ class Following:
         if replica and self._lags(reader, state, replica):
             return
         last_row, as_of_s = self._known() if self._known else (state.row, complete_s)
-        self._epoch, self._journalled = state.epoch, max(state.row, last_row)
+        self._journalled = max(state.row, last_row)
         if replica is None or self._is_gone(reader, state, replica):
             replica = self._begin(reader, state)
         if replica is None:
@@ -172,12 +174,34 @@ class Following:
             reader.identity().id != replica.store
             or state.row < replica.merged
             or state.event < replica.event
-            or is_other(reader.row_checksum(replica.merged), replica.checksum)
             or is_other(reader.event_checksum(replica.event), replica.event_checksum)
+            or state.epoch < self._epoch
+            or self._is_another_row(reader, replica)
         )
+        self._epoch = state.epoch
         if is_gone:
             log.warning("rows are gone: the map is folded again journal=%s row=%d", reader.where, replica.merged)
         return is_gone
+
+    def _is_another_row(self, reader: JournalReader, replica: Replica) -> bool:
+        """Whether the last row that was folded is not the one that is there."""
+        checksum = reader.row_checksum(replica.merged)
+        if checksum is None and replica.checksum is not None:
+            checksum = self._archived_checksum(reader, replica.merged)
+        return is_other(checksum, replica.checksum)
+
+    def _archived_checksum(self, reader: JournalReader, row: int) -> int | None:
+        """Of a row in the archive, which is read once; None where nothing new can be said."""
+        archive = self.location.archive  # with no file open: another one may have taken the place of one
+        try:
+            (file,) = archive.cover(row, row - 1)
+            stat = file.stat()
+            if (seen := (row, file, stat.st_ino, stat.st_mtime_ns)) == self._compared:
+                return None
+            checksum, self._compared = History(reader, archive).row_checksum(row), seen
+        except (StoreError, OSError):  # who needs the file says so
+            return None
+        return checksum
 
     def _begin(self, reader: JournalReader, state: JournalState) -> Replica | None:
         """Fold the map from the newest snapshot or checkpoint that is true, without answering meanwhile.
@@ -186,7 +210,7 @@ class Following:
         """
         with self._lock:
             self._replica = None
-        self._complete_s, self._anew = float("-inf"), None
+        self._complete_s, self._anew, self._epoch = float("-inf"), None, state.epoch
         self.past = self._new_past()  # its index is of rows
         self.waits.advance(0)
         replica = Replica(self.site, self.config, reader.identity().id)
@@ -205,7 +229,7 @@ class Following:
             return None
         release_memory()
         replica.adopt(grid, last, facts)
-        replica.checksum = reader.row_checksum(last)
+        replica.checksum = history.row_checksum(last)
         # The site's now is that of the rows in the map: watermarks are of these, and of some that are folded next.
         replica.reach((machine, mark.newest_ns) for (machine, _), mark in reader.watermarks().items())
         self._fold(reader, replica, reader.last_row)

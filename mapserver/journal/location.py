@@ -87,6 +87,11 @@ class JournalLocation:
         with self.reader() as reader:
             return reader.identity().id
 
+    def epoch(self) -> int:
+        """The epoch of the newest writer; StoreError where it cannot be read."""
+        with self.reader() as reader:
+            return reader.state().epoch
+
     def prepared_id(self, site: str, frame: str) -> str:
         """As `store_id`, before a server waits for its turn; one that is shared is made where there is none.
 

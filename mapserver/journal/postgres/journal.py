@@ -271,8 +271,9 @@ class PostgresJournal(TableWriter, PostgresQueries):
         """Look whether another server has taken over: the writer itself may have nothing to do."""
         with suppress(psycopg.Error), connect(self._url, "lost", target_session_attrs="read-write") as db:
             ((epoch,),) = db.execute("SELECT epoch FROM head").fetchall()
-            if epoch > self.epoch and self._session.lost:
+            if epoch > self.epoch > 0:
                 self.fenced = self._taken_over(epoch)
+                self._session.cut()
 
     def _return_to_disk(self) -> None:
         self._progress = Progress(self._load_watermarks())

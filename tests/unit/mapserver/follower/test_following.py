@@ -1,6 +1,7 @@
 """A follower of a real journal: equal to the server bit for bit, whatever happens to the journal."""
 
 import shutil
+import sqlite3
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -230,6 +231,86 @@ def test_other_rows_under_the_same_numbers_are_noticed_by_a_checksum(tmp_path, c
         with closing(open_writer(tmp_path / "one")) as writer:
             catches_up(one, writer)  # four rows: it has not lost any by number
         assert "rows are gone" in caplog.text
+
+
+def archive_all(folder: Path, writer: Writer) -> None:
+    location = JournalLocation(folder)
+
+    def forget(until: int) -> int:
+        return writer.run(lambda store: store.journal.forget(until))
+
+    with location.reader() as reader:
+        assert list(archive(location.archive.folder, reader, SITE, NOW_NS + 10**15, forget, NOW_NS))
+
+
+def test_other_rows_under_archived_numbers_are_noticed_by_a_checksum(tmp_path, caplog):
+    """The journal itself has none of them any more, and all numbers are the same."""
+    for name, seed in (("one", 2), ("other", 3)):
+        with closing(open_writer(tmp_path / name)) as writer:
+            if name == "one":
+                deliver(writer, 1)
+        if name == "one":
+            shutil.copytree(tmp_path / "one", tmp_path / "backup")
+        else:
+            shutil.rmtree(tmp_path / "other")
+            (tmp_path / "backup").rename(tmp_path / "other")
+        with closing(open_writer(tmp_path / name)) as writer:
+            deliver(writer, seed)
+            archive_all(tmp_path / name, writer)
+            assert writer.run(lambda store: (store.journalled, store.journal.archived_row, store.journal.epoch)) == (
+                2,
+                2,
+                2,
+            )
+    with following(tmp_path / "one") as one:
+        wait_for(lambda: (version(one) or MapVersion("", 0, 0)).row == 2)
+        (tmp_path / "one").rename(tmp_path / "gone")
+        (tmp_path / "other").rename(tmp_path / "one")
+        wait_for(lambda: "rows are gone" in caplog.text)
+        with closing(open_writer(tmp_path / "one")) as writer:
+            catches_up(one, writer)
+        assert caplog.text.count("rows are gone") == 1
+
+
+def test_an_epoch_that_is_lower_than_before_is_noticed(tmp_path, caplog):
+    with closing(open_writer(tmp_path)) as writer:
+        deliver(writer, 1)
+    open_writer(tmp_path).close()
+    with following(tmp_path) as one:
+        wait_for(lambda: version(one) is not None)
+        with closing(sqlite3.connect(tmp_path / "journal.db", isolation_level=None)) as db:
+            db.execute("UPDATE meta SET value = '1' WHERE key = 'epoch'")
+        wait_for(lambda: "rows are gone" in caplog.text)
+        wait_for(lambda: version(one) is not None)
+        assert caplog.text.count("rows are gone") == 1
+
+
+def test_a_slow_follower_holds_nobody_up_says_how_far_behind_it_is_and_has_the_same_map_in_the_end(
+    tmp_path, monkeypatch
+):
+    may_read = threading.Event()
+    may_read.set()
+    read = module.read_history
+
+    def slowly(*words):
+        for rows in read(*words):
+            assert may_read.wait(WAIT_S)
+            yield rows
+
+    monkeypatch.setattr(module, "read_history", slowly)
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+        may_read.clear()
+        for seed in range(2, 10):
+            deliver(writer, seed, machine="b")  # each is acknowledged
+        wait_for(lambda: one.behind()[0] > 0)
+        before_s = one.behind()[1]
+        wait_for(lambda: one.behind()[1] > before_s + 0.2)
+        assert version(one).row == 1, "and it answers with the map that it has"
+        may_read.set()
+        catches_up(one, writer)
+        wait_for(lambda: one.behind()[0] == 0 and one.behind()[1] < 1.5)
 
 
 def test_rows_that_are_forgotten_below_the_follower_or_above_it_are_read_from_the_archive(tmp_path):

@@ -30,6 +30,7 @@ from mapserver.journal.postgres.session import WriterSession
 from mapserver.trust.decisions import PERSON, TrustDecision
 from protocol.errors import ConfigError, Refusal, SitegridError, StoreError
 from protocol.wire.messages import Ack, Refused
+from tests.chaos.tcp_proxy import Proxy, Weather
 from tests.pooler import SwappingPooler
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, random_samples, same, wait_for
 
@@ -202,6 +203,51 @@ def test_a_holder_that_stops_in_the_middle_of_a_message_loses_the_lock(tmp_path,
             wait_for(other.take_lock)
         link.detach()
     holder.close()
+
+
+def test_a_holder_whose_network_swallows_all_bytes_notices_it(tmp_path, database):
+    """Something between acknowledges them, so that the kernel waits for ever."""
+    with Proxy(database.cluster.port) as proxy:
+        url = database.url.replace(str(database.cluster.port), proxy.endpoint.rpartition(":")[2])
+        store = Store(JournalLocation(tmp_path / "one", url), SITE, CONFIG, now_ns)
+        assert send(store, 1).epoch == 1
+        proxy.set(Weather(hold_there=True, hold_back=True))
+        with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
+            second = open_store(tmp_path / "two", database, standby)
+        with closing(second):
+            wait_for(lambda: store.journal._session.lost)
+            assert isinstance(send(store, 6), Refused), "and no thread waits for ever"
+            assert send(second, 6).epoch == 2
+            began_s = time.monotonic()
+            store.close()
+            assert time.monotonic() - began_s < session.ANSWER_S + 1.0
+
+
+def test_a_commit_whose_answer_never_comes_ends_once_another_server_has_taken_over(tmp_path, database):
+    with Proxy(database.cluster.port) as proxy, Proxy(database.cluster.port) as open_proxy:
+        url = database.url.replace(str(database.cluster.port), proxy.endpoint.rpartition(":")[2])
+        with closing(Store(JournalLocation(tmp_path / "one", url), SITE, CONFIG, now_ns)) as store:
+            send(store, 1)
+            proxy.set(Weather(hold_back=True))
+            store.journal._url = url.replace(proxy.endpoint.rpartition(":")[2], open_proxy.endpoint.rpartition(":")[2])
+            answers: list[object] = []
+
+            def commit() -> None:
+                try:
+                    answers.append(send(store, 6))
+                except FencedError as error:
+                    answers.append(error)
+
+            committing = threading.Thread(target=commit)
+            committing.start()
+            with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
+                second = open_store(tmp_path / "two", database, standby)
+            with closing(second):
+                committing.join(20.0)
+                assert len(answers) == 1
+                assert not isinstance(answers[0], Ack)
+                assert "taken over the journal, with epoch 2 after 1" in store.journal.fenced
+                assert send(second, 6).trimmed == 5, "it was committed, and nobody was told so"
 
 
 def test_a_holder_that_works_keeps_the_lock(tmp_path, database):
