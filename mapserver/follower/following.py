@@ -1,8 +1,8 @@
 """A thread that has a replica follow a journal; what others read of it, and how far behind it is.
 
 A row that was folded may be gone when the journal is looked at again: a store that was restored, a database that failed
-over. It is noticed by the id of the store, by numbers and checksums of the last row (in journal or archive) and the last
-event, and by an epoch that is lower than before. Then the map is given up, and folded again. A replica of a
+over. It is noticed by the id of the store, by numbers and checksums of the last row (in journal or archive) and of the
+last event, and by an epoch that is lower than before. Then the map is given up, and folded again. A replica of a
 database that is behind another one has not lost anything.
 """
 
