@@ -114,6 +114,9 @@ class JournalQueries(Protocol):
         Who has seen a row knows by this whether the journal still has it, or was restored and went another course.
         """
 
+    def event_checksum(self, number: int) -> int | None:
+        """As `row_checksum`, of an event."""
+
     def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
         """Events beyond the number `after`, of one kind or of all, in the order in which they were written."""
 
@@ -142,6 +145,16 @@ class JournalReader(JournalQueries, Protocol):
 
     site: str
     frame: str
+
+    def complete_s(self) -> float:
+        """When, by the steady clock, what can be read now was all that was journalled; negative infinity where unknown.
+
+        That is now, but where it is read from a replica of a database, which may be behind.
+        """
+
+    @property
+    def is_replica(self) -> bool:
+        """Whether it reads from a replica of a database: the next connection may be to one that is further behind."""
 
     def follow(self, known: JournalState, timeout_s: float) -> JournalState:
         """Wait until the journal is not as known any more, or for so long; returns how far it is then."""

@@ -37,6 +37,12 @@ def checksum_of(record: bytes) -> int:
     return int.from_bytes(record[-_CRC_BYTES:], "little")
 
 
+def last_checksum(rows: JournalRows) -> int:
+    """The checksum that the last one of some rows was written with."""
+    (last,) = rows.chosen(rows.numbers == rows.numbers[-1])
+    return checksum_of(record(last))
+
+
 def warm_up() -> None:
     """Compile the kernels, or read them from their cache, before a batch waits for them."""
     row = JournalRow(1, "", 1, 1, np.zeros(1, SAMPLE_DTYPE))

@@ -192,12 +192,15 @@ def test_archived_rows_are_forgotten_in_pieces(journal, reader):
     journal.shrink()
 
 
-def test_the_checksum_of_a_row_tells_it_from_another(place, journal, reader):
+def test_the_checksum_of_a_row_or_an_event_tells_it_from_another(place, journal, reader):
     write(journal, admission(), admission(2, 4))
     first, second = reader.row_checksum(1), reader.row_checksum(2)
     assert first != second
     assert journal.row_checksum(2) == second
     assert reader.row_checksum(3) is None
+    journal.append_events([("t", 1, {}), ("t", 1, {"x": 0.1})])
+    assert [reader.event_checksum(number) for number in (0, 1, 2)] == [None, *(e.checksum for e in reader.events())]
+    assert reader.event_checksum(1) != reader.event_checksum(2)
 
 
 def test_a_follower_waits_for_news(journal, reader):
