@@ -14,7 +14,7 @@ from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import JournalQueries, JournalReader, JournalState
 from mapserver.journal.location import JournalLocation
-from mapserver.journal.records import checksum_of, record
+from mapserver.journal.records import last_checksum
 from mapserver.journal.refold import fold_samples, pieces, release_memory
 from mapserver.journal.rows import JournalRows, Selection
 from protocol.errors import StoreError
@@ -144,8 +144,7 @@ class _Reading:
         """Those of all other machines."""
         try:
             for rows in read_history(self._history, self.row, self._until):
-                *_, last = rows
-                self.row, self.checksum = last.row, checksum_of(record(last))
+                self.row, self.checksum = int(rows.numbers[-1]), last_checksum(rows)
                 yield rows.without(without)
         except StoreError as error:
             self.problem = error

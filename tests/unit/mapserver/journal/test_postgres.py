@@ -309,10 +309,10 @@ def test_a_server_without_the_journal_acknowledges_not_even_what_it_had(tmp_path
 
 
 class LostAnswer:
-    """Cuts a session once, between a statement and its answer. of: what the statement has in it."""
+    """Cuts a session once, between a statement that has some text and its answer."""
 
-    def __init__(self, session: WriterSession, of: str) -> None:
-        self._db, self._of = session._db, of
+    def __init__(self, session: WriterSession, text: str) -> None:
+        self._db, self._text = session._db, text
         session._db = self
 
     def __getattr__(self, name: str) -> Any:
@@ -320,7 +320,7 @@ class LostAnswer:
 
     def execute(self, query: Any, *more: Any) -> Any:
         answer = self._db.execute(query, *more)
-        if self._of in (query.decode() if isinstance(query, bytes) else query):
+        if self._text in (query.decode() if isinstance(query, bytes) else query):
             self._db.close()
             raise psycopg.OperationalError("server closed the connection unexpectedly")
         return answer
