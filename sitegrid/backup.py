@@ -111,7 +111,9 @@ def _examined(location: JournalLocation, *, live: bool) -> Examined:
 def _journal_of(store: Path) -> JournalLocation:
     location = JournalLocation(store)
     if not location.exists():
-        raise ConfigError(store, f"holds no {JOURNAL_FILE}; a journal in PostgreSQL is backed up by pg_dump")
+        raise ConfigError(
+            store, f"holds no {JOURNAL_FILE}; a journal in PostgreSQL is backed up by pg_dump (docs/operation.md)"
+        )
     return location
 
 

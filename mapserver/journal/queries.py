@@ -82,6 +82,11 @@ class TableQueries(ABC):
         rows = self._query("SELECT record FROM journal WHERE row = ?", (row,))
         return checksum_of(rows[0][0]) if rows else None
 
+    def event_checksum(self, number: int) -> int | None:
+        """See `JournalQueries`."""
+        rows = self._query("SELECT crc32 FROM events WHERE id = ?", (number,))
+        return int(rows[0][0]) if rows else None
+
     def read(self, after: int = 0, until: int = LAST, selection: Selection = ALL) -> Iterator[JournalRow]:
         """See `JournalQueries`."""
         return chain.from_iterable(self.read_many(after, until, selection))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import secrets
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
@@ -14,6 +13,7 @@ from mapserver.journal.queries import TableQueries
 from mapserver.journal.records import extent_of, record
 from mapserver.journal.rows import (
     Admission,
+    Event,
     JournalRow,
     MachineTotals,
     SpoolKey,
@@ -119,8 +119,5 @@ def watermark_line(machine: str, spool_id: int, watermark: Watermark) -> Line:
 
 def event_lines(events: Iterable[PlainEvent], after: int) -> list[Line]:
     """Events as their table has them, with the numbers after `after`."""
-    lines = []
-    for number, (kind, stamp_ns, body) in enumerate(events, start=after + 1):
-        values = (number, kind, stamp_ns, json.dumps(body, allow_nan=False))
-        lines.append((*values, checksum(*values)))
-    return lines
+    numbered = (Event(number, *event) for number, event in enumerate(events, start=after + 1))
+    return [(event.id, event.kind, event.stamp_ns, event.text, event.checksum) for event in numbered]

@@ -4,6 +4,8 @@ A layer of a cell depends on the pages of its block, and, since a change of the 
 those of the blocks around; a layer of an area on the cells around it besides. The grid numbers its turns and knows the
 last one of each block, so a block is derived again only where something was folded into it or near to it. Layers of
 areas are derived square by square, of some blocks each: the same bits for whoever asks, for whatever window.
+
+It is one module because what is looked up on the map's thread and what is derived beside it have to agree.
 """
 
 from __future__ import annotations
@@ -206,19 +208,19 @@ class BlockLayers:
         inside = slice(reach, reach + edge)
         return {name: np.ascontiguousarray(layer[inside, inside]) for name, layer in made.items()}
 
-    def _keep(self, of: OrderedDict[Block, Kept], look: Look, made: Mapping[Block, Kept]) -> None:
+    def _keep(self, store: OrderedDict[Block, Kept], look: Look, made: Mapping[Block, Kept]) -> None:
         """Keep what was derived, unless the map is another one by now; forget what was not used for longest."""
         with self._lock:
             if look.grid is None or look.grid is not self._grid:
                 return
             for block, kept in made.items():
-                old = of.get(block)
+                old = store.get(block)
                 if old and old.turn > kept.turn:
                     continue
                 layers = {**old.layers, **kept.layers} if old and old.turn == kept.turn else kept.layers
                 self._count += _size(layers) - (_size(old.layers) if old else 0)
-                of[block] = Kept(kept.turn, layers)
-                of.move_to_end(block)
+                store[block] = Kept(kept.turn, layers)
+                store.move_to_end(block)
             while self._count > self._most:
                 fuller = self._areas if SQUARE**2 * len(self._areas) > len(self._cells) else self._cells
                 self._count -= _size(fuller.popitem(last=False)[1].layers)

@@ -56,7 +56,8 @@ class Routes:
         start, end = (self._cell(place, window) for place in (query.start, query.end))
         is_open = _open(terrain, known, query, window, self._site.cell_m)
         line = self._line(query, replace(terrain, is_open=is_open), known, start, end)
-        places: Floats = (line[:, ::-1] + 0.5 + (window.column, window.row)) * self._site.cell_m
+        corner = np.array([window.column, window.row])
+        places = np.asarray((line[:, ::-1] + 0.5 + corner) * self._site.cell_m, np.float64)
         places[0], places[-1] = query.start, query.end
         return self._answer(query, places, look, read)
 
@@ -95,7 +96,7 @@ class Routes:
         unknown = None if isinstance(query.unknown, str) else query.unknown
         if read is None:  # no evidence anywhere near
             nothing = {name: np.full((1, 1), np.nan) for name in LAYERS}
-            read = Squares.of(self._site.cell_m, 1, {(0, 0): nothing})
+            read = Squares.stacked(self._site.cell_m, 1, {(0, 0): nothing})
         steps, totals = route(
             line,
             read,
@@ -114,7 +115,7 @@ class Routes:
             facts = self._source.run(lambda state: state.facts)
             look = self._layers.look_at(self._past().view(self._cells_of(squares), as_of_ns, facts))
         layers = self._layers.squares(look, squares, LAYERS)
-        return look, Squares.of(self._site.cell_m, SQUARE_CELLS, layers) if layers else None
+        return look, Squares.stacked(self._site.cell_m, SQUARE_CELLS, layers) if layers else None
 
     def _terrain(self, query: WayQuery, window: CellWindow, read: Squares | None) -> tuple[Terrain, Bools]:
         """Ground of a window, open everywhere, and which cells of it are known."""

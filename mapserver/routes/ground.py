@@ -32,7 +32,7 @@ class Squares:
     layers: Mapping[str, AnyArray]
 
     @classmethod
-    def of(cls, cell_m: float, edge: int, squares: Mapping[tuple[int, int], Mapping[str, AnyArray]]) -> Squares:
+    def stacked(cls, cell_m: float, edge: int, squares: Mapping[tuple[int, int], Mapping[str, AnyArray]]) -> Squares:
         """Of layers (edge, edge) by the place of their square; at least one of them."""
         places = sorted(squares)
         names = squares[places[0]].keys()

@@ -34,15 +34,15 @@ def lengths(line_m: Floats) -> Floats:
 
 def steps(line_m: Floats, step_m: float) -> Steps:
     """Cut a line (k, 2) of more than one place into steps as near to step_m as divide it evenly."""
-    way_m = np.concatenate([[0.0], np.cumsum(lengths(line_m))])
-    n = max(1, round(way_m[-1] / step_m))
-    end_m = np.linspace(0.0, way_m[-1], n + 1)
-    ends = np.stack([np.interp(end_m, way_m, axis) for axis in line_m.T], axis=1)
+    distance_m = np.concatenate([[0.0], np.cumsum(lengths(line_m))])
+    n = max(1, round(distance_m[-1] / step_m))
+    end_m = np.linspace(0.0, distance_m[-1], n + 1)
+    ends = np.stack([np.interp(end_m, distance_m, axis) for axis in line_m.T], axis=1)
     middle_m = 0.5 * (end_m[:-1] + end_m[1:])
-    position = np.stack([np.interp(middle_m, way_m, axis) for axis in line_m.T], axis=1)
+    position = np.stack([np.interp(middle_m, distance_m, axis) for axis in line_m.T], axis=1)
     along = np.diff(ends, axis=0)
     chord = np.hypot(*along.T)
-    piece = np.clip(np.searchsorted(way_m, middle_m, side="right") - 1, 0, len(line_m) - 2)
+    piece = np.clip(np.searchsorted(distance_m, middle_m, side="right") - 1, 0, len(line_m) - 2)
     own = np.diff(line_m, axis=0)[piece] / np.maximum(lengths(line_m)[piece], 1e-12)[:, None]
     # a step that turns back on itself has no chord to speak of: there the piece that it is on says where it leads
     direction = np.where((chord > 0.5 * np.diff(end_m))[:, None], along / np.maximum(chord, 1e-12)[:, None], own)
@@ -55,11 +55,11 @@ def limits(line_m: Floats, end_m: Floats, lateral_mps2: float) -> Floats:
     On a curve of curvature k the sideways acceleration k v^2 stays below lateral_mps2. A direction changes over
     CURVE_M: the curvature is the change within half of it on both sides, over it.
     """
-    way_m = np.concatenate([[0.0], np.cumsum(lengths(line_m))])
+    distance_m = np.concatenate([[0.0], np.cumsum(lengths(line_m))])
     pieces = np.diff(line_m, axis=0)
     turn = np.diff(np.arctan2(pieces[:, 1], pieces[:, 0]))
     turn = (turn + np.pi) % (2 * np.pi) - np.pi  # (k - 2,) at the inner corners
-    corner_m, reverses = way_m[1:-1], np.abs(turn) > REVERSAL_RAD
+    corner_m, reverses = distance_m[1:-1], np.abs(turn) > REVERSAL_RAD
     turned = np.concatenate([[0.0], np.cumsum(np.where(reverses, 0.0, turn))])
     first, last = (np.searchsorted(corner_m, end_m + side * CURVE_M / 2, side="right") for side in (-1, 1))
     curvature = np.abs(turned[last] - turned[first]) / CURVE_M

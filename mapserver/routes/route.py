@@ -77,8 +77,8 @@ def mean_std(std: Floats, length_m: Floats) -> float:
 
     Errors of two steps correlate by exp(-way between / ALIKE_M).
     """
-    way_m = float(length_m.sum())
-    weighted = std * length_m / way_m
+    distance_m = float(length_m.sum())
+    weighted = std * length_m / distance_m
     fade = np.exp(-length_m / ALIKE_M)
     total, carried = 0.0, 0.0
     for value, kept in zip(weighted.tolist(), fade.tolist(), strict=True):
@@ -157,7 +157,7 @@ def _by_step(cut: Steps, ground: Ground, done: Drive, step_m: float) -> RouteSte
 
     time_s = np.add.reduceat(done.time_s, first)
     return RouteSteps(
-        way_m=np.cumsum(length_m),
+        distance_m=np.cumsum(length_m),
         length_m=length_m,
         x_m=cut.position_m[first, 0],
         y_m=cut.position_m[first, 1],

@@ -166,13 +166,12 @@ def _machine(parameters: ps.Parameters) -> RouteMachine:
     kind = parameters.get("machine", next(iter(MACHINES)))
     if kind not in MACHINES:
         raise _refusal("machine", f"{kind[:40]!r} is not known; known: {', '.join(MACHINES)}; or give its values")
-    given = {of: ps.number(parameters, name) for name, of in _MACHINE.items() if name in parameters}
+    given = {attribute: ps.number(parameters, name) for name, attribute in _MACHINE.items() if name in parameters}
     try:
         return replace(MACHINES[kind], **given)
     except ValueError as error:
-        attribute, _, problem = str(error).partition(": ")
-        names = {of: name for name, of in _MACHINE.items()}
-        raise _refusal(names.get(attribute, attribute), problem) from None
+        wrong, _, problem = str(error).partition(": ")
+        raise _refusal(next(name for name, attribute in _MACHINE.items() if attribute == wrong), problem) from None
 
 
 def _stops(parameters: ps.Parameters) -> tuple[bool, bool]:

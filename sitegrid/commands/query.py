@@ -362,23 +362,23 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
     query = parse_query(name, {**places, **dict(arguments.set), **{k.removesuffix("_ns"): v for k, v in times.items()}})
     assert isinstance(query, RouteQuery | WayQuery)
     answer = client.drive(replace(query, fresh=Freshness(arguments.after)))
-    of, steps = answer.totals, answer.steps
+    totals, steps = answer.totals, answer.steps
     corners = (
         []
         if name == "route"
         else [f"{len(answer.line_m)} places: " + " ".join(f"{x:.0f},{y:.0f}" for x, y in answer.line_m)]
     )
-    kwh = f"{of.energy_j / 3.6e6:.2f} kWh ({of.energy_low_j / 3.6e6:.2f}..{of.energy_high_j / 3.6e6:.2f})"
-    taken = f"{of.time_s:.0f} s ({of.time_low_s:.0f}..{of.time_high_s:.0f})"
+    kwh = f"{totals.energy_j / 3.6e6:.2f} kWh ({totals.energy_low_j / 3.6e6:.2f}..{totals.energy_high_j / 3.6e6:.2f})"
+    taken = f"{totals.time_s:.0f} s ({totals.time_low_s:.0f}..{totals.time_high_s:.0f})"
     lines = [
-        f"{of.length_m:.0f} m, {of.lift_m:+.1f} m up, {of.unknown:.0%} unknown",
-        f"{kwh}, {of.litres:.2f} l of diesel, {of.braked_j / 3.6e6:.2f} kWh braked, {taken}",
+        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {totals.unknown:.0%} unknown",
+        f"{kwh}, {totals.litres:.2f} l of diesel, {totals.braked_j / 3.6e6:.2f} kWh braked, {taken}",
         *corners,
     ]
     head = ["m", "from", "resistance", "+-", "slope %", "unknown", "kWh", "braked", "s", "km/h"]
     rows = [
         [
-            f"{steps.way_m[i]:.0f}",
+            f"{steps.distance_m[i]:.0f}",
             f"{steps.x_m[i]:.0f},{steps.y_m[i]:.0f}",
             f"{steps.resistance[i]:.4f}",
             f"{steps.resistance_std[i]:.4f}",
@@ -389,10 +389,10 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
             f"{steps.time_s[i]:.1f}",
             f"{3.6 * steps.speed_mps[i]:.1f}",
         ]
-        for i in range(len(steps.way_m))
+        for i in range(len(steps.distance_m))
     ]
     columns = {name: column.tolist() for name, column in vars(steps).items()}
-    table = {"line": answer.line_m.tolist(), "totals": asdict(of), "steps": columns, **_version(answer)}
+    table = {"line": answer.line_m.tolist(), "totals": asdict(totals), "steps": columns, **_version(answer)}
     return table, [*lines, *_table(head, rows)]
 
 

@@ -34,7 +34,7 @@ SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
 class Source:
     """One archive that was named. stores: ids of those whose samples these are, or whose place that store took."""
 
-    path: Path | Place
+    path: Path | Place | JournalLocation
     parts: tuple[Part, ...]
     decisions: Sequence[CalibrationDecision]
     stores: tuple[str, ...] = ()
@@ -42,11 +42,13 @@ class Source:
     watermarks: Mapping[SpoolKey, Watermark] = field(default_factory=dict)
 
 
-def source(path: Path | Place) -> Source:
-    """What a Parquet file, a folder of them or a store holds; nothing of its samples is read yet."""
+def source(path: Path | Place | JournalLocation) -> Source:
+    """What a Parquet file, a folder of them, a store or a journal in PostgreSQL holds; no samples are read yet."""
+    if isinstance(path, JournalLocation):
+        return _store(path)
     path = path.absolute() if isinstance(path, Path) else path
     if isinstance(path, Path) and JournalLocation(path).exists():
-        return _store(path)
+        return _store(JournalLocation(path))
     if not path.exists():
         raise ConfigError(path, "no such file or folder")
     files: list[Path | Place] = [path]
@@ -57,21 +59,25 @@ def source(path: Path | Place) -> Source:
     return Source(path, tuple(map(FilePart, files)), archived_decisions.load(files[0].parent))
 
 
-def _store(path: Path) -> Source:
-    location = JournalLocation(path)
-    if shortfall := lacking(location):
+def _store(location: JournalLocation) -> Source:
+    shortfall = None if location.is_shared else lacking(location)  # of a shared one its servers have the proof
+    if shortfall:
         advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
         raise StoreError(location, f"{shortfall}; {advice}")
     with location.reader() as journal:
         last, archived = journal.last_row, journal.archived_row
         files = location.archive.cover(archived)
         slices = range(archived, last, SLICE_ROWS)
-        host, cut = socket.gethostname(), [(after, min(after + SLICE_ROWS, last)) for after in slices]
+        host, cut = (
+            "" if location.is_shared else socket.gethostname(),
+            [(after, min(after + SLICE_ROWS, last)) for after in slices],
+        )
         rest = (JournalPart(location, after, until, host) for after, until in cut)
         identity, accepted = journal.identity(), (event.body["store"] for event in journal.events(ACCEPTED))
         stores = (identity.id, *identity.descends, *accepted)
         parts: tuple[Part, ...] = (*map(FilePart, files), *rest)
-        return Source(path, parts, calibrations(journal), stores, _site_of(path), journal.watermarks())
+        path, site = (location, None) if location.is_shared else (location.folder, _site_of(location.folder))
+        return Source(path, parts, calibrations(journal), stores, site, journal.watermarks())
 
 
 def _site_of(store: Path) -> SiteConfig | None:

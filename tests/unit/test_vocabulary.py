@@ -29,7 +29,6 @@ REPLACED = {
     "told": "stated, stamped",
     "felt": "mean of an IMU",
     "push": "balance step",
-    "way": "distance, route",
     "hire": "crew",
     "board": "at_start",
     "aside": "quarantine, lateral",
@@ -38,14 +37,10 @@ REPLACED = {
     "dead": "dead_reckoning",
 }
 WHOLE = dict.fromkeys(("found", "of"), "a noun that says what it is") | dict.fromkeys(("gives", "says"), "measures")
-PAIRS = {("left", "out"): "excluded", ("put", "aside"): "quarantine"}
+PAIRS = {("left", "out"): "excluded", ("put", "aside"): "quarantine", ("way", "m"): "distance_m"}
 # Of the field, or of the language.
 COMPOUNDS = {
-    tuple(compound.split())
-    for compound in (
-        *("dead reckoning", "dead reckoned", "data sheet", "data sheets"),
-        *("give way", "half way", "other way", "both ways"),
-    )
+    tuple(compound.split()) for compound in (*("dead reckoning", "dead reckoned", "data sheet", "data sheets"),)
 }
 
 

@@ -137,6 +137,12 @@ class SqliteReader(SqliteQueries):
             self.site, self.frame = meta.get("site", ""), meta.get("frame", "")
             opened.pop_all()
 
+    is_replica = False
+
+    def complete_s(self) -> float:
+        """See `JournalReader`."""
+        return time.monotonic()
+
     def follow(self, known: JournalState, timeout_s: float) -> JournalState:
         """See `JournalReader`: looks again and again, since SQLite tells nobody."""
         end_s, state, version = time.monotonic() + timeout_s, self.state(), self._version()

@@ -131,5 +131,7 @@ def test_so_much_is_kept_and_no_more(tmp_path):
         for _ in range(3):
             same(read(kept, writer, names=names), read(fresh(), writer, names=names))
             assert kept._count <= 60
-            held = [layer for of in (kept._cells, kept._areas) for one in of.values() for layer in one.layers.values()]
+            held = [
+                layer for store in (kept._cells, kept._areas) for one in store.values() for layer in one.layers.values()
+            ]
             assert sum(layer.size for layer in held) == kept._count * BLOCK_CELLS**2

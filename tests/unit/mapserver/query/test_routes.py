@@ -149,8 +149,8 @@ def test_an_empty_map_knows_no_cost(tmp_path):
         for query in (RouteQuery(((0.0, 0.0), (30.0, 0.0))), WayQuery((0.0, 0.0), (30.0, 0.0))):
             with pytest.raises(QueryError, match="nobody has driven near"):
                 ask(answers, query)
-        told = ask(answers, WayQuery((0.0, 0.0), (30.0, 0.0), SLOW, unknown=0.05, stops=ROLLING))
-        assert told.totals.energy_j == pytest.approx(WEIGHT_N * 0.05 * 30)
+        given = ask(answers, WayQuery((0.0, 0.0), (30.0, 0.0), SLOW, unknown=0.05, stops=ROLLING))
+        assert given.totals.energy_j == pytest.approx(WEIGHT_N * 0.05 * 30)
 
 
 def test_what_lies_off_the_site_is_refused_by_name(tmp_path):

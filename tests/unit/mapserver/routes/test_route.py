@@ -32,7 +32,7 @@ def fields(resistance: Floats | float, east: float = 0.0, north: float = 0.0, st
         "confidence": even + 0.9,
     }
     assert set(values) == set(LAYERS)
-    return Squares.of(1.0, SIZE, {(0, 0): values})
+    return Squares.stacked(1.0, SIZE, {(0, 0): values})
 
 
 def line(*corners: tuple[float, float]) -> Floats:
@@ -66,7 +66,7 @@ def test_two_soils_cost_what_each_costs_and_stand_in_their_steps() -> None:
     assert steps.resistance[[0, -1]] == pytest.approx([0.02, 0.06])
     assert steps.energy_j.sum() == pytest.approx(totals.energy_j)
     assert steps.time_s.sum() == pytest.approx(totals.time_s)
-    assert steps.way_m[-1] == pytest.approx(200)
+    assert steps.distance_m[-1] == pytest.approx(200)
 
 
 def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
@@ -93,9 +93,9 @@ def test_unknown_ground_counts_as_the_dearest_and_is_said() -> None:
     assert totals.unknown == pytest.approx(40 / 130, abs=0.02)
     assert steps.resistance[8] == pytest.approx(0.08)
     assert np.isnan(steps.confidence[8])
-    _, told = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, unknown_resistance=0.02)
-    assert told.energy_j == pytest.approx(WEIGHT_N * 0.02 * 130, rel=0.01)
-    assert totals.energy_high_j - totals.energy_low_j > told.energy_high_j - told.energy_low_j
+    _, given = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, unknown_resistance=0.02)
+    assert given.energy_j == pytest.approx(WEIGHT_N * 0.02 * 130, rel=0.01)
+    assert totals.energy_high_j - totals.energy_low_j > given.energy_high_j - given.energy_low_j
 
 
 def test_where_nothing_is_known_a_route_has_no_cost_unless_it_is_said() -> None:

@@ -163,7 +163,7 @@ def test_a_route_is_its_totals_and_a_table_of_steps(session: Session, capsys):
     assert length == "50 m, +1.5 m up, 50% unknown"
     assert cost == "0.28 kWh (0.25..0.35), 0.11 l of diesel, 0.06 kWh braked, 20 s (20..21)"
     assert names.split()[:4] == ["m", "from", "resistance", "+-"]
-    assert (first.split()[0], last.split()[1]) == ("0", "3,4")
+    assert (first.split()[0], last.split()[1]) == ("0", "2,3")
     assert main(["query", "route", "0", "0", "30", "40", "--json"]) == 0
     table = json.loads(capsys.readouterr().out)
     assert table["totals"]["energy_j"] == 1e6
