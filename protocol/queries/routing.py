@@ -63,9 +63,9 @@ MACHINES = {
 class RouteSteps:
     """n steps along a route, in its direction.
 
-    distance_m (n,): from the begin to the end of each; length_m; x_m, y_m: of its begin, in `map`. resistance, slope, their
-    deviations and confidence: means, NaN where nothing is known of them; unknown: share of its length of which nothing
-    is. energy_j: what drives the wheels; braked_j: what brakes take; time_s; speed_mps: mean.
+    distance_m (n,): from the begin of the route to the end of each; length_m; x_m, y_m: of its begin, in `map`.
+    resistance, slope, their deviations and confidence: means, NaN where nothing is known of them; unknown: share of
+    its length of which nothing is. energy_j: what drives the wheels; braked_j: what brakes take; speed_mps: mean.
     """
 
     distance_m: Floats
