@@ -1,4 +1,7 @@
-"""Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong."""
+"""Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong.
+
+It is one module because both directions of a message have to agree.
+"""
 
 import math
 import re
