@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -20,6 +21,7 @@ from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
+from mapserver.trust.decisions import PERSON, TrustDecision
 from protocol.arrays import Table
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
 from protocol.site.site_config import SiteConfig, site_toml
@@ -105,6 +107,9 @@ def test_a_backup_of_an_open_store_is_restored_with_all_that_it_had(store: Path,
         (lambda store: flip(max((store / FOLDER).glob("*.parquet"))), "is damaged"),
         (lambda store: flip(store / JOURNAL_FILE), "is damaged"),
         (lambda store: (store / JOURNAL_FILE).unlink(), "holds no journal.db"),
+        (lambda store: change(store, "UPDATE meta SET value = 'qit' WHERE key = 'site'"), "the site of the journal is"),
+        (lambda store: change(store, "UPDATE meta SET value = '9' WHERE key = 'epoch'"), "the epoch of the journal is"),
+        (lambda store: decided(store) or change(store, "DELETE FROM events"), "what follows number 0 is damaged"),
     ],
 )
 def test_damage_is_named_by_verify_and_by_backup(store: Path, tmp_path: Path, capsys, damage, problem: str):
@@ -112,6 +117,18 @@ def test_damage_is_named_by_verify_and_by_backup(store: Path, tmp_path: Path, ca
     assert problem in refused(capsys, "verify", store)
     assert problem in refused(capsys, "backup", store, "--out", tmp_path / "copy")
     assert [path.name for path in tmp_path.iterdir()] == ["store"], "nothing half-made is left"
+
+
+def change(store: Path, statement: str) -> None:
+    with closing(sqlite3.connect(store / JOURNAL_FILE, isolation_level=None)) as db:
+        db.execute(statement)
+
+
+def decided(store: Path) -> None:
+    """Have an event, and no mark that knows of it, as in a backup."""
+    with closing(Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns)) as opened:
+        opened.decide(TrustDecision("a", False, PERSON, "drifts", T0))
+    (store / f"{JOURNAL_FILE}-mark").unlink()
 
 
 def flip(path: Path) -> None:
@@ -123,8 +140,6 @@ def flip(path: Path) -> None:
 
 
 def test_samples_beyond_a_watermark_are_named(store: Path, capsys):
-    import sqlite3
-
     from mapserver.journal.rows import checksum
 
     values = ("a", (7).to_bytes(8, "big"), 199, 0, 5)
