@@ -189,9 +189,10 @@ class WriterClaim:
     def _on_query(self, query: zenoh.Query) -> None:
         with query:
             try:
-                asker, table = decode_owner(query.payload.to_bytes() if query.payload else b"")
-                if take(table, "take_over", bool, default=False) and self._writes and not self.ended:
-                    self._end(f"another map server takes over site {self._site}, {asker}")
+                asker, table = _decoded(query.payload)
+                waits = not self.epoch() and self._this.has_journal_of(asker)  # it is no obstacle
+                if take(table, "take_over", bool, default=False) and self._writes and not (waits or self.ended):
+                    self._end(f"another map server takes over site {self._site}, {asker.owner}")
             except MessageError as error:  # an answer is owed all the same
                 log.warning("claim unread error=%r", str(error))
             query.reply(query.key_expr, self._encoded())
@@ -205,8 +206,13 @@ class WriterClaim:
 
 def _claimant(reply: zenoh.Reply) -> Claimant | None:
     try:
-        owner, table = decode_owner(reply.ok.payload.to_bytes() if reply.ok else b"")
-        named = take(table, "store", str), take(table, "writes", bool), take(table, "shared", bool)
-        return Claimant(owner, *named, take(table, "epoch", int))
+        return _decoded(reply.ok.payload if reply.ok else None)[0]
     except MessageError:
         return None
+
+
+def _decoded(payload: zenoh.ZBytes | None) -> tuple[Claimant, dict[str, Any]]:
+    """A claimant, and all that it says."""
+    owner, table = decode_owner(payload.to_bytes() if payload else b"")
+    named = take(table, "store", str), take(table, "writes", bool), take(table, "shared", bool)
+    return Claimant(owner, *named, take(table, "epoch", int)), table

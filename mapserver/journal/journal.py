@@ -41,12 +41,13 @@ class ArchivedError(StoreError):
 class UnwrittenError(StoreError):
     """A transaction failed, as on a full disk: after `rollback` the journal is as it is on disk, and goes on.
 
-    problem: what the database says, without where it is.
+    problem: what the database says, without where it is. unsure: it may have been committed all the same, since the
+    answer is lost.
     """
 
-    def __init__(self, where: object, problem: str) -> None:
+    def __init__(self, where: object, problem: str, *, unsure: bool = False) -> None:
         super().__init__(where, problem)
-        self.problem = problem
+        self.problem, self.unsure = problem, unsure
 
 
 class FencedError(UnwrittenError):
@@ -163,6 +164,16 @@ class JournalReader(JournalQueries, Protocol):
 
     def __exit__(self, *_: object) -> None:
         """Close it."""
+
+
+class Waiting(Protocol):
+    """What a server does while another one writes its journal."""
+
+    def follow(self, timeout_s: float) -> None:
+        """Do it for so long; what it raises ends the wait."""
+
+    def has_checked(self, journal: JournalQueries) -> bool:
+        """Whether that was done meanwhile which `JournalQueries.check` does, and need not be done again."""
 
 
 class Journal(JournalQueries, Protocol):

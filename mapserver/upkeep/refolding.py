@@ -20,7 +20,7 @@ from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
-from mapserver.journal.journal import UnwrittenError
+from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.refold import release_memory
 from mapserver.past.anew import fold_anew
 from mapserver.past.past import Past
@@ -102,7 +102,7 @@ class Refolding:
     def decide(self, decision: Decision) -> int:
         """Keep a decision on disk, then have the map folded so; returns its number, to wait for.
 
-        Raises QueryError where it cannot be written: nothing has changed then.
+        Raises QueryError where it cannot be written: nothing has changed then, unless it says that this is not known.
         """
         return self._write(lambda store: self._keep(store, [decision]))
 
@@ -131,7 +131,12 @@ class Refolding:
         except TimeoutError:  # an OSError, but the work still waits
             problem = "the server has not written the decision yet, and may still do so; ask for `machines`"
             raise QueryError(Refusal.AFTER_TIMEOUT, problem) from None
+        except FencedError as error:
+            raise QueryError(Refusal.NOT_WRITER, f"the decision is not written: {error.problem}") from None
         except UnwrittenError as error:
+            if error.unsure:
+                problem = f"it is not known whether the decision is kept, since the answer is lost: {error.problem}"
+                raise QueryError(Refusal.AFTER_TIMEOUT, f"{problem}; ask for `machines`") from None
             problem = f"the decision cannot be written, so it does not count: {error.problem}"
             raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
 

@@ -73,7 +73,10 @@ class WriterSession:
             self._db.execute(SET_UP)
             self._look_for_replicas()
         except psycopg.Error as error:
+            is_lost = self._db.closed
             self._db.close()
+            if is_lost:  # as where the database goes down: who waits for it goes on waiting
+                raise UnwrittenError(where, line(error)) from None
             raise StoreError(where, f"is no usable journal: {line(error)}") from None
         except StoreError:
             self._db.close()
@@ -90,7 +93,7 @@ class WriterSession:
     def run(self, query: str | bytes) -> list[tuple[Any, ...]]:
         """Run statements as one transaction; what the last one answers.
 
-        UnwrittenError where it fails; whether it was committed is not known then where the session is lost too.
+        UnwrittenError where it fails, unsure where the session was lost with the answer.
         """
         with self._turn:
             if self.lost:
@@ -106,14 +109,14 @@ class WriterSession:
                 if error.sqlstate == FENCED:
                     self.lost = "another server has taken over the journal"
                     raise FencedError(self._where, self.lost) from None
-                if self._db.closed:
+                if is_lost := self._db.closed:
                     self.lost = line(error)
-                raise UnwrittenError(self._where, line(error)) from None
+                raise UnwrittenError(self._where, line(error), unsure=is_lost) from None
             finally:
                 self._asked_s = None
             if self._warning:  # of a commit that was not waited for until the replica had it
                 self._lose(self._warning)
-                raise UnwrittenError(self._where, self.lost)
+                raise UnwrittenError(self._where, self.lost, unsure=True)
             return answer
 
     def cut(self) -> None:

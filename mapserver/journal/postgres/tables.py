@@ -13,11 +13,13 @@ SCHEMA = 2
 CHANNEL = "sitegrid_journal"  # of notifications, one per database
 # `head` has one line, which every commit changes: rows are numbered by it, so that they are dense and in the order of
 # their commits. Numbers of a sequence are not, and whoever asks for what follows the last one he has seen loses rows.
+# `writer` is a name that the epoch's writer drew: it knows by that whose an epoch is.
 TABLES = """
 CREATE TABLE meta (key text PRIMARY KEY, value text NOT NULL, crc32 bigint NOT NULL);
 CREATE TABLE head (
     single boolean PRIMARY KEY DEFAULT true CHECK (single),
-    epoch bigint NOT NULL, last_row bigint NOT NULL, last_event bigint NOT NULL, archived_row bigint NOT NULL
+    epoch bigint NOT NULL, writer text NOT NULL,
+    last_row bigint NOT NULL, last_event bigint NOT NULL, archived_row bigint NOT NULL
 ) WITH (fillfactor = 10);
 CREATE TABLE journal (row bigint PRIMARY KEY, record bytea NOT NULL);
 ALTER TABLE journal ALTER record SET STORAGE EXTERNAL;
@@ -55,7 +57,7 @@ BEGIN
     IF to_regclass('{NAMESPACE}.meta') IS NULL THEN
         CREATE SCHEMA IF NOT EXISTS {NAMESPACE};
         {TABLES}
-        INSERT INTO head VALUES (true, 0, 0, 0, 0);
+        INSERT INTO head VALUES (true, 0, '', 0, 0, 0);
         {meta};
     END IF;
 END $making$"""  # noqa: S608 # constants, and literals

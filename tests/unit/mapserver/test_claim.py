@@ -180,3 +180,26 @@ def test_a_standby_whose_database_falls_behind_ends(network: Network):
         wait_for(lambda: standby.ended)
         with pytest.raises(LinkError, match="two databases have this journal"):
             standby.require()
+
+
+def test_a_take_over_ends_who_writes_and_no_server_that_waits_for_the_same_journal(network: Network):
+    with closing(shared(network, 4, 4)) as writer, closing(shared(network, 0, 4)) as standby:
+        writer.acquire()
+        standby.acquire()
+        with closing(shared(network, 0, 4)) as third:
+            third.acquire(take_over=True)
+            wait_for(lambda: writer.ended)
+            assert (standby.held, standby.ended, third.held) == (True, "", True)
+
+
+def test_a_take_over_for_another_store_ends_also_who_waits(network: Network):
+    """It would write as soon as the other one has ended."""
+    with ExitStack() as opened, ThreadPoolExecutor() as threads:
+        with closing(shared(network, 4, 4)) as writer, closing(shared(network, 0, 4)) as standby:
+            writer.acquire()
+            standby.acquire()
+            other = opened.enter_context(closing(network.claim(SECOND)))
+            taking = threads.submit(other.acquire, take_over=True)
+            wait_for(lambda: writer.ended and standby.ended)
+        taking.result(WAIT_S)
+        assert other.held

@@ -76,37 +76,38 @@ def test_a_real_dump_holds_neither_writer_nor_follower_up_and_is_a_backup(tmp_pa
 
 
 @pytest.mark.slow
-def test_a_base_backup_of_a_live_primary_has_what_was_acknowledged_before_it_began(tmp_path, database):
-    with closing(open_store(tmp_path / "one", database)) as store:
-        for first in (1, 6):
-            send(store, first)
-        ending, sent = threading.Event(), 0
+def test_a_base_backup_of_a_live_primary_has_what_was_acknowledged_before_it_began(tmp_path):
+    with server.cluster() as primary, server.cluster_folder() as folder:
+        database, copy = primary.new_database(), Cluster(folder)
+        with closing(open_store(tmp_path / "one", database)) as store:
+            for first in (1, 6):
+                send(store, first)
+            ending, sent = threading.Event(), 0
 
-        def work() -> None:
-            nonlocal sent
-            while not ending.is_set() and isinstance(send(store, 1 + sent, machine="b"), Ack):
-                sent += 5
+            def work() -> None:
+                nonlocal sent
+                while not ending.is_set() and isinstance(send(store, 1 + sent, machine="b"), Ack):
+                    sent += 5
 
-        with server.cluster_folder() as folder:
             working = threading.Thread(target=work)
             working.start()
-            copy = Cluster(folder)
-            copy.copy_of(database.cluster, "backup")
-            ending.set()
-            working.join()
-            assert sent > 0
-            (copy.data / "standby.signal").unlink()  # it is to be a primary
-            copy.start()
             try:
-                at = JournalLocation(tmp_path / "one", copy.url(database.name))
-                store.close()
-                with closing(Store(at, SITE, CONFIG, lambda: NOW_NS)) as restored:
-                    assert restored.journal.watermark("a", 7).seq == 10
-                    assert same(restored.grid, folded_by(restored))
-                    behind = sent - restored.journal.watermark("b", 7).seq
-                    assert bool(restored.shortfalls) == (behind > 0), "what came after it is named"
+                copy.copy_of(primary, "backup")
             finally:
-                copy.stop()
+                ending.set()
+                working.join()
+            assert sent > 0
+        (copy.data / "standby.signal").unlink()  # it is to be a primary
+        copy.start()
+        try:
+            at = JournalLocation(tmp_path / "one", copy.url(database.name))
+            with closing(Store(at, SITE, CONFIG, lambda: NOW_NS)) as restored:
+                assert restored.journal.watermark("a", 7).seq == 10
+                assert same(restored.grid, folded_by(restored))
+                behind = sent - restored.journal.watermark("b", 7).seq
+                assert bool(restored.shortfalls) == (behind > 0), "what came after it is named"
+        finally:
+            copy.stop()
 
 
 @pytest.mark.slow
