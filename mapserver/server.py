@@ -70,7 +70,8 @@ class Server:
         self._sign = sign
         with ExitStack() as opened:
             store = location.prepared_id(site.name, site.frame)
-            self._claim = claim = WriterClaim(ingest, site.name, store, shared=location.is_shared)
+            shared, known_epoch = location.is_shared, location.epoch
+            self._claim = claim = WriterClaim(ingest, site.name, store, shared=shared, known_epoch=known_epoch)
             opened.callback(self._claim.close)
             self._claim.acquire(take_over=take_over)
 
@@ -84,7 +85,7 @@ class Server:
             self._writer = Writer(Store(location, site, config, now_ns, verify, standby))
             if standby:
                 standby.close()
-            self._claim.store = self._writer.store_id
+            self._claim.store, self._claim.epoch = self._writer.store_id, lambda: self._writer.epoch
             opened.pop_all()
         self._changed = readers.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
@@ -115,7 +116,7 @@ class Server:
     @property
     def fenced(self) -> str:
         """Why this server may not write any more, since another one took over; the process should end."""
-        return self._writer.fenced
+        return self._writer.fenced or self._claim.superseded
 
     def close(self) -> None:
         """Stop listening, finish what has come in, commit, snapshot."""

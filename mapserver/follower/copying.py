@@ -15,6 +15,7 @@ from pathlib import Path
 import zenoh
 
 from mapserver.evidence import snapshot
+from mapserver.follower.following import is_other
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.store_folder import hold
 from mapserver.journal.journal import Journal
@@ -75,6 +76,8 @@ class Copying:
         try:
             if self.location.exists():
                 self._journal = self.location.open(self._site.name, self._site.frame)
+                if self._journal.shortfall:  # what is missing of a copy is no event of the server's
+                    self._discard()
             while not self._ending.is_set():
                 began_s = time.monotonic()
                 try:
@@ -120,12 +123,16 @@ class Copying:
         if piece.store != store:
             problem = f"is a copy of store {store}, the site's map server has {piece.store}; choose another --copy"
             raise OtherStoreError(self.location, problem)
-        ours = journal.row_checksum(journal.last_row)
-        is_other = piece.checksum is not None and ours is not None and piece.checksum != ours
-        return piece.last_row < journal.last_row or is_other
+        ours = journal.state()
+        return (
+            piece.last_row < ours.row
+            or piece.last_event < ours.event
+            or is_other(piece.checksum, journal.row_checksum(ours.row))
+            or is_other(piece.event_checksum, journal.event_checksum(ours.event))
+        )
 
     def _discard(self) -> None:
-        """Begin anew: the server's journal was restored from a backup."""
+        """Begin anew: the server's journal was restored from a backup, or the copy itself has lost its end."""
         log.warning("rows are gone: the copy is made anew folder=%s", self._folder)
         if self._journal:
             self._journal.close()

@@ -73,7 +73,7 @@ class FollowerSource:
                 epoch = reader.state().epoch
                 identity, progress = reader.identity(), Progress(reader.watermarks())
                 accepted = {event.body["store"] for event in reader.events(ACCEPTED)}
-                past.checkpoints.look(past.depends_on(reader, facts), reader.last_row)
+                past.checkpoints.look(past.depends_on(reader, facts), past.trusted_row(reader))
                 shortfalls = [Shortfall.from_event(event) for event in reader.events(shortfall.KIND)]
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None

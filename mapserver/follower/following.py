@@ -1,8 +1,9 @@
 """A thread that has a replica follow a journal; what others read of it, and how far behind it is.
 
 A row that was folded may be gone when the journal is looked at again: a store that was restored, a database that failed
-over. It is noticed by the id of the store, the numbers of the last row and event, and the checksum of the last row that
-was folded. Then the map is given up, and folded again.
+over. It is noticed by the id of the store, by numbers and checksums of the last row (in journal or archive) and of the
+last event, and by an epoch that is lower than before. Then the map is given up, and folded again. A replica of a
+database that is behind another one has not lost anything.
 """
 
 from __future__ import annotations
@@ -55,12 +56,13 @@ class Following:
         """known: of the journal that this one is a copy of: its last row, and when that was asked for [s]."""
         self.location, self.site, self.config = location, site, config
         self.waits = MergeWaits(0)
-        self.past = Past.of_store(location.folder, site.cell_m, config.fold)
+        self.past = self._new_past()
         self.ended = ""
         self._known = known
         self._lock = threading.Lock()  # of the replica: held while pages are taken from it, or rows are folded
         self._replica: Replica | None = None
-        self._checksum: int | None = None  # of the last row that was folded, where that is known
+        self._epoch = 0  # the newest one that was seen
+        self._compared: object = None  # where the last row was in the archive when it was compared
         self._journalled, self._complete_s = 0, float("-inf")
         self._problem = ""
         self._anew: tuple[Facts, Future[FoldedAnew | None]] | None = None
@@ -127,22 +129,24 @@ class Following:
         end_s = time.monotonic() + OPEN_S
         with self.location.reader() as reader:
             self._require_fit(reader)
-            state = reader.state()
-            self._look(reader, state)
-            self._name("")
             while time.monotonic() < end_s and not self._ending.is_set():
-                state = reader.follow(state, ASK_S)
-                self._look(reader, state)
+                complete_s = reader.complete_s()  # asked first: the state is of then, or newer
+                state = reader.state()
+                self._look(reader, state, complete_s)
+                self._name("")
+                reader.follow(state, ASK_S)
 
     def _require_fit(self, reader: JournalReader) -> None:
         if (reader.site, reader.frame) != (self.site.name, self.site.frame):
             theirs, ours = f"site {reader.site!r}, frame {reader.frame}", f"{self.site.name!r}, {self.site.frame}"
             raise UnfitError(reader.where, f"is of {theirs}; this follower has {ours}: compare the site files")
 
-    def _look(self, reader: JournalReader, state: JournalState) -> None:
-        """Read what is new."""
-        began_s, replica = time.monotonic(), self._replica
-        last_row, as_of_s = self._known() if self._known else (state.row, began_s)
+    def _look(self, reader: JournalReader, state: JournalState, complete_s: float) -> None:
+        """Read what is new. complete_s: see `JournalReader`."""
+        replica = self._replica
+        if replica and self._lags(reader, state, replica):
+            return
+        last_row, as_of_s = self._known() if self._known else (state.row, complete_s)
         self._journalled = max(state.row, last_row)
         if replica is None or self._is_gone(reader, state, replica):
             replica = self._begin(reader, state)
@@ -153,8 +157,16 @@ class Following:
         self._fold(reader, replica, state.row)
         self._correct(reader, replica)
         if replica.merged >= last_row:
-            self._complete_s = as_of_s
+            self._complete_s = max(self._complete_s, as_of_s)
         self.waits.advance(replica.merged)
+
+    def _lags(self, reader: JournalReader, state: JournalState, replica: Replica) -> bool:
+        """Whether the journal is read from a replica of the database that is behind another one, read before.
+
+        Where rows are gone for good, the server that goes on has a higher epoch.
+        """
+        lacks = state.row < replica.merged or state.event < replica.event or state.epoch < self._epoch
+        return lacks and reader.is_replica and state.epoch <= self._epoch and reader.identity().id == replica.store
 
     def _is_gone(self, reader: JournalReader, state: JournalState, replica: Replica) -> bool:
         """Whether the journal lacks what was read of it."""
@@ -162,11 +174,34 @@ class Following:
             reader.identity().id != replica.store
             or state.row < replica.merged
             or state.event < replica.event
-            or (self._checksum is not None and reader.row_checksum(replica.merged) not in (None, self._checksum))
+            or is_other(reader.event_checksum(replica.event), replica.event_checksum)
+            or state.epoch < self._epoch
+            or self._is_another_row(reader, replica)
         )
+        self._epoch = state.epoch
         if is_gone:
             log.warning("rows are gone: the map is folded again journal=%s row=%d", reader.where, replica.merged)
         return is_gone
+
+    def _is_another_row(self, reader: JournalReader, replica: Replica) -> bool:
+        """Whether the last row that was folded is not the one that is there."""
+        checksum = reader.row_checksum(replica.merged)
+        if checksum is None and replica.checksum is not None:
+            checksum = self._archived_checksum(reader, replica.merged)
+        return is_other(checksum, replica.checksum)
+
+    def _archived_checksum(self, reader: JournalReader, row: int) -> int | None:
+        """Of a row in the archive, which is read once; None where nothing new can be said."""
+        archive = self.location.archive  # with no file open: another one may have taken the place of one
+        try:
+            (file,) = archive.cover(row, row - 1)
+            stat = file.stat()
+            if (seen := (row, file, stat.st_ino, stat.st_mtime_ns)) == self._compared:
+                return None
+            checksum, self._compared = History(reader, archive).row_checksum(row), seen
+        except (StoreError, OSError):  # who needs the file says so
+            return None
+        return checksum
 
     def _begin(self, reader: JournalReader, state: JournalState) -> Replica | None:
         """Fold the map from the newest snapshot or checkpoint that is true, without answering meanwhile.
@@ -175,8 +210,8 @@ class Following:
         """
         with self._lock:
             self._replica = None
-        self._complete_s, self._anew, self._checksum = float("-inf"), None, None
-        self.past = Past.of_store(self.location.folder, self.site.cell_m, self.config.fold)  # its index is of rows
+        self._complete_s, self._anew, self._epoch = float("-inf"), None, state.epoch
+        self.past = self._new_past()  # its index is of rows
         self.waits.advance(0)
         replica = Replica(self.site, self.config, reader.identity().id)
         _hear(replica, reader)
@@ -194,10 +229,10 @@ class Following:
             return None
         release_memory()
         replica.adopt(grid, last, facts)
+        replica.checksum = history.row_checksum(last)
         # The site's now is that of the rows in the map: watermarks are of these, and of some that are folded next.
         replica.reach((machine, mark.newest_ns) for (machine, _), mark in reader.watermarks().items())
         self._fold(reader, replica, reader.last_row)
-        self._checksum = reader.row_checksum(replica.merged)
         with self._lock:
             self._replica = replica
         log.info("map folded row=%d fact=%d", replica.merged, facts.number)
@@ -213,7 +248,6 @@ class Following:
                 self.waits.advance(replica.merged)
             if self._ending.is_set():
                 return
-        self._checksum = reader.row_checksum(replica.merged)
 
     def _correct(self, reader: JournalReader, replica: Replica) -> None:
         """Have the map follow decisions: another grid is folded beside it, and takes its place once it has its rows."""
@@ -225,10 +259,11 @@ class Following:
         facts, future = self._anew
         if not future.done():
             return
+        self._anew = None  # one that failed is done again
         folded = future.result()
         if folded and folded.row > replica.merged:
-            return  # the rows of this one come first
-        self._anew = None
+            self._anew = facts, future  # the rows of this one come first
+            return
         if folded is None or facts.number <= replica.facts.number:  # a decision was taken back meanwhile
             return
         history, selection = History(reader, self.past.archive), Selection.by(facts)
@@ -238,9 +273,17 @@ class Following:
             log.info("map folded again fact=%d without=%s", facts.number, ",".join(sorted(facts.excluded)))
         release_memory()
 
+    def _new_past(self) -> Past:
+        return Past.of_store(self.location.folder, self.site.cell_m, self.config.fold, self.location.trusted_row)
+
     def _fold_anew(self, facts: Facts) -> FoldedAnew | None:
         with self.location.reader() as reader:
             return fold_anew(self.past, reader, facts, self._ending.is_set)
+
+
+def is_other(there: int | None, known: int | None) -> bool:
+    """Whether two checksums of one number are known, and differ: the journal went another course."""
+    return None not in (there, known) and there != known
 
 
 def _hear(replica: Replica, reader: JournalReader) -> None:

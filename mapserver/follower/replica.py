@@ -14,6 +14,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.decisions import Decisions
 from mapserver.journal.facts import Facts
+from mapserver.journal.records import last_checksum
 from mapserver.journal.rows import Event, JournalRows, Selection
 from protocol.queries.answers import GroundChange, MapVersion
 from protocol.site.site_config import SiteConfig
@@ -22,13 +23,16 @@ from protocol.site.site_config import SiteConfig
 class Replica:
     """See `MapState`. store: its id. merged: the last row that is in the grid; event: the number of the last event.
 
-    changes: of the ground, by number.
+    changes: of the ground, by number. checksum, event_checksum: those that this row and this event were written with,
+    None where that is not known.
     """
 
     def __init__(self, site: SiteConfig, config: ServerConfig, store: str) -> None:
         self.site, self.config, self.store = site, config, store
         self.grid, self.facts = Grid(site.cell_m, config.fold), Facts()
         self.merged = self.event = 0
+        self.checksum: int | None = None
+        self.event_checksum: int | None = None
         self.changes: dict[int, GroundChange] = {}
         self._decisions = Decisions()
         self._newest_ns: dict[str, int] = {}
@@ -61,7 +65,7 @@ class Replica:
             if event.kind == change_log.KIND:
                 change = change_log.change_of(event.body)
                 self.changes[change.id] = change
-            self.event = event.id
+            self.event, self.event_checksum = event.id, event.checksum
         if self.wanted == self.facts:
             self.facts = self.wanted  # of a higher number
 
@@ -72,7 +76,7 @@ class Replica:
         newest_ns = np.maximum.reduceat(stamps, ends - rows.lengths)
         names = (rows.machines[machine] for machine in rows.machine.tolist())
         self.reach(zip(names, newest_ns.tolist(), strict=True))
-        self.merged = int(rows.numbers[-1])
+        self.merged, self.checksum = int(rows.numbers[-1]), last_checksum(rows)
 
     def reach(self, newest_ns: Iterable[tuple[str, int]]) -> None:
         """Know stamps of machines that are in the map, or would be if these were not excluded."""

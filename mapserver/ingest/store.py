@@ -76,7 +76,7 @@ class Store:
         self.commits, self.commit_s = 0, 0.0
         with ExitStack() as opened:
             opened.enter_context(hold(folder))
-            self.journal = location.open(site.name, site.frame, waiting=standby.follow if standby else None)
+            self.journal = location.open(site.name, site.frame, waiting=standby)
             opened.callback(self.journal.close)
             self.history = History(self.journal, location.archive)
             self.identity = self.journal.identity()
@@ -96,7 +96,7 @@ class Store:
             release_memory()
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
-            self._snapshot_samples = self.journal.samples - tail
+            self._snapshot_samples = 0 if warm else self.journal.samples - tail  # what is warm is on no disk yet
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
             self._opened = opened.pop_all()

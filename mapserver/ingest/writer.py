@@ -72,6 +72,11 @@ class Writer:
         """Why this server may not write any more, since another one does; empty while it may."""
         return self._fenced or self._store.journal.fenced
 
+    @property
+    def epoch(self) -> int:
+        """Number of this writer among all of the journal."""
+        return self._store.journal.epoch
+
     def submit(self, incoming: Incoming, reply: Reply) -> None:
         """Hand in a batch; `reply` is called on the owner's thread, or at once for one that has to come again later."""
         with self._turn:

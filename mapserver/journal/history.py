@@ -8,6 +8,7 @@ from itertools import chain
 
 from mapserver.journal.archive import Archive
 from mapserver.journal.journal import ArchivedError, JournalQueries
+from mapserver.journal.records import checksum_of, record
 from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
 
 
@@ -17,6 +18,12 @@ class History:
 
     journal: JournalQueries
     archive: Archive
+
+    def row_checksum(self, row: int) -> int | None:
+        """As of a journal; of rows that were archived, too: those are the same, bit for bit."""
+        if (checksum := self.journal.row_checksum(row)) is not None or not 0 < row <= self.journal.archived_row:
+            return checksum
+        return next((checksum_of(record(each)) for each in history_rows(self, row - 1, row)), None)
 
 
 def read_history(

@@ -41,12 +41,13 @@ class ArchivedError(StoreError):
 class UnwrittenError(StoreError):
     """A transaction failed, as on a full disk: after `rollback` the journal is as it is on disk, and goes on.
 
-    problem: what the database says, without where it is.
+    problem: what the database says, without where it is. unsure: it may have been committed all the same, since the
+    answer is lost.
     """
 
-    def __init__(self, where: object, problem: str) -> None:
+    def __init__(self, where: object, problem: str, *, unsure: bool = False) -> None:
         super().__init__(where, problem)
-        self.problem = problem
+        self.problem, self.unsure = problem, unsure
 
 
 class FencedError(UnwrittenError):
@@ -113,6 +114,9 @@ class JournalQueries(Protocol):
         Who has seen a row knows by this whether the journal still has it, or was restored and went another course.
         """
 
+    def event_checksum(self, number: int) -> int | None:
+        """As `row_checksum`, of an event."""
+
     def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
         """Events beyond the number `after`, of one kind or of all, in the order in which they were written."""
 
@@ -142,6 +146,16 @@ class JournalReader(JournalQueries, Protocol):
     site: str
     frame: str
 
+    def complete_s(self) -> float:
+        """When, by the steady clock, what can be read now was all that was journalled; negative infinity where unknown.
+
+        That is now, but where it is read from a replica of a database, which may be behind.
+        """
+
+    @property
+    def is_replica(self) -> bool:
+        """Whether it reads from a replica of a database: the next connection may be to one that is further behind."""
+
     def follow(self, known: JournalState, timeout_s: float) -> JournalState:
         """Wait until the journal is not as known any more, or for so long; returns how far it is then."""
 
@@ -150,6 +164,16 @@ class JournalReader(JournalQueries, Protocol):
 
     def __exit__(self, *_: object) -> None:
         """Close it."""
+
+
+class Waiting(Protocol):
+    """What a server does while another one writes its journal."""
+
+    def follow(self, timeout_s: float) -> None:
+        """Do it for so long; what it raises ends the wait."""
+
+    def has_checked(self, journal: JournalQueries) -> bool:
+        """Whether that was done meanwhile which `JournalQueries.check` does, and need not be done again."""
 
 
 class Journal(JournalQueries, Protocol):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mapserver.journal.archive import FOLDER, Archive
-from mapserver.journal.journal import Journal, JournalQueries, JournalReader
+from mapserver.journal.journal import Journal, JournalQueries, JournalReader, Waiting
 from mapserver.journal.postgres import MARK_FILE
 from mapserver.journal.rows import StoreIdentity
 from mapserver.journal.sqlite.journal import SqliteJournal
@@ -48,13 +48,11 @@ class JournalLocation:
         """Whether there is one."""
         return _postgres().reader.exists(self.url) if self.url else self._file.is_file()
 
-    def open(
-        self, site: str, frame: str, descends: Iterable[str] = (), waiting: Callable[[float], None] | None = None
-    ) -> Journal:
+    def open(self, site: str, frame: str, descends: Iterable[str] = (), waiting: Waiting | None = None) -> Journal:
         """Become its writer, and make it where there is none; StoreError says why not.
 
-        descends: ids of the stores that a new one is made from. waiting: is called, for so many seconds, again and
-        again while another server writes a journal that is shared; without it, that is an error.
+        descends: ids of the stores that a new one is made from. waiting: what to do, again and again, while another
+        server writes a journal that is shared; without it, that is an error.
         """
         self._require_one()
         if self.url:
@@ -87,14 +85,19 @@ class JournalLocation:
         with self.reader() as reader:
             return reader.identity().id
 
+    def epoch(self) -> int:
+        """The epoch of the newest writer; StoreError where it cannot be read."""
+        with self.reader() as reader:
+            return reader.state().epoch
+
     def prepared_id(self, site: str, frame: str) -> str:
-        """As `store_id`, before a server waits for its turn; one that is shared is made where there is none.
+        """As `store_id`, before a server waits for its turn; one that is shared is made where there never was one.
 
         Servers that start at once on a new database know by its id that they have one journal.
         """
         if self.url:
             self._require_one()
-            _postgres().journal.prepare(self.url, site, frame)
+            _postgres().journal.prepare(self.url, self.folder, site, frame)
         return self.store_id()
 
     def trusted_row(self, journal: JournalQueries) -> int:

@@ -37,6 +37,12 @@ def checksum_of(record: bytes) -> int:
     return int.from_bytes(record[-_CRC_BYTES:], "little")
 
 
+def last_checksum(rows: JournalRows) -> int:
+    """The checksum that the last one of some rows was written with."""
+    (last,) = rows.chosen(rows.numbers == rows.numbers[-1])
+    return checksum_of(record(last))
+
+
 def warm_up() -> None:
     """Compile the kernels, or read them from their cache, before a batch waits for them."""
     row = JournalRow(1, "", 1, 1, np.zeros(1, SAMPLE_DTYPE))
@@ -46,7 +52,10 @@ def warm_up() -> None:
 
 @numba.njit(cache=True, nogil=True)
 def extent_of(samples: Table) -> tuple[int, int, float, float, float, float]:
-    """When and where samples lie: first and last stamp, west, south, east, north."""
+    """When and where samples lie: first and last stamp, west, south, east, north.
+
+    Never -0.0, of which databases make 0.0: the checksum of what they give back would be another one.
+    """
     first = samples[0]
     first_ns = last_ns = first.stamp_ns
     west_m, south_m, east_m, north_m = first.x_m, first.y_m, first.x_m, first.y_m
@@ -54,7 +63,7 @@ def extent_of(samples: Table) -> tuple[int, int, float, float, float, float]:
         first_ns, last_ns = min(first_ns, sample.stamp_ns), max(last_ns, sample.stamp_ns)
         west_m, east_m = min(west_m, sample.x_m), max(east_m, sample.x_m)
         south_m, north_m = min(south_m, sample.y_m), max(north_m, sample.y_m)
-    return first_ns, last_ns, west_m, south_m, east_m, north_m
+    return first_ns, last_ns, west_m + 0.0, south_m + 0.0, east_m + 0.0, north_m + 0.0
 
 
 def decoded(numbers: Sequence[int], records: Sequence[Any]) -> JournalRows:

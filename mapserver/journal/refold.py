@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from typing import TypeVar
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.workers import ALONE, Workers
 from mapserver.journal.history import History, read_history
-from mapserver.journal.rows import ALL, LAST, Selection
+from mapserver.journal.rows import ALL, LAST, JournalRows, Selection
 from protocol.arrays import Table
 
 # Kernels run beside each other, what is Python between them does not. Not more are tried: docs/results/refold.md
@@ -54,7 +54,7 @@ def fold_history(
 
     Whether it came to the end: where `stopped` says so it ends early, and the grid is of no use.
     """
-    return fold_samples(grid, _pieces(history, after, until, selection), stopped, threads)
+    return fold_samples(grid, pieces(read_history(history, after, until, selection), selection), stopped, threads)
 
 
 def fold_samples(
@@ -87,9 +87,9 @@ def ahead(pieces: Iterator[T]) -> Generator[T, None, None]:
             pool.shutdown(cancel_futures=True)
 
 
-def _pieces(history: History, after: int, until: int, selection: Selection) -> Generator[Samples, None, None]:
-    """Samples in pieces, none of them long, so that those read ahead take little memory."""
-    for rows in read_history(history, after, until, selection):
+def pieces(history: Iterable[JournalRows], selection: Selection) -> Generator[Samples, None, None]:
+    """Samples of rows in pieces, none of them long, so that those read ahead take little memory."""
+    for rows in history:
         samples, names = rows.selected(selection)
         for first in range(0, len(samples), PIECE):
             yield samples[first : first + PIECE], names[first : first + PIECE]

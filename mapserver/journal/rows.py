@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -220,6 +221,16 @@ class Event:
     kind: str
     stamp_ns: int
     body: Mapping[str, Any]
+
+    @property
+    def text(self) -> str:
+        """Its body as it is kept."""
+        return json.dumps(self.body, allow_nan=False)
+
+    @property
+    def checksum(self) -> int:
+        """The checksum that it is written with."""
+        return checksum(self.id, self.kind, self.stamp_ns, self.text)
 
 
 def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float) -> int:

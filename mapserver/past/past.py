@@ -8,7 +8,7 @@ samples up to that time, bit for bit, whichever checkpoint it begins with, and a
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,11 +43,21 @@ class Past:
     checkpoints: Checkpoints
     cell_m: float
     config: FoldConfig
+    trusted_row: Callable[[JournalReader], int]
 
     @classmethod
-    def of_store(cls, folder: Path, cell_m: float, config: FoldConfig) -> Past:
-        """The past of the store in a folder."""
-        return cls(Archive(folder / FOLDER), StampIndex(), Checkpoints(folder), cell_m, config)
+    def of_store(
+        cls,
+        folder: Path,
+        cell_m: float,
+        config: FoldConfig,
+        trusted_row: Callable[[JournalReader], int] = lambda reader: reader.last_row,
+    ) -> Past:
+        """The past of the store in a folder.
+
+        trusted_row: checkpoints of rows up to this one are of the journal; a server has removed those that are not.
+        """
+        return cls(Archive(folder / FOLDER), StampIndex(), Checkpoints(folder), cell_m, config, trusted_row)
 
     def depends_on(self, reader: JournalReader, facts: Facts) -> FactsBefore:
         """What evidence of samples stamped before a time depends on; no checkpoint made with anything else is used."""
@@ -126,7 +136,7 @@ class Past:
         self, reader: JournalReader, to_ns: int, window: CellWindow | None, facts: Facts
     ) -> tuple[Grid, Header | None]:
         """The evidence of the nearest checkpoint without later samples, and its header; empty where there is none."""
-        before, last_row = self.depends_on(reader, facts), reader.last_row
+        before, last_row = self.depends_on(reader, facts), self.trusted_row(reader)
         while checkpoint := self.checkpoints.nearest(to_ns + 1, before, last_row):
             with checkpoint:
                 try:

@@ -5,10 +5,13 @@ On a connection and a thread of its own, so that no reader of it holds up ingest
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import accumulate
+
 import zenoh
 
 from mapserver.journal.history import History, read_history
-from mapserver.journal.rows import JournalRow
+from mapserver.journal.rows import Event, JournalRow
 from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.queryable import Replies, question
 from mapserver.query.region_pieces import PIECE_BYTES
@@ -59,10 +62,10 @@ class JournalQueryable:
         location, site = self._source.location, self._source.site
         try:
             with location.reader() as reader:
-                identity, last_row = reader.identity(), reader.last_row
+                identity, state = reader.identity(), reader.state()
                 rows: list[RowMessage] = []
                 size = 0
-                for part in read_history(History(reader, location.archive), query.row, last_row):
+                for part in read_history(History(reader, location.archive), query.row, state.row):
                     for row in part:
                         rows.append(_message(row, site.frame))
                         size += len(rows[-1].batch)
@@ -71,12 +74,20 @@ class JournalQueryable:
                     else:
                         continue
                     break
-                events = reader.events(after=query.event)[:EVENTS_AT_ONCE]
-                checksum = reader.row_checksum(query.row)
+                events = _messages(reader.events(after=query.event))
+                checksums = reader.row_checksum(query.row), reader.event_checksum(query.event)
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None
-        messages = tuple(EventMessage(event.id, event.kind, event.stamp_ns, event.body) for event in events)
-        return JournalPiece(identity.id, identity.descends, last_row, checksum, tuple(rows), messages)
+        ends = (state.row, checksums[0], state.event, checksums[1])
+        return JournalPiece(identity.id, identity.descends, *ends, tuple(rows), events)
+
+
+def _messages(events: Sequence[Event]) -> tuple[EventMessage, ...]:
+    """The first of some events: as many as one piece may have, and one at least."""
+    sizes = accumulate(len(event.text) for event in events)  # MessagePack has up to twice as many
+    fit = sum(1 for size in sizes if size <= PIECE_BYTES)
+    first = events[: min(max(fit, 1), EVENTS_AT_ONCE)]
+    return tuple(EventMessage(event.id, event.kind, event.stamp_ns, event.body) for event in first)
 
 
 def _message(row: JournalRow, frame: str) -> RowMessage:

@@ -48,14 +48,16 @@ class EventMessage:
 class JournalPiece:
     """The next rows and events of the journal of a store.
 
-    descends: ids of the stores that it was folded from. last_row: the last one that there is. checksum: of the row
-    that was asked with, None where that is archived, or not there.
+    descends: ids of the stores that it was folded from. last_row, last_event: the last ones that there are. checksum,
+    event_checksum: of the row and the event that were asked with, None where that is archived, or not there.
     """
 
     store: str
     descends: tuple[str, ...]
     last_row: int
     checksum: int | None
+    last_event: int
+    event_checksum: int | None
     rows: tuple[RowMessage, ...]
     events: tuple[EventMessage, ...]
 
@@ -83,7 +85,10 @@ def decode_journal_piece(data: bytes) -> JournalPiece:
     descends = take(table, "descends", list)
     if not all(type(store) is str and STORE_ID.fullmatch(store) for store in descends):
         raise MessageError(Refusal.OUT_OF_RANGE, "not all are ids of stores", field="descends")
-    checksum = None if table.get("checksum") is None else take(table, "checksum", int)
+    last_row, last_event = (take(table, name, int) for name in ("last_row", "last_event"))
+    checksum, event_checksum = (
+        None if table.get(name) is None else take(table, name, int) for name in ("checksum", "event_checksum")
+    )
     rows = tuple(
         RowMessage(take(row, "row", int), take(row, "received_ns", int), take(row, "batch", bytes))
         for row in _tables(table, "rows")
@@ -91,8 +96,8 @@ def decode_journal_piece(data: bytes) -> JournalPiece:
     events = tuple(map(_event, _tables(table, "events")))
     _require_each([row.row for row in rows], "rows")
     _require_each([event.id for event in events], "events")
-    last_row = take(table, "last_row", int)
-    return JournalPiece(take_store(table), tuple(descends), last_row, checksum, rows, events)
+    ends = (last_row, checksum, last_event, event_checksum)
+    return JournalPiece(take_store(table), tuple(descends), *ends, rows, events)
 
 
 def _event(table: dict[str, Any]) -> EventMessage:

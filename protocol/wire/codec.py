@@ -23,17 +23,24 @@ MAX_ITEMS = 1000  # of one list, except in answers: the decoder reserves memory 
 MAX_DEPTH = 16  # of plain values
 MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
+MAX_INT = 2**64 - 1  # of MessagePack
 MAX_RETRY_S = 3600.0
 _WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
 _STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value in OPTIONAL.items()}
-_NO_ROWS = empty()
 STORE_ID = re.compile(r"[0-9a-f]{16}")
 
 
 def pack(table: dict[str, Any]) -> bytes:
-    """MessagePack with the protocol's version in front."""
-    packed: bytes = msgpack.packb({"v": VERSION, **table})
+    """MessagePack with the protocol's version in front; an integer beyond its 64 bits is the greatest that it has."""
+    packed: bytes = msgpack.packb({"v": VERSION, **table}, default=_fitting)
     return packed
+
+
+def _fitting(value: Any) -> int:
+    """A sum of what machines say that they lost may be any number: it must not keep all others from being read."""
+    if type(value) is int and value > MAX_INT:
+        return MAX_INT
+    raise TypeError(f"{type(value).__name__} is no value of MessagePack")
 
 
 def unpack(data: bytes, limit: int, items: int = MAX_ITEMS) -> dict[str, Any]:
@@ -159,7 +166,7 @@ def unpack_batch(data: bytes) -> PackedBatch:
         machine=take_name(table),
         spool_id=_take_int(table, "spool_id", 1, MAX_U64),
         first_seq=first_seq,
-        rows=_NO_ROWS,
+        rows=empty(),
         frame=take(table, "frame", str),
         lost_before=lost_before,
         store=take_store(table, optional=True),

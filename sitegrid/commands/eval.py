@@ -163,11 +163,11 @@ def _with_oracle(table: Callable[[Runner], tuple[Report, Any]]) -> Callable[[Run
 
 def _blackout(arguments: Namespace) -> Report:
     from evaluation.campaign.recordings import SETUPS
-    from evaluation.positions import blackouts
+    from evaluation.outages import blackouts
 
     setup = SETUPS[arguments.scenario]
     work = partial(blackouts.run, seeds=_seeds(arguments), seconds=arguments.seconds, setup=setup)
-    return _experiment(arguments, "machines drive, and lose GPS", work, "evaluation.positions.blackout_plots")
+    return _experiment(arguments, "machines drive, and lose GPS", work, "evaluation.outages.plots")
 
 
 def _budget(arguments: Namespace) -> Report:

@@ -17,7 +17,10 @@ EXTRA = "server"
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add = parser.add_argument
-    what = "a Parquet file, a folder of them, or a store; also at any address that fsspec reaches (s3://...)"
+    what = (
+        "a Parquet file, a folder of them, or a store; also at any address that fsspec reaches (s3://...); "
+        "or a journal in PostgreSQL (postgresql://...)"
+    )
     add("archives", type=archive_place, nargs="+", metavar="ARCHIVE", help=what)
     add("--out", type=FOLDER, required=True, metavar="STORE", help="folder of the new store")
     add("--site-file", type=Path, help="site file, if the archives hold no site (site.toml)")
@@ -33,8 +36,11 @@ def add_options(parser: ArgumentParser) -> None:
 
 def archive_place(word: str) -> Any:
     """Parse a path or an address; what that takes is imported for this command alone."""
+    from mapserver.journal.location import JournalLocation
     from mapserver.journal.places import place
 
+    if word.startswith(("postgresql://", "postgres://")):
+        return JournalLocation(Path(), word)
     return place(word)
 
 

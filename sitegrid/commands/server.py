@@ -19,7 +19,7 @@ from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
 from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import address
-from sitegrid.process.lifetime import return_large_blocks, say, stop_flag, tell
+from sitegrid.process.lifetime import end_in_time, return_large_blocks, say, stop_flag, tell
 from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
 
@@ -102,6 +102,7 @@ def run(arguments: Namespace) -> int:
                 raise LinkError(arguments.endpoint, f"{server.ended}; this one ends")
             if server.fenced:
                 tell(f"sitegrid server: {location}: {server.fenced}; this one ends")
+                end_in_time(FENCED)  # its database may not answer
                 return FENCED
     return 1 if server.failed else 0
 

@@ -85,6 +85,17 @@ def _watch_signals(stop: threading.Event, handler: Callable[..., None], end_s: f
     threading.Thread(target=watch, args=(woken,), name="signals", daemon=True).start()
 
 
+def end_in_time(code: int, end_s: float = END_S) -> None:
+    """End the process with this exit code within end_s, whatever it is doing then."""
+
+    def end() -> None:
+        time.sleep(end_s)
+        _log_or_not(log.warning, "ended in mid-work seconds=%g", end_s)
+        os._exit(code)
+
+    threading.Thread(target=end, name="end", daemon=True).start()
+
+
 def _log_or_not(write: Callable[..., None], *event: object) -> None:
     """Log from a thread that is not waited for: standard error may be a pipe that nobody empties."""
     thread = threading.Thread(target=write, args=event, daemon=True)

@@ -62,7 +62,7 @@ class FilePart:
 class JournalPart:
     """Rows after < row <= until of a store's journal; those that are archived meanwhile are read from its archive.
 
-    host: that wrote it. SQLite's files are no good to others while a server writes to them.
+    host: that alone can read it, empty where all can: SQLite's files are no good to others while a server writes.
     """
 
     location: JournalLocation
@@ -90,7 +90,7 @@ class JournalPart:
         return f"{self.location}, rows {self.after + 1} to {self.until}"
 
     def _reader(self) -> JournalReader:
-        if (here := socket.gethostname()) != self.host:
+        if self.host and (here := socket.gethostname()) != self.host:
             advice = "fold its archive alone, or fold on that host with --jobs"
             raise StoreError(
                 self.location, f"is a journal that {self.host} alone can read, and a worker runs on {here}; {advice}"

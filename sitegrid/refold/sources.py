@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import socket
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
 from pathlib import Path
 
 from mapserver.config import ServerConfig
@@ -34,7 +35,7 @@ SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
 class Source:
     """One archive that was named. stores: ids of those whose samples these are, or whose place that store took."""
 
-    path: Path | Place
+    path: Path | Place | JournalLocation
     parts: tuple[Part, ...]
     decisions: Sequence[CalibrationDecision]
     stores: tuple[str, ...] = ()
@@ -42,11 +43,13 @@ class Source:
     watermarks: Mapping[SpoolKey, Watermark] = field(default_factory=dict)
 
 
-def source(path: Path | Place) -> Source:
-    """What a Parquet file, a folder of them or a store holds; nothing of its samples is read yet."""
+def source(path: Path | Place | JournalLocation) -> Source:
+    """What a Parquet file, a folder of them, a store or a journal in PostgreSQL holds; no samples are read yet."""
+    if isinstance(path, JournalLocation):
+        return _store(path)
     path = path.absolute() if isinstance(path, Path) else path
     if isinstance(path, Path) and JournalLocation(path).exists():
-        return _store(path)
+        return _store(JournalLocation(path))
     if not path.exists():
         raise ConfigError(path, "no such file or folder")
     files: list[Path | Place] = [path]
@@ -57,21 +60,25 @@ def source(path: Path | Place) -> Source:
     return Source(path, tuple(map(FilePart, files)), archived_decisions.load(files[0].parent))
 
 
-def _store(path: Path) -> Source:
-    location = JournalLocation(path)
-    if shortfall := lacking(location):
+def _store(location: JournalLocation) -> Source:
+    shortfall = None if location.is_shared else lacking(location)  # of a shared one its servers have the proof
+    if shortfall:
         advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
         raise StoreError(location, f"{shortfall}; {advice}")
     with location.reader() as journal:
         last, archived = journal.last_row, journal.archived_row
         files = location.archive.cover(archived)
         slices = range(archived, last, SLICE_ROWS)
-        host, cut = socket.gethostname(), [(after, min(after + SLICE_ROWS, last)) for after in slices]
+        host, cut = (
+            "" if location.is_shared else socket.gethostname(),
+            [(after, min(after + SLICE_ROWS, last)) for after in slices],
+        )
         rest = (JournalPart(location, after, until, host) for after, until in cut)
         identity, accepted = journal.identity(), (event.body["store"] for event in journal.events(ACCEPTED))
         stores = (identity.id, *identity.descends, *accepted)
         parts: tuple[Part, ...] = (*map(FilePart, files), *rest)
-        return Source(path, parts, calibrations(journal), stores, _site_of(path), journal.watermarks())
+        path, site = (location, None) if location.is_shared else (location.folder, _site_of(location.folder))
+        return Source(path, parts, calibrations(journal), stores, site, journal.watermarks())
 
 
 def _site_of(store: Path) -> SiteConfig | None:
@@ -109,24 +116,22 @@ def chosen_config(sources: Sequence[Source], arguments: Namespace) -> tuple[Serv
 
 
 def joined_decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
-    """Those of all sources, each history once; of one that another holds, as of a store and its archive, what goes on.
+    """Those of all sources in the order of their stamps, whatever order the sources are given in.
 
-    A decision that was made twice counts twice: who corrects, takes that back, and corrects again, has corrected.
+    What two histories share, as a store and its archive do, counts once. A decision that one history has twice counts
+    twice: who corrects, takes that back, and corrects again, has corrected. Each history keeps its own order, also
+    where the site's clock went back.
     """
-    out: list[CalibrationDecision] = []
-    taken: list[Sequence[CalibrationDecision]] = []
+    places: dict[tuple[CalibrationDecision, int], tuple[int, int]] = {}
     for history in histories:
-        if history not in taken:
-            out += history[max((_held(history, other) for other in taken), default=0) :]
-            taken.append(history)
-    return out
-
-
-def _held(history: Sequence[CalibrationDecision], other: Sequence[CalibrationDecision]) -> int:
-    """How much of a history another one holds, from its beginning on; in that of a fold of both it comes later."""
-    starts = (i for i, decision in enumerate(other) if history and history[0] == decision)
-    runs = (takewhile(lambda pair: pair[0] == pair[1], zip(history, other[i:], strict=False)) for i in starts)
-    return max((sum(1 for _ in run) for run in runs), default=0)
+        newest_ns, times = 0, Counter[CalibrationDecision]()
+        for position, decision in enumerate(history):
+            newest_ns = max(newest_ns, decision.stamp_ns)
+            times[decision] += 1
+            key = decision, times[decision]
+            places[key] = max(places.get(key, (0, 0)), (newest_ns, position))
+    ordered = sorted(places, key=lambda key: (places[key], json.dumps(key[0].body()), key[1]))
+    return [decision for decision, _ in ordered]
 
 
 def descent(sources: Sequence[Source], contents: Sequence[Contents]) -> Iterator[str]:

@@ -267,6 +267,8 @@ JOURNAL = JournalPiece(
     ("fedcba9876543210",),
     18,
     0x1234ABCD,
+    4,
+    0x89ABCDEF,
     (RowMessage(17, T0, codec.encode_batch(BATCH)), RowMessage(18, T0 + 1, codec.encode_batch(BATCH))),
     (EventMessage(4, "trust", T0, {"machine": "loader-1", "trusted": False, "by": "person", "reason": "drifts"}),),
 )

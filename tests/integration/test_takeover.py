@@ -13,7 +13,7 @@ from benchmarks.postgres import server
 from benchmarks.postgres.server import Database
 from sitegrid import connect
 from sitegrid.process.children import Children, wait_until
-from tests.takeover.site import FENCED, SITE, TakeOverSite, cut_answer, kill, round_of, stop, terminate
+from tests.takeover.site import FENCED, READY_S, SITE, TakeOverSite, cut_answer, kill, round_of, stop, terminate
 
 pytestmark = pytest.mark.processes
 
@@ -69,3 +69,32 @@ def test_a_server_goes_on_at_the_promoted_replica_when_its_database_is_killed(tm
     print(f"first acknowledgement {took_s:.2f} s after the kill; {verdict}")
     assert verdict.is_clean, verdict
     assert took_s < 10.0
+
+
+def test_of_two_servers_at_a_promoted_replica_and_at_the_old_primary_the_old_one_ends(tmp_path: Path) -> None:
+    """Nobody turned the old primary off, and it waits for no replica: both databases take commits."""
+    with server.cluster() as primary, Children(tmp_path) as children:
+        database = primary.new_database()
+        with server.replica(primary, "b") as replica:
+            site = TakeOverSite(tmp_path, children, database, hosts=(primary,))
+            site.start()
+            site.wait_for_acknowledgements(5)
+            row = site.acknowledged()[-1].row
+            there = Database(replica, database.name)
+            wait_until(
+                lambda: there.sql("SELECT last_row FROM sitegrid.head")[0][0] >= row, 30.0, "the replica follows"
+            )
+            for sender in site.senders:
+                sender.end()
+            assert site.standby
+            site.standby.child.stop()
+            replica.promote()
+            site._hosts, old = (replica,), site.active
+            new = site._server()
+            new.child.expect("ready", READY_S)
+            assert old.child.wait(30.0) == FENCED
+            assert "two databases have this journal" in (tmp_path / f"{old.name}.log").read_text()
+            assert new.child.code is None, f"pids {old.child.pid}, {new.child.pid}"
+            with connect(site.endpoint, SITE.name) as client:
+                wait_until(lambda: client.info().epoch == 2, 30.0, "the one at the promoted replica serves")
+            new.child.stop()

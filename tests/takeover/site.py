@@ -258,9 +258,6 @@ def round_of(site: TakeOverSite, fault: Callable[[TakeOverSite], None]) -> dict[
     took_s = site.wait_for_acknowledgements(beyond=epoch) - began_s
     if fault in (stop, stop_in_commit):
         site.active.child.send(signal.SIGCONT)
-    if fault is cut_network:
-        site.active.proxy.set(Weather(cut=True))
-        site.active.proxy.set(FAIR)
     site.wait_for_acknowledgements(3)
     site.settle()
     return {"fault": fault.__name__, "seconds": round(took_s, 3), "epoch": site.epoch()}

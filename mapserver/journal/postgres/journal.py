@@ -10,20 +10,21 @@ to do when its answer is lost, are about the same few values.
 from __future__ import annotations
 
 import logging
+import secrets
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 import psycopg
 
-from mapserver.journal.journal import ROWS_AT_ONCE, FencedError, UnwrittenError
+from mapserver.journal.journal import ROWS_AT_ONCE, FencedError, UnwrittenError, Waiting
 from mapserver.journal.postgres import MARK_FILE
-from mapserver.journal.postgres.connection import Connection, connect, shown
-from mapserver.journal.postgres.mark import CHECKSUM, EPOCH, STORE, traces_of, trusted_by
+from mapserver.journal.postgres.connection import SCHEMA, Connection, connect, shown
+from mapserver.journal.postgres.mark import CHECKSUM, EPOCH, STORE, known_store, store_in, traces_of, trusted_by
 from mapserver.journal.postgres.reader import PostgresQueries
 from mapserver.journal.postgres.session import HANGS_S, WriterSession
-from mapserver.journal.postgres.statements import insert
+from mapserver.journal.postgres.statements import insert, literal
 from mapserver.journal.postgres.tables import CHANNEL, creation
 from mapserver.journal.progress import Progress
 from mapserver.journal.records import checksum_of
@@ -34,6 +35,7 @@ from protocol.disk.high_water_mark import HighWaterMark
 from protocol.errors import StoreError
 from protocol.files import make_private
 
+_WHOSE = "SELECT epoch, writer FROM head"
 LOOK_S = 0.1  # between two looks whether the lock is free
 _PUT = (
     "ON CONFLICT (machine, spool_id) DO UPDATE SET"
@@ -42,10 +44,29 @@ _PUT = (
 log = logging.getLogger("mapserver.journal.postgres.journal")
 
 
-def prepare(url: str, site: str, frame: str) -> None:
+def prepare(url: str, folder: Path, site: str, frame: str) -> None:
     """Make the tables where there are none, before anybody is the writer; StoreError where it is no usable journal."""
     with closing(WriterSession(url, shown(url))) as session:
-        session.run(creation(site, frame))
+        _prepare(session, shown(url), folder, site, frame)
+
+
+def _prepare(
+    session: WriterSession, where: str, folder: Path, site: str, frame: str, descends: Iterable[str] = ()
+) -> None:
+    """As `prepare`: not where the folder is of a store, for which a new one would be in the way of its restore."""
+    if not (known := store_in(folder)):
+        session.run(creation(site, frame, descends))
+    elif not _is_there(session):
+        raise _gone(where, f"{folder} is of journal {known}", "choose another --store for a new one")
+
+
+def _is_there(session: WriterSession) -> bool:
+    ((there,),) = session.run(f"SELECT to_regclass('{SCHEMA}.meta') IS NOT NULL")  # a constant
+    return bool(there)
+
+
+def _gone(where: str, was: str, or_else: str) -> StoreError:
+    return StoreError(where, f"holds no journal, and {was}; restore the database from a backup, or {or_else}")
 
 
 class PostgresJournal(TableWriter, PostgresQueries):
@@ -58,14 +79,15 @@ class PostgresJournal(TableWriter, PostgresQueries):
         site: str,
         frame: str,
         descends: Iterable[str] = (),
-        waiting: Callable[[float], None] | None = None,
+        waiting: Waiting | None = None,
     ) -> None:
-        """folder: of the server, for its mark. waiting: is called for so many seconds while another one writes.
+        """folder: of the server, for its mark. waiting: what to do while another one writes.
 
         Without `waiting`, StoreError where another one writes.
         """
         super().__init__(url)
         self.fenced, self.epoch = "", 0
+        self._name = secrets.token_hex(8)  # beside its epochs, since the answer to who takes one may be lost
         self._row = self._newest = self._committed = 0
         self._rows: list[tuple[int, bytes]] = []
         self._extents: list[Line] = []
@@ -75,20 +97,12 @@ class PostgresJournal(TableWriter, PostgresQueries):
         with ExitStack() as opened:
             self._session = WriterSession(url, self.where, self._on_loss)
             opened.callback(self._close_sessions)
-            waited = self._take_lock(waiting)
-            self._create_or_check(site, frame, descends)
-            try:
-                make_private(folder / MARK_FILE)
-                self._mark = HighWaterMark(folder / MARK_FILE)
-            except OSError as error:
-                raise StoreError(folder / MARK_FILE, f"cannot be used: {error.strerror}") from None
+            _prepare(self._session, self.where, folder, site, frame, descends)
+            self._mark = _opened_mark(folder)
             opened.callback(self._mark.close)
-            self._take_epoch(self._mark.values.get(EPOCH, 0))
-            self._return_to_disk()
-            if not waited:  # a standby has looked before
-                self.check()
-            self._require_folder(folder)
-            self._compare()
+            self._require(folder, site, frame)
+            while not self._take_turn(waiting):
+                pass
             opened.pop_all()
 
     @property
@@ -117,9 +131,7 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._progress.put(machine, spool_id, watermark)
 
     def commit(self) -> None:
-        """See `Journal`."""
-        if not self._puts:
-            return
+        """See `Journal`: also where nothing is written, since who has lost the journal must acknowledge nothing."""
         puts = [watermark_line(*key, watermark) for key, watermark in self._puts.items()]
         self._run(
             self._advance(self._row, self._newest),
@@ -132,7 +144,8 @@ class PostgresJournal(TableWriter, PostgresQueries):
         if self._rows:
             changed |= {ROW: self._row, CHECKSUM: checksum_of(self._rows[-1][1])}
         self._forget_puts()
-        self._mark.write(changed)
+        if changed:
+            self._mark.write(changed)
 
     def rollback(self) -> None:
         """See `Journal`: what is on disk beyond what was known, is so once `begin` has opened the journal again."""
@@ -194,35 +207,69 @@ class PostgresJournal(TableWriter, PostgresQueries):
     def _forget_puts(self) -> None:
         self._rows, self._extents, self._puts, self._before = [], [], {}, {}
 
-    def _take_lock(self, waiting: Callable[[float], None] | None) -> bool:
-        """Wait until no other session has the lock, also while the database is away; whether that took any time.
+    def _take_turn(self, waiting: Waiting | None) -> bool:
+        """Become the writer; False where the session was lost over it, for who may wait to try again."""
+        self._take_lock(waiting)
+        try:
+            self._require_same()
+            self._take_epoch(self._mark.values.get(EPOCH, 0))
+            self._return_to_disk()
+            if not (waiting and waiting.has_checked(self)):
+                self.check()
+            self.trusted_row = trusted_by(self._mark.values, self)
+            self._compare()
+        except StoreError as error:
+            if waiting is None or not self._session.lost:
+                raise
+            log.warning("journal not taken yet problem=%r", str(error))
+            self.epoch = 0
+        self.fenced = ""
+        return self.epoch > 0
+
+    def _take_lock(self, waiting: Waiting | None) -> None:
+        """Wait until no other session has the lock, also while the database is away.
 
         Who may not wait waits for as long as the database needs to notice that the last holder is gone.
         """
-        waited, end_s = False, time.monotonic() + 2 * HANGS_S
+        end_s = time.monotonic() + 2 * HANGS_S
         while True:
             with suppress(UnwrittenError):
                 if self._session.lost:
+                    self._close_sessions()
                     self._session = WriterSession(self._url, self.where, self._on_loss)
                 if self._session.take_lock():
-                    return waited
+                    return
             if waiting is None and time.monotonic() > end_s:
                 problem = self._session.lost or "another server is writing this journal; stop it first"
                 raise StoreError(self.where, problem)
-            (waiting or time.sleep)(LOOK_S)
-            waited = waiting is not None
+            (waiting.follow if waiting else time.sleep)(LOOK_S)
 
-    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
-        self._session.run(creation(site, frame, descends))
+    def _require(self, folder: Path, site: str, frame: str) -> None:
+        """StoreError unless it is this site's and the folder's, which is this journal's from now on."""
         self._require_meta(site, frame)
+        known, store = known_store(self._mark.values), self.identity().id
+        if known and known != store:
+            problem = f"belongs to journal {known}, and {self.where} is {store}; choose another --store"
+            raise StoreError(folder, problem)
+        if not known:
+            self._mark.write({STORE: int(store, 16)})
+        self._close_reads()  # a long wait would be too long for it
+
+    def _require_same(self) -> None:
+        """StoreError where the database has another journal than before the wait, as while one is restored."""
+        store = known_store(self._mark.values)
+        if not _is_there(self._session):
+            raise _gone(self.where, f"this server waited for journal {store}", "start it with another --store")
+        if (now := self.identity().id) != store:
+            raise StoreError(self.where, f"is journal {now} now, and this server waited for {store}; start it again")
 
     def _take_epoch(self, known: int) -> None:
         """Become the newest writer, which waits for a commit of the last one that is under way.
 
         known: an epoch that there was, which a database from a backup may not know.
         """
-        query = f"UPDATE head SET epoch = GREATEST(epoch, {known}) + 1 RETURNING epoch"  # noqa: S608 # a number
-        ((self.epoch,),) = self._session.run(query)
+        values = f"epoch = GREATEST(epoch, {known}) + 1, writer = {literal(self._name)}"
+        ((self.epoch,),) = self._session.run(f"UPDATE head SET {values} RETURNING epoch")  # noqa: S608 # a number
         log.info("journal taken epoch=%d", self.epoch)
 
     def _open_again(self) -> None:
@@ -240,24 +287,30 @@ class PostgresJournal(TableWriter, PostgresQueries):
 
     def _take_again(self) -> None:
         is_free = self._session.take_lock()
-        ((epoch,),) = self._session.run("SELECT epoch FROM head")
-        if epoch > self.epoch:
+        ((epoch, writer),) = self._session.run(_WHOSE)
+        if self._is_taken_over(epoch, writer):
             self._fence(self._taken_over(epoch))
         if not is_free:
             raise StoreError(self.where, "the last session still has its lock")
-        known = self._mark.values
-        if epoch == self.epoch and int(self.identity().id, 16) == known.get(STORE):
-            self._take_epoch(epoch)
-        state, checksum = super().state(), self.row_checksum(self._committed)
-        same = state.row >= self._committed and checksum in (known.get(CHECKSUM) if self._committed else None, None)
-        if state.epoch != self.epoch or not same:
+        if epoch < self.epoch or not self._has_all():
             self._fence(
                 "it is another journal than before, or lacks rows that were acknowledged; start this server again"
             )
-        if state.event != self._newest:
+        self._take_epoch(epoch)
+        if super().state().event != self._newest:
             self._fence("a decision was committed whose answer was lost")
         self._return_to_disk()
         self._note_mark()
+
+    def _has_all(self) -> bool:
+        """Whether it is the same journal as before, with all rows that were known."""
+        if self.identity().id != known_store(self._mark.values) or super().state().row < self._committed:
+            return False
+        is_archived = self._committed <= self.archived_row
+        return is_archived or self.row_checksum(self._committed) == self._mark.values.get(CHECKSUM)
+
+    def _is_taken_over(self, epoch: int, writer: str) -> bool:
+        return epoch > self.epoch > 0 and writer != self._name
 
     def _taken_over(self, epoch: int) -> str:
         return f"another server has taken over the journal, with epoch {epoch} after {self.epoch}"
@@ -269,10 +322,13 @@ class PostgresJournal(TableWriter, PostgresQueries):
 
     def _on_loss(self) -> None:
         """Look whether another server has taken over: the writer itself may have nothing to do."""
+        if not self.epoch:  # it waits for its turn
+            return
         with suppress(psycopg.Error), connect(self._url, "lost", target_session_attrs="read-write") as db:
-            ((epoch,),) = db.execute("SELECT epoch FROM head").fetchall()
-            if epoch > self.epoch and self._session.lost:
+            ((epoch, writer),) = db.execute(_WHOSE).fetchall()
+            if self._is_taken_over(epoch, writer):
                 self.fenced = self._taken_over(epoch)
+                self._session.cut()
 
     def _return_to_disk(self) -> None:
         self._progress = Progress(self._load_watermarks())
@@ -280,16 +336,6 @@ class PostgresJournal(TableWriter, PostgresQueries):
         self._row = self._committed = state.row
         self._newest = state.event
         self._forget_puts()
-
-    def _require_folder(self, folder: Path) -> None:
-        """StoreError where the folder has the snapshots of another journal."""
-        store = self._mark.values.get(STORE, 0)
-        if store and f"{store:016x}" != self.identity().id:
-            problem = (
-                f"belongs to journal {store:016x}, and {self.where} is {self.identity().id}; choose another --store"
-            )
-            raise StoreError(folder, problem)
-        self.trusted_row = trusted_by(self._mark.values, self)
 
     def _compare(self) -> None:
         """Compare what there is with the mark, and name what is missing."""
@@ -306,6 +352,9 @@ class PostgresJournal(TableWriter, PostgresQueries):
 
     def _close_sessions(self) -> None:
         self._session.close()
+        self._close_reads()
+
+    def _close_reads(self) -> None:
         if self._db is not None:
             self._db.close()
 
@@ -313,3 +362,11 @@ class PostgresJournal(TableWriter, PostgresQueries):
         if self._db is None or self._db.closed:
             self._db = connect(self._url, "writer's reads", target_session_attrs="read-write")
         return self._db
+
+
+def _opened_mark(folder: Path) -> HighWaterMark:
+    try:
+        make_private(folder / MARK_FILE)
+        return HighWaterMark(folder / MARK_FILE)
+    except OSError as error:
+        raise StoreError(folder / MARK_FILE, f"cannot be used: {error.strerror}") from None

@@ -18,11 +18,17 @@ STORE, EPOCH, CHECKSUM = "store", "epoch", "checksum"  # beside what every mark 
 
 def traces_in(folder: Path) -> Traces:
     """What a server's folder says of how far the journal once was; StoreError where that cannot be read."""
-    path = folder / MARK_FILE
-    try:
-        return traces_of(read_mark(path), path)
-    except OSError as error:
-        raise StoreError(path, f"cannot be read: {error.strerror}") from None
+    return traces_of(_values_in(folder), folder / MARK_FILE)
+
+
+def known_store(values: Mapping[str, int]) -> str:
+    """Id of the store that a mark is of, empty where it names none."""
+    return f"{values[STORE]:016x}" if values.get(STORE) else ""
+
+
+def store_in(folder: Path) -> str:
+    """Id of the store that a folder is of, empty for none; StoreError where that cannot be read."""
+    return known_store(_values_in(folder))
 
 
 def trusted_row(folder: Path, journal: JournalQueries) -> int:
@@ -32,8 +38,8 @@ def trusted_row(folder: Path, journal: JournalQueries) -> int:
 
 def trusted_by(values: Mapping[str, int], journal: JournalQueries) -> int:
     """See `Journal.trusted_row`, by the values of a mark."""
-    row, store = values.get(ROW, 0), values.get(STORE, 0)
-    is_there = f"{store:016x}" == journal.identity().id and row <= journal.last_row
+    row = values.get(ROW, 0)
+    is_there = known_store(values) == journal.identity().id and row <= journal.last_row
     is_same = is_there and (row <= journal.archived_row or journal.row_checksum(row) == values.get(CHECKSUM))
     return row if is_same else 0
 
@@ -42,3 +48,10 @@ def traces_of(values: Mapping[str, int], path: Path) -> Traces:
     """What a mark tells that is about losses."""
     mark = {name: n for name, n in values.items() if name not in (STORE, EPOCH, CHECKSUM)}
     return Traces(mark, LogScan(), path, b"")
+
+
+def _values_in(folder: Path) -> dict[str, int]:
+    try:
+        return read_mark(folder / MARK_FILE)
+    except OSError as error:
+        raise StoreError(folder / MARK_FILE, f"cannot be read: {error.strerror}") from None

@@ -24,6 +24,8 @@ _READ_SOME = """SELECT row, record FROM extent LEFT JOIN journal USING (row)
 WHERE extent.last_stamp_ns >= %(from_ns)s AND extent.first_stamp_ns <= %(to_ns)s
     AND west_m <= %(east_m)s AND east_m >= %(west_m)s AND south_m <= %(north_m)s AND north_m >= %(south_m)s
     AND row > %(after)s AND row <= %(until)s ORDER BY row LIMIT %(most)s"""
+_RECEIVED = """SELECT pg_is_in_recovery(), pg_last_wal_receive_lsn()::text,
+EXISTS (SELECT FROM pg_stat_wal_receiver WHERE COALESCE(status, 'streaming') = 'streaming')"""
 _EVERYWHERE = {"west_m": -math.inf, "south_m": -math.inf, "east_m": math.inf, "north_m": math.inf}
 _LOOK_S = 1.0  # a notification may be lost, as one of a server that has ended meanwhile
 _LOOK_AGAIN_S = 0.05  # at a replica, which has no notifications
@@ -123,12 +125,37 @@ class PostgresReader(PostgresQueries):
     def __init__(self, url: str) -> None:
         super().__init__(url)
         self._listens: Connection | None = None
+        self._noted: tuple[Any, float] | None = None  # how far a replica had received it, and when
+        self._complete_s = -math.inf
         try:
             meta = self._meta()
         except StoreError:
             self.close()
             raise
         self.site, self.frame = meta.get("site", ""), meta.get("frame", "")
+
+    @property
+    def is_replica(self) -> bool:
+        """See `JournalReader`."""
+        return bool(self._query("SELECT pg_is_in_recovery()")[0][0])
+
+    def complete_s(self) -> float:
+        """See `JournalReader`: of a replica, when it had received what it has replayed by now.
+
+        One whose link to the primary hangs notices that after its `wal_receiver_timeout`.
+        """
+        now_s = time.monotonic()
+        ((is_replica, received, streams),) = self._query(_RECEIVED)
+        if not is_replica:
+            return now_s
+        if not streams:
+            self._noted = None
+            return self._complete_s
+        lsn, since_s = self._noted or (received, now_s)
+        self._noted = lsn, since_s
+        if self._query("SELECT pg_last_wal_replay_lsn() >= ?::text::pg_lsn", (lsn,))[0][0]:
+            self._noted, self._complete_s = None, since_s
+        return self._complete_s
 
     def follow(self, known: JournalState, timeout_s: float) -> JournalState:
         """See `JournalReader`: waits for a notification, and looks by itself once a second."""

@@ -6,12 +6,19 @@ the session ever sends is single messages of the simple query protocol, each a t
 the middle of one leaves a session that is idle for the database, while between the messages of a pipeline or of a
 prepared statement no time limit of PostgreSQL 15 runs. And nothing large is read on it: a database that waits until its
 answer is taken is not idle either.
+
+A network that swallows bytes, with something in it that acknowledges them, never fails by itself. So a sign of life
+that has no answer for ANSWER_S gives the session up. A commit may wait longer, for a replica; then the holder looks by
+another connection whether it was replaced.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import socket
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -24,6 +31,7 @@ from protocol.errors import StoreError
 
 HANGS_S = 1.5  # a holder that says nothing for so long has lost the lock
 AWAKE_S = 0.3  # between two signs of life
+ANSWER_S = 2 * HANGS_S  # for a sign of life; the database answers at once
 LOOK_TURNS = 10  # signs of life between two looks for replicas
 LOCK = 0x517E62D1  # of journals; advisory locks are those of one database
 FENCED = "SG001"  # SQLSTATE of `advance`
@@ -48,11 +56,13 @@ class WriterSession:
     """
 
     def __init__(self, url: str, where: str, lost: Callable[[], None] = lambda: None) -> None:
-        """lost: is called, on a thread of its own, again and again once the session is lost."""
+        """lost: is called, on a thread of its own, again and again while the session is lost or has no answer."""
         self.lost, self.replica = "", "none"
         self._where, self._on_loss = where, lost
         self._turn, self._ending = threading.Lock(), threading.Event()
         self._warning = ""
+        self._asked_s: float | None = None  # since when an answer is waited for
+        self._is_sign = False
         try:
             self._db = connect(url, "writer", target_session_attrs="read-write")
         except psycopg.Error as error:
@@ -63,13 +73,17 @@ class WriterSession:
             self._db.execute(SET_UP)
             self._look_for_replicas()
         except psycopg.Error as error:
+            is_lost = self._db.closed
             self._db.close()
+            if is_lost:  # as where the database goes down: who waits for it goes on waiting
+                raise UnwrittenError(where, line(error)) from None
             raise StoreError(where, f"is no usable journal: {line(error)}") from None
         except StoreError:
             self._db.close()
             raise
         self._thread = threading.Thread(target=self._stay_awake, name="journal", daemon=True)
         self._thread.start()
+        threading.Thread(target=self._watch, name="journal watch", daemon=True).start()
 
     def take_lock(self) -> bool:
         """Become the journal's writer; whether no other session is."""
@@ -79,12 +93,13 @@ class WriterSession:
     def run(self, query: str | bytes) -> list[tuple[Any, ...]]:
         """Run statements as one transaction; what the last one answers.
 
-        UnwrittenError where it fails; whether it was committed is not known then where the session is lost too.
+        UnwrittenError where it fails, unsure where the session was lost with the answer.
         """
         with self._turn:
             if self.lost:
                 raise UnwrittenError(self._where, self.lost)
             self._warning = ""
+            self._asked_s = time.monotonic()
             try:
                 cursor = self._db.execute(query)
                 while cursor.nextset():
@@ -94,21 +109,32 @@ class WriterSession:
                 if error.sqlstate == FENCED:
                     self.lost = "another server has taken over the journal"
                     raise FencedError(self._where, self.lost) from None
-                if self._db.closed:
+                if is_lost := self._db.closed:
                     self.lost = line(error)
-                raise UnwrittenError(self._where, line(error)) from None
+                raise UnwrittenError(self._where, line(error), unsure=is_lost) from None
+            finally:
+                self._asked_s = None
             if self._warning:  # of a commit that was not waited for until the replica had it
                 self._lose(self._warning)
-                raise UnwrittenError(self._where, self.lost)
+                raise UnwrittenError(self._where, self.lost, unsure=True)
             return answer
+
+    def cut(self) -> None:
+        """Have whoever waits for an answer stop that: the session is lost. For any thread."""
+        with suppress(OSError, psycopg.Error), socket.socket(fileno=os.dup(self._db.fileno())) as link:
+            link.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Let go of the lock."""
-        self._ending.set()  # its thread ends by itself, unless it waits for a database that does not answer
+        self._ending.set()  # its threads end by themselves
+        in_time = threading.Timer(ANSWER_S, self.cut)
+        in_time.daemon = True
+        in_time.start()
         with self._turn:
             with suppress(psycopg.Error):
                 self._db.execute("SELECT pg_advisory_unlock_all()")  # now, not once the database sees that it is closed
             self._lose("it is closed")
+        in_time.cancel()
 
     def _require_settings(self) -> int:
         """The backend's process id; StoreError where what it acknowledges may be lost."""
@@ -142,7 +168,19 @@ class WriterSession:
                 finally:
                     self._turn.release()
 
+    def _watch(self) -> None:
+        """Notice that no answer comes."""
+        while not self._ending.wait(AWAKE_S):
+            asked_s = self._asked_s
+            if asked_s is None or time.monotonic() - asked_s < ANSWER_S:
+                continue
+            if self._is_sign:
+                self.cut()
+            self._on_loss()
+            self._ending.wait(ANSWER_S)
+
     def _say_something(self, *, look: bool) -> None:
+        self._asked_s, self._is_sign = time.monotonic(), True
         try:
             ((pid,),) = self._db.execute("SELECT pg_backend_pid()").fetchall()
             if pid != self._pid:
@@ -151,6 +189,8 @@ class WriterSession:
                 self._look_for_replicas()
         except psycopg.Error as error:
             self._lose(line(error))
+        finally:
+            self._asked_s, self._is_sign = None, False
 
     def _lose(self, why: str) -> None:
         self.lost = self.lost or why

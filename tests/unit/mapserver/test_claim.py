@@ -135,3 +135,71 @@ def test_whatever_is_asked_is_answered(network: Network):
         with suppress(LinkError):
             network.claim(SECOND).acquire()
         assert (claim.held, claim.ended) == (True, "")
+
+
+def shared(network: Network, epoch: int, known: int) -> WriterClaim:
+    """The claim of a server with the journal FIRST. known: the newest epoch of its database."""
+    claim = WriterClaim(network.session(), "pit", FIRST, shared=True, known_epoch=lambda: known)
+    claim.epoch = lambda: epoch
+    return claim
+
+
+def test_servers_of_one_journal_let_each_other_be(network: Network):
+    with closing(shared(network, 4, 4)) as writer, closing(shared(network, 0, 4)) as standby:
+        writer.acquire()
+        standby.acquire()
+        end_s = time.monotonic() + 2.5  # two of its questions
+        wait_for(lambda: writer.superseded or writer.ended or standby.ended or time.monotonic() > end_s)
+        assert (writer.held, standby.held) == (True, True)
+
+
+def test_of_two_servers_that_write_one_journal_in_two_databases_the_lower_epoch_ends(network: Network):
+    with closing(shared(network, 4, 4)) as old, closing(shared(network, 0, 4)) as promoted:
+        old.acquire()
+        promoted.acquire()
+        promoted.epoch = lambda: 5  # it has taken its turn, in the other database
+        wait_for(lambda: old.superseded)
+        assert "writes with epoch 5, and this one with 4" in old.superseded
+        assert not old.held
+        assert (promoted.held, promoted.superseded, promoted.ended) == (True, "", "")
+
+
+def test_a_server_whose_database_lacks_an_epoch_that_is_written_with_does_not_begin(network: Network):
+    with closing(shared(network, 5, 5)) as writer, closing(shared(network, 0, 4)) as behind:
+        writer.acquire()
+        with pytest.raises(LinkError, match="writes with epoch 5, of which this server's database does not know; two"):
+            behind.acquire()
+        assert writer.held
+
+
+def test_a_standby_whose_database_falls_behind_ends(network: Network):
+    with closing(shared(network, 5, 5)) as writer, closing(shared(network, 0, 5)) as standby:
+        writer.acquire()
+        standby.acquire()
+        writer.epoch = lambda: 6  # in a database that is not the standby's
+        wait_for(lambda: standby.ended)
+        with pytest.raises(LinkError, match="two databases have this journal"):
+            standby.require()
+
+
+def test_a_take_over_ends_who_writes_and_no_server_that_waits_for_the_same_journal(network: Network):
+    with closing(shared(network, 4, 4)) as writer, closing(shared(network, 0, 4)) as standby:
+        writer.acquire()
+        standby.acquire()
+        with closing(shared(network, 0, 4)) as third:
+            third.acquire(take_over=True)
+            wait_for(lambda: writer.ended)
+            assert (standby.held, standby.ended, third.held) == (True, "", True)
+
+
+def test_a_take_over_for_another_store_ends_also_who_waits(network: Network):
+    """It would write as soon as the other one has ended."""
+    with ExitStack() as opened, ThreadPoolExecutor() as threads:
+        with closing(shared(network, 4, 4)) as writer, closing(shared(network, 0, 4)) as standby:
+            writer.acquire()
+            standby.acquire()
+            other = opened.enter_context(closing(network.claim(SECOND)))
+            taking = threads.submit(other.acquire, take_over=True)
+            wait_for(lambda: writer.ended and standby.ended)
+        taking.result(WAIT_S)
+        assert other.held

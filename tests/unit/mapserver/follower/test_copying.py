@@ -93,7 +93,7 @@ def test_a_copy_has_all_rows_and_events_of_the_server_and_goes_on_after_a_restar
         deliver(server, 6)
         with copied(sessions, tmp_path / "copy") as copying:
             follows(server, copying)
-            assert copying.known[0] == 6
+            wait_for(lambda copying=copying: copying.known[0] == 6)
     with copied(sessions, tmp_path / "copy") as copying, served(sessions, tmp_path / "store") as server:
         deliver(server, 7)
         follows(server, copying)
@@ -207,3 +207,53 @@ def test_a_decision_without_rows_reaches_a_copy(sessions, tmp_path):
         follows(server, copying)
         server._writer.run(lambda store: store.decide(TrustDecision("a", False, PERSON, "gone", NOW_NS)))
         follows(server, copying)
+
+
+def test_another_decision_under_the_same_number_has_the_copy_made_anew(sessions, tmp_path, caplog):
+    with served(sessions, tmp_path / "store") as server:
+        for seed in (0, 1):
+            deliver(server, seed)
+    shutil.copytree(tmp_path / "store", tmp_path / "backup")
+    decide = lambda server, name: server._writer.run(  # noqa: E731
+        lambda store: store.decide(TrustDecision(name, False, PERSON, "drifts", NOW_NS))
+    )
+    with copied(sessions, tmp_path / "copy") as copying:
+        with served(sessions, tmp_path / "store") as server:
+            decide(server, "a")
+            follows(server, copying)
+        shutil.rmtree(tmp_path / "store")
+        (tmp_path / "backup").rename(tmp_path / "store")
+        with served(sessions, tmp_path / "store") as server:
+            decide(server, "b")
+            follows(server, copying)
+    assert "the copy is made anew" in caplog.text
+
+
+def test_a_copy_that_has_lost_its_end_is_made_anew(sessions, tmp_path, caplog):
+    older = tmp_path / "older.db"
+    with served(sessions, tmp_path / "store") as server:
+        deliver(server, 0)
+        with copied(sessions, tmp_path / "copy") as copying:
+            follows(server, copying)
+        shutil.copy2(tmp_path / "copy" / "journal.db", older)
+        deliver(server, 1)
+        with copied(sessions, tmp_path / "copy") as copying:
+            follows(server, copying)
+        shutil.copy2(older, tmp_path / "copy" / "journal.db")  # the mark beside it knows of more
+        server._writer.run(lambda store: store.decide(TrustDecision("a", False, PERSON, "gone", NOW_NS)))
+        with copied(sessions, tmp_path / "copy") as copying:
+            follows(server, copying)
+    assert "the copy is made anew" in caplog.text
+
+
+def test_events_are_cut_where_one_answer_cannot_have_all_of_them(sessions, tmp_path, monkeypatch):
+    with served(sessions, tmp_path / "store") as server:
+        body = {"values": [0.0] * 1000}  # twice as many bytes in MessagePack as in JSON
+        server._writer.run(lambda store: store.journal.append_events([("other", NOW_NS, body)] * 450))
+        first = server._rows.piece(parse_journal_query({}))
+        assert len(encode_journal_piece(first)) < 2 * journal_queryable.PIECE_BYTES
+        assert 100 < len(first.events) < 450
+        rest = server._rows.piece(parse_journal_query({"event": str(first.events[-1].id)}))
+        assert rest.events[0].id == first.events[-1].id + 1
+        monkeypatch.setattr(journal_queryable, "PIECE_BYTES", 10)
+        assert len(server._rows.piece(parse_journal_query({})).events) == 1

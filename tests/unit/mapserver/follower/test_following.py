@@ -1,6 +1,7 @@
 """A follower of a real journal: equal to the server bit for bit, whatever happens to the journal."""
 
 import shutil
+import sqlite3
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -11,17 +12,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.postgres import server
 from mapserver.change import change_log
 from mapserver.follower import following as module
 from mapserver.follower.following import Following
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
-from mapserver.journal.archive import archive
+from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.location import JournalLocation
+from mapserver.journal.rows import LAST
 from mapserver.journal.sqlite.reader import SqliteReader
+from mapserver.journal.writing import meta_line
+from mapserver.past.making import make
+from mapserver.past.past import Past
 from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
-from protocol.errors import QueryError, Refusal
+from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import GroundChange, MapVersion
 from tests.unit.mapserver.data import (
     CONFIG,
@@ -228,6 +234,86 @@ def test_other_rows_under_the_same_numbers_are_noticed_by_a_checksum(tmp_path, c
         assert "rows are gone" in caplog.text
 
 
+def archive_all(folder: Path, writer: Writer) -> None:
+    location = JournalLocation(folder)
+
+    def forget(until: int) -> int:
+        return writer.run(lambda store: store.journal.forget(until))
+
+    with location.reader() as reader:
+        assert list(archive(location.archive.folder, reader, SITE, NOW_NS + 10**15, forget, NOW_NS))
+
+
+def test_other_rows_under_archived_numbers_are_noticed_by_a_checksum(tmp_path, caplog):
+    """The journal itself has none of them any more, and all numbers are the same."""
+    for name, seed in (("one", 2), ("other", 3)):
+        with closing(open_writer(tmp_path / name)) as writer:
+            if name == "one":
+                deliver(writer, 1)
+        if name == "one":
+            shutil.copytree(tmp_path / "one", tmp_path / "backup")
+        else:
+            shutil.rmtree(tmp_path / "other")
+            (tmp_path / "backup").rename(tmp_path / "other")
+        with closing(open_writer(tmp_path / name)) as writer:
+            deliver(writer, seed)
+            archive_all(tmp_path / name, writer)
+            assert writer.run(lambda store: (store.journalled, store.journal.archived_row, store.journal.epoch)) == (
+                2,
+                2,
+                2,
+            )
+    with following(tmp_path / "one") as one:
+        wait_for(lambda: (version(one) or MapVersion("", 0, 0)).row == 2)
+        (tmp_path / "one").rename(tmp_path / "gone")
+        (tmp_path / "other").rename(tmp_path / "one")
+        wait_for(lambda: "rows are gone" in caplog.text)
+        with closing(open_writer(tmp_path / "one")) as writer:
+            catches_up(one, writer)
+        assert caplog.text.count("rows are gone") == 1
+
+
+def test_an_epoch_that_is_lower_than_before_is_noticed(tmp_path, caplog):
+    with closing(open_writer(tmp_path)) as writer:
+        deliver(writer, 1)
+    open_writer(tmp_path).close()
+    with following(tmp_path) as one:
+        wait_for(lambda: version(one) is not None)
+        with closing(sqlite3.connect(tmp_path / "journal.db", isolation_level=None)) as db:
+            db.execute("REPLACE INTO meta VALUES (?, ?, ?)", meta_line("epoch", "1"))
+        wait_for(lambda: "rows are gone" in caplog.text)
+        wait_for(lambda: version(one) is not None)
+        assert caplog.text.count("rows are gone") == 1
+
+
+def test_a_slow_follower_holds_nobody_up_says_how_far_behind_it_is_and_has_the_same_map_in_the_end(
+    tmp_path, monkeypatch
+):
+    may_read = threading.Event()
+    may_read.set()
+    read = module.read_history
+
+    def slowly(*words):
+        for rows in read(*words):
+            assert may_read.wait(WAIT_S)
+            yield rows
+
+    monkeypatch.setattr(module, "read_history", slowly)
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+        may_read.clear()
+        for seed in range(2, 10):
+            deliver(writer, seed, machine="b")  # each is acknowledged
+        wait_for(lambda: one.behind()[0] > 0)
+        before_s = one.behind()[1]
+        wait_for(lambda: one.behind()[1] > before_s + 0.2)
+        assert version(one).row == 1, "and it answers with the map that it has"
+        may_read.set()
+        catches_up(one, writer)
+        wait_for(lambda: one.behind()[0] == 0 and one.behind()[1] < 1.5)
+
+
 def test_rows_that_are_forgotten_below_the_follower_or_above_it_are_read_from_the_archive(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
         for seed in range(6):
@@ -330,3 +416,117 @@ def test_changes_of_the_ground_come_with_the_events(tmp_path):
             grown = replace(change, cells=cells)
             writer.run(lambda store, g=grown: store.journal.append_event(change_log.KIND, 2, asdict(g)))
         wait_for(lambda: version(one) and one.run(lambda replica: replica.changes) == {1: replace(change, cells=9)})
+
+
+def test_a_fold_beside_that_fails_is_done_again(tmp_path, monkeypatch):
+    fold_anew, folds = module.fold_anew, list[int]()
+
+    def failing(past, reader, facts, stopped):
+        folds.append(facts.number)
+        if len(folds) == 1:
+            raise StoreError("the database", "terminating connection due to administrator command")
+        return fold_anew(past, reader, facts, stopped)
+
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        for seed in (1, 2):
+            deliver(writer, seed, machine="ab"[seed % 2])
+        catches_up(one, writer)
+        monkeypatch.setattr(module, "fold_anew", failing)
+        writer.run(lambda store: store.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)))
+        wait_for(lambda: one.run(lambda replica: replica.facts.excluded) == {"b"})
+        assert folds == [1, 1]
+
+
+def test_a_damaged_row_behind_a_sound_one_takes_no_map_away(tmp_path, caplog):
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+
+        def damage(store) -> None:
+            db = store.journal._db
+            record = bytearray(db.execute("SELECT record FROM journal WHERE row = 3").fetchone()[0])
+            record[60] ^= 1
+            db.execute("UPDATE journal SET record = ? WHERE row = 3", (bytes(record),))
+
+        with one._lock:  # it sees both rows at once
+            for seed in (2, 3):
+                deliver(writer, seed)
+            writer.run(damage)
+        wait_for(lambda: "journal row 3" in caplog.text)
+        wait_for(lambda: one.behind()[1] > 2.5)  # it has opened the journal again
+        assert version(one).row == 2
+        assert one.behind()[0] == 1
+        assert "rows are gone" not in caplog.text
+
+
+def test_another_decision_under_the_same_number_is_noticed_by_a_checksum(tmp_path, caplog):
+    with closing(open_writer(tmp_path / "store")) as writer:
+        for seed in (1, 2):
+            deliver(writer, seed, machine="ab"[seed % 2])
+    shutil.copytree(tmp_path / "store", tmp_path / "backup")
+    with closing(open_writer(tmp_path / "store")) as writer:
+        writer.run(lambda store: store.decide(TrustDecision("a", False, PERSON, "drifts", NOW_NS)))
+    with following(tmp_path / "store") as one:
+        wait_for(lambda: version(one) and one.run(lambda replica: replica.facts.excluded) == {"a"})
+        with closing(open_writer(tmp_path / "backup")) as writer:
+            writer.run(lambda store: store.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)))
+        (tmp_path / "store").rename(tmp_path / "gone")
+        (tmp_path / "backup").rename(tmp_path / "store")
+        wait_for(lambda: version(one) and one.run(lambda replica: replica.facts.excluded) == {"b"})
+        assert "rows are gone" in caplog.text
+
+
+def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_path, database):
+    location = JournalLocation(tmp_path / "store", database.url)
+    with closing(Store(location, SITE, CONFIG, now_ns)) as store:
+        for seed in (1, 2, 3):
+            store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
+        with location.reader() as reader:
+            past = Past.of_store(location.folder, SITE.cell_m, CONFIG.fold)
+            assert list(make(past, reader, (NOW_NS // HOUR_NS + 1) * HOUR_NS, store.facts))
+    database.sql("DELETE FROM sitegrid.journal WHERE row > 1; DELETE FROM sitegrid.extent WHERE row > 1")
+    database.sql(
+        "UPDATE sitegrid.head SET last_row = 1; DELETE FROM sitegrid.watermark WHERE spool_id <> '\\x0000000000000001'"
+    )
+    with closing(Store(JournalLocation(tmp_path / "other", database.url), SITE, CONFIG, now_ns)) as other:
+        for seed in (4, 5, 6):  # another host's server goes on
+            other.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
+        one = Following(location, SITE, CONFIG)
+        one.start()
+        with closing(one):
+            wait_for(lambda: version(one) == other.version)
+            assert one.run(lambda replica: same(replica.grid, other.grid))
+            with location.reader() as reader:
+                assert same(one.past.grid_as_of(reader, LAST), other.grid)
+
+
+def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_it_is(tmp_path, caplog):
+    with server.cluster() as primary, server.replica(primary, "b") as replica:
+        database = primary.new_database()
+        with closing(Store(JournalLocation(tmp_path / "store", database.url), SITE, CONFIG, now_ns)) as store:
+
+            def deliver(seed: int) -> None:
+                store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
+
+            deliver(1)
+            url = replica.url(database.name)
+            known = f"SELECT 1 FROM pg_database WHERE datname = '{database.name}'"
+            wait_for(lambda: replica.sql(known) and JournalLocation(tmp_path, url).exists())
+            of_one = Following(JournalLocation(tmp_path / "one", url), SITE, CONFIG)
+            ports = f"127.0.0.1:{primary.port},127.0.0.1:{replica.port}"
+            pool = f"postgresql://postgres@{ports}/{database.name}?load_balance_hosts=random"
+            of_any = Following(JournalLocation(tmp_path / "any", pool), SITE, CONFIG)
+            with closing(of_one), closing(of_any):
+                for each in (of_one, of_any):
+                    each.start()
+                    wait_for(lambda each=each: version(each) == store.version and each.behind()[1] < 1)
+                replica.sql("SELECT pg_wal_replay_pause()")
+                wait_for(lambda: replica.sql("SELECT pg_get_wal_replay_pause_state()") == [("paused",)])
+                deliver(2)
+                wait_for(lambda: version(of_any) == store.version)
+                wait_for(lambda: of_one.behind()[1] > 4)
+                assert version(of_one).row == 1
+                assert version(of_any) == store.version
+                replica.sql("SELECT pg_wal_replay_resume()")
+                wait_for(lambda: version(of_one) == store.version and of_one.behind()[1] < 2.5)
+        assert "rows are gone" not in caplog.text

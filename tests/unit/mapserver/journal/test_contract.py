@@ -23,6 +23,7 @@ from mapserver.journal.rows import Admission, Selection, Watermark
 from mapserver.journal.sqlite.journal import SqliteJournal
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
+from protocol.wire.codec import pack, unpack
 from protocol.wire.messages import Ack, Refused
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, incoming, now_ns, random_samples, same, samples
 
@@ -191,12 +192,15 @@ def test_archived_rows_are_forgotten_in_pieces(journal, reader):
     journal.shrink()
 
 
-def test_the_checksum_of_a_row_tells_it_from_another(place, journal, reader):
+def test_the_checksum_of_a_row_or_an_event_tells_it_from_another(place, journal, reader):
     write(journal, admission(), admission(2, 4))
     first, second = reader.row_checksum(1), reader.row_checksum(2)
     assert first != second
     assert journal.row_checksum(2) == second
     assert reader.row_checksum(3) is None
+    journal.append_events([("t", 1, {}), ("t", 1, {"x": 0.1})])
+    assert [reader.event_checksum(number) for number in (0, 1, 2)] == [None, *(e.checksum for e in reader.events())]
+    assert reader.event_checksum(1) != reader.event_checksum(2)
 
 
 def test_a_follower_waits_for_news(journal, reader):
@@ -226,16 +230,41 @@ def test_a_journal_of_another_site_or_frame_is_refused(place):
         ("UPDATE extent SET west_m = west_m - 1 WHERE row = 2", "extent of journal row 2"),
         ("DELETE FROM extent WHERE row = 2", "what follows number 1"),
         ("UPDATE events SET stamp_ns = 0", "event 1"),
-        ("UPDATE meta SET value = 'x' WHERE key = 'store'", "id of the store"),
+        ("UPDATE meta SET value = 'x' WHERE key = 'store'", "the store of the journal"),
+        ("UPDATE meta SET value = 'hill' WHERE key = 'site'", "the site of the journal"),
+        ("DELETE FROM events WHERE id = 2", "what follows number 1"),
     ],
 )
 def test_damage_is_found_on_opening(place, change, problem):
     with closing(place.open()) as journal:
         write(journal, admission(), admission(1, 4))
-        journal.append_event("t", 5, {})
+        for stamp_ns in (5, 6):
+            journal.append_event("t", stamp_ns, {})
     place.sql(change)
     with pytest.raises(StoreError, match=problem):
         place.open().close()
+
+
+def test_samples_at_minus_zero_are_no_damage(place):
+    """Databases make 0.0 of -0.0, whose bits are others."""
+    rows = samples(3, x_m=[-0.0, -0.0, 5.0], y_m=[-7.0, -0.0, -0.0])
+    with closing(place.open()) as journal:
+        write(journal, Admission(batch(rows), trimmed=0, lost=0), Admission(batch(rows[1:2], 4), trimmed=0, lost=0))
+    with closing(place.open()) as journal:
+        assert [row.rows.tobytes() for row in journal.read()] == [rows.tobytes(), rows[1:2].tobytes()]
+        assert [row.row for row in journal.read(selection=Selection(bounds=Bounds(-1.0, -1.0, 0.0, 0.0)))] == [1, 2]
+
+
+def test_losses_beyond_what_the_wire_has_can_be_asked_for(place):
+    """What one machine says that it lost must not keep the state of all others from being read."""
+    most = 2**62
+    with closing(place.store()) as store:
+        for spool_id in range(1, 7):
+            lost = incoming(samples(1), most, spool_id=spool_id, lost_before=most - 1)
+            assert isinstance(store.commit([lost])[0], Ack)
+    with closing(place.store()) as store:
+        assert unpack(pack(store.info()), 2**16)["machines"]["a"]["lost"] == 2**64 - 1
+        assert store.machines()["a"]["samples"] == 6
 
 
 def test_a_damaged_row_is_found_when_it_is_read(place, journal, reader):

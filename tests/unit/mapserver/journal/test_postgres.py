@@ -6,7 +6,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -21,17 +21,21 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
+from mapserver.ingest.writer import Writer
 from mapserver.journal.history import history_rows
 from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.postgres import session
 from mapserver.journal.postgres.connection import shown
+from mapserver.journal.postgres.journal import PostgresJournal
 from mapserver.journal.postgres.session import WriterSession
 from mapserver.trust.decisions import PERSON, TrustDecision
-from protocol.errors import ConfigError, Refusal, SitegridError, StoreError
+from mapserver.upkeep.refolding import Refolding
+from protocol.errors import ConfigError, QueryError, Refusal, SitegridError, StoreError
 from protocol.wire.messages import Ack, Refused
+from tests.chaos.tcp_proxy import Proxy, Weather
 from tests.pooler import SwappingPooler
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, random_samples, same, wait_for
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, past_of, random_samples, same, wait_for
 
 YEAR_NS = 365 * 86400 * 10**9
 
@@ -154,6 +158,9 @@ def test_a_pooler_is_refused_and_a_session_that_is_swapped_loses_the_lock(tmp_pa
 def test_a_folder_is_of_one_journal(tmp_path, database, postgres_cluster):
     open_store(tmp_path / "one", database).close()
     other = postgres_cluster.new_database()
+    with pytest.raises(StoreError, match=r"holds no journal, and .*one is of journal .* choose another --store"):
+        open_store(tmp_path / "one", other)
+    open_store(tmp_path / "other", other).close()
     with pytest.raises(StoreError, match=r"belongs to journal .* choose another --store"):
         open_store(tmp_path / "one", other)
     with pytest.raises(ConfigError, match="give its --journal"):
@@ -161,6 +168,27 @@ def test_a_folder_is_of_one_journal(tmp_path, database, postgres_cluster):
     Store(JournalLocation(tmp_path / "two"), SITE, CONFIG, now_ns).close()
     with pytest.raises(ConfigError, match=r"journal\.db of its own"):
         open_store(tmp_path / "two", database)
+
+
+def test_a_database_of_any_encoding_has_a_journal(tmp_path, postgres_cluster):
+    """SQL_ASCII is what `initdb` makes under the C locale: its text comes as bytes, unless that is said."""
+    for encoding in ("sql_ascii", "latin1"):
+        name = f"in_{encoding}"
+        postgres_cluster.sql(f"CREATE DATABASE {name} TEMPLATE template0 ENCODING '{encoding}' LOCALE 'C'")
+        for first in (1, 6):
+            with closing(open_store(tmp_path / encoding, Database(postgres_cluster, name))) as store:
+                assert send(store, first).watermark == first + 4
+
+
+def test_limits_that_a_database_has_for_others_are_not_for_a_server(tmp_path, database):
+    for name in ("idle_session_timeout", "statement_timeout", "lock_timeout"):
+        database.sql(f"ALTER DATABASE {database.name} SET {name} = '500ms'")
+    with closing(open_store(tmp_path, database)) as store, place(tmp_path, database).reader() as reader:
+        session_ends_s = time.monotonic() + 1.0
+        wait_for(lambda: time.monotonic() > session_ends_s)
+        assert reader.last_row == store.journal.last_row == 0
+        for name in ("idle_session_timeout", "statement_timeout", "lock_timeout"):
+            assert reader._query(f"SHOW {name}") == [("0",)]
 
 
 # --- the lock ---------------------------------------------------------------------------------------------------------
@@ -204,6 +232,51 @@ def test_a_holder_that_stops_in_the_middle_of_a_message_loses_the_lock(tmp_path,
     holder.close()
 
 
+def test_a_holder_whose_network_swallows_all_bytes_notices_it(tmp_path, database):
+    """Something between acknowledges them, so that the kernel waits for ever."""
+    with Proxy(database.cluster.port) as proxy:
+        url = database.url.replace(str(database.cluster.port), proxy.endpoint.rpartition(":")[2])
+        store = Store(JournalLocation(tmp_path / "one", url), SITE, CONFIG, now_ns)
+        assert send(store, 1).epoch == 1
+        proxy.set(Weather(hold_there=True, hold_back=True))
+        with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
+            second = open_store(tmp_path / "two", database, standby)
+        with closing(second):
+            wait_for(lambda: store.journal._session.lost)
+            assert isinstance(send(store, 6), Refused), "and no thread waits for ever"
+            assert send(second, 6).epoch == 2
+            began_s = time.monotonic()
+            store.close()
+            assert time.monotonic() - began_s < session.ANSWER_S + 1.0
+
+
+def test_a_commit_whose_answer_never_comes_ends_once_another_server_has_taken_over(tmp_path, database):
+    with Proxy(database.cluster.port) as proxy, Proxy(database.cluster.port) as open_proxy:
+        url = database.url.replace(str(database.cluster.port), proxy.endpoint.rpartition(":")[2])
+        with closing(Store(JournalLocation(tmp_path / "one", url), SITE, CONFIG, now_ns)) as store:
+            send(store, 1)
+            proxy.set(Weather(hold_back=True))
+            store.journal._url = url.replace(proxy.endpoint.rpartition(":")[2], open_proxy.endpoint.rpartition(":")[2])
+            answers: list[object] = []
+
+            def commit() -> None:
+                try:
+                    answers.append(send(store, 6))
+                except FencedError as error:
+                    answers.append(error)
+
+            committing = threading.Thread(target=commit)
+            committing.start()
+            with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
+                second = open_store(tmp_path / "two", database, standby)
+            with closing(second):
+                committing.join(20.0)
+                assert len(answers) == 1
+                assert not isinstance(answers[0], Ack)
+                assert "taken over the journal, with epoch 2 after 1" in store.journal.fenced
+                assert send(second, 6).trimmed == 5, "it was committed, and nobody was told so"
+
+
 def test_a_holder_that_works_keeps_the_lock(tmp_path, database):
     with closing(open_store(tmp_path, database)) as store:
         end_s = time.monotonic() + 2 * session.HANGS_S
@@ -221,6 +294,93 @@ def test_a_writer_without_its_lock_cannot_commit(tmp_path, database):
             send(store, 1)
         assert store.journal.fenced
         assert database.sql("SELECT count(*) FROM sitegrid.journal") == [(0,)]
+
+
+def test_a_server_without_the_journal_acknowledges_not_even_what_it_had(tmp_path, database):
+    with closing(open_store(tmp_path, database)) as store:
+        assert isinstance(send(store, 1), Ack)
+        database.sql("UPDATE sitegrid.head SET epoch = epoch + 1")
+        with pytest.raises(FencedError):
+            send(store, 1)
+    with closing(open_store(tmp_path, database)) as store:
+        database.sql("UPDATE sitegrid.head SET epoch = epoch + 1")
+        with pytest.raises(FencedError):
+            store.commit([incoming(random_samples(0, 1), 1)])
+
+
+class LostAnswer:
+    """Cuts a session once, between a statement that has some text and its answer."""
+
+    def __init__(self, session: WriterSession, text: str) -> None:
+        self._db, self._text = session._db, text
+        session._db = self
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._db, name)
+
+    def execute(self, query: Any, *more: Any) -> Any:
+        answer = self._db.execute(query, *more)
+        if self._text in (query.decode() if isinstance(query, bytes) else query):
+            self._db.close()
+            raise psycopg.OperationalError("server closed the connection unexpectedly")
+        return answer
+
+
+def test_a_decision_whose_answer_is_lost_is_not_called_refused(tmp_path, database):
+    writer = Writer(open_store(tmp_path, database))
+    with closing(writer), closing(Refolding(writer, past_of(writer))) as refolding:
+        LostAnswer(writer._store.journal._session, "INSERT INTO events")
+        with pytest.raises(QueryError, match=r"not known whether the decision is kept.*ask for") as caught:
+            refolding.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        assert caught.value.reason == Refusal.AFTER_TIMEOUT
+        with pytest.raises(
+            QueryError, match="is not written: a decision was committed whose answer was lost"
+        ) as caught:
+            refolding.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
+        assert caught.value.reason == Refusal.NOT_WRITER
+    with closing(open_store(tmp_path, database)) as store:
+        assert store.facts.excluded == {"b"}
+
+
+def test_a_session_that_is_cut_while_it_is_made_is_no_reason_to_end(database, monkeypatch):
+    monkeypatch.setattr(WriterSession, "_look_for_replicas", lambda self: self._db.close() or self._db.execute(""))
+    with pytest.raises(UnwrittenError):
+        WriterSession(database.url, "here")
+
+
+def test_an_epoch_whose_answer_is_lost_is_not_taken_for_another_server(tmp_path, database, monkeypatch):
+    with closing(open_store(tmp_path, database)) as store:
+        assert send(store, 1).epoch == 1
+        real = WriterSession.take_lock
+        monkeypatch.setattr(WriterSession, "take_lock", lambda self: (LostAnswer(self, "SET epoch"), real(self))[1])
+        database.end_writer()
+        assert isinstance(send(store, 6), Refused)
+        assert isinstance(send(store, 6), Refused)
+        assert database.sql("SELECT epoch FROM sitegrid.head") == [(2,)]
+        monkeypatch.undo()
+        answer = send(store, 6)
+        assert (answer.watermark, answer.epoch) == (10, 3)
+        assert same(store.grid, folded_by(store))
+
+
+def test_another_server_with_the_epoch_that_was_asked_for_is_known_as_such(tmp_path, database, monkeypatch):
+    with closing(open_store(tmp_path / "one", database)) as store:
+        real = WriterSession.run
+
+        def run(self: WriterSession, query: Any) -> Any:
+            if "SET epoch" in str(query):
+                self._lose("it was cut before it was sent")
+            return real(self, query)
+
+        monkeypatch.setattr(WriterSession, "run", run)
+        database.end_writer()
+        wait_for(lambda: store.journal._session.lost)
+        assert isinstance(send(store, 1), Refused)
+        monkeypatch.undo()
+        with closing(open_store(tmp_path / "two", database)) as other:
+            with pytest.raises(FencedError, match="with epoch 2 after 1"):
+                send(store, 1)
+            assert send(other, 1).epoch == 2
 
 
 @pytest.mark.parametrize("end", [Database.end_writer, Database.end_all])
@@ -249,6 +409,139 @@ def test_servers_that_start_at_once_on_an_empty_database_have_one_journal(tmp_pa
 def test_a_second_server_is_refused_where_it_may_not_wait(tmp_path, database):
     with closing(open_store(tmp_path / "one", database)), pytest.raises(StoreError, match="another server is writing"):
         open_store(tmp_path / "two", database)
+
+
+# --- who stands by ----------------------------------------------------------------------------------------------------
+
+
+class StandsBy:
+    """A server that waits for the journal on a thread. store: once it has it; error: why it does not wait any more."""
+
+    def __init__(self, folder: Path, database: Database) -> None:
+        self.store: Store | None = None
+        self.error: BaseException | None = None
+        self.on_turn: Callable[[], object] = lambda: None
+        self.standby = Standby(place(folder, database), SITE, CONFIG, lambda _: self.on_turn())
+        self._words = (folder, database, self.standby)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.store = open_store(*self._words)
+        except BaseException as error:
+            self.error = error
+
+    def join(self) -> None:
+        self._thread.join(20.0)
+        assert not self._thread.is_alive()
+
+    def close(self) -> None:
+        self.standby.close()
+        if self.store:
+            self.store.close()
+
+
+def test_a_session_that_is_lost_while_it_waits_is_closed_and_fences_nobody(tmp_path, database, monkeypatch):
+    looked = threading.Semaphore(0)
+    real = PostgresJournal._on_loss
+    monkeypatch.setattr(PostgresJournal, "_on_loss", lambda self: (real(self), looked.release()))
+    first = open_store(tmp_path / "one", database)
+    send(first, 1)
+    mine = f"application_name = 'sitegrid writer' AND pid <> {first.journal._session._pid}"
+    with closing(StandsBy(tmp_path / "two", database)) as second:
+        wait_for(lambda: second.standby.row == 1)
+        waiting = database.sql(f"SELECT pid FROM pg_stat_activity WHERE {mine}")
+
+        def lose() -> None:
+            second.on_turn = lambda: None
+            database.sql(f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE {mine}")
+            assert looked.acquire(timeout=20.0), "it is lost while rows are folded, which takes time"
+
+        second.on_turn = lose
+        wait_for(lambda: database.sql(f"SELECT pid FROM pg_stat_activity WHERE {mine}") not in (waiting, []))
+        first.close()
+        second.join()
+        assert second.store.journal.fenced == ""
+        assert send(second.store, 6).epoch == 2
+        wait_for(lambda: sum(thread.name == "journal" for thread in threading.enumerate()) == 1)
+
+
+def test_a_standby_whose_take_over_is_cut_waits_again(tmp_path, database, monkeypatch):
+    first = open_store(tmp_path / "one", database)
+    send(first, 1)
+    with closing(StandsBy(tmp_path / "two", database)) as second:
+        wait_for(lambda: second.standby.row == 1)
+        real, cut = WriterSession.run, []
+
+        def run(self: WriterSession, query: Any) -> Any:
+            if "SET epoch" in str(query) and not cut:
+                cut.append(LostAnswer(self, "SET epoch"))
+            return real(self, query)
+
+        monkeypatch.setattr(WriterSession, "run", run)
+        first.close()
+        second.join()
+        assert second.error is None
+        assert cut
+        assert send(second.store, 6).epoch == 3
+
+
+def test_a_standby_of_a_database_that_is_made_anew_ends_and_leaves_it_empty(tmp_path, database):
+    """What it made there would be in the way of the backup that is put back."""
+    cluster, name = database.cluster, database.name
+    with closing(open_store(tmp_path / "one", database)) as store:
+        send(store, 1)
+    cluster.sql(f"CREATE DATABASE backup_{name} TEMPLATE {name}")
+    first = open_store(tmp_path / "one", database)
+    with closing(StandsBy(tmp_path / "two", database)) as second:
+        wait_for(lambda: second.standby.row == 1)
+        first.close()
+        cluster.sql(f"DROP DATABASE {name} WITH (FORCE)")
+        cluster.sql(f"CREATE DATABASE {name}")
+        second.join()
+        assert second.error or second.store, "it may have been faster than the database was gone"
+    for folder in ("one", "two"):  # as supervisors start them again
+        with pytest.raises(StoreError, match=r"holds no journal, and .* restore the database from a backup") as caught:
+            place(tmp_path / folder, database).prepared_id(SITE.name, SITE.frame)
+        assert "\n" not in str(caught.value)
+        with pytest.raises(StoreError, match=r"holds no journal, and .* restore the database from a backup"):
+            open_store(tmp_path / folder, database)
+    assert database.sql("SELECT to_regnamespace('sitegrid')") == [(None,)]
+    cluster.sql(f"DROP DATABASE {name} WITH (FORCE)")
+    cluster.sql(f"ALTER DATABASE backup_{name} RENAME TO {name}")
+    with closing(open_store(tmp_path / "two", database)) as store:
+        assert store.journalled == 1
+
+
+def test_a_standby_with_the_folder_of_another_journal_does_not_wait(tmp_path, database, postgres_cluster):
+    open_store(tmp_path / "other", postgres_cluster.new_database()).close()
+    with closing(open_store(tmp_path / "one", database)), closing(StandsBy(tmp_path / "other", database)) as second:
+        second.join()
+        assert "belongs to journal" in str(second.error)
+        assert database.sql("SELECT epoch FROM sitegrid.head") == [(1,)]
+
+
+def test_what_a_start_refuses_is_refused_by_a_take_over(tmp_path, database):
+    with closing(open_store(tmp_path / "one", database)) as first:
+        send(first, 1)
+        database.sql("UPDATE sitegrid.extent SET west_m = west_m + 1000")
+        second = StandsBy(tmp_path / "two", database)
+        wait_for(lambda: second.standby._problem)
+    with closing(second):
+        second.join()
+        assert "the extent of journal row 1 is damaged" in str(second.error)
+
+
+def test_a_warm_grid_counts_as_what_no_snapshot_has(tmp_path, database):
+    standby = Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)
+    with closing(open_store(tmp_path / "one", database)) as first:
+        send(first, 1)
+        standby.follow(5.0)
+    with closing(standby), closing(open_store(tmp_path / "two", database, standby)) as second:
+        assert (second.samples_behind, second.snapshot_row, snapshot.rows_on_disk(tmp_path / "two")) == (5, 0, [])
+        second.save_snapshot()
+        assert second.samples_behind == 0
 
 
 def test_a_standby_follows_rows_and_decisions(tmp_path, database):

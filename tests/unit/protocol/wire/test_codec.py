@@ -488,3 +488,13 @@ def test_every_prefix_of_a_message_is_refused(golden):
         data = entry.encode(entry.record)
         for end in range(0, len(data), 7):
             refusal(data[:end], entry.decode)
+
+
+def test_a_number_beyond_64_bits_is_the_greatest_and_anything_else_is_refused():
+    assert codec.unpack(codec.pack({"n": [2**64 - 1, 2**64, 2**80], "m": -(2**63)}), 99) == {
+        "v": codec.VERSION,
+        "n": [2**64 - 1] * 3,
+        "m": -(2**63),
+    }
+    with pytest.raises(TypeError, match="object is no value"):
+        codec.pack({"n": object()})

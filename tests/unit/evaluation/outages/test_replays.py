@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from agents.pipeline import PipelineConfig, Positioning
-from evaluation.positions import without_gps
-from evaluation.positions.without_gps import (
+from evaluation.outages import replays
+from evaluation.outages.replays import (
     BACK_S,
     BLACKOUT,
     CASES,
@@ -44,7 +44,7 @@ def test_after_a_gap_fixes_are_off_by_a_jump_that_fades() -> None:
     fixes = [r for r in jumped if isinstance(r, Gps)]
     first_ns = made.readings[0].stamp_ns
     assert fixes[0].stamp_ns >= first_ns + GAP_S * 1e9
-    assert len(jumped) - len(fixes) == len(without_gps.without_gps(made.readings))
+    assert len(jumped) - len(fixes) == len(replays.without_gps(made.readings))
     for gps in fixes[:: len(fixes) // 5]:
         x, y, _ = PROJECTION.to_map(gps.lat_deg, gps.lon_deg, gps.height_m)
         x0, y0, _ = PROJECTION.to_map(true[gps.stamp_ns].lat_deg, true[gps.stamp_ns].lon_deg, gps.height_m)
@@ -61,9 +61,7 @@ def test_without_the_reference_one_receiver_one_gyro_and_the_wheels_are_left() -
 @pytest.mark.slow
 def test_a_copy_goes_on_as_the_original_would_and_leaves_it_as_it_was() -> None:
     made = drive([*S_BEND, Leg(30)], VEHICLE)
-    (early, rest), (late, _) = without_gps._forks(
-        Positioning(SITE, VEHICLE, PipelineConfig()), made.readings, [20.0, 40.0]
-    )
+    (early, rest), (late, _) = replays._forks(Positioning(SITE, VEHICLE, PipelineConfig()), made.readings, [20.0, 40.0])
     assert early.pose
     assert early.pose.stamp_ns < START_NS + 20.1e9
     early.step([r for r in rest if r.stamp_ns < made.readings[0].stamp_ns + 40_000_000_000])
@@ -86,9 +84,9 @@ def test_each_case_has_its_own_courses_of_those_of_a_drive() -> None:
 def test_a_receiver_that_comes_back_is_missed_for_a_minute_as_in_a_blackout() -> None:
     """What was believed when it came back is the same in all cases; then the errors part."""
     made = drive([*S_BEND, Leg(80)], VEHICLE)
-    core, rest = without_gps._forks(Positioning(SITE, VEHICLE, PipelineConfig()), made.readings, [20.0])[0]
+    core, rest = replays._forks(Positioning(SITE, VEHICLE, PipelineConfig()), made.readings, [20.0])[0]
     assert (rest[-1].stamp_ns - rest[0].stamp_ns) * 1e-9 > GAP_S + 5
-    traces = without_gps._lost(core, rest, SITE, 0.0)
+    traces = replays._lost(core, rest, SITE, 0.0)
     blackout, jump = traces[BLACKOUT], traces["jump-15m"]
     gap = int((blackout.since_start_s < GAP_S).sum())
     np.testing.assert_array_equal(blackout.position_m[:gap], jump.position_m[:gap])

@@ -1,4 +1,4 @@
-"""Positions without GPS: how far off they get, and whether their ellipses say so; what is replayed is in `without_gps`.
+"""Positions without GPS: how far off they get, and whether their ellipses say so; what is replayed is in `replays`.
 
 Errors are compared by case and length, with the attitude reference and without, between the profiles.
 """
@@ -13,8 +13,7 @@ import numpy as np
 from evaluation.campaign.experiment import Runner, replay_task
 from evaluation.campaign.figures import Goal, Report, Row, half_width, judge, rounded
 from evaluation.campaign.recordings import PAPER, PlannedDrive, Setup
-from evaluation.positions.configurations import PROFILES
-from evaluation.positions.without_gps import (
+from evaluation.outages.replays import (
     BACK_S,
     BLACKOUT,
     CASES,
@@ -28,6 +27,7 @@ from evaluation.positions.without_gps import (
     Filtering,
     placements_s,
 )
+from evaluation.positions.configurations import PROFILES
 from protocol.errors import SitegridError
 
 MAX_RATIO = 1.5  # of the error on one drive to that of the profile `paper`

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from evaluation.campaign.experiment import Runner, Task
-from evaluation.positions import blackouts
-from evaluation.positions.blackouts import Variant, compare, summarise
-from evaluation.positions.without_gps import BLACKOUT, LENGTHS_S, START, Courses, Filtering, sizes
+from evaluation.outages import blackouts
+from evaluation.outages.blackouts import Variant, compare, summarise
+from evaluation.outages.replays import BLACKOUT, LENGTHS_S, START, Courses, Filtering, sizes
 from protocol.errors import SitegridError
 
 

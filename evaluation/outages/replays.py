@@ -39,7 +39,7 @@ SENSORS = ("reference", "gyro")  # with the attitude reference, and with one gyr
 SOURCES = (
     "agents",
     "protocol",
-    *(f"evaluation/positions/{part}.py" for part in ("without_gps", "configurations", "replay")),
+    *(f"evaluation/{part}.py" for part in ("outages/replays", "positions/configurations", "positions/replay")),
 )
 
 

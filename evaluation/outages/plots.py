@@ -15,9 +15,9 @@ from evaluation.campaign import pictures
 from evaluation.campaign.experiment import Runner
 from evaluation.campaign.figures import Report
 from evaluation.campaign.pictures import head
-from evaluation.positions.blackouts import Outcome
+from evaluation.outages.blackouts import Outcome
+from evaluation.outages.replays import GAP_S, JUMPS, SENSORS
 from evaluation.positions.plots import COLOUR, RADIUS_95
-from evaluation.positions.without_gps import GAP_S, JUMPS, SENSORS
 from protocol.arrays import Floats
 
 NAMES = {"reference": "with the attitude reference", "gyro": "one gyro and wheels alone"}

@@ -1,0 +1,197 @@
+"""A grid that follows a journal: whatever happens to the journal, it is the fold of the rows that it says it has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.postgres.server import Database
+from mapserver.evidence.grid import Grid
+from mapserver.ingest import standby as module
+from mapserver.ingest.standby import Standby
+from mapserver.ingest.store import Store
+from mapserver.journal.history import history_rows
+from mapserver.journal.journal import JournalQueries
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.postgres import reader as postgres_reader
+from mapserver.trust.decisions import PERSON, TrustDecision
+from protocol.errors import StoreError
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, random_samples, same, wait_for
+
+
+@pytest.fixture
+def location(tmp_path: Path, database: Database) -> JournalLocation:
+    return JournalLocation(tmp_path / "one", database.url)
+
+
+@pytest.fixture
+def standby(tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch) -> Iterator[Standby]:
+    """One that reads row by row, and tries again at once."""
+    for name in ("ROWS_AT_ONCE", "BYTES_AT_ONCE"):
+        monkeypatch.setattr(postgres_reader, name, 1)
+    monkeypatch.setattr(module, "_MOST_PAUSE_S", 0.0)
+    monkeypatch.setattr(module, "_PAUSE_S", 0.0)
+    with closing(Standby(JournalLocation(tmp_path / "two", database.url), SITE, CONFIG, bool)) as made:
+        yield made
+
+
+def opened(location: JournalLocation) -> Store:
+    return Store(location, SITE, CONFIG, now_ns)
+
+
+def send(store: Store, first: int, last: int, machine: str = "a") -> None:
+    for seq in range(first, last + 1):
+        store.commit([incoming(random_samples(1, seq), seq, machine)])
+
+
+def is_fold(standby: Standby, journal: JournalQueries, without: frozenset[str] = frozenset()) -> bool:
+    """Whether the grid is what its rows make."""
+    grid = Grid(SITE.cell_m, CONFIG.fold)
+    for row in history_rows(standby_history(journal), until=standby.row):
+        if row.machine not in without:
+            grid.fold(row.rows, row.machine)
+    return same(standby._grid, grid)
+
+
+def standby_history(journal: JournalQueries) -> Any:
+    from mapserver.journal.history import History
+
+    return History(journal, JournalLocation(Path("/nowhere")).archive)
+
+
+def fails_after(reads: int, standby: Standby) -> None:
+    """Have its reader fail at a read, once."""
+    reader = standby._opened()
+    real, left = reader._piece, [reads]
+
+    def piece(*words: Any) -> Any:
+        left[0] -= 1
+        if left[0] == -1:
+            raise StoreError("the database", "the connection was cut")
+        return real(*words)
+
+    reader._piece = piece
+
+
+@pytest.mark.parametrize("warm_rows", [0, 2])
+def test_rows_before_a_read_that_fails_are_folded_once(location, standby, warm_rows):
+    with closing(opened(location)) as store:
+        send(store, 1, warm_rows)
+        if warm_rows:
+            standby.follow(5.0)
+        send(store, warm_rows + 1, 8)
+        fails_after(3, standby)
+        standby.follow(5.0)
+        assert standby.row == warm_rows + 3
+        assert is_fold(standby, store.journal)
+        standby.follow(5.0)
+        assert standby.row == 8
+        assert is_fold(standby, store.journal)
+
+
+@pytest.mark.parametrize("warm_rows", [0, 2])
+def test_before_a_damaged_row_it_waits_and_folds_nothing_twice(location, standby, warm_rows, database):
+    with closing(opened(location)) as store:
+        send(store, 1, warm_rows)
+        if warm_rows:
+            standby.follow(5.0)
+        send(store, warm_rows + 1, 6)
+        ((sound,),) = database.sql("SELECT record FROM sitegrid.journal WHERE row = 4")
+        database.sql("UPDATE sitegrid.journal SET record = '\\x00' WHERE row = 4")
+        for _ in range(5):
+            standby.follow(0.1)
+            assert standby.row == 3
+            assert is_fold(standby, store.journal)
+        assert "journal row 4 is damaged" in standby._problem
+        database.sql(f"UPDATE sitegrid.journal SET record = '\\x{sound.hex()}' WHERE row = 4")
+        standby.follow(0.1)
+        assert (standby.row, standby._problem) == (6, "")
+        assert is_fold(standby, store.journal)
+
+
+def test_after_a_failed_read_it_tries_again_ever_more_seldom(location, standby, database, monkeypatch):
+    monkeypatch.setattr(module, "_MOST_PAUSE_S", 3600.0)
+    standby._pause_s = 1800.0
+    with closing(opened(location)) as store:
+        send(store, 1, 1)
+        fails_after(0, standby)
+        standby.follow(0.01)
+        assert standby._pause_s == 3600.0
+        standby.follow(0.01)
+        assert standby.row == 0, "it did not look"
+        standby._again_s = 0.0
+        standby.follow(0.01)
+        assert (standby.row, standby._pause_s) == (1, module._PAUSE_S)
+
+
+def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
+    with closing(opened(location)) as store:
+        send(store, 1, 2)
+        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        standby.follow(5.0)
+        send(store, 1, 3, machine="b")
+        standby.follow(5.0)
+        assert standby.row == 5
+        assert is_fold(standby, store.journal, facts.excluded)
+        send(store, 3, 3)
+        standby.follow(5.0)
+        assert is_fold(standby, store.journal, facts.excluded)
+
+
+def restore(database: Database, row: int) -> None:
+    """As a backup of the same epoch would have it."""
+    database.sql(f"DELETE FROM sitegrid.journal WHERE row > {row}; DELETE FROM sitegrid.extent WHERE row > {row}")
+    database.sql(f"UPDATE sitegrid.head SET last_row = {row}")
+
+
+@pytest.mark.parametrize("rows_since", [0, 2, 4, 6])
+def test_a_database_that_is_restored_within_an_epoch_is_folded_again(location, standby, database, rows_since):
+    with closing(opened(location)) as store:
+        send(store, 1, 4)
+        standby.follow(5.0)
+        assert standby.has_checked(store.journal)
+    restore(database, 1)
+    epoch = database.sql("SELECT epoch FROM sitegrid.head")[0][0]
+    with closing(opened(location)) as store:
+        send(store, 1, rows_since, machine="b")
+        database.sql(f"UPDATE sitegrid.head SET epoch = {epoch}")
+        assert not standby.has_checked(store.journal)
+        assert standby.grid_for(store.journal, store.facts) is None
+        standby.follow(5.0)
+        assert standby.row == 1 + rows_since
+        assert is_fold(standby, store.journal)
+        standby.follow(0.1)
+        assert standby.has_checked(store.journal)
+
+
+def test_a_decision_of_another_course_is_not_kept(location, standby, database):
+    """A restored database may have another decision under the number of one that is gone."""
+    with closing(opened(location)) as store:
+        send(store, 1, 4)
+        send(store, 1, 4, machine="b")
+        store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        standby.follow(5.0)
+        assert standby._facts.excluded == {"b"}
+    restore(database, 2)
+    database.sql("DELETE FROM sitegrid.events; UPDATE sitegrid.head SET last_event = 0")
+    with closing(opened(location)) as store:
+        events = store.journal.state().event
+        store.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
+        assert events == 1, "what is missing is an event"
+    wait_for(lambda: standby.follow(0.1) or standby._facts.excluded == {"c"})
+
+
+def test_a_snapshot_is_where_it_begins(location, standby, tmp_path, database):
+    with closing(opened(JournalLocation(tmp_path / "two", database.url))) as store:
+        send(store, 1, 4)
+        store.save_snapshot()
+        send(store, 5, 6)
+        fails_after(1, standby)
+        standby.follow(5.0)
+        assert standby.row == 5, "the snapshot's four, and one"
+        standby.follow(5.0)
+        assert is_fold(standby, store.journal)
