@@ -32,6 +32,8 @@ from protocol.queries.requests import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.site.geometry import Bounds, CellWindow
 
 LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older journals are not read for it
+MOST_SEGMENTS = 10_000  # of one answer: 250 km of roads, 3 MB
+MOST_CHANGES = 1000  # of one worklist, the newest
 LINE_POINTS = 5  # a point of a line is a metre from the next; one in so many is told
 
 
@@ -74,6 +76,9 @@ class RoadMaps:
         traffic, hours = _traffic(roads, query)
         rows = _Records(roads.segments, traffic, losses(traffic, roads.segments, 0.0), hours)
         chosen = _inside(roads.segments, query.bounds)
+        if len(chosen) > MOST_SEGMENTS:
+            problem = f"{len(chosen)} segments; at most {MOST_SEGMENTS} are answered: ask for less with `bounds`"
+            raise QueryError(Refusal.TOO_LARGE, problem)
         version = (roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns)
         return answers.Segments(*version, hours, traffic.placed, tuple(rows(i) for i in chosen))
 
@@ -111,7 +116,8 @@ class RoadMaps:
             for change in roads.changes
             if change.segment in inside
         ]
-        return answers.Worklist(*version, hours, query.target, total, tuple(out), tuple(changes))
+        shown = tuple(changes[:MOST_CHANGES])
+        return answers.Worklist(*version, hours, query.target, total, tuple(out), shown)
 
     def _read(self, query: RoadQuery) -> RoadMap:
         _require_on_site(query.bounds, self._source.site.extent_m)

@@ -43,12 +43,13 @@ class Network:
 def network(skeleton: Skeleton) -> Network:
     """The graph of roads of a skeleton."""
     places, metres = skeleton.places, skeleton.metres
+    traced = chains(places)
     for _ in range(ROUNDS):
-        traced = chains(places)
         gone = _superfluous(places, metres, traced, skeleton.raster_m)
         if not gone.any():
             break
         places, metres = places[~gone], metres[~gone]
+        traced = chains(places)
     return _lines(places, traced, skeleton.raster_m)
 
 

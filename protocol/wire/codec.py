@@ -30,7 +30,6 @@ MAX_INT = 2**64 - 1  # of MessagePack
 MAX_RETRY_S = 3600.0
 _WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
 _STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value in OPTIONAL.items()}
-_NO_ROWS = empty()
 STORE_ID = re.compile(r"[0-9a-f]{16}")
 
 
@@ -170,7 +169,7 @@ def unpack_batch(data: bytes) -> PackedBatch:
         machine=take_name(table),
         spool_id=_take_int(table, "spool_id", 1, MAX_U64),
         first_seq=first_seq,
-        rows=_NO_ROWS,
+        rows=empty(),
         frame=take(table, "frame", str),
         lost_before=lost_before,
         store=take_store(table, optional=True),

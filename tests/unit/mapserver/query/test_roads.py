@@ -214,3 +214,11 @@ def test_a_repair_is_told_and_counts(tmp_path):
         assert change.saved_kwh_ph > 0
     assert then.changes == ()
     assert [row.segment.id for row in then.rows] == [row.segment.id for row in before.rows]
+
+
+def test_more_segments_than_an_answer_holds_are_refused_with_what_to_do(writer, monkeypatch):
+    monkeypatch.setattr("mapserver.query.roads.MOST_SEGMENTS", 10)
+    with pytest.raises(QueryError, match="at most 10 are answered: ask for less with `bounds`") as refused:
+        segments(answers_of(writer))
+    assert refused.value.reason == Refusal.TOO_LARGE
+    assert segments(answers_of(writer), bounds=Bounds(0, 0, 100, 50)).segments

@@ -169,3 +169,17 @@ def test_small_cells_show_the_same_roads():
     blocks = grid.blocks_in(EVERYWHERE)
     pages = dict(zip(blocks, grid.pages(blocks), strict=True))
     assert Skeletons(0.5).skeleton(pages).raster_m == 1.0
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 8])
+def test_a_yard_driven_all_over_gives_roads_that_are_whole(monkeypatch, rounds):
+    """However early pruning ends: lines are of cells that are there."""
+    monkeypatch.setattr("mapserver.roads.network.ROUNDS", rounds)
+    draw = np.random.default_rng(9)
+    shown = roads(*(passes(along(draw.uniform(0, 80, (12, 2))), 1, seed=seed) for seed in range(4)))
+    assert np.isfinite(shown.points).all()
+    assert ((shown.points > -10) & (shown.points < 90)).all()
+    assert (shown.length_m > 0).all()
+    assert len(set(shown.ids)) == len(shown.ids)
+    steps = [np.hypot(*np.diff(shown.line(i), axis=0).T).max() for i in range(len(shown.ids))]
+    assert max(steps) < 8.0
