@@ -11,12 +11,13 @@ import hashlib
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum, auto
 
 import zenoh
 
-from protocol.errors import ConfigError, LinkError, QueryError, Refusal
+from protocol.errors import ConfigError, LinkError, MessageError, QueryError, Refusal
 from protocol.queries import requests
 from protocol.queries.answer_codec import decode_alive, decode_error
 from protocol.queries.answers import FollowerState, ServerAlive
@@ -120,13 +121,14 @@ class Asker:
         return self._get(query, wait_s)
 
     def followers(self) -> list[FollowerState]:
-        """Followers whose tokens are there and that answer, by name."""
+        """Followers whose tokens are there and that answer what can be read, by name."""
         states = []
         for name in sorted(self._followers.look()):  # one by one: routers let no wildcard pass to a name
             key = keys.follower_query(self._site, name, requests.AliveQuery.name)
             answered = self._once(_Attempt(key, {}, name), self._timeout_s / 2)
             if isinstance(answered, Answered):
-                states.append(_state(decode_alive(answered.data), answered.origin))
+                with suppress(MessageError):
+                    states.append(_state(decode_alive(answered.data), answered.origin))
         return states
 
     def command(self, key: str, parameters: Mapping[str, str], wait_s: float) -> bytes:
@@ -196,6 +198,15 @@ class Asker:
         time.sleep(refusal.retry_after_s)
 
     def _once(self, attempt: _Attempt, timeout_s: float) -> Answered | QueryError | _Silence:
+        """Ask once. A follower that says what cannot be read, as one of another version, is as good as silent."""
+        try:
+            return self._heard(attempt, timeout_s)
+        except MessageError:
+            if attempt.follower:
+                return _Silence.NOBODY
+            raise
+
+    def _heard(self, attempt: _Attempt, timeout_s: float) -> Answered | QueryError | _Silence:
         outcome: Answered | QueryError | _Silence = _Silence.NOBODY
         for reply in self._session.get(attempt.selector, timeout=timeout_s):
             if reply.ok is not None:

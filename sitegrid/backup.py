@@ -7,6 +7,7 @@ is whole and has been read back.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ from pathlib import Path
 
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.losses import lacking
-from mapserver.ingest.store_folder import hold, is_in_use
+from mapserver.ingest.store_folder import hold_place, is_in_use
 from mapserver.journal import archived_decisions
 from mapserver.journal.history import History, read_history
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
@@ -45,6 +46,7 @@ class Examined:
 def backup(store: Path, out: Path) -> Examined:
     """Copy a store, also while its server writes, and read the copy back; StoreError, ConfigError."""
     with _making(store, out) as (source, part):
+        _require_whole(source)
         with source.file_reader() as journal:
             journal.copy_to(part / JOURNAL_FILE)
         with JournalLocation(part).reader() as copied:  # what moves to the archive from now on is in the copy
@@ -67,16 +69,22 @@ def restore(copy: Path, store: Path) -> Examined:
             archived = journal.archived_row
         _copy_archive(source, part, archived)
         if (decisions := source.archive.folder / archived_decisions.FILE).exists():
-            shutil.copy2(decisions, part / source.archive.folder.name)
+            _copy(decisions, JournalLocation(part).archive.folder)
         return _examined(JournalLocation(part), live=False)
 
 
 def verify(store: Path) -> Examined:
     """Read all of a store or a backup; StoreError names the first thing that is not as it was written."""
     location = _journal_of(store)
-    if shortfall := lacking(location):
-        raise StoreError(location, f"lacks what was acknowledged: {shortfall}")
+    _require_whole(location)
     return _examined(location, live=is_in_use(store))
+
+
+def _require_whole(location: JournalLocation) -> None:
+    """StoreError where the journal lacks what was acknowledged, and no start of a server has named that."""
+    if shortfall := lacking(location):
+        advice = "restore a backup, or start a map server on it once: it keeps a note of that, and goes on"
+        raise StoreError(location, f"lacks what was acknowledged: {shortfall}; {advice}")
 
 
 def _examined(location: JournalLocation, *, live: bool) -> Examined:
@@ -121,26 +129,25 @@ def _journal_of(store: Path) -> JournalLocation:
 def _making(source: Path, out: Path) -> Iterator[tuple[JournalLocation, Path]]:
     """A folder beside its place, which gets its name in the end; after an error it is gone."""
     location, out = _journal_of(source), out.absolute()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(out, "exists and is not empty; choose another --out")
     part = out.with_name(f"{out.name}.part")
-    if is_in_use(part):
-        raise ConfigError(part, "another copy is being made there; wait for it, or choose another --out")
-    try:
-        if part.exists():
-            shutil.rmtree(part)  # of one that was killed
-        with hold(part):
+    with hold_place(part):
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise ConfigError(out, "exists and is not empty; choose another --out")
+        try:
+            if part.exists():
+                shutil.rmtree(part)  # of one that was killed
+            part.mkdir()
             yield location, part
-        for name in BESIDE:
-            if (source / name).is_file():
-                shutil.copy2(source / name, part / name)
-        sync_folder(part)
-        part.replace(out)
-        sync_folder(out.parent)
-    except OSError as error:
-        raise StoreError(out, f"cannot be written: {error.strerror or error}") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)  # nothing, where it has its name
+            for name in BESIDE:
+                if (source / name).is_file():
+                    _copy(source / name, part)
+            sync_folder(part)
+            part.replace(out)
+            sync_folder(out.parent)
+        except OSError as error:
+            raise StoreError(out, f"cannot be written: {error.strerror or error}") from None
+        finally:
+            shutil.rmtree(part, ignore_errors=True)  # nothing, where it has its name
 
 
 def _copy_archive(source: JournalLocation, part: Path, until: int) -> None:
@@ -149,8 +156,15 @@ def _copy_archive(source: JournalLocation, part: Path, until: int) -> None:
         folder = JournalLocation(part).archive.folder
         folder.mkdir()
         for path in source.archive.cover(until):
-            shutil.copy2(path, folder / path.name)
-        sync_folder(folder)
+            _copy(path, folder)
+
+
+def _copy(path: Path, folder: Path) -> None:
+    """Copy a file, to disk: the server that has the original may forget its rows as soon as there is a backup."""
+    shutil.copy2(path, folder)
+    with (folder / path.name).open("rb") as file:
+        os.fsync(file.fileno())
+    sync_folder(folder)
 
 
 def lines(store: Path, examined: Examined) -> list[str]:

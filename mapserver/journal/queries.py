@@ -130,10 +130,8 @@ class TableQueries(ABC):
 
     def identity(self) -> StoreIdentity:
         """See `JournalQueries`."""
-        words = self._meta().get("store", "").split()
-        if len(words) < 2 or words[-1] != f"{checksum(*words[:-1]):08x}":
-            raise self._damaged("the id of the store")
-        return StoreIdentity(words[0], tuple(words[1:-1]))
+        store, *descends = self._meta()["store"].split()
+        return StoreIdentity(store, tuple(descends))
 
     def events(self, kind: str | None = None, after: int = 0) -> list[Event]:
         """See `JournalQueries`."""
@@ -149,17 +147,24 @@ class TableQueries(ABC):
         with self._one_state():
             self.identity()
             self._require_each(self._extent_rows(), self.archived_row, self.last_row)
-            self._require_each((event.id for event in self.events()), 0)
+            self._require_each((event.id for event in self.events()), 0, self.state().event)
             self._load_watermarks()
 
     def _meta(self) -> dict[str, str]:
-        """All of the table meta; StoreError where the journal has another schema."""
-        meta = dict(self._query("SELECT key, value FROM meta"))
-        if meta.get("schema") != str(self.schema):
-            problem = f"has schema {meta.get('schema')!r}, this version knows {self.schema}"
+        """All of the table meta; StoreError where the journal has another schema, or a line is damaged."""
+        (schema,) = self._query("SELECT value FROM meta WHERE key = 'schema'") or [(None,)]
+        if schema != (str(self.schema),):
+            problem = f"has schema {schema[0]!r}, this version knows {self.schema}"
             raise StoreError(
                 self.where, f"{problem}; open it with the version that wrote it, or choose another --store"
             )
+        meta = {}
+        for key, value, crc32 in self._query("SELECT key, value, crc32 FROM meta"):
+            if crc32 != checksum(key, value):
+                raise self._damaged(f"the {key} of the journal")
+            meta[key] = value
+        if missing := {"site", "frame", "store"} - meta.keys():
+            raise self._damaged(f"the {min(missing)} of the journal")
         return meta
 
     def _number(self, query: str) -> int:

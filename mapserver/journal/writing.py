@@ -97,18 +97,23 @@ class TableWriter(TableQueries):
         """StoreError unless it is this site's."""
         meta = self._meta()
         for key, value in (("site", site), ("frame", frame)):
-            if meta.get(key) != value:
+            if meta[key] != value:
                 problem = (
-                    f"the store has {key} {meta.get(key)!r}, this server {value!r}; choose another --store or --journal"
+                    f"the store has {key} {meta[key]!r}, this server {value!r}; choose another --store or --journal"
                 )
                 raise StoreError(self.where, problem)
 
 
-def new_meta(schema: int, site: str, frame: str, descends: Iterable[str], store: str = "") -> dict[str, str]:
+def new_meta(schema: int, site: str, frame: str, descends: Iterable[str], store: str = "") -> list[Line]:
     """What a new journal says of itself. descends: ids of the stores that it is made from. store: of a copy, its id."""
-    words = (store or secrets.token_hex(8), *descends)
-    store = " ".join((*words, f"{checksum(*words):08x}"))
-    return {"schema": str(schema), "site": site, "frame": frame, "store": store}
+    store = " ".join((store or secrets.token_hex(8), *descends))
+    meta = {"schema": str(schema), "site": site, "frame": frame, "store": store}
+    return [meta_line(*each) for each in meta.items()]
+
+
+def meta_line(key: str, value: str) -> Line:
+    """What a journal says of itself, as its table has it."""
+    return key, value, checksum(key, value)
 
 
 def watermark_line(machine: str, spool_id: int, watermark: Watermark) -> Line:

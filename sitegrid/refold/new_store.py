@@ -14,9 +14,9 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid_state import GridState
 from mapserver.fleet.decisions import CalibrationDecision
-from mapserver.ingest.decisions import plain
+from mapserver.ingest.decisions import calibrations, plain
 from mapserver.ingest.store import Store
-from mapserver.ingest.store_folder import hold, is_in_use
+from mapserver.ingest.store_folder import hold_place
 from mapserver.journal.archive import FOLDER, file_name
 from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
@@ -62,7 +62,8 @@ class NewStore:
                 journal.follow_archive(self.rows, watermarks)
             if not journal.events():
                 journal.append_events(map(plain, decisions))
-            if (journal.last_row, journal.watermarks()) != (self.rows, watermarks):
+            known = (journal.last_row, journal.watermarks(), calibrations(journal))
+            if known != (self.rows, watermarks, list(decisions)):
                 raise _of_another(self.folder)
 
     def finish(self, out: Path, texts: Mapping[str, str], config: ServerConfig) -> dict[str, Any]:
@@ -80,21 +81,20 @@ class NewStore:
 @contextmanager
 def making(folder: Path, site: SiteConfig, descends: tuple[str, ...], rows: int) -> Iterator[NewStore]:
     """Make a store in a folder, or go on with it; after an error nothing is left, or what the same command can use."""
-    if is_in_use(folder / WORK):
-        raise ConfigError(folder, "another fold is at work there; wait for it, or choose another --out")
-    try:
-        with hold(folder / WORK):
+    with hold_place(folder):
+        try:
+            (folder / WORK).mkdir(parents=True, exist_ok=True)
             yield NewStore(folder, _identity(folder, site, descends), site, rows)
-    except (SitegridError, OSError) as error:
-        problem = str(error)
-        if isinstance(error, OSError):
-            problem = f"{folder}: cannot be written: {error.strerror or error}"
-        if _is_useful(folder):
-            problem = f"{problem}; what is done is kept in {folder}, and the same command goes on"
-        raise SitegridError(problem) from None
-    finally:
-        if folder.exists() and not _is_useful(folder):
-            shutil.rmtree(folder)
+        except (SitegridError, OSError) as error:
+            problem = str(error)
+            if isinstance(error, OSError):
+                problem = f"{folder}: cannot be written: {error.strerror or error}"
+            if _is_useful(folder):
+                problem = f"{problem}; what is done is kept in {folder}, and the same command goes on"
+            raise SitegridError(problem) from None
+        finally:
+            if folder.exists() and not _is_useful(folder):
+                shutil.rmtree(folder)
 
 
 def _identity(folder: Path, site: SiteConfig, descends: tuple[str, ...]) -> str:

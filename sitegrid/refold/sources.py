@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import socket
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
 from pathlib import Path
 
 from mapserver.config import ServerConfig
@@ -115,24 +116,22 @@ def chosen_config(sources: Sequence[Source], arguments: Namespace) -> tuple[Serv
 
 
 def joined_decisions(histories: Iterable[Sequence[CalibrationDecision]]) -> list[CalibrationDecision]:
-    """Those of all sources, each history once; of one that another holds, as of a store and its archive, what goes on.
+    """Those of all sources in the order of their stamps, whatever order the sources are given in.
 
-    A decision that was made twice counts twice: who corrects, takes that back, and corrects again, has corrected.
+    What two histories share, as a store and its archive do, counts once. A decision that one history has twice counts
+    twice: who corrects, takes that back, and corrects again, has corrected. Each history keeps its own order, also
+    where the site's clock went back.
     """
-    out: list[CalibrationDecision] = []
-    taken: list[Sequence[CalibrationDecision]] = []
+    places: dict[tuple[CalibrationDecision, int], tuple[int, int]] = {}
     for history in histories:
-        if history not in taken:
-            out += history[max((_held(history, other) for other in taken), default=0) :]
-            taken.append(history)
-    return out
-
-
-def _held(history: Sequence[CalibrationDecision], other: Sequence[CalibrationDecision]) -> int:
-    """How much of a history another one holds, from its beginning on; in that of a fold of both it comes later."""
-    starts = (i for i, decision in enumerate(other) if history and history[0] == decision)
-    runs = (takewhile(lambda pair: pair[0] == pair[1], zip(history, other[i:], strict=False)) for i in starts)
-    return max((sum(1 for _ in run) for run in runs), default=0)
+        newest_ns, times = 0, Counter[CalibrationDecision]()
+        for position, decision in enumerate(history):
+            newest_ns = max(newest_ns, decision.stamp_ns)
+            times[decision] += 1
+            key = decision, times[decision]
+            places[key] = max(places.get(key, (0, 0)), (newest_ns, position))
+    ordered = sorted(places, key=lambda key: (places[key], json.dumps(key[0].body()), key[1]))
+    return [decision for decision, _ in ordered]
 
 
 def descent(sources: Sequence[Source], contents: Sequence[Contents]) -> Iterator[str]:

@@ -9,13 +9,13 @@ from mapserver.journal.postgres.statements import insert
 from mapserver.journal.writing import new_meta
 
 MAKING = 0x517E62D2  # an advisory lock for as long as tables are made
-SCHEMA = 1
+SCHEMA = 2
 CHANNEL = "sitegrid_journal"  # of notifications, one per database
 # `head` has one line, which every commit changes: rows are numbered by it, so that they are dense and in the order of
 # their commits. Numbers of a sequence are not, and whoever asks for what follows the last one he has seen loses rows.
 # `writer` is a name that the epoch's writer drew: it knows by that whose an epoch is.
 TABLES = """
-CREATE TABLE meta (key text PRIMARY KEY, value text NOT NULL);
+CREATE TABLE meta (key text PRIMARY KEY, value text NOT NULL, crc32 bigint NOT NULL);
 CREATE TABLE head (
     single boolean PRIMARY KEY DEFAULT true CHECK (single),
     epoch bigint NOT NULL, writer text NOT NULL,
@@ -50,7 +50,7 @@ END $$;
 
 def creation(site: str, frame: str, descends: Iterable[str] = ()) -> str:
     """A statement that makes the tables where there are none; of several servers that run it at once, one does."""
-    meta = insert("meta", list(new_meta(SCHEMA, site, frame, descends).items()))
+    meta = insert("meta", new_meta(SCHEMA, site, frame, descends))
     return f"""DO $making$
 BEGIN
     PERFORM pg_advisory_xact_lock({MAKING});

@@ -18,7 +18,7 @@ from mapserver.journal.progress import Progress
 from mapserver.journal.rows import JournalRow, SpoolKey, Watermark
 from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
 from mapserver.journal.sqlite.reader import SCHEMA, TABLES, SqliteQueries
-from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, new_meta, watermark_line
+from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, meta_line, new_meta, watermark_line
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
 from protocol.disk.traces import Traces, look_beside
 from protocol.errors import StoreError
@@ -52,7 +52,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 self._row = super().last_row
                 self.check()
                 self.epoch = self.state().epoch + 1
-                self._db.execute("REPLACE INTO meta VALUES ('epoch', ?)", (str(self.epoch),))
+                self._db.execute("REPLACE INTO meta VALUES (?, ?, ?)", meta_line("epoch", str(self.epoch)))
                 self._return_to_disk()
                 self._mark = HighWaterMark(mark_path(path))
                 opened.callback(self._mark.close)
@@ -106,14 +106,16 @@ class SqliteJournal(TableWriter, SqliteQueries):
         with self._transaction():
             for line in lines:
                 self._write("INSERT INTO events VALUES (?, ?, ?, ?, ?)", line)
-                self._changed[EVENT] = line[0]
+            if lines:
+                self._changed[EVENT] = lines[-1][0]
+                self._put_meta("event", lines[-1][0])
             return self._last_event()
 
     def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
         """Have a new journal go on after an archive with rows up to `row`, and spools up to these watermarks."""
         with self._transaction():
             self._write("INSERT INTO sqlite_sequence VALUES ('journal', ?)", (row,))
-            self._write("REPLACE INTO meta VALUES ('archived_row', ?)", (str(row),))
+            self._put_meta("archived_row", row)
             self._row = row
             for spool, watermark in watermarks.items():
                 self.put_watermark(*spool, watermark)
@@ -128,7 +130,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
         with self._transaction():
             for table in ("journal", "extent"):
                 self._write(f"DELETE FROM {table} WHERE row <= ?", (last,))  # noqa: S608 # one of two constants
-            self._write("REPLACE INTO meta VALUES ('archived_row', ?)", (str(last),))
+            self._put_meta("archived_row", last)
         return last
 
     def shrink(self, most_pages: int = 100) -> int:
@@ -152,6 +154,9 @@ class SqliteJournal(TableWriter, SqliteQueries):
         self._db.close()
         self._mark.close()
 
+    def _put_meta(self, key: str, number: int) -> None:
+        self._write("REPLACE INTO meta VALUES (?, ?, ?)", meta_line(key, str(number)))
+
     def _write(self, statement: str, values: Sequence[Any] = ()) -> None:
         try:
             self._db.execute(statement, values)
@@ -172,7 +177,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
             self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
             meta = new_meta(SCHEMA, site, frame, descends, store)
-            self._db.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
+            self._db.executemany("INSERT INTO meta VALUES (?, ?, ?)", meta)
             self._db.execute("COMMIT")
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # no damage of a log takes the store's id away
         self._require_meta(site, frame)

@@ -18,9 +18,9 @@ from mapserver.journal.rows import Selection
 from protocol.errors import StoreError
 from protocol.files import make_private
 
-SCHEMA = 5
+SCHEMA = 6
 TABLES = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc32 INTEGER NOT NULL) WITHOUT ROWID;
 CREATE TABLE journal (
     row INTEGER PRIMARY KEY AUTOINCREMENT,
     record BLOB NOT NULL
@@ -71,15 +71,17 @@ class SqliteQueries(TableQueries):
     @property
     def archived_row(self) -> int:
         """See `JournalQueries`."""
-        return self._number("SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = 'archived_row'")
+        return self._meta_number("archived_row")
 
     def state(self) -> JournalState:
         """See `JournalQueries`."""
-        epoch = self._number("SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = 'epoch'")
-        return JournalState(epoch, self.last_row, self._last_event())
+        return JournalState(self._meta_number("epoch"), self.last_row, self._last_event())
 
     def _last_event(self) -> int:
-        return self._number("SELECT COALESCE(MAX(id), 0) FROM events")
+        return self._meta_number("event")  # and not the greatest one, which may have lost those after it
+
+    def _meta_number(self, key: str) -> int:
+        return self._number(f"SELECT COALESCE(MAX(value), '0') FROM meta WHERE key = '{key}'")  # noqa: S608 # a constant
 
     @contextmanager
     def _one_state(self) -> Iterator[None]:

@@ -13,6 +13,8 @@ from protocol.queries.origin import Origin, encode_origin
 from protocol.queries.requests import AliveQuery, Freshness, InfoQuery, PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
+from protocol.wire.codec import pack
+from protocol.wire.messages import VERSION
 from sitegrid import asking
 from sitegrid.asking import Asker, Followers, preferred
 from sitegrid.client import Client
@@ -20,7 +22,7 @@ from tests.unit.records import STORE, map_info, version
 
 POINT = codec.encode_point(PointAnswer(0.5, 1.5, {"visits": 2.0}, version(17, 3), 5))
 SITE = SiteConfig("pit", 48.0, 11.0)
-SILENT, HANGS = "nobody", "hangs"
+SILENT, HANGS, UNREADABLE = "nobody", "hangs", "unreadable"
 
 
 class Site:
@@ -43,8 +45,12 @@ class Site:
         answer = self.answers.get(name, SILENT)
         if answer == SILENT:
             return []
+        if answer == UNREADABLE:
+            answer = POINT
         data = answer if isinstance(answer, bytes) else b"Timeout" if answer == HANGS else codec.encode_error(answer)
         origin = encode_origin(Origin(name, 3, 0.25)) if name else None
+        if self.answers.get(name) == UNREADABLE:
+            origin = pack({"v": VERSION + 1})
         attachment = SimpleNamespace(to_bytes=lambda: origin) if origin else None
         reply = SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: data), attachment=attachment)
         is_answer = isinstance(answer, bytes)
@@ -113,6 +119,20 @@ def test_what_a_follower_refuses_for_what_it_is_the_server_is_asked(reason):
     site = Site(a=QueryError(reason, "not I", 5.0))
     assert asker(site).ask(PointQuery(0, 0)).origin == Origin()
     assert site.whom == ["a", ""]
+
+
+@pytest.mark.parametrize("answer", [UNREADABLE, b"Internal: no link"])
+def test_one_that_answers_what_cannot_be_read_is_as_good_as_silent(answer, monkeypatch):
+    site = Site(a=answer)
+    if isinstance(answer, bytes):  # Zenoh's own errors are no messages
+        monkeypatch.setattr(codec, "encode_error", lambda _: answer)
+        site.answers["a"] = QueryError("internal", "no link")
+    one = asker(site)
+    assert [one.ask(PointQuery(0, 0)).origin for _ in range(2)] == [Origin(), Origin()]
+    assert site.whom == ["a", "", ""]
+    assert one.followers() == []
+    with pytest.raises(QueryError, match="does not answer any more"):
+        one.ask(RegionQuery(Bounds(0, 0, 1, 1)), at=Origin("a"))
 
 
 def test_a_bad_question_is_refused_once():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -16,13 +17,17 @@ import pytest
 
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
+from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
+from mapserver.trust.decisions import PERSON, TrustDecision
 from protocol.arrays import Table
+from protocol.disk.high_water_mark import HighWaterMark, mark_path
 from protocol.site.site_config import SiteConfig, site_toml
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
+from sitegrid.backup import _making
 from sitegrid.cli import main
 from sitegrid.process.children import wait_until
 from tests.unit.sitegrid.refold.archives import SITE, T0, samples
@@ -102,6 +107,9 @@ def test_a_backup_of_an_open_store_is_restored_with_all_that_it_had(store: Path,
         (lambda store: flip(max((store / FOLDER).glob("*.parquet"))), "is damaged"),
         (lambda store: flip(store / JOURNAL_FILE), "is damaged"),
         (lambda store: (store / JOURNAL_FILE).unlink(), "holds no journal.db"),
+        (lambda store: change(store, "UPDATE meta SET value = 'qit' WHERE key = 'site'"), "the site of the journal is"),
+        (lambda store: change(store, "UPDATE meta SET value = '9' WHERE key = 'epoch'"), "the epoch of the journal is"),
+        (lambda store: decided(store) or change(store, "DELETE FROM events"), "what follows number 0 is damaged"),
     ],
 )
 def test_damage_is_named_by_verify_and_by_backup(store: Path, tmp_path: Path, capsys, damage, problem: str):
@@ -109,6 +117,18 @@ def test_damage_is_named_by_verify_and_by_backup(store: Path, tmp_path: Path, ca
     assert problem in refused(capsys, "verify", store)
     assert problem in refused(capsys, "backup", store, "--out", tmp_path / "copy")
     assert [path.name for path in tmp_path.iterdir()] == ["store"], "nothing half-made is left"
+
+
+def change(store: Path, statement: str) -> None:
+    with closing(sqlite3.connect(store / JOURNAL_FILE, isolation_level=None)) as db:
+        db.execute(statement)
+
+
+def decided(store: Path) -> None:
+    """Have an event, and no mark that knows of it, as in a backup."""
+    with closing(Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns)) as opened:
+        opened.decide(TrustDecision("a", False, PERSON, "drifts", T0))
+    (store / f"{JOURNAL_FILE}-mark").unlink()
 
 
 def flip(path: Path) -> None:
@@ -120,8 +140,6 @@ def flip(path: Path) -> None:
 
 
 def test_samples_beyond_a_watermark_are_named(store: Path, capsys):
-    import sqlite3
-
     from mapserver.journal.rows import checksum
 
     values = ("a", (7).to_bytes(8, "big"), 199, 0, 5)
@@ -130,6 +148,45 @@ def test_samples_beyond_a_watermark_are_named(store: Path, capsys):
         db.commit()
     (store / f"{JOURNAL_FILE}-mark").unlink()
     assert "has other samples of a, spool 0000000000000007, than its watermark says" in refused(capsys, "verify", store)
+
+
+def test_a_store_that_lacks_what_was_acknowledged_is_not_copied_as_if_it_were_whole(
+    store: Path, tmp_path: Path, capsys
+):
+    with closing(HighWaterMark(mark_path(store / JOURNAL_FILE))) as mark:
+        mark.write({"a 0000000000000007": 240})
+    for command in (("verify", store), ("backup", store, "--out", tmp_path / "copy")):
+        error = refused(capsys, *command)
+        assert "lacks what was acknowledged: 40 acknowledged samples of a are gone" in error
+        assert "start a map server on it once" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+    Store(JournalLocation(store), SITE, ServerConfig(), time.time_ns).close()  # it keeps a note of that
+    assert run("backup", store, "--out", tmp_path / "copy") == 0
+    assert "1 events" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["backup", "restore"])
+def test_a_copy_is_on_the_disk_before_it_has_its_name(store: Path, tmp_path: Path, monkeypatch, command: str):
+    archived_decisions.save(store / FOLDER, "0123456789abcdef", [])
+    synced, fsync = set[str](), os.fsync
+
+    def noted(descriptor: int) -> None:
+        synced.add(str(Path(f"/proc/self/fd/{descriptor}").readlink()))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    assert run(command, store, "--out", tmp_path / "copy") == 0
+    files = [path.relative_to(tmp_path / "copy") for path in (tmp_path / "copy").rglob("*")]
+    assert len(files) >= 1 + 1 + 3 + 1
+    assert {str(tmp_path / "copy.part" / path) for path in files} <= synced
+
+
+def test_two_copies_to_one_place_do_not_meet(store: Path, tmp_path: Path, capsys):
+    with _making(store, tmp_path / "copy") as (_, part):
+        (part / "something").touch()
+        assert "another process is at work there" in refused(capsys, "backup", store, "--out", tmp_path / "copy")
+        assert (part / "something").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copy", "store"]
 
 
 def test_a_place_that_is_taken_is_refused_and_a_live_store_is_no_backup(store: Path, tmp_path: Path, capsys):

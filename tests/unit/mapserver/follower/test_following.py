@@ -22,6 +22,7 @@ from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import LAST
 from mapserver.journal.sqlite.reader import SqliteReader
+from mapserver.journal.writing import meta_line
 from mapserver.past.making import make
 from mapserver.past.past import Past
 from mapserver.trust.decisions import PERSON, TrustDecision
@@ -279,7 +280,7 @@ def test_an_epoch_that_is_lower_than_before_is_noticed(tmp_path, caplog):
     with following(tmp_path) as one:
         wait_for(lambda: version(one) is not None)
         with closing(sqlite3.connect(tmp_path / "journal.db", isolation_level=None)) as db:
-            db.execute("UPDATE meta SET value = '1' WHERE key = 'epoch'")
+            db.execute("REPLACE INTO meta VALUES (?, ?, ?)", meta_line("epoch", "1"))
         wait_for(lambda: "rows are gone" in caplog.text)
         wait_for(lambda: version(one) is not None)
         assert caplog.text.count("rows are gone") == 1

@@ -354,7 +354,7 @@ def test_a_damaged_id_is_found_when_the_store_is_opened(tmp_path):
     with closing(sqlite3.connect(tmp_path / "journal.db")) as db:
         db.execute("UPDATE meta SET value = replace(value, substr(value, 1, 1), 'x') WHERE key = 'store'")
         db.commit()
-    with pytest.raises(StoreError, match="the id of the store is damaged"):
+    with pytest.raises(StoreError, match="the store of the journal is damaged"):
         open_store(tmp_path)
 
 

@@ -230,13 +230,16 @@ def test_a_journal_of_another_site_or_frame_is_refused(place):
         ("UPDATE extent SET west_m = west_m - 1 WHERE row = 2", "extent of journal row 2"),
         ("DELETE FROM extent WHERE row = 2", "what follows number 1"),
         ("UPDATE events SET stamp_ns = 0", "event 1"),
-        ("UPDATE meta SET value = 'x' WHERE key = 'store'", "id of the store"),
+        ("UPDATE meta SET value = 'x' WHERE key = 'store'", "the store of the journal"),
+        ("UPDATE meta SET value = 'hill' WHERE key = 'site'", "the site of the journal"),
+        ("DELETE FROM events WHERE id = 2", "what follows number 1"),
     ],
 )
 def test_damage_is_found_on_opening(place, change, problem):
     with closing(place.open()) as journal:
         write(journal, admission(), admission(1, 4))
-        journal.append_event("t", 5, {})
+        for stamp_ns in (5, 6):
+            journal.append_event("t", stamp_ns, {})
     place.sql(change)
     with pytest.raises(StoreError, match=problem):
         place.open().close()

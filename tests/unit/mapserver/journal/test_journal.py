@@ -12,6 +12,7 @@ from mapserver.journal.journal import ArchivedError, UnwrittenError
 from mapserver.journal.rows import ALL, Admission, Event, Selection, Watermark
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteQueries, SqliteReader
+from mapserver.journal.writing import meta_line
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples, samples
@@ -148,7 +149,7 @@ def test_a_journal_of_another_schema_is_refused_with_what_to_do(tmp_path, schema
     sql(journal, f"UPDATE meta SET value = '{schema}' WHERE key = 'schema'")
     journal.close()
     for opened in (lambda: open_journal(tmp_path), lambda: SqliteReader(journal.path)):
-        with pytest.raises(StoreError, match=f"schema '{schema}', this version knows 5; open it with the version that"):
+        with pytest.raises(StoreError, match=f"schema '{schema}', this version knows 6; open it with the version that"):
             opened()
 
 
@@ -159,7 +160,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path):
 
 
 def test_tables_and_their_names_are_made_in_one_transaction(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.journal.sqlite.journal.TABLES", "CREATE TABLE meta (key, value, more); ")
+    monkeypatch.setattr("mapserver.journal.sqlite.journal.TABLES", "CREATE TABLE meta (key, value, crc32, more); ")
     with pytest.raises(StoreError):
         open_journal(tmp_path)
     monkeypatch.undo()
@@ -479,8 +480,13 @@ def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
         ("UPDATE events SET body = '{}' WHERE id = 1", "event 1"),
         ("UPDATE events SET kind = 'u' WHERE id = 2", "event 2"),
         ("DELETE FROM events WHERE id = 1", "what follows number 0"),
-        ("INSERT INTO meta VALUES ('archived_row', '2')", "what follows number 2"),
-        ("INSERT INTO meta VALUES ('archived_row', '2x')", "the value '2x'"),
+        ("DELETE FROM events WHERE id = 2", "what follows number 1"),
+        (f"INSERT INTO meta VALUES {meta_line('archived_row', '2')}", "what follows number 2"),
+        (f"INSERT INTO meta VALUES {meta_line('archived_row', '2x')}", "the value '2x'"),
+        ("INSERT INTO meta VALUES ('archived_row', '2', 0)", "the archived_row of the journal"),
+        ("UPDATE meta SET value = '7' WHERE key = 'epoch'", "the epoch of the journal"),
+        ("UPDATE meta SET value = 'hill' WHERE key = 'site'", "the site of the journal"),
+        ("DELETE FROM meta WHERE key = 'frame'", "the frame of the journal"),
     ],
 )
 def test_what_stands_beside_the_rows_is_checked_on_opening(placed, monkeypatch, change, problem):

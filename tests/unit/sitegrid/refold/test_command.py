@@ -20,7 +20,6 @@ from mapserver.fleet import decisions
 from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.ingest.store import Incoming, Store
-from mapserver.ingest.store_folder import hold
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import history_rows
@@ -646,6 +645,37 @@ def test_what_is_done_is_kept_when_a_later_step_fails_and_used_when_the_fold_goe
 
 
 def test_two_folds_into_one_place_do_not_meet(store: Path, tmp_path: Path, capsys):
-    with hold(tmp_path / "new.part" / "work"):
-        assert "another fold is at work there" in refused(capsys, store, "--out", tmp_path / "new")
-    assert (tmp_path / "new.part").exists()
+    """Neither one that looks while the first is at work, nor one that has waited for its lock when the first ends."""
+    site, place = SITE, tmp_path / "new.part"
+    with new_store.making(place, site, ("0123456789abcdef",), 10) as first:
+        assert "another process is at work there" in refused(capsys, store, "--out", tmp_path / "new")
+        assert first.work.exists()
+    assert [path.name for path in tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize("order", [*permutations(range(3))])
+def test_decisions_count_in_the_order_of_their_stamps_however_archives_are_given(order: tuple[int, ...]):
+    def decided(zero: float, stamp_s: int) -> CalibrationDecision:
+        return CalibrationDecision(
+            "a", PERSON, "", T0 + stamp_s * S, (Correction("a", 0, LAST_NS, zero, 0.0, 0.0, ()),)
+        )
+
+    first, second = [decided(0.001, 1), decided(0.003, 9)], [decided(0.002, 5)]
+    histories = (first, second, joined_decisions([second, first]))
+    joined = joined_decisions(histories[number] for number in order)
+    assert [decision.corrections[0].zero for decision in joined] == [0.001, 0.002, 0.003]
+    went_back = [decided(0.004, 20), decided(0.005, 2)]  # the site's clock did
+    assert joined_decisions([went_back, first])[-2:] == went_back
+
+
+def test_a_fold_does_not_go_on_with_other_decisions_than_it_began_with(
+    store: Path, tmp_path: Path, capsys, monkeypatch
+):
+    decide(store)
+    with monkeypatch.context() as killed:
+        killed.setattr(new_store.NewStore, "finish", lambda *_: (_ for _ in ()).throw(OSError(4, "killed")))
+        assert "the same command goes on" in refused(capsys, store, "--out", tmp_path / "new")
+    decide(store)
+    assert "is left from a fold of something else" in refused(capsys, store, "--out", tmp_path / "new")
+    shutil.rmtree(tmp_path / "new.part")
+    assert run(store, "--out", tmp_path / "new") == 0
