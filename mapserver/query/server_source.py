@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from mapserver.ingest.writer import Writer
 from mapserver.past.past import Past
 from mapserver.query.source import MapState
+from mapserver.upkeep.refolding import write
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.queries import answer_codec as codec
 from protocol.queries.answers import GroundChange, ServerAlive
@@ -68,7 +69,7 @@ class Commands:
         """Parse and carry out one command; QueryError says what is wrong with it."""
         command = parse_command(name, parameters)
         if isinstance(command, AcceptCommand):
-            self._writer.run(lambda store: store.accept(command.store, command.reason))
+            write(self._writer, lambda store: store.accept(command.store, command.reason))
             return codec.encode_info(self._info())
         if isinstance(command, CalibrateCommand):
             return encode_calibration(self._calibrate(command))

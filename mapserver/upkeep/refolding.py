@@ -89,7 +89,7 @@ class Refolding:
         Raises QueryError as `decide` does; the audit then decides the same the next time.
         """
         if self._writer.config.trust.exclude:
-            self._write(lambda store: self._judge(store, verdicts, stamp_ns))
+            write(self._writer, lambda store: self._judge(store, verdicts, stamp_ns))
 
     def calibrate(self, solved: Calibration, stamp_ns: int, *, asked: bool = False) -> int:
         """Decide what the solver may decide, or all that it would where a person asks; returns a number to wait for.
@@ -97,14 +97,14 @@ class Refolding:
         While the map does not follow what is decided, what the solver wants waits: folds of a large site take longer.
         Raises QueryError as `decide` does; the solver then decides the same the next time.
         """
-        return self._write(lambda store: self._calibrate(store, solved, stamp_ns, asked=asked))
+        return write(self._writer, lambda store: self._calibrate(store, solved, stamp_ns, asked=asked))
 
     def decide(self, decision: Decision) -> int:
         """Keep a decision on disk, then have the map folded so; returns its number, to wait for.
 
         Raises QueryError where it cannot be written: nothing has changed then, unless it says that this is not known.
         """
-        return self._write(lambda store: self._keep(store, [decision]))
+        return write(self._writer, lambda store: self._keep(store, [decision]))
 
     def wait(self, number: int, wait_s: float) -> None:
         """Wait until a decision, which is kept, counts in the map; QueryError after wait_s."""
@@ -123,22 +123,6 @@ class Refolding:
             self._changed.notify_all()
         self._thread.join()
         self._reader.close()
-
-    def _write(self, work: Callable[[Store], T]) -> T:
-        """Have work done on the writer's thread, one at a time: what is in memory is what is on disk, in its order."""
-        try:
-            return self._writer.run(work)
-        except TimeoutError:  # an OSError, but the work still waits
-            problem = "the server has not written the decision yet, and may still do so; ask for `machines`"
-            raise QueryError(Refusal.AFTER_TIMEOUT, problem) from None
-        except FencedError as error:
-            raise QueryError(Refusal.NOT_WRITER, f"the decision is not written: {error.problem}") from None
-        except UnwrittenError as error:
-            if error.unsure:
-                problem = f"it is not known whether the decision is kept, since the answer is lost: {error.problem}"
-                raise QueryError(Refusal.AFTER_TIMEOUT, f"{problem}; ask for `machines`") from None
-            problem = f"the decision cannot be written, so it does not count: {error.problem}"
-            raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
 
     def _judge(self, store: Store, verdicts: Mapping[str, Verdict], stamp_ns: int) -> None:
         with self._changed:
@@ -229,6 +213,26 @@ class Refolding:
         Never two in a row: where decisions come faster than folds, the map would not follow for ever.
         """
         return self._ending or (self._wanted != facts and not self._gave_up)
+
+
+def write(writer: Writer, work: Callable[[Store], T]) -> T:
+    """Have a decision kept on the writer's thread, one at a time: what is in memory is what is on disk, in its order.
+
+    Raises QueryError as `Refolding.decide` does.
+    """
+    try:
+        return writer.run(work)
+    except TimeoutError:  # an OSError, but the work still waits
+        problem = "the server has not written the decision yet, and may still do so; ask for `machines`"
+        raise QueryError(Refusal.AFTER_TIMEOUT, problem) from None
+    except FencedError as error:
+        raise QueryError(Refusal.NOT_WRITER, f"the decision is not written: {error.problem}") from None
+    except UnwrittenError as error:
+        if error.unsure:
+            problem = f"it is not known whether the decision is kept, since the answer is lost: {error.problem}"
+            raise QueryError(Refusal.AFTER_TIMEOUT, f"{problem}; ask for `machines`") from None
+        problem = f"the decision cannot be written, so it does not count: {error.problem}"
+        raise QueryError(Refusal.STORE, f"{problem}; make room on the server's disk, then give it again") from None
 
 
 def _log(decision: Decision) -> None:
