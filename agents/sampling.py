@@ -174,9 +174,6 @@ class Sampler:
         if max(xx, yy) > MAX_STD_M**2:
             self.withheld["unsure_position"] += 1
             return False
-        if e.is_blurred:
-            self.withheld[e.reason] += 1
-            return False
         if e.reason:
             self.without_resistance[e.reason] += 1
         return True
@@ -189,7 +186,7 @@ class Sampler:
         x, y = pose.x_m + c * self._load_centre_m, pose.y_m + s * self._load_centre_m
         grade = (c * e.slope_x - s * e.slope_y, s * e.slope_x + c * e.slope_y, e.slope_var)
         at = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)
-        return (*at, e.c_rr, e.c_rr_var, *grade, e.zero, e.scale)
+        return (*at, e.c_rr, e.c_rr_var, *grade, e.zero, e.scale, e.mass_kg)
 
 
 def joined(made: Sequence[Samples]) -> Samples:

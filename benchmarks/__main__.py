@@ -8,7 +8,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, past, query, sim
+from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, past, query, roads, sim
 from benchmarks.agents import filter as filters
 from benchmarks.fleets import fleet, follow
 from benchmarks.folds import archive
@@ -65,6 +65,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
     ),
     "past": (past.run, "checkpoints, maps of the past, the history of a point", {"hours": HOURS, "runs": 3}),
     "query": (query.run, "queries of a real server, while samples come in", {"hours": HOURS, "queries": 200}),
+    "roads": (roads.run, "roads of 40 km, and the worklist of a day", {"hours": 24.0, "runs": 5}),
     "ingest": (ingest.run, "samples that the server takes, from bytes to the grid", {"runs": 5, "samples": 20_000}),
     "fleet": (
         fleet.run,

@@ -19,6 +19,7 @@ from protocol.queries.calibration import CalibrationAnswer, CorrectedSpan, Machi
 from protocol.queries.map_tiles import MapTile, TilesAnswer
 from protocol.queries.origin import Origin
 from protocol.queries.reasons import CellReasons, Votes
+from protocol.queries.roads import RoadChange, RoadSegment, Segments, Worklist, WorklistRow
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
 from protocol.version import package_version
@@ -30,5 +31,6 @@ __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridE
 __all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
 __all__ += ["CalibrationAnswer", "CorrectedSpan", "MachineCalibration"]
 __all__ += ["CellReasons", "FollowerState", "MapTile", "MapVersion", "Origin", "TilesAnswer", "Votes"]
+__all__ += ["RoadChange", "RoadSegment", "Segments", "Worklist", "WorklistRow"]
 __all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __version__ = package_version()

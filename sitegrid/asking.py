@@ -36,7 +36,8 @@ FOLLOWER_WAIT_S = 1.0  # for a row, at a follower that lacks it: one that follow
 TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 # Refusals that are about who was asked, not about the question.
 ELSEWHERE = (Refusal.AFTER_TIMEOUT, Refusal.NOT_HERE, Refusal.OVERLOADED, Refusal.STORE, "internal")
-READ = (requests.PointQuery, requests.RegionQuery, requests.TilesQuery, requests.WhyQuery, requests.HistoryQuery)
+CELLS = (requests.PointQuery, requests.RegionQuery, requests.TilesQuery, requests.WhyQuery, requests.HistoryQuery)
+READ = (*CELLS, requests.SegmentsQuery, requests.WorklistQuery)
 # A follower has these a moment later than the server, whose events tell of them: it is asked where no server is.
 SERVER_FIRST = (requests.InfoQuery, requests.ChangesQuery)
 

@@ -1,4 +1,7 @@
-"""The Python client of the map. It needs the base install only."""
+"""The Python client of the map. It needs the base install only.
+
+It is one module because it is one class: all that a program may ask.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +31,7 @@ from protocol.queries.map_tiles import TilesAnswer, decode_tiles
 from protocol.queries.origin import SERVER, Origin
 from protocol.queries.pieces import Progress, joined
 from protocol.queries.reasons import CellReasons, decode_why
+from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
@@ -136,6 +140,41 @@ class Client:
     def why(self, x_m: float, y_m: float, *, as_of_ns: int | None = None) -> CellReasons:
         """Everything that is known of the cell at a position in `map`: votes, passes, machines, changes."""
         return decode_why(self._ask(requests.WhyQuery(float(x_m), float(y_m), as_of_ns)))
+
+    def segments(
+        self,
+        *,
+        from_ns: int | None = None,
+        to_ns: int | None = None,
+        as_of_ns: int | None = None,
+        bounds: Bounds | None = None,
+        after: int = 0,
+        wait_s: float = 10.0,
+    ) -> Segments:
+        """Roads that the map shows, segment by segment, and what drove on them from one hour to another."""
+        fresh = requests.Freshness(after, wait_s)
+        return decode_segments(self._ask(requests.SegmentsQuery(from_ns, to_ns, as_of_ns, bounds, fresh)))
+
+    def worklist(
+        self,
+        target: float = 0.02,
+        *,
+        efficiency: float = 0.35,
+        limit: int = 100,
+        from_ns: int | None = None,
+        to_ns: int | None = None,
+        as_of_ns: int | None = None,
+        bounds: Bounds | None = None,
+        after: int = 0,
+        wait_s: float = 10.0,
+    ) -> Worklist:
+        """Stretches of road that cost more than ground of a target c_rr would, the dearest first.
+
+        efficiency: of engine and drive train, for litres of diesel.
+        """
+        fresh = requests.Freshness(after, wait_s)
+        query = requests.WorklistQuery(target, efficiency, limit, from_ns, to_ns, as_of_ns, bounds, fresh)
+        return decode_worklist(self._ask(query))
 
     def alive(self) -> ServerAlive:
         """Whether the server takes batches: for probes, since it waits for nothing."""

@@ -24,7 +24,7 @@ import zenoh
 
 from protocol.arrays import Table
 from protocol.errors import QueryError
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire import keys
@@ -91,7 +91,7 @@ class SoakMachine:
     def _samples(self, at_s: np.ndarray) -> Table:
         self._error_m = 0.9 * self._error_m + self._draw.normal(0, 0.4, 2)
         angle = at_s * 5.0 / self._radius_m
-        rows = np.zeros(len(at_s), SAMPLE_DTYPE)
+        rows = empty(len(at_s))
         rows["stamp_ns"] = START_NS + np.round(at_s * 1e9).astype(np.int64)
         rows["x_m"] = self._centre_m[0] + self._radius_m * np.cos(angle) + self._error_m[0]
         rows["y_m"] = self._centre_m[1] + self._radius_m * np.sin(angle) + self._error_m[1]

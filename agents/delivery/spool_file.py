@@ -9,7 +9,7 @@ from pathlib import Path
 from agents.delivery.spool_mark import RunEnd
 from protocol.files import make_private
 
-SCHEMA = 6
+SCHEMA = 7
 LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
 _TABLES = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",

@@ -36,7 +36,7 @@ class Balance:
     their variance, as the body has them, without squat; sine_x: of the one ahead, by the accelerometer alone.
     pitch_radps: rate of the pitch, nose up positive. norm_mps2: of the specific force. on_front: share of the load on
     the front axle, 0 if not known. body_mps2: acceleration ahead by the accelerometer. torque_s, wheels_s: age of their
-    newest reading.
+    newest reading. mass_kg: with payload.
     """
 
     stamp_ns: int
@@ -56,6 +56,7 @@ class Balance:
     body_mps2: float
     torque_s: float
     wheels_s: float
+    mass_kg: float
 
     @property
     def direction(self) -> float:
@@ -101,6 +102,11 @@ class Balancer:
         self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = 0
         self._force_sums = NO_SUMS  # count; force ahead at base_link, norm, rate of nose up, a negative turn about y
         self._torque_nm, self._torque_sums = 0.0, (0, 0.0)
+
+    @property
+    def mass_kg(self) -> float:
+        """Of the machine and its payload."""
+        return self._machine.mass_kg + self.payload_kg
 
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> Balance | None:
         """Add a reading, after dead reckoning did; returns the balance of the step that it ends."""
@@ -149,7 +155,7 @@ class Balancer:
         (n, *sums), (torques, torque_nm) = self._force_sums, self._torque_sums
         force, norm, rate = (value / n for value in sums)
         drive_n = (torque_nm / torques if torques else self._torque_nm) / machine.wheel_radius_m
-        share = drive_n / ((machine.mass_kg + self.payload_kg) * g)
+        share = drive_n / (self.mass_kg * g)
         on_front = front_share(machine, self.payload_kg, force)
         squat = squat_rad(machine, self.payload_kg, force)
         bend = self._climb_of_bend(on_front, squat)
@@ -174,6 +180,7 @@ class Balancer:
             body_mps2=force - g * self._slope.ahead.sine,
             torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
             wheels_s=self._wheels_s() if dead_reckoning.wheels.is_known else math.inf,
+            mass_kg=self.mass_kg,
         )
 
     def _climb_of_bend(self, on_front: float, squat: float) -> float:

@@ -8,7 +8,7 @@ stamp is asked for a little later, so that the steps after it help.
 import math
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from agents.dead_reckoning import DeadReckoning
@@ -64,7 +64,8 @@ class GroundEstimate:
     """The ground at a stamp.
 
     c_rr, c_rr_var: NaN where `reason` states why c_rr is not known, "" else. slope_x, slope_y: rise over run ahead and
-    to the left, slope_var of either; NaN without accelerometer. zero, scale: of the calibration that is applied in it.
+    to the left, slope_var of either; NaN where the slope is not known. zero, scale: of the calibration that is applied
+    in it. mass_kg: of machine and payload, NaN where it is not known.
     """
 
     c_rr: float
@@ -75,11 +76,7 @@ class GroundEstimate:
     reason: str
     zero: float = 0.0
     scale: float = 0.0
-
-    @property
-    def is_blurred(self) -> bool:
-        """Whether the slope is worth nothing either."""
-        return self.reason in SLOPE_TOO
+    mass_kg: float = math.nan
 
 
 NOTHING_KNOWN = GroundEstimate(math.nan, math.nan, math.nan, math.nan, math.nan, "no_imu")
@@ -185,8 +182,10 @@ class GroundEstimator:
         """The estimate for a recent stamp, with the steps after it."""
         judged = self._nearest(stamp_ns)
         if judged is None:
-            return NOTHING_KNOWN
+            return replace(NOTHING_KNOWN, mass_kg=self._known_mass(self._balancer.mass_kg))
         balance, applied = judged.balance, self._applied
+        if judged.reason in SLOPE_TOO:
+            return replace(NOTHING_KNOWN, reason=judged.reason, mass_kg=self._known_mass(balance.mass_kg))
         resistance = None if judged.reason else self._resistance.at(stamp_ns)
         c_rr, variance = math.nan, math.nan
         if resistance:
@@ -198,7 +197,12 @@ class GroundEstimator:
         # The mean of both directions: work shows the zero ahead, and nothing shows the one across.
         slope_var = balance.slope_var + (applied.covariance[0][0] + ZERO_STD**2) / 2
         slope_y, calibration = math.tan(balance.slope_y), (applied.zero, applied.scale)
-        return GroundEstimate(c_rr, variance, slope_x, slope_y, slope_var, reason, *calibration)
+        mass_kg = self._known_mass(balance.mass_kg)
+        return GroundEstimate(c_rr, variance, slope_x, slope_y, slope_var, reason, *calibration, mass_kg)
+
+    def _known_mass(self, mass_kg: float) -> float:
+        """The mass as weighed; where it is to be estimated, that is a ratio of forces, and not kilograms."""
+        return math.nan if self._config.mass == "estimated" else mass_kg
 
     def _nearest(self, stamp_ns: int) -> _JudgedBalance | None:
         index = bisect_left(self._judged, stamp_ns, key=lambda judged: judged.stamp_ns)

@@ -10,7 +10,7 @@ import math
 from agents.estimation.balance import Balance
 from protocol.units import GRAVITY_MPS2
 
-# Reasons that make the slope worthless too: the whole sample is withheld.
+# Reasons that make the slope worthless too: such a sample says that the machine was there, and how heavy.
 SLOPE_TOO = frozenset({"pitch_transient", "accelerometer"})
 # Reasons that are a fault of a sensor, not of the moment.
 FAULTS = frozenset({"accelerometer", "no_torque", "no_wheels", "torque_frozen", "torque_implausible"})

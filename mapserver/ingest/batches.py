@@ -15,7 +15,7 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Floats32, Table
 from protocol.errors import MessageError
-from protocol.machine.samples import COLUMNS, GRADE, LIMITS, RESISTANCE, SAMPLE_DTYPE, check_samples, empty
+from protocol.machine.samples import COLUMNS, LIMITS, NAN_ALLOWED, SAMPLE_DTYPE, check_samples, empty
 from protocol.wire.codec import unpack_batch
 from protocol.wire.messages import PackedBatch, SampleBatch
 
@@ -28,8 +28,9 @@ _FIRST_SINGLE = _WORDS - len(_SINGLE)
 _LOW, _HIGH = (np.array([LIMITS[name][end] for name in _SINGLE], np.float32) for end in (0, 1))
 _FIRST_NS, _LAST_NS = LIMITS["stamp_ns"]
 _XX, _XY, _YY = (_FIRST_SINGLE + _SINGLE.index(name) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
-# Bits of the columns that may be NaN, but only together.
-_RESISTANCE, _GRADE = (sum(1 << _SINGLE.index(name) for name in names) for names in (RESISTANCE, GRADE))
+# Bits of the columns that may be NaN, each group only together.
+_NAN_GROUPS = tuple(sum(1 << _SINGLE.index(name) for name in names) for names in NAN_ALLOWED)
+_NAN_ALLOWED = sum(_NAN_GROUPS)
 
 
 def decode_batches(payloads: Sequence[bytes], extent_m: float) -> list[SampleBatch | MessageError]:
@@ -119,7 +120,9 @@ def _is_plausible(row: Any, singles: Floats32, extent_m: float) -> bool:
         value = singles[_FIRST_SINGLE + j]
         unknown |= np.isnan(value) << j
         inside &= not (value < _LOW[j] or value > _HIGH[j])
-    partly = unknown & _RESISTANCE not in (0, _RESISTANCE) or unknown & _GRADE not in (0, _GRADE)
+    partly = False
+    for group in _NAN_GROUPS:
+        partly |= unknown & group not in (0, group)
     xx, xy, yy = np.float64(singles[_XX]), np.float64(singles[_XY]), np.float64(singles[_YY])
     semidefinite = xx * yy - xy * xy >= -1e-6 * max(xx * yy, 1e-12)
-    return bool(inside and semidefinite and not partly and not unknown & ~(_RESISTANCE | _GRADE))
+    return bool(inside and semidefinite and not partly and not unknown & ~_NAN_ALLOWED)

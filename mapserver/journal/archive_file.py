@@ -28,7 +28,7 @@ from protocol.errors import ConfigError, StoreError
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 
-SCHEMA = 3
+SCHEMA = 4
 KEY = b"sitegrid"  # of our own metadata
 NAME = re.compile(r"\d{4}-\d\d-\d\dT\d\d_(\d+)-(\d+)\.parquet")
 _IDENTITY = ["machine", "row", "spool_id", "seq", "received_ns"]  # columns beside those of samples

@@ -34,8 +34,9 @@ SURE_AXIS = 0.2  # least length of the mean axis, 0 to 1, that is a preferred on
 class ReadConfig:
     """How evidence is read.
 
-    min_weight_m: cells with fewer metres of evidence than this are unknown. boundaries: of the classes of resistance,
-    increasing; n of them make n + 1 classes. fill_reach_m: so far from the next known cell gaps are filled.
+    min_weight_m: cells with fewer metres of evidence than this are unknown; so are resistance and gradient where fewer
+    metres than this have one. boundaries: of the classes of resistance, increasing; n of them make n + 1 classes.
+    fill_reach_m: so far from the next known cell gaps are filled.
     """
 
     min_weight_m: float = 0.1
@@ -64,8 +65,13 @@ class CellEvidence:
     config: ReadConfig
 
     def votes(self, part: slice) -> Floats:
-        """Votes (cells, bins) of one histogram; exact as floating point, and several times faster."""
-        return self.evidence.counts[..., part].astype(np.float64)
+        """Votes (cells, bins) of one histogram; exact as floating point, and several times faster.
+
+        None where they are too few: most samples of a cell may say only that the machine was there.
+        """
+        votes: Floats = self.evidence.counts[..., part].astype(np.float64)
+        votes[votes.sum(axis=-1) < self.config.min_weight_m * ev.WEIGHT_UNITS_PER_M] = 0.0
+        return votes
 
     # Centres on the bin axis; several layers ask for them.
     @cached_property

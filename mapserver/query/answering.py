@@ -13,6 +13,7 @@ from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
+from mapserver.query.roads import RoadMaps
 from mapserver.query.source import MapSource
 from mapserver.query.views import PastMaps, View, cropped, read_cells, view_now, widened
 from mapserver.query.why import reasons
@@ -33,6 +34,7 @@ from protocol.queries.requests import (
     When,
     WhyQuery,
 )
+from protocol.queries.roads import encode_segments, encode_worklist
 from protocol.site.geometry import Bounds, CellWindow
 
 SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
@@ -47,6 +49,7 @@ class Answers:
         self._site, self._config = source.site, source.config
         self._open = OpenRegions()
         self._tiles = Tiles(source)
+        self._roads = RoadMaps(source)
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
 
     @property
@@ -77,6 +80,10 @@ class Answers:
                 return encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
+            case requests.SegmentsQuery():
+                return encode_segments(self._roads.segments(query))
+            case requests.WorklistQuery():
+                return encode_worklist(self._roads.worklist(query))
             case _:
                 return self._of_process(query)
 

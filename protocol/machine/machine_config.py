@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Floats
-from protocol.config import from_table
+from protocol.config import from_table, require_between
 from protocol.errors import ConfigError
 from protocol.machine.readings import KINDS, Correction
 from protocol.rotations import matrix_from_rpy
@@ -32,6 +32,7 @@ QUANTITIES = {
 MODES = ABSOLUTE, DIFFERENTIAL, RELATIVE = ("absolute", "differential", "relative")
 WITH_MODE = ("gps", "attitude")
 MAX_DELAY_S = 0.4  # what is 0.5 s behind the newest reading is refused as late; readings do not arrive in perfect order
+MOST_KG = 500_000.0  # of a machine, and of what it carries: a sample states the sum
 MAX_EARLY_S = 10.0  # a stamp that is further ahead of its reading is no delay, but another clock
 
 
@@ -151,8 +152,9 @@ class MachineConfig:
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
-        if min(self.mass_kg, self.wheel_radius_m) <= 0:
-            raise ValueError("mass_kg and wheel_radius_m must be positive")
+        require_between(self, 1, MOST_KG, "mass_kg")
+        if self.wheel_radius_m <= 0:
+            raise ValueError("wheel_radius_m must be positive")
         if self.rotating_mass_factor < 1:
             raise ValueError("rotating_mass_factor: below 1")
         if self.machine_share is not None and not 0 <= self.machine_share <= 1:

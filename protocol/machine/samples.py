@@ -28,6 +28,7 @@ SAMPLE_DTYPE = np.dtype(
         ("grade_var", "<f4"),
         ("applied_zero", "<f4"),
         ("applied_scale", "<f4"),
+        ("mass_kg", "<f4"),
     ]
 )
 COLUMNS: tuple[str, ...] = SAMPLE_DTYPE.names or ()
@@ -35,9 +36,11 @@ RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records 
 
 RESISTANCE = ("c_rr", "c_rr_var")  # may both be NaN
 GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
-# What the machine's own calibration has taken off its balance already. They may be missing: it took off nothing.
-APPLIED = ("applied_zero", "applied_scale")
-
+APPLIED = ("applied_zero", "applied_scale")  # what the machine's own calibration has taken off its balance already
+MASS = "mass_kg"  # of machine and load; may be NaN
+# Columns that a batch may lack, and what stands for them: nothing was taken off; the mass is not known.
+OPTIONAL = {**dict.fromkeys(APPLIED, 0.0), MASS: np.nan}
+NAN_ALLOWED = (RESISTANCE, GRADE, (MASS,))  # groups of columns: NaN together, or not at all
 
 # Plausible range of each column.
 LIMITS: dict[str, tuple[float, float]] = {
@@ -56,12 +59,15 @@ LIMITS: dict[str, tuple[float, float]] = {
     # No accelerometer or drive train that a machine is driven with is further off: ten times what is expected.
     "applied_zero": (-0.05, 0.05),
     "applied_scale": (-0.5, 0.5),
+    "mass_kg": (1.0, 1e6),
 }
 
 
 def empty(n: int = 0) -> Table:
-    """Return `n` zeroed samples."""
-    return np.zeros(n, SAMPLE_DTYPE)
+    """Return `n` samples of zeros, of no known mass."""
+    rows = np.zeros(n, SAMPLE_DTYPE)
+    rows[MASS] = np.nan
+    return rows
 
 
 def joined(tables: Sequence[Table]) -> Table:
@@ -90,12 +96,12 @@ def check_samples(rows: Table, extent_m: float) -> None:
 
 
 def _check_finite(rows: Table) -> None:
-    for group in (RESISTANCE, GRADE):
+    for group in NAN_ALLOWED:
         missing = np.stack([np.isnan(rows[name]) for name in group]).sum(axis=0)
         partly = (missing > 0) & (missing < len(group))
         _refuse(partly, rows, group[0], Refusal.NOT_FINITE, f"{', '.join(group)} must be NaN together or not at all")
     for name in COLUMNS[1:]:
-        may_be_nan = name in RESISTANCE or name in GRADE
+        may_be_nan = any(name in group for group in NAN_ALLOWED)
         bad = np.isinf(rows[name]) if may_be_nan else ~np.isfinite(rows[name])
         _refuse(bad, rows, name, Refusal.NOT_FINITE, "not finite")
 

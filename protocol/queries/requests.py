@@ -15,6 +15,7 @@ from protocol.site.geometry import MAX_CELLS, Bounds
 MAX_WAIT_S = 60.0
 MAX_SPANS = 2000  # of one history
 MAX_SPAN_S = 1e9
+MAX_LIMIT = 1000  # stretches of one worklist
 
 
 @dataclass(frozen=True)
@@ -164,8 +165,55 @@ class WhyQuery:
     name = "why"
 
 
+@dataclass(frozen=True)
+class SegmentsQuery:
+    """Roads of the map, segment by segment, and what drove on them.
+
+    from_ns, to_ns: traffic of the hours that begin in from_ns <= time < to_ns, None for all that is remembered.
+    as_of_ns: from samples stamped so or earlier. bounds: segments whose middle lies there.
+    """
+
+    from_ns: int | None = None
+    to_ns: int | None = None
+    as_of_ns: int | None = None
+    bounds: Bounds | None = None
+    fresh: Freshness = Freshness()
+
+    name = "segments"
+
+
+@dataclass(frozen=True)
+class WorklistQuery:
+    """Where work on roads pays: segments that cost more than ground of a target c_rr would, the dearest first.
+
+    efficiency: of engine and drive train, for litres. limit: at most so many. The others: as in SegmentsQuery.
+    """
+
+    target: float = 0.02
+    efficiency: float = 0.35
+    limit: int = 100
+    from_ns: int | None = None
+    to_ns: int | None = None
+    as_of_ns: int | None = None
+    bounds: Bounds | None = None
+    fresh: Freshness = Freshness()
+
+    name = "worklist"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.target <= 1:
+            raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `target`: {self.target:g} is not above 0 and at most 1")
+        if not 0 < self.efficiency <= 1:
+            problem = f"parameter `efficiency`: {self.efficiency:g} is not above 0 and at most 1"
+            raise QueryError(Refusal.OUT_OF_RANGE, problem)
+        if not 1 <= self.limit <= MAX_LIMIT:
+            problem = f"parameter `limit`: {self.limit} is not between 1 and {MAX_LIMIT}"
+            raise QueryError(Refusal.OUT_OF_RANGE, problem)
+
+
 CellQuery = PointQuery | RegionQuery | PieceQuery | HistoryQuery | WhyQuery
-MapQuery = CellQuery | TilesQuery | InfoQuery | AliveQuery | MachinesQuery | CalibrationQuery | ChangesQuery
+RoadQuery = SegmentsQuery | WorklistQuery
+MapQuery = CellQuery | RoadQuery | TilesQuery | InfoQuery | AliveQuery | MachinesQuery | CalibrationQuery | ChangesQuery
 
 
 def check_size(columns: int, rows: int) -> None:
@@ -190,7 +238,11 @@ def encode_query(query: MapQuery) -> dict[str, str]:
             return _of_tiles(query)
         case WhyQuery():
             return {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m), **_stamps({"as_of": query.as_of_ns})}
-    parameters = _of_map(query) if isinstance(query, PointQuery | RegionQuery | HistoryQuery) else {}
+    parameters = {}
+    if isinstance(query, PointQuery | RegionQuery | HistoryQuery):
+        parameters = _of_map(query)
+    elif isinstance(query, SegmentsQuery | WorklistQuery):
+        parameters = _of_roads(query)
     if query.fresh.after:
         parameters |= {"after": str(query.fresh.after), "wait": ps.text_of(query.fresh.wait_s)}
     return parameters
@@ -198,6 +250,8 @@ def encode_query(query: MapQuery) -> dict[str, str]:
 
 def reads_past(query: MapQuery) -> bool:
     """Whether the server has to read its journal for a query, which takes a while."""
+    if isinstance(query, SegmentsQuery | WorklistQuery):
+        return True
     if isinstance(query, TilesQuery | WhyQuery):
         return query.as_of_ns is not None
     if isinstance(query, PointQuery | RegionQuery):
@@ -215,14 +269,27 @@ def _of_tiles(query: TilesQuery) -> dict[str, str]:
 def _of_map(query: PointQuery | RegionQuery | HistoryQuery) -> dict[str, str]:
     parameters = {"layers": ",".join(query.layers)} if query.layers else {}
     if isinstance(query, RegionQuery):
-        b = query.bounds
-        parameters["bounds"] = ",".join(ps.text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
+        parameters["bounds"] = _text_of_bounds(query.bounds)
     else:
         parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
     if isinstance(query, HistoryQuery):
         parameters |= _stamps({"from": query.from_ns, "to": query.to_ns})
         return parameters | ({"span": ps.text_of(query.span_s)} if query.span_s is not None else {})
     return parameters | _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
+
+
+def _of_roads(query: RoadQuery) -> dict[str, str]:
+    parameters = _stamps({"from": query.from_ns, "to": query.to_ns, "as_of": query.as_of_ns})
+    if query.bounds:
+        parameters["bounds"] = _text_of_bounds(query.bounds)
+    if isinstance(query, WorklistQuery):
+        numbers = {"target": ps.text_of(query.target), "efficiency": ps.text_of(query.efficiency)}
+        parameters |= {**numbers, "limit": str(query.limit)}
+    return parameters
+
+
+def _text_of_bounds(b: Bounds) -> str:
+    return ",".join(ps.text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
 
 
 def _stamps(stamps: Mapping[str, int | None]) -> dict[str, str]:
@@ -254,9 +321,7 @@ def _parse_piece(parameters: ps.Parameters) -> PieceQuery:
 
 
 def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
-    from_ns, to_ns = ps.stamp(parameters, "from"), ps.stamp(parameters, "to")
-    if from_ns and to_ns and from_ns > to_ns:
-        raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
+    from_ns, to_ns = _times(parameters)
     span_s = ps.number(parameters, "span") if "span" in parameters else None
     if span_s is not None and not 1 <= span_s <= MAX_SPAN_S:
         problem = f"parameter `span`: {span_s:g} s is not between 1 and {MAX_SPAN_S:g} s"
@@ -285,6 +350,21 @@ def _parse_why(parameters: ps.Parameters) -> WhyQuery:
     return WhyQuery(*_place(parameters), ps.stamp(parameters, "as_of"))
 
 
+def _parse_segments(parameters: ps.Parameters) -> SegmentsQuery:
+    bounds = _bounds(parameters) if "bounds" in parameters else None
+    return SegmentsQuery(*_times(parameters), ps.stamp(parameters, "as_of"), bounds, _freshness(parameters))
+
+
+def _parse_worklist(parameters: ps.Parameters) -> WorklistQuery:
+    same, default = _parse_segments(parameters), WorklistQuery()
+    target, efficiency = (
+        ps.number({name: ps.text_of(getattr(default, name)), **parameters}, name) for name in ("target", "efficiency")
+    )
+    limit = ps.count({"limit": str(default.limit), **parameters}, "limit")
+    return WorklistQuery(target, efficiency, limit, same.from_ns, same.to_ns, same.as_of_ns, same.bounds, same.fresh)
+
+
+_ROADS = ("from", "to", "as_of", "bounds")
 _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
     "point": (("x", "y", "layers", "as_of", "minus", *_FRESH), _parse_point),
@@ -296,6 +376,8 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
     "tiles": (("store", "row", "fact", "as_of", "place"), _parse_tiles),
     "why": (("x", "y", "as_of"), _parse_why),
+    "segments": ((*_ROADS, *_FRESH), _parse_segments),
+    "worklist": (("target", "efficiency", "limit", *_ROADS, *_FRESH), _parse_worklist),
     "alive": ((), lambda _: AliveQuery()),
     "info": (_FRESH, lambda parameters: InfoQuery(_freshness(parameters))),
 }
@@ -303,6 +385,13 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
 
 def _place(parameters: ps.Parameters) -> tuple[float, float]:
     return ps.number(parameters, "x"), ps.number(parameters, "y")
+
+
+def _times(parameters: ps.Parameters) -> tuple[int | None, int | None]:
+    from_ns, to_ns = ps.stamp(parameters, "from"), ps.stamp(parameters, "to")
+    if from_ns and to_ns and from_ns > to_ns:
+        raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
+    return from_ns, to_ns
 
 
 def _layers(parameters: ps.Parameters) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
-from protocol.machine.samples import APPLIED, COLUMNS, SAMPLE_DTYPE, check_samples, empty
+from protocol.machine.samples import COLUMNS, OPTIONAL, SAMPLE_DTYPE, check_samples, empty
 from protocol.site.site_config import NAME
 from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
 
@@ -26,7 +26,7 @@ MAX_SEQ = 2**62
 MAX_INT = 2**64 - 1  # of MessagePack
 MAX_RETRY_S = 3600.0
 _WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
-_NO_ROWS = empty()
+_STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value in OPTIONAL.items()}
 STORE_ID = re.compile(r"[0-9a-f]{16}")
 
 
@@ -166,7 +166,7 @@ def unpack_batch(data: bytes) -> PackedBatch:
         machine=take_name(table),
         spool_id=_take_int(table, "spool_id", 1, MAX_U64),
         first_seq=first_seq,
-        rows=_NO_ROWS,
+        rows=empty(),
         frame=take(table, "frame", str),
         lost_before=lost_before,
         store=take_store(table, optional=True),
@@ -175,7 +175,7 @@ def unpack_batch(data: bytes) -> PackedBatch:
 
 
 def _columns(cols: dict[str, Any], n: int) -> tuple[bytes, ...]:
-    missing = {name: bytes(n * SAMPLE_DTYPE[name].itemsize) for name in APPLIED if cols.get(name) is None}
+    missing = {name: n * value for name, value in _STAND_IN.items() if cols.get(name) is None}
     columns: tuple[Any, ...] = tuple(map((cols | missing).get, COLUMNS))
     for name, width, data in zip(COLUMNS, _WIDTHS, columns, strict=True):
         if type(data) is not bytes:

@@ -44,13 +44,14 @@ def add_options(parser: ArgumentParser) -> None:
     fleet = add_action(
         what, "fleet", "measure what calibration of machines by each other and by the ground gives the map"
     )
-    for action in (table, blackout, budget, ground, base, merge, lag, fleet):
+    roads = add_action(what, "roads", "measure roads, traffic, losses and repairs on random patches of soil")
+    for action in (table, blackout, budget, ground, base, merge, lag, fleet, roads):
         action.add_argument("--seeds", type=count, default=12, help="number of seeds (default %(default)s)")
     physics.add_argument("--seeds", type=count, default=3, help="number of seeds (default %(default)s)")
-    for action in (physics, table, blackout, budget, ground, base, merge, lag, fleet):
+    for action in (physics, table, blackout, budget, ground, base, merge, lag, fleet, roads):
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
-    for action in (table, blackout, budget, ground, base, merge, lag, fleet):
+    for action in (table, blackout, budget, ground, base, merge, lag, fleet, roads):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
@@ -69,6 +70,7 @@ def add_options(parser: ArgumentParser) -> None:
         (base, 1200.0),
         (lag, 900.0),
         (fleet, 900.0),
+        (roads, 900.0),
     ):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
@@ -115,6 +117,7 @@ def run(arguments: Namespace) -> int:
         "merge": _merge,
         "lag": _lag,
         "fleet": _fleet,
+        "roads": _roads,
         "log": _log,
         "parity": _parity,
     }
@@ -211,6 +214,13 @@ def _fleet(arguments: Namespace) -> Report:
 
     work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
     return _experiment(arguments, "machines drive, and are calibrated by the ground", work, "evaluation.fleet.plots")
+
+
+def _roads(arguments: Namespace) -> Report:
+    from evaluation.roads import experiment
+
+    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    return _experiment(arguments, "machines drive on patches of soil, their samples show roads", work)
 
 
 def _experiment(

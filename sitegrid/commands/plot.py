@@ -22,6 +22,7 @@ def add_options(parser: ArgumentParser) -> None:
     sides = "west, south, east, north in metres (default: the whole map)"
     add("--bounds", type=float, nargs=4, metavar=("W", "S", "E", "N"), help=sides)
     add("--truth", type=Path, help="true map of a simulation (truth_map.npz): also draw the difference")
+    add("--worklist", action="store_true", help="draw roads, and the ten stretches where work pays most, instead")
     add("--follow", action="store_true", help="redraw while machines drive, until stopped")
     add("--every", type=positive, default=1.0, help="seconds between two pictures (default %(default)s)")
     add("--pictures", type=int, default=0, help="with --follow: exit after this many pictures")

@@ -1,4 +1,7 @@
-"""`sitegrid query`: ask the map from the command line."""
+"""`sitegrid query`: ask the map from the command line.
+
+It is one module because all queries share their options and their tables.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,7 @@ from protocol.queries.answers import CheckpointCounts, GroundChange, MachineStat
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
 from protocol.queries.explanations import calibrated, why
 from protocol.queries.pieces import Progress
+from protocol.queries.roads import RoadSegment
 from sitegrid.client import Client, connect
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.outputs import OutputFile
@@ -53,6 +57,14 @@ def add_options(parser: ArgumentParser) -> None:
     _add_numbers(history, "x_m", "y_m")
     _add_times(history, ("from", "samples from this time on"), ("to", "samples up to this time; default the newest"))
     history.add_argument("--span", type=positive, metavar="SECONDS", help="length of one span; default 5 minutes")
+    for ask, summary in (
+        (_segments, "roads that the map shows, and what drove on them"),
+        (_worklist, "stretches of road where work pays, the dearest first"),
+    ):
+        roads = _add_query(queries, ask, summary)
+        hours = ("from", "traffic of the hours from this time on"), ("to", "traffic of the hours before this time")
+        _add_times(roads, *hours, ("as-of", "the map as of this time"))
+    roads.add_argument("--target", type=positive, default=0.02, help="rolling resistance of good ground (default 0.02)")
     _add_query(queries, _machines, "state of each machine: samples, trust, reasons")
     _add_query(queries, _calibration, "what is taken off the samples of each machine")
     changes = _add_query(queries, _changes, "list of ground changes: place and time")
@@ -159,6 +171,64 @@ def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> A
     return table, _table(["from (UTC)", *spans[0].values], rows)
 
 
+def _road_times(client: Client, arguments: Namespace) -> dict[str, Any]:
+    times = {"from": arguments.from_time, "to": arguments.to_time, "as_of": arguments.as_of_time}
+    return {**_stamps(client, **times), "after": arguments.after}
+
+
+def _segments(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
+    answer = client.segments(**_road_times(client, arguments))
+    if not answer.segments:
+        return answer, ["no roads are known"]
+    head = ["stretch", "around", "m", "resistance", "+-", "grade", "passes/h there", "back", "t/h there", "back"]
+    rows = (
+        [
+            *_place(one),
+            f"{one.length_m:.0f}",
+            *map(_value, (one.resistance, one.resistance_std, one.grade, *one.passes_ph, *one.tonnes_ph)),
+        ]
+        for one in answer.segments
+    )
+    km = sum(one.length_m for one in answer.segments) / 1000
+    return answer, [f"{km:.2f} km of roads, traffic of {answer.hours:.2f} h", *_table(head, rows)]
+
+
+def _worklist(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
+    answer = client.worklist(arguments.target, **_road_times(client, arguments))
+    total = f"{answer.total_kwh_ph:.2f} kWh/h lost on all roads against a resistance of {answer.target:g}"
+    if not answer.rows and not answer.changes:
+        return answer, [f"{total}: no stretch is worse for sure"]
+    head = ["", "stretch", "around", "kWh/h", "low..high", "l/h", "s/h", "resistance", "+-", "a day", "machines"]
+    rows = (
+        [
+            str(row.rank),
+            *_place(row.segment),
+            f"{row.kwh_ph[0]:.2f}",
+            f"{row.kwh_ph[1]:.2f}..{row.kwh_ph[2]:.2f}",
+            f"{row.litres_ph[0]:.2f}",
+            f"{row.seconds_ph[0]:.0f}",
+            *map(_value, (row.segment.resistance, row.segment.resistance_std)),
+            "-" if row.segment.trend is None else f"{row.segment.trend:+.4f}",
+            str(row.segment.machines),
+        ]
+        for row in answer.rows
+    )
+    lines = [f"{total}, traffic of {answer.hours:.2f} h", *_table(head, rows)]
+    if any(row.segment.guessed for row in answer.rows):
+        lines.append("no machine stated its mass on some of them: what is lost there is a guess")
+    lines += [
+        f"{utc_text(one.first_ns)} {one.id}: resistance {_value(one.before)} -> {_value(one.after)}, "
+        f"saves {one.saved_kwh_ph:.2f} kWh/h"
+        for one in answer.changes
+    ]
+    return answer, lines
+
+
+def _place(segment: RoadSegment) -> list[str]:
+    x_m, y_m = segment.line[len(segment.line) // 2]
+    return [segment.id, f"{x_m:.0f}, {y_m:.0f}"]
+
+
 def _machines(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     machines = client.machines(after=arguments.after)
     head = ["machine", "trusted", "since", "samples", "lost", "newest", "accelerometer zero", "torque gain", "why"]
@@ -238,7 +308,7 @@ def _change_line(change: GroundChange) -> str:
 def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     info = client.info(after=arguments.after)
     return info, [
-        f"site {info.site.name}: {info.cells} cells known, bounds {info.bounds and list(info.bounds)}",
+        f"site {info.site.name}: {info.cells} cells driven, bounds {info.bounds and list(info.bounds)}",
         f"  journal row {info.journalled}, merged {info.merged}, snapshot {info.snapshot}",
         f"  {_checkpoints(info.checkpoints)}",
         f"  samples merged {info.samples_merged}, too unsure of their place {info.samples_too_unsure}",

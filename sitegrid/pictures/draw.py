@@ -12,6 +12,7 @@ import zenoh
 
 from mapserver.pictures.frame import Image
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from mapserver.pictures.worklist import draw_worklist
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError
 from protocol.queries.answers import MachineState, Region
@@ -52,13 +53,22 @@ def run(arguments: Namespace) -> int:
 def _draw_if_possible(client: Client, arguments: Namespace, tracks: list[Track]) -> int:
     """Draw one picture; with --follow, wait for a server that does not answer."""
     try:
-        draw(client, arguments.out, arguments.bounds, tracks, arguments.truth)
+        if arguments.worklist:
+            draw_roads(client, arguments.out, arguments.bounds)
+        else:
+            draw(client, arguments.out, arguments.bounds, tracks, arguments.truth)
     except (LinkError, QueryError) as error:
         if not arguments.follow:
             raise
         note(f"sitegrid plot: {error}; trying again")
         return 0
     return 1
+
+
+def draw_roads(client: Client, out: Path, bounds: list[float] | None) -> None:
+    """Ask for roads and worklist, and write their picture."""
+    chosen = _bounds(client, bounds) if bounds else None
+    write_image(out, draw_worklist(client.segments(bounds=chosen), client.worklist(bounds=chosen)))
 
 
 def draw(

@@ -419,7 +419,7 @@ class World:
         return self._now_ns
 
     def _sample(self, agent: SimulatedAgent) -> bytes:
-        row = np.zeros(1, SAMPLE_DTYPE)
+        row = empty(1)
         row["stamp_ns"] = self._now_ns + agent.clock_ns + next(self._numbers)
         row["cov_xx_m2"] = row["cov_yy_m2"] = 1.0
         row["c_rr"] = 99.0 if self.rng.random() < self.rates.bad_sample else 0.05

@@ -26,7 +26,7 @@ from protocol.machine.readings import (
     Odometry,
     Torque,
 )
-from protocol.machine.samples import APPLIED, SAMPLE_DTYPE
+from protocol.machine.samples import OPTIONAL, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
 from protocol.queries.calibration import (
@@ -46,6 +46,17 @@ from protocol.queries.journal_piece import (
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.origin import Origin, decode_origin, encode_origin
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
+from protocol.queries.roads import (
+    RoadChange,
+    RoadSegment,
+    Segments,
+    Worklist,
+    WorklistRow,
+    decode_segments,
+    decode_worklist,
+    encode_segments,
+    encode_worklist,
+)
 from protocol.wire import codec, correction_codec
 from protocol.wire.messages import (
     Ack,
@@ -77,29 +88,18 @@ class Golden:
 
 
 def rows() -> np.ndarray:
-    """Return three samples: complete, without a gradient, without a resistance."""
+    """Return four samples: complete, without a gradient, without a resistance, and with neither."""
+    whole = (T0, 12.25, -40.5, 1.5, 0.25, 2.0, 0.5, 2.75, 0.55, 0.02, 1e-5, 0.125, -0.25, 1e-4)
+    level = (T0 + 200_000_000, 12.75, -40.25, 1.5, -0.25, 2.0, 0.5, -2.75, 0.5, 0.25, 1e-5, NAN, NAN, NAN)
+    ahead = (T0 + 400_000_000, 13.25, -40.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, NAN, NAN, 0.0, 0.0, 1e-4)
+    place = (T0 + 600_000_000, 13.75, -39.75, 1.5, 0.25, 2.0, 0.5, 2.75, 0.5, NAN, NAN, NAN, NAN, NAN)
+    calibration = (0.00390625, -0.0625)
     return np.array(
         [
-            (T0, 12.25, -40.5, 1.5, 0.25, 2.0, 0.5, 2.75, 0.55, 0.02, 1e-5, 0.125, -0.25, 1e-4, 0.00390625, -0.0625),
-            (
-                T0 + 200_000_000,
-                12.75,
-                -40.25,
-                1.5,
-                -0.25,
-                2.0,
-                0.5,
-                -2.75,
-                0.5,
-                0.25,
-                1e-5,
-                NAN,
-                NAN,
-                NAN,
-                0.00390625,
-                -0.0625,
-            ),
-            (T0 + 400_000_000, 13.25, -40.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, NAN, NAN, 0.0, 0.0, 1e-4, 0.0, 0.0),
+            (*whole, *calibration, 17_500.0),
+            (*level, *calibration, 44_000.5),
+            (*ahead, 0.0, 0.0, NAN),
+            (*place, *calibration, 17_500.0),
         ],
         SAMPLE_DTYPE,
     )
@@ -235,6 +235,33 @@ WHY = CellReasons(
 ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 OVERLOADED = QueryError(Refusal.OVERLOADED, "the server has too many queries to answer", 2.5)
 
+STRETCH = RoadSegment(
+    id="3_-2_ne",
+    line=((75.5, -49.5), (80.25, -44.0), (93.0, -31.5)),
+    length_m=25.5,
+    resistance=0.0625,
+    resistance_std=0.0025,
+    grade=-0.03125,
+    trend=0.001,
+    unmeasured=0.25,
+    passes_ph=(12.5, 0.5),
+    tonnes_ph=(550.0, 8.75),
+    guessed=False,
+    machines=4,
+)
+SPUR = replace(STRETCH, id="4_-2_e.1", resistance=None, resistance_std=None, grade=None, trend=None, guessed=True)
+ROADS = Segments(STORE, 17, 3, T0, 1.5, 0.984375, (STRETCH, SPUR))
+WORKLIST = Worklist(
+    STORE,
+    17,
+    3,
+    T0,
+    1.5,
+    0.02,
+    4.5,
+    (WorklistRow(1, STRETCH, (3.5, 3.25, 3.75), (1.0, 0.75, 1.25), (48.0, 45.0, 51.0)),),
+    (RoadChange("3_-2_ne", STRETCH.line, T0, T0 + 60 * 10**9, 0.0625, 0.03125, 2.5),),
+)
 JOURNAL = JournalPiece(
     STORE,
     ("fedcba9876543210",),
@@ -270,6 +297,8 @@ GOLDEN: dict[str, Golden] = {
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
     "why.bin": Golden(WHY, encode_why, decode_why),
+    "segments.bin": Golden(ROADS, encode_segments, decode_segments),
+    "worklist.bin": Golden(WORKLIST, encode_worklist, decode_worklist),
     "calibration.bin": Golden(CALIBRATION, encode_calibration, decode_calibration),
     "piece.bin": Golden(piece(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
@@ -300,14 +329,14 @@ NEWER = "batch_newer.bin"  # of a later version of the software: an unknown fiel
 def older_batch() -> bytes:
     """Return BATCH as an agent without a calibration sends it."""
     table = msgpack.unpackb(codec.encode_batch(BATCH))
-    cols = {name: column for name, column in table["cols"].items() if name not in APPLIED}
+    cols = {name: column for name, column in table["cols"].items() if name not in OPTIONAL}
     return bytes(msgpack.packb({**table, "cols": cols}))
 
 
 def newer_batch() -> bytes:
     """Return BATCH as a newer agent might send it."""
     table = msgpack.unpackb(codec.encode_batch(BATCH))
-    table["cols"]["slip"] = np.zeros(3, "<f4").tobytes()
+    table["cols"]["slip"] = np.zeros(len(BATCH.rows), "<f4").tobytes()
     return bytes(msgpack.packb({**table, "firmware": "2.0"}))
 
 

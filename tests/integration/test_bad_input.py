@@ -12,7 +12,7 @@ import zenoh
 
 from mapserver.query.queryable import ANSWERED
 from protocol.errors import Refusal
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import SAMPLE_DTYPE, empty
 from protocol.queries.answer_codec import decode_error
 from protocol.site.site_file import load_site
 from protocol.wire import keys
@@ -53,7 +53,7 @@ class Probe:
 
     def batch(self, n: int = 3, **over: Any) -> SampleBatch:
         columns = {name: over.pop(name) for name in list(over) if name in SAMPLE_DTYPE.names}
-        rows = np.zeros(n, SAMPLE_DTYPE)
+        rows = empty(n)
         rows["stamp_ns"] = NOW_NS + np.arange(n) * 10**9
         rows["distance_m"], rows["c_rr"], rows["cov_xx_m2"], rows["cov_yy_m2"] = 1.0, 0.04, 1.0, 1.0
         for name, value in columns.items():

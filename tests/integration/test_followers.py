@@ -106,6 +106,11 @@ def region(sender: Sender, run: Followed, follower: str, row: int) -> bytes:
     return sender.ask(keys.follower_query(run.site, follower, "region"), ask).payload.to_bytes()
 
 
+def roads(sender: Sender, run: Followed, follower: str, query: str) -> bytes:
+    key = keys.follower_query(run.site, follower, query) if follower else keys.map_query(run.site, query)
+    return sender.ask(key, "").payload.to_bytes()
+
+
 def tiles(sender: Sender, run: Followed, follower: str) -> dict[tuple[int, int], tuple[int, bytes]]:
     key = keys.follower_query(run.site, follower, "tiles") if follower else keys.map_query(run.site, "tiles")
     answer = decode_tiles(sender.ask(key, "").payload.to_bytes())
@@ -137,6 +142,9 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
                 )
             maps = [region(sender, run, name, row) for name in ("", "near", "far")]
             assert maps[0] == maps[1] == maps[2], pids  # all of the answer, to the byte
+            for query in ("segments", "worklist"):  # of a server that followed, and of processes that read it all
+                answers = [roads(sender, run, name, query) for name in ("", "near", "far")]
+                assert answers[0] == answers[1] == answers[2], (query, pids)
             drawn = [tiles(sender, run, name) for name in ("", "near", "far")]
             assert drawn[0] == drawn[1] == drawn[2], pids
 

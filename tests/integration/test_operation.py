@@ -23,7 +23,7 @@ from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.sqlite.reader import SqliteReader
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire import keys
@@ -61,7 +61,7 @@ def session_of(endpoint: str) -> closing[zenoh.Session]:
 def drive(n: int, seed: int, first_s: int = 0) -> np.ndarray:
     """Samples of a machine all over 50 x 50 m, one a second."""
     draw = np.random.default_rng(seed)
-    rows = np.zeros(n, SAMPLE_DTYPE)
+    rows = empty(n)
     rows["stamp_ns"] = NOW_NS + (first_s + np.arange(n)) * 10**9
     rows["x_m"], rows["y_m"] = draw.uniform(0, 50, (2, n))
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0

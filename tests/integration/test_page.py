@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import empty
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_pose
 from protocol.wire.messages import Pose, SampleBatch
@@ -401,7 +401,7 @@ class Sweeper:
         """The batch of an hour, which begins 900 times as late as the others' seconds."""
         hour = from_s / BATCH_S
         x, y = np.meshgrid(np.arange(20.5, 80), np.arange(20.5, 50))
-        rows = np.zeros(x.size, SAMPLE_DTYPE)
+        rows = empty(x.size)
         rows["x_m"], rows["y_m"] = x.ravel(), y.ravel()
         rows["stamp_ns"] = START_NS + round(hour * 3600e9) + np.arange(len(rows)) * 400_000_000
         rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.04

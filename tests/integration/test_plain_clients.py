@@ -34,7 +34,7 @@ SENDER = ROOT / "tests" / "clients" / "plain_sender.py"
 SITE, SAMPLES, KILLS = "lot", 1200, 8
 MACHINES = ("digger-1", "digger-2")
 READY_S, DELIVERED_S = 40.0, 120.0
-SAMPLE = struct.Struct(f"{plain_sender.ROW}ff")  # and a calibration: none, as nothing is stated
+SAMPLE = struct.Struct(f"{plain_sender.ROW}fff")  # and a calibration, none, and a mass, NaN, as nothing is stated
 HEAD = struct.Struct("<qqQqB")
 
 
@@ -120,7 +120,8 @@ def journal(store: Path) -> Counter[tuple[str, int, int, int]]:
             machine = record[HEAD.size : begin].decode()
             for i, sample in enumerate(SAMPLE.iter_unpack(record[begin:-4])):
                 counts[machine, run, first + i, sample[0]] += 1
-                assert sample[-2:] == (0.0, 0.0)
+                assert sample[-3:-1] == (0.0, 0.0)
+                assert math.isnan(sample[-1])
     return counts
 
 

@@ -20,7 +20,7 @@ from agents.stream_order import by_stamp
 from protocol.arrays import Floats, Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, Imu, Payload, Reading, Torque
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import empty
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
@@ -248,7 +248,7 @@ def with_ahrs(made: Drive, off_rad: float = 0.0, from_s: float = 0.0, variance: 
 def made_up_samples(n: int, seed: int = 0) -> Table:
     """Plausible samples, every one different."""
     rng = np.random.default_rng(seed)
-    rows = np.zeros(n, SAMPLE_DTYPE)
+    rows = empty(n)
     rows["stamp_ns"] = START_NS + np.arange(n) * 100_000_000
     for name, low, high in (("x_m", 0, 200), ("y_m", 0, 150), ("c_rr", 0.01, 0.3), ("c_rr_var", 1e-5, 1e-3)):
         rows[name] = rng.uniform(low, high, n)

@@ -43,6 +43,7 @@ STEADY = Balance(
     body_mps2=0.0,
     torque_s=0.01,
     wheels_s=0.02,
+    mass_kg=17_500.0,
 )
 
 

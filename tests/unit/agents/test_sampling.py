@@ -10,10 +10,10 @@ from agents.localisation.filters.belief import PoseBelief
 from agents.sampling import EVERY_M, HISTORY_S, LAG_S, Odometer, PoseHistory, Sampler
 from protocol.arrays import Table
 from protocol.machine.readings import Encoder, Imu, Odometry, Reading
-from protocol.machine.samples import check_samples
+from protocol.machine.samples import GRADE, RESISTANCE, check_samples
 
 S = 10**9
-ESTIMATE = GroundEstimate(0.05, 1e-4, 0.2, 0.1, 1e-3, "")
+ESTIMATE = GroundEstimate(0.05, 1e-4, 0.2, 0.1, 1e-3, "", mass_kg=22_000.0)
 
 
 def ns(seconds: float) -> int:
@@ -200,11 +200,17 @@ def test_marks_before_the_first_pose_are_counted() -> None:
 
 
 @pytest.mark.parametrize("reason", ["pitch_transient", "accelerometer"])
-def test_samples_whose_slope_is_blurred_are_withheld_and_counted(reason: str) -> None:
+def test_where_the_slope_is_blurred_place_distance_and_mass_are_sampled_and_counted(reason: str) -> None:
     sampler = PlacedSampler()
-    assert not len(drive(sampler, replace(ESTIMATE, c_rr=math.nan, c_rr_var=math.nan, reason=reason)))
-    assert sampler.withheld == {reason: 20}
-    assert not sampler.without_resistance
+    rows = drive(sampler, replace(NOTHING_KNOWN, reason=reason, mass_kg=22_000.0))
+    assert len(rows) == 20
+    for name in (*RESISTANCE, *GRADE):
+        assert np.isnan(rows[name]).all()
+    assert rows["mass_kg"] == pytest.approx(22_000.0)
+    assert rows["distance_m"] == pytest.approx(drive(PlacedSampler())["distance_m"])
+    assert sampler.without_resistance == {reason: 20}
+    assert not sampler.withheld
+    check_samples(rows, 1e4)
 
 
 @pytest.mark.parametrize("reason", ["braking", "no_torque", "torque_frozen", "standstill", "settling"])

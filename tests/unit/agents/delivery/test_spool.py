@@ -299,7 +299,7 @@ def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(t
 
 def test_damage_of_a_pending_sample_is_mended_by_its_final_value(spool: Spool) -> None:
     spool.record(ROWS[:2], pending=2)
-    spool._db.execute("UPDATE sample SET row = zeroblob(76) WHERE number = 1")
+    spool._db.execute("UPDATE sample SET row = zeroblob(80) WHERE number = 1")
     assert spool.head(99) is None
     spool.record(ROWS[:0], finals=better(ROWS[:2]))
     assert hashes(spool.head(99).rows) == hashes(better(ROWS[:2]))
@@ -374,7 +374,7 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
     spool.close()
-    spool = opened(changed(tmp_path, "UPDATE sample SET row = zeroblob(76) WHERE number IN (1, 2, 3, 6)"))
+    spool = opened(changed(tmp_path, "UPDATE sample SET row = zeroblob(80) WHERE number IN (1, 2, 3, 6)"))
     first = spool.head(2)
     assert (first.first_seq, first.lost_before) == (4, 3)
     assert hashes(first.rows) == hashes(ROWS[3:5])

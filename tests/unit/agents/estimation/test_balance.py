@@ -248,7 +248,9 @@ def test_payload_reading_is_kept_until_the_next() -> None:
     vehicle = loader()
     made = [r for r in drive(FORWARDS, vehicle).readings if not isinstance(r, Payload)]
     stated = [Payload("scale", made[0].stamp_ns, 4000.0)]
-    shares = [b.share for b in balances(vehicle, [*stated, *made])]
+    loaded = balances(vehicle, [*stated, *made])
+    assert {b.mass_kg for b in loaded} == {21_500.0}
+    shares = [b.share for b in loaded]
     empty = [b.share for b in balances(vehicle, made)]
     assert shares == pytest.approx([share * 17.5 / 21.5 for share in empty])
 

@@ -334,7 +334,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 def test_a_file_of_another_schema_is_refused(day, monkeypatch):
     monkeypatch.setattr(ar, "asdict", lambda header: asdict(header) | {"schema": 1})
     path = ar.write_file(day.folder, "0" * 16, SITE, ((row, row.received_ns) for row in day.reader.read()))
-    with pytest.raises(StoreError, match="has schema 1, this version knows 3"):
+    with pytest.raises(StoreError, match="has schema 1, this version knows 4"):
         ArchiveFile(path)
 
 

@@ -248,6 +248,17 @@ def test_what_a_cell_has_no_votes_for_is_nan():
     assert value(no_resistance, "grade_east") == pytest.approx(0.1, abs=1e-3)
 
 
+def test_where_machines_could_measure_nothing_a_cell_is_driven_and_not_known():
+    nothing = dict.fromkeys(("c_rr", "c_rr_var", "grade_e", "grade_n", "grade_var"), np.nan)
+    grid = folded(samples(5, **nothing))
+    known = {name for name in LAYERS if np.isfinite(value(grid, name))}
+    assert known == {"weight", "visits", "machines", "heading", "age_s"}
+    grid.fold(samples(1, distance_m=0.05, **EXACT), "a")  # a trace of a measurement in a cell that is driven much
+    assert np.isnan(value(grid, "resistance"))
+    assert np.isnan(value(grid, "grade_east"))
+    assert value(grid, "resistance", ReadConfig(min_weight_m=0.02)) == pytest.approx(0.04, rel=0.01)
+
+
 def test_cells_with_too_little_evidence_are_unknown():
     grid = folded(samples(1, distance_m=0.05, **EXACT))
     assert np.isnan(value(grid, "resistance"))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, Encoder, Imu, columns
-from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
+from protocol.machine.samples import COLUMNS, OPTIONAL, SAMPLE_DTYPE, empty
 from protocol.queries import answer_codec as answers
 from protocol.queries.answers import PointAnswer, Region
 from protocol.wire import codec, correction_codec
@@ -21,7 +21,7 @@ T0 = 1_750_000_000_000_000_000
 
 
 def rows(n: int = 5) -> np.ndarray:
-    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4, 1e-3, 0.01)
+    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4, 1e-3, 0.01, 17_500.0)
     return np.array([one] * n, SAMPLE_DTYPE)
 
 
@@ -145,6 +145,9 @@ def test_column_of_another_length_is_named(column, change):
         ("applied_zero", 0.051, Refusal.OUT_OF_RANGE),
         ("applied_scale", -np.inf, Refusal.NOT_FINITE),
         ("applied_scale", -0.51, Refusal.OUT_OF_RANGE),
+        ("mass_kg", np.inf, Refusal.NOT_FINITE),
+        ("mass_kg", 0.0, Refusal.OUT_OF_RANGE),
+        ("mass_kg", 1.1e6, Refusal.OUT_OF_RANGE),
     ],
 )
 def test_bad_value_is_named_with_its_row(column, value, reason):
@@ -155,13 +158,13 @@ def test_bad_value_is_named_with_its_row(column, value, reason):
     assert f"{error.field}[3]" in str(error)
 
 
-@pytest.mark.parametrize("missing", [("applied_zero",), ("applied_scale",), ("applied_zero", "applied_scale")])
+@pytest.mark.parametrize("missing", [("applied_zero",), ("applied_scale",), ("mass_kg",), tuple(OPTIONAL)])
 @pytest.mark.parametrize("nil", [False, True])
-def test_a_calibration_that_is_not_stated_is_none(missing, nil):
+def test_a_calibration_that_is_not_stated_is_none_and_a_mass_unknown(missing, nil):
     cols = {name: column for name, column in msgpack.unpackb(changed())["cols"].items() if name not in missing}
     expected = rows()
     for name in missing:
-        expected[name] = 0.0
+        expected[name] = {"applied_zero": 0.0, "applied_scale": 0.0, "mass_kg": np.nan}[name]
     got = decode_batch(changed(cols=cols | (dict.fromkeys(missing) if nil else {})), EXTENT_M)
     assert got.rows.tobytes() == expected.tobytes()
 
@@ -193,12 +196,13 @@ def test_largest_batch_fits():
     assert len(encode_batch(batch(rows(codec.MAX_BATCH_SAMPLES)))) < codec.MAX_BATCH_BYTES
 
 
-def test_unknown_resistance_or_gradient_is_allowed():
+def test_unknown_resistance_gradient_or_mass_is_allowed():
     table = rows()
     for name in ("c_rr", "c_rr_var"):
         table[name][1] = np.nan
     for name in ("grade_e", "grade_n", "grade_var"):
         table[name][2] = np.nan
+    table["mass_kg"][3] = np.nan
     assert decode_batch(encode_batch(batch(table)), EXTENT_M).rows.tobytes() == table.tobytes()
 
 
@@ -221,8 +225,9 @@ def tables(draw):
         "c_rr": st.floats(-1, 5, width=32),
         "applied_zero": st.floats(-0.03125, 0.03125, width=32),
         "applied_scale": st.floats(-0.5, 0.5, width=32),
+        "mass_kg": st.floats(1, 1e6, width=32),
     }
-    table = np.zeros(draw(st.integers(0, 4)), SAMPLE_DTYPE)
+    table = empty(draw(st.integers(0, 4)))
     for row in table:
         for name in COLUMNS:
             row[name] = draw(values[name])

@@ -39,9 +39,10 @@ def test_unknown_field_and_column_of_a_newer_agent_are_ignored(golden):
     assert same(golden.decode_batch((FOLDER / golden.NEWER).read_bytes()), golden.BATCH)
 
 
-def test_an_agent_that_states_no_calibration_has_applied_none(golden):
+def test_an_agent_that_states_neither_calibration_nor_mass_has_applied_none_and_is_of_unknown_mass(golden):
     rows = golden.BATCH.rows.copy()
     rows["applied_zero"] = rows["applied_scale"] = 0.0
+    rows["mass_kg"] = np.nan
     older = golden.decode_batch((FOLDER / golden.OLDER).read_bytes())
     assert same(older, dataclasses.replace(golden.BATCH, rows=rows))
 
@@ -50,4 +51,4 @@ def test_columns_and_types_are_the_specified_ones():
     from protocol.machine.samples import SAMPLE_DTYPE
 
     assert SAMPLE_DTYPE.names[:3] == ("stamp_ns", "x_m", "y_m")
-    assert [SAMPLE_DTYPE[name].str for name in SAMPLE_DTYPE.names] == ["<i8", "<f8", "<f8", *["<f4"] * 13]
+    assert [SAMPLE_DTYPE[name].str for name in SAMPLE_DTYPE.names] == ["<i8", "<f8", "<f8", *["<f4"] * 14]

@@ -23,15 +23,19 @@ from protocol.queries.requests import (
     MapQuery,
     PointQuery,
     RegionQuery,
+    SegmentsQuery,
     When,
+    WorklistQuery,
     parse_query,
 )
+from protocol.queries.roads import Segments, Worklist, encode_segments, encode_worklist
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
 from sitegrid.asking import PAST_S
 from sitegrid.cli import main
 from sitegrid.client import Client
 from sitegrid.commands import query
+from tests.paths import GOLDEN
 from tests.unit.records import STORE, map_info, version
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
@@ -68,12 +72,19 @@ class Session:
             first = HistorySpan(T0, T0 + 299, {"resistance": 0.25, "age_s": math.nan})
             spans = (first, HistorySpan(T0 + 300 * S, T0, {"resistance": 0.5, "age_s": 3.0}))
             return encode_history(HistoryAnswer(0.5, 1.5, () if asked.x_m < 0 else spans, version(17, 3), T0))
+        if isinstance(asked, SegmentsQuery | WorklistQuery):
+            return (GOLDEN / f"{asked.name}.bin").read_bytes() if asked.from_ns is None else self._no_roads(asked)
         assert isinstance(asked, PointQuery | RegionQuery)
         stamp_ns = asked.when.as_of_ns or self.now_ns
         if isinstance(asked, PointQuery):
             return encode_point(PointAnswer(0.5, 1.5, {"visits": 2.0}, version(17, 3), stamp_ns))
         layers = {"visits": np.ones((1, 1), np.float32)}
         return encode_region(Region(np.array([0.5]), np.array([1.5]), 1.0, layers, version(17, 3), stamp_ns))
+
+    def _no_roads(self, asked: MapQuery) -> bytes:
+        if isinstance(asked, WorklistQuery):
+            return encode_worklist(Worklist(STORE, 17, 3, T0, 0.0, asked.target, 0.0, (), ()))
+        return encode_segments(Segments(STORE, 17, 3, T0, 0.0, 1.0, ()))
 
 
 class Reply:
@@ -120,6 +131,39 @@ def test_a_probe_is_one_line_or_one_object(session: Session, capsys):
     assert main(["query", "alive", "--json"]) == 0
     expected = {"store": STORE, "journalled": 18, "merged": 17, "busy_s": 0.5}
     assert json.loads(capsys.readouterr().out) == expected
+
+
+def test_a_worklist_is_a_table_with_what_changed_below(session: Session, capsys):
+    assert main(["query", "worklist", "--target", "0.03", "--as-of", str(T0)]) == 0
+    assert session.asked[-1] == WorklistQuery(0.03, as_of_ns=T0)
+    head, names, row, changed = capsys.readouterr().out.splitlines()
+    assert head == "4.50 kWh/h lost on all roads against a resistance of 0.02, traffic of 1.50 h"
+    assert names.split()[:3] == ["stretch", "around", "kWh/h"]
+    assert row.split()[:5] == ["1", "3_-2_ne", "80,", "-44", "3.50"]
+    assert "3.25..3.75" in row
+    assert "3_-2_ne: resistance 0.0625 -> 0.03125, saves 2.50 kWh/h" in changed
+    assert main(["query", "worklist", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"][0]["segment"]["id"] == "3_-2_ne"
+    assert main(["query", "worklist", "--from", str(T0)]) == 0
+    assert "no stretch is worse for sure" in capsys.readouterr().out
+
+
+def test_segments_are_a_table(session: Session, capsys):
+    assert main(["query", "--after", "3", "segments"]) == 0
+    assert session.asked[-1] == SegmentsQuery(fresh=Freshness(3))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "0.05 km of roads, traffic of 1.50 h"
+    assert lines[2].startswith("3_-2_ne")
+    assert "unknown" in lines[3]
+    assert main(["query", "segments", "--from", str(T0)]) == 0
+    assert capsys.readouterr().out == "no roads are known\n"
+
+
+def test_a_target_that_is_none_is_a_usage_error(session: Session, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["query", "worklist", "--target", "0"])
+    assert end.value.code == 2
+    assert "--target" in capsys.readouterr().err
 
 
 def test_without_times_the_map_is_asked_as_it_is(session: Session):

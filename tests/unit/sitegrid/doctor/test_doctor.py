@@ -27,7 +27,7 @@ from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.location import JournalLocation
 from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
-from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.machine.samples import empty
 from protocol.queries.answer_codec import encode_info
 from protocol.queries.answers import FollowerState, MapInfo, SampleCounts
 from protocol.queries.requests import InfoQuery
@@ -54,7 +54,7 @@ SITE_TOML = 'name = "pit"\norigin_lat_deg = 48.0\norigin_lon_deg = 11.0\n'
 
 
 def samples(n: int) -> np.ndarray:
-    rows = np.zeros(n, SAMPLE_DTYPE)
+    rows = empty(n)
     rows["stamp_ns"] = NOW_NS + np.arange(n) * 10**9
     rows["distance_m"] = 1.0
     return rows
@@ -367,7 +367,7 @@ def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
     filled_store(tmp_path)
     with closing(Store(JournalLocation(tmp_path), SITE, ServerConfig(), time.time_ns)):
         state = disk.read_store(tmp_path, time.time() + 100)
-    assert state == StoreState("pit", SITE.frame, 5, 2, 0, 1, 1, state.snapshot_age_s)
+    assert state == StoreState("pit", SITE.frame, 6, 2, 0, 1, 1, state.snapshot_age_s)
     assert 99 < state.snapshot_age_s < 160
 
 

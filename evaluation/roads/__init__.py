@@ -1,0 +1,1 @@
+"""Accuracy of roads, traffic and the worklist, on a haul road with random patches of soil."""

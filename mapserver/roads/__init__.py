@@ -1,0 +1,1 @@
+"""Roads that the evidence shows, and what driving on them costs."""

@@ -1,0 +1,126 @@
+"""What bad ground costs: the work of all that drove on a segment, over what it would have been on the target's ground.
+
+Per pass over a slice of length L in a direction with slope s: m g L (max(0, c + s) - max(0, target + s)), and nothing
+where the ground is better than the target. Where the brakes would have taken the difference, nothing is lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapserver.roads.ledger import Ledger, filled, mean, resistance
+from mapserver.roads.segments import Segments
+from mapserver.roads.tally import PER_C, PER_M, squares_of
+from protocol.arrays import Bools, Floats, Ints
+from protocol.units import GRAVITY_MPS2
+
+GUESSED_KG = 30_000.0  # of a machine where no sample states a mass: between a loader and a loaded truck
+SIGMA_90 = 1.645
+# Standard deviation of what is left of a machine's zero after calibration, and of c_rr that all machines share: the
+# balance of forces leaves out the wind and the tyres.
+ZERO_STD, MODEL_SHARE = 0.003, 0.06
+CORRELATED_M = 10.0  # errors of one pass are alike over so much of the way
+GAP_SHARE = 0.35  # of c_rr, by which a slice that nobody measured is off
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Of segments (k,). c_rr, c_std; grade along, from beginning to end; work_j: lost in all, low and high of 90 %.
+
+    kg: mean mass (k, 2) by direction; guessed: whether no sample of it states one. unmeasured: share of the slices.
+    passes: (k, 2) by direction.
+    """
+
+    c_rr: Floats
+    c_std: Floats
+    grade: Floats
+    work_j: Floats
+    low_j: Floats
+    high_j: Floats
+    kg: Floats
+    guessed: Bools
+    unmeasured: Floats
+    passes: Floats
+
+
+def losses(ledger: Ledger, segments: Segments, target: float, level: Floats | None = None) -> Losses:
+    """What was lost on each segment against ground of a target c_rr.
+
+    level (k,): c_rr of segments in place of what was measured, which was before or after a repair; NaN for the others.
+    """
+    owner = np.repeat(np.arange(len(segments.ids)), np.diff(ledger.ends))
+    metres, weighed, kg_m = (ledger.of_slices(name).astype(np.float64) / PER_M for name in ("metres", "weighed", "kg"))
+    known_kg = kg_m.sum() / weighed.sum() if weighed.any() else GUESSED_KG
+    segment_kg = _by_segment(kg_m, ledger.ends) / np.maximum(_by_segment(weighed, ledger.ends), 1e-9)
+    guessed = _by_segment(weighed, ledger.ends).sum(axis=1) == 0
+    segment_kg = np.where(_by_segment(weighed, ledger.ends) > 0, segment_kg, known_kg)
+    kg = np.where(weighed > 0, kg_m / np.maximum(weighed, 1e-9), segment_kg[owner])
+    c, slope = resistance(ledger), _slope(ledger, segments, owner)
+    if level is not None:
+        share = level / mean(c, ledger.ends)
+        c = c * np.where(np.isfinite(share) & (share > 0), share, 1.0)[owner]
+    load = kg * metres * GRAVITY_MPS2  # of all passes, newton metres per unit of c_rr
+    std = _std(ledger)
+    slopes = np.stack([slope, -slope], axis=1)
+
+    def work(shift: Floats) -> Floats:
+        ground = np.maximum((c + shift[owner])[:, None], 0.0)
+        excess = np.maximum(ground + slopes, 0.0) - np.maximum(target + slopes, 0.0)
+        return np.asarray(_by_segment((np.maximum(excess, 0.0) * load).sum(axis=1), ledger.ends), np.float64)
+
+    none = np.zeros(len(segments.ids))
+    measured = ledger.of_slices("measured").sum(axis=1) > 0
+    return Losses(
+        c_rr=mean(c, ledger.ends),
+        c_std=std,
+        grade=mean(slope, ledger.ends),
+        work_j=np.nan_to_num(work(none)),
+        low_j=np.nan_to_num(work(-SIGMA_90 * std)),
+        high_j=np.nan_to_num(work(SIGMA_90 * std)),
+        kg=segment_kg,
+        guessed=guessed,
+        unmeasured=mean(~measured, ledger.ends),
+        passes=_by_segment(metres, ledger.ends) / np.maximum(segments.length_m, 1e-9)[:, None],
+    )
+
+
+def _by_segment(values: Floats, ends: Ints) -> Floats:
+    """Sum the slices of each segment, (k, ...)."""
+    if not len(values):
+        return np.zeros((0, *values.shape[1:]))
+    return np.asarray(np.add.reduceat(values, ends[:-1], axis=0), np.float64)
+
+
+def _slope(ledger: Ledger, segments: Segments, owner: Ints) -> Floats:
+    """Rise over run of slices (s,) from beginning to end, 0 where it is not known."""
+    graded = ledger.of_slices("graded").sum(axis=1)
+    east, north = (ledger.of_slices(name).sum(axis=1) / np.maximum(graded, 1) / PER_C for name in ("east", "north"))
+    along = east * segments.ahead[owner, 0] + north * segments.ahead[owner, 1]
+    return np.nan_to_num(filled(np.where(graded > 0, along, np.nan), ledger.ends))
+
+
+def _std(ledger: Ledger) -> Floats:
+    """Standard deviation (k,) of the mean c_rr of segments; NaN where nothing was measured.
+
+    Noise of single passes, as slices repeat it; what calibration leaves of the machines' zeros; what all share; and
+    slices that nobody measured.
+    """
+    measured = ledger.of_slices("measured").sum(axis=1)
+    known = measured > 0
+    mean_c = ledger.of_slices("c").sum(axis=1) / np.maximum(measured, 1) / PER_C
+    variance = np.maximum(
+        squares_of(ledger.of_slices("c2").sum(axis=1)) / np.maximum(measured / PER_M, 1e-9) - mean_c**2, 0
+    )
+    count = np.maximum(np.add.reduceat(known, ledger.ends[:-1]), 1e-9) if len(known) else np.zeros(0)
+    within = _by_segment(np.where(known, variance, 0.0), ledger.ends) / count
+    driven_m = _by_segment(measured / PER_M, ledger.ends)
+    noise = within / np.maximum(driven_m / CORRELATED_M, 1.0)
+    totals = ledger.totals()
+    machines = np.bitwise_count(np.bitwise_or(totals["machines"][:, 0], totals["machines"][:, 1]))
+    c_rr = mean(resistance(ledger), ledger.ends)
+    gaps = 1 - count / np.diff(ledger.ends) if len(known) else count
+    gap = gaps * GAP_SHARE * c_rr
+    std = np.sqrt(noise + ZERO_STD**2 / np.maximum(machines, 1) + (MODEL_SHARE * c_rr) ** 2 + gap**2)
+    return np.asarray(std, np.float64)

@@ -1,0 +1,148 @@
+"""What was driven, by span of time, place and direction: sums of integers, from which any segment has its traffic.
+
+Places are cells that do not depend on where roads run, so that samples which move a road move no traffic: it is summed
+up for the segments when it is read. Any order and any batching of the samples give the same tally, bit for bit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mapserver.roads.segments import LATTICE_M
+from protocol.arrays import Floats, Ints, Table
+
+CELL_M = LATTICE_M / 10  # so that cells end where segments do
+HOUR_NS = 3_600_000_000_000
+HOURS = 120  # with driving that are remembered; what is older is read from the journal
+SECTORS = 16  # of the direction of travel, the first one centred on east
+PER_M = 1000  # metres, and places in the cell
+PER_C = 100_000  # c_rr and gradient
+_C2_SHIFT = 100  # squares are in units of this over PER_C squared, so that sums of any hour fit
+_AXIS_BITS, _SECTOR_BITS = 17, 4  # sites reach 100 km from their origin
+_HALF = 1 << (_AXIS_BITS - 1)  # with 25 bits left for slots, of a minute or more
+_SLOT_SHIFT = 2 * _AXIS_BITS + _SECTOR_BITS
+_PENDING_ROWS = 16_384  # merged at once: merging costs a sort of everything
+
+# metres driven; of these weighed, where the mass is known, measured, where c_rr is, and graded. Sums over metres: kg,
+# c_rr and its square, gradient east and north, place from the cell's corner.
+SUMS = ("metres", "weighed", "measured", "graded", "kg", "c", "c2", "east", "north", "x", "y")
+TALLY = np.dtype([("key", "<i8"), *((name, "<i8") for name in SUMS), ("machines", "<u8")])
+_SECTOR_RAD = 2 * np.pi / SECTORS
+
+
+class Tally:
+    """Sums of some machines over spans of time. slots: how many spans with driving it remembers, the newest ones."""
+
+    def __init__(self, slot_ns: int = HOUR_NS, slots: int = HOURS, cell_m: float = CELL_M) -> None:
+        """cell_m: edge of the cells, a whole part of the lattice's."""
+        self.slot_ns, self.cell_m, self._slots = slot_ns, cell_m, slots
+        self._table: Table = np.zeros(0, TALLY)
+        self._pending: list[Table] = []
+        self._waiting = 0
+
+    def add(self, rows: Table, names: NDArray[np.uint64]) -> None:
+        """Add samples (n,), corrected, whose position is sure enough to vote; names (n,): hashes of their machines'."""
+        new = tally(rows, names, self.slot_ns, self.cell_m)
+        self._pending.append(new)
+        self._waiting += len(new)
+        if self._waiting > max(_PENDING_ROWS, len(self._table) // 4):
+            self.table()
+
+    def table(self) -> Table:
+        """All rows, by their keys.
+
+        A span that is forgotten can never come back among the newest ones, so that when this runs has no influence.
+        """
+        if self._pending:
+            whole = summed(np.concatenate([self._table, *self._pending]))
+            self._pending, self._waiting = [], 0
+            each = slot(whole["key"])
+            kept = np.unique(each)[-self._slots :]
+            self._table = whole[int(np.searchsorted(each, kept[0])) :].copy() if len(kept) else whole
+        return self._table
+
+
+def tally(rows: Table, names: NDArray[np.uint64], slot_ns: int, cell_m: float = CELL_M) -> Table:
+    """The tally of samples (n,) of machines whose names have these hashes (n,)."""
+    out = np.zeros(len(rows), TALLY)
+    return summed(out[: _measure(rows, names, cell_m, slot_ns, out)])
+
+
+def summed(rows: Table) -> Table:
+    """Sum what has the same key; sorted by it."""
+    order = np.argsort(rows["key"], kind="stable")  # mostly sorted runs already
+    rows = rows[order]
+    first = np.flatnonzero(np.diff(rows["key"], prepend=-1))
+    out = np.zeros(len(first), TALLY)
+    if len(first):
+        out["key"] = rows["key"][first]
+        for name in SUMS:
+            out[name] = np.add.reduceat(rows[name], first)
+        out["machines"] = np.bitwise_or.reduceat(rows["machines"], first)
+    return out
+
+
+def slot(keys: Ints) -> Ints:
+    """Which span of time, counted since 1970."""
+    return keys >> _SLOT_SHIFT
+
+
+def place(keys: Ints) -> Ints:
+    """A number of cell and sector."""
+    return keys & ((1 << _SLOT_SHIFT) - 1)
+
+
+def corner_m(keys: Ints, cell_m: float) -> Floats:
+    """South-west corner (n, 2) of cells of this size [m]."""
+    column = ((keys >> _SECTOR_BITS) & ((1 << _AXIS_BITS) - 1)) - _HALF
+    row = ((keys >> (_SECTOR_BITS + _AXIS_BITS)) & ((1 << _AXIS_BITS) - 1)) - _HALF
+    return np.asarray(np.stack([column, row], axis=1) * cell_m, np.float64)
+
+
+def heading_rad(keys: Ints) -> Floats:
+    """Direction of travel, the middle of the sector."""
+    return np.asarray((keys & ((1 << _SECTOR_BITS) - 1)) * _SECTOR_RAD, np.float64)
+
+
+def squares_of(c2: Ints) -> Floats:
+    """Sums of squares as c_rr squared over metres."""
+    return np.asarray(c2 * (_C2_SHIFT / PER_C**2 / PER_M), np.float64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _measure(rows: Any, names: Any, cell_m: float, slot_ns: int, out: Any) -> int:
+    """Rows of single samples; returns how many there are: one that did not move drove nothing."""
+    used = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        metres = np.int64(np.rint(np.float64(row.distance_m) * PER_M))
+        column, line = np.floor(row.x_m / cell_m), np.floor(row.y_m / cell_m)
+        if metres <= 0 or abs(column) >= _HALF or abs(line) >= _HALF:
+            continue
+        sector = np.int64(np.floor(np.float64(row.heading_rad) / _SECTOR_RAD + 0.5))
+        sector = (sector + (SECTORS // 2 if row.speed_mps < 0.0 else 0)) % SECTORS
+        at = (np.int64(line) + _HALF) << _AXIS_BITS | (np.int64(column) + _HALF)
+        sums = out[used]
+        sums.key = (row.stamp_ns // slot_ns) << _SLOT_SHIFT | at << _SECTOR_BITS | sector
+        sums.metres = metres
+        sums.machines = np.uint64(1) << (names[i] >> np.uint64(58))
+        sums.x = metres * np.int64((row.x_m - column * cell_m) * PER_M)
+        sums.y = metres * np.int64((row.y_m - line * cell_m) * PER_M)
+        if not np.isnan(row.mass_kg):
+            sums.weighed = metres
+            sums.kg = metres * np.int64(np.rint(np.float64(row.mass_kg)))
+        if not np.isnan(row.c_rr):
+            c = np.int64(np.rint(min(max(np.float64(row.c_rr), -1.0), 1.0) * PER_C))
+            sums.measured = metres
+            sums.c = metres * c
+            sums.c2 = metres * (c * c // _C2_SHIFT)
+        if not np.isnan(row.grade_e):
+            sums.graded = metres
+            sums.east = metres * np.int64(np.rint(np.float64(row.grade_e) * PER_C))
+            sums.north = metres * np.int64(np.rint(np.float64(row.grade_n) * PER_C))
+        used += 1
+    return used

@@ -1,0 +1,35 @@
+"""The picture of a worklist: red where it costs most, grey where nothing is known, and no roads at all."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mapserver.pictures.worklist import REPAIRED, UNKNOWN, WORST, draw_worklist
+from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
+from tests.paths import GOLDEN
+
+ROADS = decode_segments((GOLDEN / "segments.bin").read_bytes())
+WORK = decode_worklist((GOLDEN / "worklist.bin").read_bytes())
+
+
+def count(image, colour) -> int:
+    return int((image == np.array(colour, np.uint8)).all(axis=-1).sum())
+
+
+def test_stretches_have_the_colours_of_their_cost():
+    known, spur = ROADS.segments
+    roads = replace(ROADS, segments=(known, replace(spur, line=((120.0, 0.0), (150.0, 0.0)))))
+    listed, nothing = (
+        draw_worklist(roads, replace(WORK, changes=())),
+        draw_worklist(roads, replace(WORK, rows=(), changes=())),
+    )
+    assert count(listed, WORST) > count(nothing, WORST) == 0
+    assert count(listed, UNKNOWN) > 100
+    assert count(draw_worklist(roads, replace(WORK, rows=())), REPAIRED) > 100
+
+
+def test_a_map_without_roads_is_a_picture():
+    version = (WORK.store, 0, 0, 0)
+    picture = draw_worklist(Segments(*version, 0.0, 1.0, ()), Worklist(*version, 0.0, 0.02, 0.0, (), ()))
+    assert picture.ndim == 3
+    assert count(picture, WORST) == 0

@@ -1,0 +1,185 @@
+"""Roads of known lines: what is found, how it hangs together, and that nothing but samples and facts decides it."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from mapserver.evidence.fold_config import FoldConfig
+from mapserver.evidence.grid import Grid
+from mapserver.roads.segments import LATTICE_M, SLIVER_M, Segments
+from mapserver.roads.skeleton import Skeletons
+from protocol.arrays import Floats
+from tests.unit.mapserver.roads.drives import EVERYWHERE, along, grid_of, passes, ring, roads, roads_of
+
+END_M = 3.5  # a road ends within so much of where machines turned round
+
+
+def off_m(line: Floats, shown: Segments) -> float:
+    """How far points of a line are from the roads at most."""
+    return float(max(np.hypot(*(shown.points - place).T).min() for place in line))
+
+
+def beyond_m(line: Floats, shown: Segments) -> float:
+    """How far the roads are from a line at most."""
+    return float(max(np.hypot(*(line - place).T).min() for place in shown.points))
+
+
+def degrees(shown: Segments) -> Counter[int]:
+    """How many nodes there are of each degree."""
+    return Counter(Counter(shown.nodes[shown.nodes >= 0].tolist()).values())
+
+
+def same(one: Segments, other: Segments) -> bool:
+    arrays = ("points", "ends", "ahead", "length_m", "nodes")
+    return one.ids == other.ids and all(
+        getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in arrays
+    )
+
+
+def test_an_empty_map_has_no_roads():
+    shown = roads()
+    assert (shown.ids, len(shown.points), shown.ahead.shape, shown.nodes.shape) == ((), 0, (0, 2), (0, 2))
+
+
+def test_a_straight_road_is_cut_at_the_lattice():
+    line = along([(10, 10), (210, 10)])
+    shown = roads(passes(line))
+    assert shown.ids == tuple(f"{column}_0_e" for column in range(9))
+    assert off_m(line, shown) < 2.0
+    assert beyond_m(line, shown) < END_M
+    cuts = np.array([shown.line(i)[0, 0] for i in range(1, 9)])
+    np.testing.assert_allclose(cuts % LATTICE_M, 0.5)  # the first cell of the next one
+    assert (shown.length_m >= SLIVER_M).all()
+    np.testing.assert_allclose(shown.ahead, [(1.0, 0.0)] * 9, atol=0.05)
+
+
+def test_one_pass_is_a_road():
+    line = along([(10, 10), (210, 60)])
+    assert off_m(line, roads(passes(line, 1))) < 3.0
+
+
+def test_a_one_way_ring_is_closed():
+    line = ring((100, 100), 40)
+    shown = roads(passes(line))
+    assert off_m(line, shown) < 2.0
+    assert beyond_m(line, shown) < 2.0
+    assert not degrees(shown)
+    assert shown.length_m.sum() == pytest.approx(2 * np.pi * 40, rel=0.02)
+    ends = Counter(tuple(point) for i in range(len(shown.ids)) for point in shown.line(i)[[0, -1]].tolist())
+    assert set(ends.values()) == {2}  # each segment goes on in another one
+
+
+def test_a_loop_with_corners_is_closed():
+    line = along([(20, 20), (220, 20), (220, 120), (20, 120), (20, 20)])
+    shown = roads(passes(line))
+    assert off_m(line, shown) < 3.0
+    assert not degrees(shown)
+
+
+def test_a_crossing_is_crossed():
+    shown = roads(passes(along([(20, 50), (180, 50)])), passes(along([(100, 0), (100, 100)]), seed=1))
+    assert degrees(shown) == {1: 4, 4: 1}
+
+
+def test_a_way_that_is_seldom_driven_crosses_one_that_is_driven_much():
+    shown = roads(passes(along([(20, 50), (180, 50)]), 60), passes(along([(100, 0), (100, 100)]), 2, seed=1))
+    assert degrees(shown) == {1: 4, 4: 1}
+
+
+def test_the_y_of_a_loader_has_four_arms():
+    legs = ([(20, 50), (80, 50)], [(80, 50), (50, 50), (50, 20)], [(50, 20), (50, 80)])
+    shown = roads(*(passes(along(leg), seed=i) for i, leg in enumerate(legs)))
+    assert degrees(shown) == {1: 4, 4: 1}
+
+
+def test_a_fork_hangs_together():
+    line = [(20, 50), (100, 50)]
+    shown = roads(passes(along([*line, (180, 80)])), passes(along([*line, (180, 20)]), seed=1))
+    assert degrees(shown) == {1: 3, 3: 1}
+
+
+@pytest.mark.parametrize("weak", [3, 10])
+@pytest.mark.parametrize("turn", [0.0, 0.2, 0.4])
+def test_lanes_six_metres_apart_stay_apart(weak, turn):
+    c, s = np.cos(turn), np.sin(turn)
+    there, back = (along(line) @ np.array([(c, s), (-s, c)]) for line in ([(20, 50), (180, 50)], [(180, 56), (20, 56)]))
+    shown = roads(passes(there, 40), passes(back, weak, seed=1))
+    assert degrees(shown) == {1: 4}
+    assert off_m(np.concatenate([there, back]), shown) < 2.0
+    assert beyond_m(np.concatenate([there, back]), shown) < END_M
+    assert len(set(shown.ids)) == len(shown.ids)
+
+
+def test_names_do_not_depend_on_order_or_batches():
+    rows = passes(along([(20, 20), (220, 20), (220, 120), (20, 120), (20, 20)]), 4)
+    shuffled = rows[np.random.default_rng(3).permutation(len(rows))]
+    grid = Grid(1.0, FoldConfig())
+    for first in range(0, len(shuffled), 777):
+        grid.fold(shuffled[first : first + 777], "truck-0")
+    assert same(roads_of(grid), roads(rows))
+
+
+def test_names_do_not_depend_on_what_was_made_before():
+    """Tile by tile, as evidence comes: what was kept of an earlier map shows nowhere."""
+    skeletons, grid = Skeletons(1.0), Grid(1.0, FoldConfig())
+    parts = [
+        passes(along(line), seed=i)
+        for i, line in enumerate(
+            ([(-150, -20), (250, 130)], [(60, -200), (40, 300)], [(-100, 200), (300, 190)], [(300, 190), (310, -150)])
+        )
+    ]
+    for i, part in enumerate(parts):
+        grid.fold(part, f"truck-{i}")
+        roads_of(grid, skeletons)
+    assert same(roads_of(grid, skeletons), roads(*parts))
+
+
+def test_a_tile_is_made_again_only_where_something_changed():
+    skeletons, grid = Skeletons(1.0), grid_of(passes(along([(10, 10), (1990, 10)]), 1))
+    roads_of(grid, skeletons)
+    made = skeletons.made
+    assert made >= 15
+    roads_of(grid, skeletons)
+    assert skeletons.made == made
+    grid.fold(passes(along([(1900, 10), (1990, 10)]), 1), "truck-1")
+    roads_of(grid, skeletons)
+    assert made < skeletons.made <= made + 3
+
+
+def test_a_road_elsewhere_renames_nothing():
+    here = passes(along([(20, 20), (220, 60)]))
+    alone, both = roads(here), roads(here, passes(along([(1000, 1000), (1200, 1100)])))
+    assert set(alone.ids) < set(both.ids)
+    for i, name in enumerate(alone.ids):
+        assert both.line(both.ids.index(name)).tobytes() == alone.line(i).tobytes()
+
+
+def test_halves_of_the_samples_have_the_same_names():
+    line = along([(20, 30), (420, 40), (430, 240), (30, 260), (20, 30)])
+    one, other = (roads(passes(line, 6, seed=seed)) for seed in (1, 2))
+    kept = sum(length for name, length in zip(one.ids, one.length_m, strict=True) if name in other.ids)
+    assert kept / one.length_m.sum() > 0.97
+
+
+def test_small_cells_show_the_same_roads():
+    rows = passes(along([(20, 20), (180, 60)]))
+    grid = Grid(0.5, FoldConfig())
+    grid.fold(rows, "truck-0")
+    blocks = grid.blocks_in(EVERYWHERE)
+    pages = dict(zip(blocks, grid.pages(blocks), strict=True))
+    assert Skeletons(0.5).skeleton(pages).raster_m == 1.0
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 8])
+def test_a_yard_driven_all_over_gives_roads_that_are_whole(monkeypatch, rounds):
+    """However early pruning ends: lines are of cells that are there."""
+    monkeypatch.setattr("mapserver.roads.network.ROUNDS", rounds)
+    draw = np.random.default_rng(9)
+    shown = roads(*(passes(along(draw.uniform(0, 80, (12, 2))), 1, seed=seed) for seed in range(4)))
+    assert np.isfinite(shown.points).all()
+    assert ((shown.points > -10) & (shown.points < 90)).all()
+    assert (shown.length_m > 0).all()
+    assert len(set(shown.ids)) == len(shown.ids)
+    steps = [np.hypot(*np.diff(shown.line(i), axis=0).T).max() for i in range(len(shown.ids))]
+    assert max(steps) < 8.0
