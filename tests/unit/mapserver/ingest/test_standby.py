@@ -14,7 +14,6 @@ from mapserver.evidence.grid import Grid
 from mapserver.ingest import standby as module
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
-from mapserver.journal.history import history_rows
 from mapserver.journal.journal import JournalQueries
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.postgres import reader as postgres_reader
@@ -51,16 +50,10 @@ def send(store: Store, first: int, last: int, machine: str = "a") -> None:
 def is_fold(standby: Standby, journal: JournalQueries, without: frozenset[str] = frozenset()) -> bool:
     """Whether the grid is what its rows make."""
     grid = Grid(SITE.cell_m, CONFIG.fold)
-    for row in history_rows(standby_history(journal), until=standby.row):
+    for row in journal.read(until=standby.row):
         if row.machine not in without:
             grid.fold(row.rows, row.machine)
     return same(standby._grid, grid)
-
-
-def standby_history(journal: JournalQueries) -> Any:
-    from mapserver.journal.history import History
-
-    return History(journal, JournalLocation(Path("/nowhere")).archive)
 
 
 def fails_after(reads: int, standby: Standby) -> None:
