@@ -36,10 +36,11 @@ class Command(NamedTuple):
                     continue
                 value = given.get(option.dest)
                 is_needed = option.required or option in chosen or not option.option_strings
+                values = [] if value is None else [value]
                 if value is None and is_needed and option.nargs != "?":
-                    value = _anything(option)
-                if value is not None:
-                    line += [*option.option_strings[-1:], value]
+                    values = _anything(option)
+                if values:
+                    line += [*option.option_strings[-1:], *values]
         return line
 
 
@@ -60,10 +61,12 @@ def _commands(parser: ArgumentParser, words: tuple[str, ...] = (), above: Parser
     ]
 
 
-def _anything(option: Action) -> str:
+def _anything(option: Action) -> list[str]:
+    if option.type is float and option.nargs == "+":
+        return ["1", "2", "3", "4"]  # two places
     if option.type is float:
-        return "2" if option.dest in ("east_m", "north_m") else "1"
-    return str(next(iter(option.choices))) if option.choices else "nothing-of-the-sort"
+        return ["2" if option.dest in ("east_m", "north_m", "to_x_m") else "1"]
+    return [str(next(iter(option.choices))) if option.choices else "nothing-of-the-sort"]
 
 
 COMMANDS = _commands(build_parser())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -122,7 +123,8 @@ class Answers:
         """State of the map, with the names of its layers."""
         names = {"layers": [*cell_layers.LAYERS, *AREA_LAYERS], "boundaries": list(self._config.read.boundaries)}
         info = self._source.info()
-        counters = {**info["counters"], LAYERS_KEPT: self._layers.used, LAYERS_DERIVED: self._layers.derived}
+        layers = Counter({LAYERS_KEPT: self._layers.used, LAYERS_DERIVED: self._layers.derived})
+        counters = {**info["counters"], **+layers}
         return {**info, "counters": counters, "checkpoints": self._source.past.checkpoints.state, **names}
 
     def point(self, query: PointQuery) -> PointAnswer:

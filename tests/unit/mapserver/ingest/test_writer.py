@@ -554,7 +554,7 @@ def test_a_refused_batch_is_counted_by_its_reason(start, reason, payload):
 
 
 QUERIES = [
-    (Refusal.UNKNOWN_QUERY, "route", {}),
+    (Refusal.UNKNOWN_QUERY, "weather", {}),
     (Refusal.UNKNOWN_QUERY, "*", {}),
     (Refusal.UNKNOWN_PARAMETER, "point", {"x": "1", "y": "1", "z": "1"}),
     (Refusal.UNKNOWN_LAYER, "point", {"x": "1", "y": "1", "layers": "grade,colour"}),
