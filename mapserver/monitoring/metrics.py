@@ -128,7 +128,9 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _counter("sitegrid_batches_refused_total", "Batches that were refused.", batches, "reason"),
         _counter("sitegrid_queries_refused_total", "Map queries that were refused.", queries, "reason"),
         _counter("sitegrid_queries_answered_total", "Map queries that were answered.", answered),
-        _counter("sitegrid_layers_total", "Blocks whose layers a query needed.", _layers(counters), "source"),
+        _counter(
+            "sitegrid_layers_total", "Blocks and squares whose layers a query needed.", _layers(counters), "source"
+        ),
         _counter("sitegrid_samples_trimmed_total", "Samples that came in once more, and do not count.", trimmed),
         _gauge("sitegrid_journal_rows", "The last row of the journal on disk.", info["journalled"]),
         _gauge("sitegrid_merged_rows", "The last row of the journal that is in the map.", info["merged"]),

@@ -42,7 +42,7 @@ from protocol.queries.routing import encode_answer
 from protocol.site.geometry import Bounds, CellWindow
 
 SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
-# Counters of `info`: blocks whose layers were kept from an earlier query, and that were derived for one.
+# Counters of `info`: blocks and squares whose layers were kept from an earlier query, and were derived for one.
 LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 

@@ -82,7 +82,7 @@ class BlockLayers:
         self._areas: OrderedDict[Block, Kept] = OrderedDict()
         self._count = 0  # layers of blocks in both
         self._grid: ReferenceType[Grid] | None = None
-        self.used, self.derived = 0, 0  # blocks whose layers were kept, and that had to be derived
+        self.used, self.derived = 0, 0  # blocks and squares whose layers were kept, and had to be derived
 
     def look(self, state: MapState, window: CellWindow, names: Sequence[str]) -> Look:
         """What these layers of a window are read from."""
@@ -160,6 +160,7 @@ class BlockLayers:
         cells = self._cells_of(look, blocks, cell_layers.required(names))
         made = {square: Kept(wanted[square], self._derive(square, cells, names)) for square in sorted(stale)}
         self._keep(self._areas, look, made)
+        self._note(len(areas), len(made))
         return {square: kept.layers for square, kept in (areas | made).items()}
 
     def _margin(self, names: Sequence[str]) -> int:
@@ -183,9 +184,8 @@ class BlockLayers:
                 old = look.cells.get(block)
                 before = old.layers if old and old.turn == blocks[block] else {}
                 made[block] = Kept(blocks[block], {**before, **{name: layer[i] for name, layer in values.items()}})
-        with self._lock:
-            self.used, self.derived = self.used + len(cells), self.derived + len(made)
         self._keep(self._cells, look, made)
+        self._note(len(cells), len(made))
         return cells | made
 
     def _around(self, squares: Iterable[Block], names: Sequence[str]) -> set[Block]:
@@ -207,6 +207,10 @@ class BlockLayers:
         made = cell_layers.derive_area(names, needs, self._cell_m, self._config.read)
         inside = slice(reach, reach + edge)
         return {name: np.ascontiguousarray(layer[inside, inside]) for name, layer in made.items()}
+
+    def _note(self, used: int, derived: int) -> None:
+        with self._lock:
+            self.used, self.derived = self.used + used, self.derived + derived
 
     def _keep(self, store: OrderedDict[Block, Kept], look: Look, made: Mapping[Block, Kept]) -> None:
         """Keep what was derived, unless the map is another one by now; forget what was not used for longest."""

@@ -33,7 +33,7 @@ from tests.unit.mapserver.data import random_samples
 
 pytestmark = pytest.mark.processes
 
-WHOLE = "bounds=-80,-80,80,80;layers=resistance,grade_east,visits,age_s"
+WHOLE = "bounds=-80,-80,80,80;layers=resistance,grade_east,visits,age_s,resistance_filled,grade_filled_std"
 QUIET = "[store]\narchive_after_h = 0.0\n[trust]\nexclude = false\n[calibration]\nautomatic = false\n"
 
 
@@ -107,8 +107,9 @@ def region(sender: Sender, run: Followed, follower: str, row: int) -> bytes:
 
 
 def roads(sender: Sender, run: Followed, follower: str, query: str) -> bytes:
-    key = keys.follower_query(run.site, follower, query) if follower else keys.map_query(run.site, query)
-    return sender.ask(key, "").payload.to_bytes()
+    name, _, parameters = query.partition("?")
+    key = keys.follower_query(run.site, follower, name) if follower else keys.map_query(run.site, name)
+    return sender.ask(key, parameters).payload.to_bytes()
 
 
 def tiles(sender: Sender, run: Followed, follower: str) -> dict[tuple[int, int], tuple[int, bytes]]:
@@ -142,7 +143,12 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
                 )
             maps = [region(sender, run, name, row) for name in ("", "near", "far")]
             assert maps[0] == maps[1] == maps[2], pids  # all of the answer, to the byte
-            for query in ("segments", "worklist"):  # of a server that followed, and of processes that read it all
+            lines = ("route?line=-40,-40,0,10,40,40", "way?from=-40,-40;to=40,30;max_grade=1")
+            for query in (
+                "segments",
+                "worklist",
+                *lines,
+            ):  # of a server that followed, and of processes that read it all
                 answers = [roads(sender, run, name, query) for name in ("", "near", "far")]
                 assert answers[0] == answers[1] == answers[2], (query, pids)
             drawn = [tiles(sender, run, name) for name in ("", "near", "far")]
