@@ -42,6 +42,7 @@ from protocol.queries.routing import encode_answer
 from protocol.site.geometry import Bounds, CellWindow
 
 SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
+WAY_BYTES = 2**23  # as much of the budget as a search for a way takes: four may wait or be in work
 # Counters of `info`: blocks and squares whose layers were kept from an earlier query, and were derived for one.
 LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
@@ -66,7 +67,9 @@ class Answers:
 
     def size(self, query: MapQuery) -> int:
         """About how many bytes the answer has."""
-        if isinstance(query, requests.PieceQuery | TilesQuery):
+        if isinstance(query, WayQuery):
+            return WAY_BYTES
+        if isinstance(query, requests.PieceQuery | TilesQuery | RouteQuery):
             return PIECE_BYTES
         if not isinstance(query, RegionQuery):
             return SMALL_BYTES
