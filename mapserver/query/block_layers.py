@@ -10,7 +10,6 @@ It is one module because what is looked up on the map's thread and what is deriv
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -29,7 +28,7 @@ from mapserver.evidence.timeline import Block, evidence
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.source import MapState
-from mapserver.query.views import View
+from mapserver.query.views import View, place
 from protocol.arrays import AnyArray, Floats, Floats32
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -147,7 +146,7 @@ class BlockLayers:
                     place_square(layer, window, square, kept[name])
             else:
                 for block, of_cells in cells.items():
-                    _place(layer, window, block, _at(of_cells.layers, name, look.stamp_ns))
+                    place(layer, window, block, _at(of_cells.layers, name, look.stamp_ns))
         return out
 
     def squares(self, look: Look, squares: Set[Block], names: Sequence[str]) -> dict[Block, Layers]:
@@ -203,7 +202,7 @@ class BlockLayers:
         for near in self._around([square], names):
             if kept := cells.get(near):
                 for name, layer in needs.items():
-                    _place(layer, wide, near, kept.layers[name])
+                    place(layer, wide, near, kept.layers[name])
         made = cell_layers.derive_area(names, needs, self._cell_m, self._config.read)
         inside = slice(reach, reach + edge)
         return {name: np.ascontiguousarray(layer[inside, inside]) for name, layer in made.items()}
@@ -336,14 +335,4 @@ def _spread(turns: Mapping[Block, int], rect: Rect, reach: int) -> dict[Block, i
 
 def place_square(out: Floats32, window: CellWindow, square: Block, values: AnyArray) -> None:
     """Copy a square's values (64, 64) into a window."""
-    _place(out, window, (square[0] * SQUARE, square[1] * SQUARE), values)
-
-
-def _place(out: Floats32, window: CellWindow, block: Block, values: AnyArray) -> None:
-    """Copy a block's values (256,), or those of a square whose first block it is, into the window."""
-    n = math.isqrt(values.size)
-    column, row = block[0] * BLOCK_CELLS - window.column, block[1] * BLOCK_CELLS - window.row
-    left, top = max(0, -column), max(0, -row)
-    right, bottom = min(n, window.columns - column), min(n, window.rows - row)
-    if left < right and top < bottom:
-        out[row + top : row + bottom, column + left : column + right] = values.reshape(n, n)[top:bottom, left:right]
+    place(out, window, (square[0] * SQUARE, square[1] * SQUARE), values)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from mapserver.layers import cell_layers
 from mapserver.past.cell_history import CellHistory, cell_history
 from mapserver.past.past import Past
 from mapserver.query.source import MapState
-from protocol.arrays import Floats32
+from protocol.arrays import AnyArray, Floats32
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -37,16 +38,6 @@ class View:
     pages: Pages
     version: MapVersion
     stamp_ns: int
-
-    def around(self, window: CellWindow, reach: int) -> View:
-        """Only what a part of the window is read from."""
-        wide = _surroundings(window, reach)
-        (left, right), (bottom, top) = (
-            (first // BLOCK_CELLS, (first + count) // BLOCK_CELLS)
-            for first, count in ((wide.column, wide.columns), (wide.row, wide.rows))
-        )
-        blocks = ((x, y) for x in range(left, right) for y in range(bottom, top))
-        return replace(self, pages={block: self.pages[block] for block in blocks if block in self.pages})
 
 
 @dataclass(frozen=True)
@@ -101,19 +92,24 @@ def read_cells(
     for some in chunks([block for block in view.pages if _touches(block, window)]):
         sums = evidence([view.pages[block] for block in some], [first[block] for block in some])
         for name, values in cell_layers.read(sums, names, config.read, view.stamp_ns).items():
-            _place(out[name], window, some, values)
+            for block, of_block in zip(some, values, strict=True):
+                place(out[name], window, block, of_block)
     return out
+
+
+def place(out: Floats32, window: CellWindow, block: Block, values: AnyArray) -> None:
+    """Copy values of a square of blocks, whose first one this is, into a window; (256,) of one block alone."""
+    n = math.isqrt(values.size)
+    column, row = block[0] * BLOCK_CELLS - window.column, block[1] * BLOCK_CELLS - window.row
+    left, top = max(0, -column), max(0, -row)
+    right, bottom = min(n, window.columns - column), min(n, window.rows - row)
+    if left < right and top < bottom:
+        out[row + top : row + bottom, column + left : column + right] = values.reshape(n, n)[top:bottom, left:right]
 
 
 def widened(window: CellWindow, cells: int) -> CellWindow:
     """A window with so many cells more on each side."""
     return CellWindow(window.column - cells, window.row - cells, window.columns + 2 * cells, window.rows + 2 * cells)
-
-
-def cropped(layer: Floats32, wide: CellWindow, window: CellWindow) -> Floats32:
-    """Cut a window out of a layer (rows, columns) of a wider one."""
-    row, column = window.row - wide.row, window.column - wide.column
-    return layer[row : row + window.rows, column : column + window.columns]
 
 
 def _pages(grid: Grid, window: CellWindow, reach: int) -> Pages:
@@ -133,13 +129,3 @@ def _surroundings(window: CellWindow, reach: int) -> CellWindow:
 def _touches(block: Block, window: CellWindow) -> bool:
     column, row = block[0] * BLOCK_CELLS - window.column, block[1] * BLOCK_CELLS - window.row
     return -BLOCK_CELLS < column < window.columns and -BLOCK_CELLS < row < window.rows
-
-
-def _place(out: Floats32, window: CellWindow, blocks: list[Block], values: Floats32) -> None:
-    """Copy block values (blocks, 256) into the window."""
-    n = BLOCK_CELLS
-    for (x, y), block in zip(blocks, values.reshape(-1, n, n), strict=True):
-        column, row = x * n - window.column, y * n - window.row
-        left, top = max(0, -column), max(0, -row)
-        right, bottom = min(n, window.columns - column), min(n, window.rows - row)
-        out[row + top : row + bottom, column + left : column + right] = block[top:bottom, left:right]
