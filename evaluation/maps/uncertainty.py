@@ -60,7 +60,8 @@ class Believed:
     def calibration_error(self) -> float:
         """Expected calibration error: mean distance between what was said and what was right, over cells."""
         bins = [row for row in self.reliability if row["cells"]]
-        return sum(row["cells"] * abs(row["said"] - row["right"]) for row in bins) / max(1, len(self.right))
+        off = [row["cells"] * abs(row["said"] - row["right"]) for row in bins]
+        return float(sum(off)) / max(1, len(self.right))
 
     @property
     def brier(self) -> float:

@@ -37,6 +37,7 @@ UNKNOWN_RGB = (0.88, 0.88, 0.88)
 BEHIND_RGB, WRONG_RGB = (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)  # of difference maps: what was not plotted, what is wrong
 DARKNESS = 0.5  # of right cells there
 WINDOW_S = 120.0  # of errors over time that outages are marked in
+LAP_S = 180.0  # of tracks: about a lap, since many laps over each other show nothing
 TRUE_COLOUR, BELIEVED_COLOUR = "#D62728", "#1F77B4"  # red and blue, as the paper's tracks
 METHODS = {SERVED.merge: pictures.BLUE, **dict(zip(FORECASTS, (pictures.VERMILION, pictures.ORANGE), strict=True))}
 PANEL_IN = 3.1
@@ -188,13 +189,15 @@ def draw_tracks(alone: Sequence[MapOutcome], runner: Runner) -> Figure:
     figure, panels = _grid(max(map(len, profiles.values())), len(profiles))
     for line, (profile, outcomes) in zip(panels, profiles.items(), strict=True):
         for axes, outcome in zip(line, outcomes, strict=True):
-            _, believed_m, true_m = _places(outcome, runner)
+            time_s, believed_m, true_m = _places(outcome, runner)
+            last = time_s > time_s[-1] - LAP_S
+            believed_m, true_m = believed_m[last], true_m[last]
             axes.plot(*true_m.T, color=TRUE_COLOUR, lw=1.0, label="truth")
             axes.plot(*believed_m.T, color=BELIEVED_COLOUR, lw=0.7, label="believed at once")
             head(axes, f"{_name(outcome)}, {profile}", 8)
             axes.set_aspect("equal")
     handles, _ = panels[0, 0].get_legend_handles_labels()
-    return _finish(figure, panels, handles, f"Tracks of load centres; seed {alone[0].drive.seed}")
+    return _finish(figure, panels, handles, f"Tracks of load centres, the last {LAP_S:g} s; seed {alone[0].drive.seed}")
 
 
 def draw_errors(alone: Sequence[MapOutcome], runner: Runner) -> Figure:
@@ -202,14 +205,15 @@ def draw_errors(alone: Sequence[MapOutcome], runner: Runner) -> Figure:
     profiles = _by_profile(alone)
     groups = next(iter(profiles.values()))
     figure, panels = plt.subplots(len(groups), figsize=(pictures.WIDTH_IN, 2.1 * len(groups) + 0.6), squeeze=False)
-    start_s = max(0.0, alone[0].drive.seconds / 2 - WINDOW_S / 2)
+    seconds = alone[0].drive.seconds
+    start_s = max(0.0, (seconds - WINDOW_S) / 2)
     for i, axes in enumerate(panels[:, 0]):
         for profile, colour in zip(profiles, (pictures.VERMILION, pictures.BLUE), strict=False):
             time_s, believed_m, true_m = _places(profiles[profile][i], runner)
             axes.plot(time_s, np.hypot(*(believed_m - true_m).T), color=colour, lw=1.2, label=profile)
         _mark_outages(axes, groups[i], runner)
         head(axes, _name(groups[i]), 9)
-        axes.set(xlim=(start_s, start_s + WINDOW_S), ylabel="error [m]")
+        axes.set(xlim=(start_s, min(start_s + WINDOW_S, seconds)), ylabel="error [m]")
         axes.set_ylim(bottom=0)
     panels[0, 0].legend(loc="upper right", ncols=4)
     panels[-1, 0].set_xlabel("time [s]")
