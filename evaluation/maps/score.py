@@ -122,7 +122,7 @@ def by_border_distance(estimated: Ints, true: Ints, border_m: Floats) -> list[Ro
 
 def pooled_by_border(seeds: Sequence[Sequence[Row]]) -> list[Row]:
     """Bins of distances (`by_border_distance`) of several seeds in one: all cells, and which of the known are wrong."""
-    return [_pooled([seed[i] for seed in seeds]) for i in range(len(EDGES_M))]
+    return [_pooled(bins) for bins in zip(*seeds, strict=True)]
 
 
 def _pooled(bins: Sequence[Row]) -> Row:

@@ -110,7 +110,7 @@ def write_map(outcomes: Outcomes, runner: Runner, path: Path) -> None:
     """Write the map that the paper plots, by its own method with the sensors that it recommends, of the first seed."""
     theirs = replace(RECOMMENDED, profile="paper")
     outcome = next(each for each in outcomes.maps if each.source.machines == 1 and each.source.configuration == theirs)
-    write_tensor(path, outcome.made.of(PAPERS), scene(outcome.drive, runner.cache).truth)
+    write_tensor(path, outcome.made.layers_of(PAPERS), scene(outcome.drive, runner.cache).truth)
 
 
 def _positions(runner: Runner, plan: Plan) -> dict[Configuration, list[ScoredRun]]:
@@ -185,7 +185,7 @@ def _row(named: Row, figures: Sequence[Row], published: Published | None) -> Row
 def _figures(outcome: MapOutcome, kind: MapKind, runner: Runner) -> Row:
     """Figures of one map of one seed; its errors are of the places where samples were put."""
     true = scene(outcome.drive, runner.cache)
-    region, truth = region_of(true.truth, outcome.made.of(kind)), true_layers(true.truth)
+    region, truth = region_of(true.truth, outcome.made.layers_of(kind)), true_layers(true.truth)
     driven = score_driven(region, truth, [track.place_m for track in true.tracks.values()])
     everywhere = score(region, truth)
     east, north = outcome.made.errors_m(kind)
@@ -204,7 +204,7 @@ def forecast_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list
     believed: dict[str, list[Believed]] = {name: [] for name in (SERVED.merge, *FORECASTS)}
     for outcome in outcomes.all_of(source):
         true, made = _driven(outcome, runner), outcome.made
-        said = {SERVED.merge: layers_forecast(made.of(SERVED)), **{name: made.forecast(name) for name in FORECASTS}}
+        said = {SERVED.merge: layers_forecast(made.layers_of(SERVED)), **{name: made.forecast(name) for name in FORECASTS}}
         for name, forecast in said.items():
             believed[name].append(forecast.judged(true.kind, true.driven))
     return [forecast_row({**_of(source), "method": name}, pooled(parts)) for name, parts in believed.items()]
@@ -215,7 +215,7 @@ def coverage_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list
     errors: dict[str, list[AnyArray]] = {name: [] for name in DEVIATIONS}
     stated: dict[str, list[AnyArray]] = {name: [] for name in DEVIATIONS}
     for outcome in outcomes.all_of(source):
-        true, layers = _driven(outcome, runner), outcome.made.of(SERVED)
+        true, layers = _driven(outcome, runner), outcome.made.layers_of(SERVED)
         for deviation, of_layers in DEVIATIONS.items():
             for name in of_layers:
                 errors[deviation].append((layers[name] - true.layers[name])[true.driven])

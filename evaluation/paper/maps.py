@@ -91,7 +91,7 @@ class MadeMaps:
     rmse_m: Floats
     samples: int
 
-    def of(self, kind: MapKind) -> dict[str, Floats32]:
+    def layers_of(self, kind: MapKind) -> dict[str, Floats32]:
         """The layers of one map."""
         return dict(zip(LAYERS, self.layers[KINDS.index(kind)], strict=True))
 

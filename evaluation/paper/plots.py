@@ -137,7 +137,7 @@ def draw_maps(maps: Sequence[Titled], _: Runner) -> Figure:
     """The maps as they were plotted: resistance above, grade below."""
     figure, panels = _grid(len(maps), 2)
     for column, (title, outcome, kind) in zip(panels.T, maps, strict=True):
-        for axes, classes, palette in zip(column, _classes(outcome.made.of(kind)), (ZONE_RGB, GRADE_RGB), strict=True):
+        for axes, classes, palette in zip(column, _classes(outcome.made.layers_of(kind)), (ZONE_RGB, GRADE_RGB), strict=True):
             _image(axes, _rgb(classes, palette))
         head(column[0], title, 8)
     return _finish(figure, panels, _key(Patch(color=UNKNOWN_RGB, label="not known")), _seed("Plotted maps", maps))
@@ -149,7 +149,7 @@ def draw_differences(maps: Sequence[Titled], runner: Runner) -> Figure:
     for column, (title, outcome, kind) in zip(panels.T, maps, strict=True):
         true = _classes(true_layers(scene(outcome.drive, runner.cache).truth))
         names, palettes = ("J_r", "J_s"), (ZONE_RGB, GRADE_RGB)
-        parts = zip(column, _classes(outcome.made.of(kind)), true, palettes, names, strict=True)
+        parts = zip(column, _classes(outcome.made.layers_of(kind)), true, palettes, names, strict=True)
         for axes, classes, true_classes, palette, name in parts:
             rgb = _rgb(classes, DARKNESS * palette + (1 - DARKNESS) / 2, BEHIND_RGB)
             rgb[(classes != UNKNOWN) & (classes != true_classes)] = WRONG_RGB

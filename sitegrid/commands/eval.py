@@ -1,4 +1,7 @@
-"""`sitegrid eval`: the experiments behind the project's figures."""
+"""`sitegrid eval`: the experiments behind the project's figures.
+
+It is one module because experiments share options, and each of them adds only a few lines.
+"""
 
 from __future__ import annotations
 

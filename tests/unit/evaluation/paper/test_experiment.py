@@ -148,7 +148,7 @@ def test_options_reach_the_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     for more in (["--seeds", "2", "--first-seed", "1000", "--seconds", "300"], [], ["--quick"]):
         assert cli.main([*words, *more]) == 0
     assert asked == [Plan(range(1000, 1002), 300.0), Plan(range(12), 1200.0), QUICK]
-    assert cli.main([*words, "--quick", "--seeds", "3"]) == 1
+    assert cli.main(["eval", "paper", "--quick", "--seeds", "3"]) == 1
     error = capsys.readouterr().err
     assert error == "sitegrid: --quick: has a drive of its own: leave out --seeds, --first-seed and --seconds\n"
 

@@ -47,7 +47,7 @@ def made(scene) -> MadeMaps:
 
 
 def wrong(made: MadeMaps, kind: MapKind, true: Scene) -> float:
-    return score(region_of(true.truth, made.of(kind)), true_layers(true.truth)).wrong_resistance_pct
+    return score(region_of(true.truth, made.layers_of(kind)), true_layers(true.truth)).wrong_resistance_pct
 
 
 def test_true_values_are_those_of_the_true_place_wherever_a_sample_is_put(scene):
@@ -89,7 +89,7 @@ def test_every_map_has_its_layers_and_every_method_its_forecast(made: MadeMaps, 
     assert made.samples == sum(map(len, rows.values()))
     assert made.layers.shape == (len(KINDS), len(LAYERS), *true.truth.c_rr.shape)
     for kind in KINDS:
-        known = {name for name, values in made.of(kind).items() if np.isfinite(values).any()}
+        known = {name for name, values in made.layers_of(kind).items() if np.isfinite(values).any()}
         assert known == (set(LAYERS) if kind.merge == "soft_votes" else {"resistance", "grade_east", "grade_north"})
     for method in ("last_write", "mean"):
         forecast = made.forecast(method)
