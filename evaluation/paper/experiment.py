@@ -204,7 +204,10 @@ def forecast_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list
     believed: dict[str, list[Believed]] = {name: [] for name in (SERVED.merge, *FORECASTS)}
     for outcome in outcomes.all_of(source):
         true, made = _driven(outcome, runner), outcome.made
-        said = {SERVED.merge: layers_forecast(made.layers_of(SERVED)), **{name: made.forecast(name) for name in FORECASTS}}
+        said = {
+            SERVED.merge: layers_forecast(made.layers_of(SERVED)),
+            **{name: made.forecast(name) for name in FORECASTS},
+        }
         for name, forecast in said.items():
             believed[name].append(forecast.judged(true.kind, true.driven))
     return [forecast_row({**_of(source), "method": name}, pooled(parts)) for name, parts in believed.items()]

@@ -137,7 +137,9 @@ def draw_maps(maps: Sequence[Titled], _: Runner) -> Figure:
     """The maps as they were plotted: resistance above, grade below."""
     figure, panels = _grid(len(maps), 2)
     for column, (title, outcome, kind) in zip(panels.T, maps, strict=True):
-        for axes, classes, palette in zip(column, _classes(outcome.made.layers_of(kind)), (ZONE_RGB, GRADE_RGB), strict=True):
+        for axes, classes, palette in zip(
+            column, _classes(outcome.made.layers_of(kind)), (ZONE_RGB, GRADE_RGB), strict=True
+        ):
             _image(axes, _rgb(classes, palette))
         head(column[0], title, 8)
     return _finish(figure, panels, _key(Patch(color=UNKNOWN_RGB, label="not known")), _seed("Plotted maps", maps))
