@@ -7,7 +7,8 @@ import pytest
 
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.roads.segments import LATTICE_M, SLIVER_M, Segments
+from mapserver.roads.cutting import LATTICE_M, SLIVER_M
+from mapserver.roads.segments import Segments
 from mapserver.roads.skeleton import Skeletons
 from protocol.arrays import Floats
 from tests.unit.mapserver.roads.drives import EVERYWHERE, along, grid_of, passes, ring, roads, roads_of
