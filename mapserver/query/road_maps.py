@@ -69,9 +69,14 @@ class RoadMap:
         out = np.zeros(len(self.segments.ids), np.int64)
         known, first = np.unique(rows["segment"], return_index=True)  # by segment, then slot
         out[known] = rows["slot"][first] * HOUR_NS
-        for change in reversed(self.changes):  # the newest last
-            out[change.segment] = change.first_ns
+        for segment, change in self.last_changes.items():
+            out[segment] = change.first_ns
         return out
+
+    @cached_property
+    def last_changes(self) -> dict[int, Repair]:
+        """The last change of each segment that changed."""
+        return {change.segment: change for change in reversed(self.changes)}
 
 
 class Traffic:

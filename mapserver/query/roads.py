@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
 from mapserver.query.road_maps import RoadMap
 from mapserver.roads.ledger import Ledger
 from mapserver.roads.loss import Losses, losses
+from mapserver.roads.repairs import Repair
 from mapserver.roads.segments import Segments
 from mapserver.roads.tally import HOUR_NS
 from mapserver.roads.trend import DAY_NS, Daily, daily, trends
@@ -30,7 +31,7 @@ Read = Callable[[int | None, str], RoadMap]  # as of a time, with the traffic of
 def segments(read: Read, query: SegmentsQuery, extent_m: float) -> answers.Segments:
     """Roads, and what drove on them."""
     roads, traffic, hours = _read(read, query, extent_m)
-    rows = _Records(roads.segments, traffic, losses(traffic, roads.segments, 0.0), hours)
+    rows = _Records(roads, traffic, _lost(roads, traffic, 0.0), hours)
     chosen = _inside(roads.segments, query.bounds)
     if len(chosen) > MOST_SEGMENTS:
         problem = f"{len(chosen)} segments; at most {MOST_SEGMENTS} are answered: ask for less with `bounds`"
@@ -41,44 +42,20 @@ def segments(read: Read, query: SegmentsQuery, extent_m: float) -> answers.Segme
 def worklist(read: Read, query: WorklistQuery, extent_m: float) -> answers.Worklist:
     """Where work pays."""
     roads, traffic, hours = _read(read, query, extent_m)
-    before, after = _levels(roads)
-    lost = losses(traffic, roads.segments, query.target, after)
-    saved_j = losses(traffic, roads.segments, query.target, before).work_j - lost.work_j
-    rows, listed = _Records(roads.segments, traffic, lost, hours), ranked(lost)
-    inside, since_ns, days = _inside(roads.segments, query.bounds), roads.since_ns(), daily(traffic)
-    work = np.stack([lost.work_j, lost.low_j, lost.high_j]) / max(hours, 1e-9)
-    saved_kwh_ph = saved_j / max(hours, 1e-9) / KWH
-    kg = lost.kg.mean(axis=1)
-    out: list[answers.WorklistRow] = []
-    for i, rank in zip(listed.order.tolist(), listed.rank.tolist(), strict=True):
-        if i in inside and len(out) < query.limit:
-            of_it = (work[:, i] / KWH, litres(work[:, i], query.efficiency), seconds(work[:, i], kg[i]))
-            changed = math.isfinite(before[i])
-            out.append(
-                answers.WorklistRow(
-                    rank,
-                    rows(i),
-                    *(tuple(values.tolist()) for values in of_it),
-                    since_ns=int(since_ns[i]),
-                    before=_known(before[i]),
-                    saved_kwh_ph=float(saved_kwh_ph[i]) if changed else None,
-                    **_days(days, i),
-                )
-            )
-    changes = tuple(
-        answers.RoadChange(
-            roads.segments.ids[change.segment],
-            rows(change.segment).line,
-            change.first_ns,
-            change.seen_ns,
-            change.before,
-            change.after,
-            float(saved_kwh_ph[change.segment]),
-        )
-        for change in [change for change in roads.changes if change.segment in inside][:MOST_CHANGES]
+    lost, saved_j = _lost(roads, traffic, query.target), _saved_j(roads, traffic, query.target)
+    saved_kwh_ph = {change: joules / max(hours, 1e-9) / KWH for change, joules in saved_j.items()}
+    rows = _Rows(_Records(roads, traffic, lost, hours), roads, daily(traffic), saved_kwh_ph, query.efficiency)
+    listed, inside = ranked(lost), _inside(roads.segments, query.bounds)
+    ranks = [(i, rank) for i, rank in zip(listed.order.tolist(), listed.rank.tolist(), strict=True) if i in inside]
+    changes = [change for change in roads.changes if change.segment in inside]
+    return answers.Worklist(
+        *_version(roads),
+        hours,
+        query.target,
+        float(lost.work_j[sorted(inside)].sum() / max(hours, 1e-9) / KWH),
+        tuple(rows.row(i, rank) for i, rank in ranks[: query.limit]),
+        tuple(map(rows.change, changes[:MOST_CHANGES])),
     )
-    total = float(work[0, sorted(inside)].sum() / KWH)
-    return answers.Worklist(*_version(roads), hours, query.target, total, tuple(out), changes)
 
 
 def _read(read: Read, query: RoadQuery, extent_m: float) -> tuple[RoadMap, Ledger, float]:
@@ -102,10 +79,30 @@ def _require_on_site(bounds: Bounds | None, extent_m: float) -> None:
         raise QueryError(Refusal.OUT_OF_RANGE, problem)
 
 
-def _levels(roads: RoadMap) -> tuple[Floats, Floats]:
-    """c_rr of segments (k,) before and after their last change, NaN where there was none."""
-    before, after = np.full((2, len(roads.segments.ids)), np.nan)
-    for change in reversed(roads.changes):  # the newest last
+def _lost(roads: RoadMap, traffic: Ledger, target: float) -> Losses:
+    """What is lost with this traffic, on ground as it is since its last change."""
+    _, after = _levels(roads.segments, roads.last_changes.values())
+    return losses(traffic, roads.segments, target, after)
+
+
+def _saved_j(roads: RoadMap, traffic: Ledger, target: float) -> dict[Repair, float]:
+    """Work that each change saves of the same traffic [J]: one change of each segment at a time."""
+    out: dict[Repair, float] = {}
+    left = list(roads.changes)
+    while left:
+        some = {change.segment: change for change in left}
+        before, after = (
+            losses(traffic, roads.segments, target, level).work_j for level in _levels(roads.segments, some.values())
+        )
+        out |= {change: float(before[segment] - after[segment]) for segment, change in some.items()}
+        left = [change for change in left if change not in out]
+    return out
+
+
+def _levels(roads: Segments, changes: Iterable[Repair]) -> tuple[Floats, Floats]:
+    """c_rr of segments (k,) before and after these changes, NaN where there is none."""
+    before, after = np.full((2, len(roads.ids)), np.nan)
+    for change in changes:
         before[change.segment], after[change.segment] = change.before, change.after
     return before, after
 
@@ -120,29 +117,20 @@ def _inside(roads: Segments, bounds: Bounds | None) -> set[int]:
     return set(np.flatnonzero(within).tolist())
 
 
-def _days(days: Daily, segment: int) -> dict[str, tuple[float, ...]]:
-    """Days of one segment as fields of a row."""
-    own = slice(*np.searchsorted(days.segment, [segment, segment + 1]))
-    day_ns = (days.day[own] * DAY_NS).tolist()
-    return {"day_ns": tuple(day_ns), "day_resistance": tuple(days.c_rr[own].tolist())}
-
-
 class _Records:
-    """Records of segments, by number."""
+    """Records of segments, by number. lost: on them, in so many hours."""
 
-    def __init__(self, roads: Segments, traffic: Ledger, lost: Losses, hours: float) -> None:
-        self._segments, self._lost, self._hours = roads, lost, max(hours, 1e-9)
+    def __init__(self, roads: RoadMap, traffic: Ledger, lost: Losses, hours: float) -> None:
+        self._segments, self.lost, self.hours = roads.segments, lost, max(hours, 1e-9)
         self._trends = trends(traffic)
         machines = traffic.totals()["machines"]
         self._machines: Ints = np.bitwise_count(machines[:, 0] | machines[:, 1]).astype(np.int64)
 
     def __call__(self, i: int) -> answers.RoadSegment:
-        lost, line = self._lost, self._segments.line(i)
-        passes = lost.passes[i] / self._hours
-        some = np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2)
+        lost, passes = self.lost, self.lost.passes[i] / self.hours
         return answers.RoadSegment(
             id=self._segments.ids[i],
-            line=tuple(tuple(point) for point in some.tolist()),
+            line=self.line(i),
             length_m=float(self._segments.length_m[i]),
             resistance=_known(lost.c_rr[i]),
             resistance_std=_known(lost.c_std[i]),
@@ -154,6 +142,53 @@ class _Records:
             guessed=bool(lost.guessed[i]),
             machines=int(self._machines[i]),
         )
+
+    def line(self, i: int) -> answers.Line:
+        """Some points of a segment's line."""
+        line = self._segments.line(i)
+        some = np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2)
+        return tuple(tuple(point) for point in some.tolist())
+
+
+class _Rows:
+    """Rows of a worklist, and changes, by number of their segment. saved_kwh_ph: by each change."""
+
+    def __init__(
+        self,
+        records: _Records,
+        roads: RoadMap,
+        days: Daily,
+        saved_kwh_ph: Mapping[Repair, float],
+        efficiency: float,
+    ) -> None:
+        self._records, self._ids, self._days = records, roads.segments.ids, days
+        self._saved_kwh_ph, self._efficiency = saved_kwh_ph, efficiency
+        self._last, self._since_ns = roads.last_changes, roads.since_ns()
+        lost = records.lost
+        self._work = np.stack([lost.work_j, lost.low_j, lost.high_j]) / records.hours
+        self._kg = lost.kg.mean(axis=1)
+
+    def row(self, i: int, rank: int) -> answers.WorklistRow:
+        """A row of this rank."""
+        work, change = self._work[:, i], self._last.get(i)
+        of_it = (work / KWH, litres(work, self._efficiency), seconds(work, self._kg[i]))
+        days = slice(*np.searchsorted(self._days.segment, [i, i + 1]).tolist())
+        return answers.WorklistRow(
+            rank,
+            self._records(i),
+            *(tuple(values.tolist()) for values in of_it),
+            since_ns=int(self._since_ns[i]),
+            before=change.before if change else None,
+            saved_kwh_ph=self._saved_kwh_ph[change] if change else None,
+            day_ns=tuple((self._days.day[days] * DAY_NS).tolist()),
+            day_resistance=tuple(self._days.c_rr[days].tolist()),
+        )
+
+    def change(self, change: Repair) -> answers.RoadChange:
+        """A change of the ground."""
+        times, levels = (change.first_ns, change.seen_ns), (change.before, change.after)
+        line = self._records.line(change.segment)
+        return answers.RoadChange(self._ids[change.segment], line, *times, *levels, self._saved_kwh_ph[change])
 
 
 def _known(value: float) -> float | None:
