@@ -83,6 +83,8 @@ def _smooth(points: Any, closed: bool, out: Any) -> None:  # noqa: FBT001
             out[i, axis] = total / (2 * k + 1) if k > 0 else points[i, axis]
     if closed:
         out[last] = out[0]
+    else:  # to the last bit, since others end there too
+        out[0], out[last] = points[0], points[last]
 
 
 @numba.njit(cache=True, nogil=True)

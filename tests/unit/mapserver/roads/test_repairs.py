@@ -128,12 +128,12 @@ def test_nothing_driven_is_nothing_repaired():
 
 
 def test_ground_that_wears_is_compared_with_the_newest_passes():
-    """A rise of 2 % from pass to pass is none, and a repair of what it has come to is one."""
-    worn = [0.02 * 1.02**i for i in range(2 * KNOWN_BY)]
-    repaired, looks = shown(fleet([*worn, 0.02, 0.02], noise=0.0))
+    """Half a percent more from pass to pass is no change; over all passes it would hide the repair in the end."""
+    worn = [0.02 * 1.005**i for i in range(2 * KNOWN_BY)]
+    repaired, looks = shown(fleet([*worn, 0.014, 0.014], noise=0.0))
     assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
     assert all(each.minute > START_NS // MINUTE_NS + 150 * len(worn) // 60 - 3 for each in repaired)
-    assert looks == 5 * (len(worn) + 2 - BEFORE - AGREE + 1) - 5 * (AGREE - 1)
+    assert looks == 5 * (len(worn) + 2 - BEFORE - AGREE + 1)
 
 
 def cells_of(blocks):
@@ -156,8 +156,8 @@ def test_a_change_begins_an_age_of_the_cells_of_its_segment_alone(cell_m):
     middles = (places + 0.5) * cell_m
     assert set(begins.tolist()) == {10 * MINUTE_NS}
     assert np.abs(middles[:, 1] - line[:, 1].mean()).max() <= 3.5
-    assert middles[:, 0].min() == pytest.approx(line[:, 0].min(), abs=cell_m)
-    assert middles[:, 0].max() == pytest.approx(line[:, 0].max(), abs=cell_m)
+    assert middles[:, 0].min() == pytest.approx(line[:, 0].min(), abs=1.0)
+    assert middles[:, 0].max() == pytest.approx(line[:, 0].max(), abs=1.0)
     assert len(places) * cell_m**2 == pytest.approx(25 * 6, rel=0.25)
 
 
