@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,7 @@ from protocol.wire.messages import SampleBatch
 GOALS_MS = {"minute": 50.0, "worklist": 300.0}
 ROADS, LENGTH_M, APART_M, STEP_M = 20, 1000.0, 50.0, 0.5  # as many along either axis: 40 km, 400 crossings
 TRUCKS, MINUTE_M = 10, 480.0  # at 8 m/s
+PASSES = 3  # of each road, an hour
 TARGET, END_NS = 0.02, START_NS + 1000 * HOUR_NS
 SITE = CellWindow(-100, -100, 1300, 1300)
 INGEST_SITE, WINDOW_S, MOST_LOST_PCT = SiteConfig("bench", 48.0, 11.0), 10.0, 5.0
@@ -55,8 +57,8 @@ def run(hours: float, runs: int, seconds: float) -> Report:
     """
     grid, traffic = Grid(1.0, FoldConfig()), Traffic()
     for hour in range(round(hours)):
-        for road in range(2 * ROADS):
-            rows, name = _pass(road, hour), f"truck-{road % TRUCKS}"
+        for road, turn in product(range(2 * ROADS), range(PASSES)):
+            rows, name = _pass(road, hour, turn), f"truck-{(road + turn) % TRUCKS}"
             if hour < 2:
                 grid.fold(rows, name)
             traffic.add(rows, np.full(len(rows), name_hash(name), np.uint64))
@@ -71,7 +73,7 @@ def run(hours: float, runs: int, seconds: float) -> Report:
         pages = _pages(grid)  # folded before it is timed: that is the fold's work
         return _timed(lambda: segments(network(skeletons.skeleton(pages))))
 
-    variants = {
+    variants: dict[str, Callable[[], float]] = {
         "whole": lambda: _timed(lambda: _roads(Skeletons(1.0), grid)),
         "minute": minute,
         "worklist": lambda: _timed(lambda: _worklist(roads, traffic)),
@@ -82,6 +84,7 @@ def run(hours: float, runs: int, seconds: float) -> Report:
     counts = {
         "km": round(float(roads.length_m.sum()) / 1000, 2),
         "segments": len(roads.ids),
+        "passes_looked_at": repairs(traffic.passes.passes(Ledgers(roads)))[1],
         "tally_rows": len(traffic.tally.table()),
         "tally_mb": round(traffic.tally.table().nbytes / 1e6, 1),
     }
@@ -145,9 +148,9 @@ def _sending(link: zenoh.Session, counts: list[int], ended: threading.Event) -> 
         raise RuntimeError("the machines stopped sending") from problems[0]
 
 
-def _pass(road: int, hour: int) -> Table:
+def _pass(road: int, hour: int, turn: int = 0) -> Table:
     """Samples along one road, two metres from the last pass at most."""
-    draw = np.random.default_rng([road, hour])
+    draw = np.random.default_rng([road, hour, turn])
     along = np.arange(0.0, LENGTH_M, STEP_M)
     beside = np.full(len(along), road % ROADS * APART_M + 25.0 + draw.normal(0.0, 0.4))
     rows = empty(len(along))
@@ -156,7 +159,7 @@ def _pass(road: int, hour: int) -> Table:
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.25
     rows["speed_mps"], rows["distance_m"], rows["mass_kg"] = 8.0, STEP_M, 40_000.0
     rows["c_rr"] = 0.02 + 0.02 * draw.random() + draw.normal(0.0, 0.003, len(along))
-    rows["stamp_ns"] = START_NS + hour * HOUR_NS + np.arange(len(along)) * 62_500_000
+    rows["stamp_ns"] = START_NS + hour * HOUR_NS + turn * HOUR_NS // PASSES + np.arange(len(along)) * 62_500_000
     return rows
 
 

@@ -66,7 +66,7 @@ def expand_votes(table: Any, runs: Any, cells: Any, counts: Any, high: Any, out:
 @numba.njit(cache=True, nogil=True)
 def sum_planes(runs: Any, cells: Any, counts: Any, high: Any, first: int, out: Any) -> None:
     """Add the votes of planes from `first` on to out (planes, 256). runs, cells, counts, high: of CompactPages."""
-    at = 0
+    at = np.int64(0)
     for r in range(len(runs)):
         plane, end = np.int64(runs[r, 0]) - first, at + np.int64(runs[r, 1]) + 1
         if 0 <= plane < len(out):

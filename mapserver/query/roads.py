@@ -171,12 +171,14 @@ class _Rows:
     def row(self, i: int, rank: int) -> answers.WorklistRow:
         """A row of this rank."""
         work, change = self._work[:, i], self._last.get(i)
-        of_it = (work / KWH, litres(work, self._efficiency), seconds(work, self._kg[i]))
+        kwh, of_diesel, of_driving = work / KWH, litres(work, self._efficiency), seconds(work, self._kg[i])
         days = slice(*np.searchsorted(self._days.segment, [i, i + 1]).tolist())
         return answers.WorklistRow(
             rank,
             self._records(i),
-            *(tuple(values.tolist()) for values in of_it),
+            tuple(kwh.tolist()),
+            tuple(of_diesel.tolist()),
+            tuple(of_driving.tolist()),
             since_ns=int(self._since_ns[i]),
             before=change.before if change else None,
             saved_kwh_ph=self._saved_kwh_ph[change] if change else None,

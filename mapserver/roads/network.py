@@ -6,6 +6,7 @@ All rules look at places and metres alone, never at what was there before.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -56,7 +57,7 @@ def network(skeleton: Skeleton) -> Network:
 @numba.njit(cache=True, nogil=True)
 def _superfluous(
     places: AnyArray, metres: AnyArray, cells: AnyArray, ends: AnyArray, degree: AnyArray, raster_m: float
-) -> AnyArray:
+) -> Any:
     """Which cells (n,) are no road; cells, ends, degree: as in Chains."""
     gone = degree == 0
     along = np.empty(len(cells), np.int64)

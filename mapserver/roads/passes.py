@@ -60,8 +60,9 @@ class PassTally:
         (segment, machine, direction, minute), (metres, measured, c) = _joined(keys, sums, ledgers.segments.length_m)
         known = np.flatnonzero(measured >= LEAST_M * PER_M)
         known = known[np.lexsort((machine[known], direction[known], minute[known], segment[known]))]
-        columns = (column[known] for column in (segment, minute, direction, machine))
-        return Passes(*columns, metres[known] / float(PER_M), c[known] / (measured[known] * float(PER_C)))
+        segment, minute, direction, machine = (column[known] for column in (segment, minute, direction, machine))
+        metres_m, c_rr = metres[known] / float(PER_M), c[known] / (measured[known] * float(PER_C))
+        return Passes(segment, minute, direction, machine, metres_m, c_rr)
 
 
 def _joined(keys: Ints, sums: Ints, length_m: Floats) -> tuple[Ints, Ints]:

@@ -73,7 +73,8 @@ class Skeletons:
         changed = [block for block, own in pages.items() if known.get(block) is not own]
         changed += [block for block in known if block not in pages]
         stale = self._near(changed)
-        moved = {near for tile in stale if self._look(tile) for near in product(*((v - 1, v, v + 1) for v in tile))}
+        others = [tile for tile in stale if self._look(tile)]
+        moved = {(x + dx, y + dy) for x, y in others for dx, dy in product((-1, 0, 1), repeat=2)}
         for tile in sorted(moved | (stale & self._lines.keys())):
             self._draw(tile, thin=tile in moved)
         parts = self._lines.values()
@@ -124,7 +125,7 @@ class Skeletons:
                 mask[(dy + 1) * TILE : (dy + 2) * TILE, (dx + 1) * TILE : (dx + 2) * TILE] = near
         wide = slice(TILE - EDGE, 2 * TILE + EDGE)
         lines = thinned(mask[wide, wide])[EDGE:-EDGE, EDGE:-EDGE]
-        return np.argwhere(lines) + np.array(tile[::-1]) * TILE
+        return np.asarray(np.argwhere(lines) + np.array(tile[::-1]) * TILE, np.int64)
 
     def _axes(self, tile: Tile, margin: int) -> Ints:
         """Metres (rows, columns, AXES) driven along each axis in a tile and so many cells around it."""
