@@ -98,7 +98,8 @@ def add_options(parser: ArgumentParser) -> None:
     paper.add_argument("--tensor", type=OutputFile((".npy",)), metavar="FILE", help=tensor)
     quick = "short drives of its own without PyBullet, and few rows: to see that all works"
     paper.add_argument("--quick", action="store_true", help=quick)
-    merge.add_argument("--cases", default="", help="names, comma-separated; default all")
+    for action in (merge, roads):
+        action.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
 
@@ -257,7 +258,8 @@ def _fleet(arguments: Namespace) -> Report:
 def _roads(arguments: Namespace) -> Report:
     from evaluation.roads import experiment
 
-    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    cases = experiment.select([name for name in arguments.cases.split(",") if name])
+    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds, cases=cases)
     return _experiment(arguments, "machines drive on patches of soil, their samples show roads", work)
 
 
