@@ -12,7 +12,7 @@ import numpy as np
 from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from evaluation.campaign.experiment import Experiment, Task
-from evaluation.campaign.recordings import PlannedDrive, Setup, toml_of
+from evaluation.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, toml_of
 from evaluation.ground.lag import final_samples
 from evaluation.ground.truth import LoadTrack, read_load_track
 from protocol.arrays import Table
@@ -23,7 +23,7 @@ from sim.recorder import TRACKS_FOLDER
 from sim.scenario.file import load_scenario
 from sim.truth import MAP_FILE, TruthMap
 
-SOURCES = ("agents", "protocol", "evaluation/fleet/drives.py", "evaluation/ground/lag.py")
+SOURCES = ("agents", *MACHINES_PROTOCOL, "evaluation/fleet/drives.py", "evaluation/ground/lag.py")
 
 
 @dataclass(frozen=True)

@@ -45,13 +45,14 @@ def add_options(parser: ArgumentParser) -> None:
         what, "fleet", "measure what calibration of machines by each other and by the ground gives the map"
     )
     roads = add_action(what, "roads", "measure roads, traffic, losses and repairs on random patches of soil")
-    for action in (table, blackout, budget, ground, base, merge, lag, fleet, roads):
+    routes = add_action(what, "routes", "compare routes with what machines spent, and ways with a finer search")
+    for action in (table, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
         action.add_argument("--seeds", type=count, default=12, help="number of seeds (default %(default)s)")
     physics.add_argument("--seeds", type=count, default=3, help="number of seeds (default %(default)s)")
-    for action in (physics, table, blackout, budget, ground, base, merge, lag, fleet, roads):
+    for action in (physics, table, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
-    for action in (table, blackout, budget, ground, base, merge, lag, fleet, roads):
+    for action in (table, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
@@ -71,6 +72,7 @@ def add_options(parser: ArgumentParser) -> None:
         (lag, 900.0),
         (fleet, 900.0),
         (roads, 900.0),
+        (routes, 900.0),
     ):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
@@ -82,7 +84,8 @@ def add_options(parser: ArgumentParser) -> None:
     table.add_argument("--shares", type=shares, default=(None,), help=shared)
     judged = "compare the EKF of the profile default with the batch optimum of the same runs, by GTSAM (extra oracle)"
     table.add_argument("--oracle", action="store_true", help=judged)
-    merge.add_argument("--cases", default="", help="names, comma-separated; default all")
+    for action in (merge, routes):
+        action.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
 
@@ -118,6 +121,7 @@ def run(arguments: Namespace) -> int:
         "lag": _lag,
         "fleet": _fleet,
         "roads": _roads,
+        "routes": _routes,
         "log": _log,
         "parity": _parity,
     }
@@ -221,6 +225,14 @@ def _roads(arguments: Namespace) -> Report:
 
     work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
     return _experiment(arguments, "machines drive on patches of soil, their samples show roads", work)
+
+
+def _routes(arguments: Namespace) -> Report:
+    from evaluation.routes import experiment
+
+    cases = experiment.select([name for name in arguments.cases.split(",") if name])
+    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds, cases=cases)
+    return _experiment(arguments, "machines drive on patches of soil, their samples price routes", work)
 
 
 def _experiment(

@@ -17,7 +17,7 @@ from protocol.site.site_config import Projection
 from sim.config import SimConfig
 from sim.recorder import record
 from sim.simulator import BUNDLE_MS, START_NS, Simulator
-from sim.truth import TRACK_VALUES, TruthMap
+from sim.truth import TRACK_DTYPE, TruthMap
 
 CONFIG = SimConfig(seed=11, seconds=1.6, world="fast")
 
@@ -156,7 +156,7 @@ def test_recording_holds_the_same_readings_and_the_truth(tmp_path: Path) -> None
     for f in fields(TruthMap):
         assert np.array_equal(getattr(truth, f.name), getattr(simulator.truth_map, f.name))
     lines = (tmp_path / "truth" / "tracks" / "loader-1.csv").read_text().splitlines()
-    assert lines[0] == ",".join(("stamp_ns", *TRACK_VALUES))
+    assert lines[0] == ",".join(TRACK_DTYPE.names)
     assert len(lines) == 17
     assert tuple(map(float, lines[-1].split(",")[1:])) == tuple(simulator.tracks()["loader-1"][-1].tolist()[1:])
 
