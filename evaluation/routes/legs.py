@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,7 @@ def _spans(table: Table, track: LoadTrack) -> Iterator[tuple[int, int, tuple[boo
     moves = np.abs(speed) > STANDING_MPS
     edges = np.flatnonzero(np.diff(moves.astype(int))) + 1
     bounds = [0, *edges.tolist(), len(moves)]
-    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for begin, end in pairwise(bounds):
         if not moves[begin] or (speed[begin:end] < -STANDING_MPS).any():
             continue
         if begin > 0 and end < len(moves):

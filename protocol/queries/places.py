@@ -13,7 +13,7 @@ from protocol.queries import parameters as ps
 Place = tuple[float, float]
 
 MAX_PLACES = 10_000  # of one line or list
-MAX_CORNERS = 1000  # of one outline: each of its sides is compared with each other one
+MAX_CORNERS = 500  # of one outline: each of its sides is compared with each other one
 PLACES_BYTES = 2**19  # of the parameters of a query with places: MAX_PLACES of them with all their digits
 
 
