@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.sparse.csgraph import dijkstra
 
 from evaluation.campaign.figures import Row
 from evaluation.routes.maps import KnownMap, true_squares
-from mapserver.routes.least_cost import Cell, Terrain, graph, least_cost_line, moves
+from evaluation.routes.reference import least_cost
+from mapserver.routes.least_cost import Cell, Terrain, least_cost_line
 from mapserver.routes.route import route
 from protocol.arrays import Bools, Floats
 from protocol.machine.samples import empty
@@ -63,18 +63,11 @@ def drawn(draw: np.random.Generator, size: int = SIZE) -> Terrain:
     return Terrain(resistance, east, north, np.ones((size, size), bool), 1.0)
 
 
-def reference(terrain: Terrain, start: Cell, end: Cell) -> float:
-    """Cost of the cheapest line in steps to 64 neighbours, all cells searched."""
-    columns = terrain.is_open.shape[1]
-    distance = dijkstra(graph(terrain, moves(4)), indices=start[0] * columns + start[1])
-    return float(distance[end[0] * columns + end[1]])
-
-
 def _random(draw: np.random.Generator) -> Row:
     terrain = drawn(draw)
     start, end = _ends(draw)
     there, back = _cost(terrain, start, end), _cost(terrain, end, start)
-    return {"over": there / reference(terrain, start, end) - 1, "back": abs(back / there - 1)}
+    return {"over": there / least_cost(terrain, start, end) - 1, "back": abs(back / there - 1)}
 
 
 def _even(draw: np.random.Generator) -> Row:
@@ -97,7 +90,7 @@ def _sand(draw: np.random.Generator) -> Row:
     assert result
     through = GRAVEL * math.dist(start, end) * (SIZE - 2 * MARGIN - (right - left + 1)) / (SIZE - 2 * MARGIN)
     through += SAND * math.dist(start, end) * (right - left + 1) / (SIZE - 2 * MARGIN)
-    return {"over": result[1] / min(reference(terrain, start, end), through) - 1, "of_straight": result[1] / through}
+    return {"over": result[1] / min(least_cost(terrain, start, end), through) - 1, "of_straight": result[1] / through}
 
 
 def _unknown(draw: np.random.Generator) -> Row:

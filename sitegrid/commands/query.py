@@ -104,8 +104,8 @@ def _add_numbers(query: ArgumentParser, *names: str) -> None:
 
 def _add_drive(query: ArgumentParser) -> None:
     examples = (
-        "machine=truck (a kind, or a machine's name), mass=30000, speed=6, unknown=refuse, step=50; of a way cost=time, "
-        "margin=5, max_grade=0.1"
+        "machine=truck (a kind, or a machine's name), mass=30000, speed=6, unknown=refuse, step=50; "
+        "of a way cost=time, margin=5, max_grade=0.1"
     )
     option = f"anything that docs/protocol.md (Routes) lists, as {examples}; may be repeated"
     query.add_argument("--set", action="append", type=named_text, default=[], metavar="NAME=VALUE", help=option)
@@ -390,7 +390,7 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
     kwh = f"{totals.energy_j / 3.6e6:.2f} kWh ({totals.energy_low_j / 3.6e6:.2f}..{totals.energy_high_j / 3.6e6:.2f})"
     taken = f"{totals.time_s:.0f} s ({totals.time_low_s:.0f}..{totals.time_high_s:.0f})"
     lines = [
-        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {totals.unknown:.0%} unknown; "
+        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {totals.unknown:.0%} unknown",
         f"{machine.mass_kg / 1000:.1f} t, at most {machine.speed_mps:g} m/s, {machine.power_w / 1000:.0f} kW",
         f"{kwh}, {totals.litres:.2f} l of diesel, {totals.braked_j / 3.6e6:.2f} kWh braked, {taken}",
         *corners,
