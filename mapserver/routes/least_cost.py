@@ -18,12 +18,11 @@ import cv2
 import numba
 import numpy as np
 
+from mapserver.routes.grid_search import LEAST_COST, dijkstra
 from protocol.arrays import Bools, Floats, Ints
 
 Cell = tuple[int, int]  # row and column in a window
 
-# Negative costs would give silently wrong distances: downhill a metre costs this, not less. As resistance.
-LEAST_COST = 0.002
 LOOK_AHEAD = 64  # places of a line that a straight piece may skip at a time; the next pass skips as many of the rest
 BAND = 8  # cells: lines that were found in a wider one cost the same
 
@@ -63,7 +62,7 @@ def _search(terrain: Terrain, start: Cell, end: Cell, steps: Ints) -> Ints | Non
     columns, cells = terrain.is_open.shape[1], terrain.is_open.size
     source, target = start[0] * columns + start[1], end[0] * columns + end[1]
     distance, before = np.full(cells, math.inf), np.full(cells, -1, np.int32)
-    _dijkstra(*_arrays(terrain), steps, *_touched(steps), source, target, distance, before)
+    dijkstra(*_arrays(terrain), steps, *_touched(steps), source, target, distance, before)
     if not math.isfinite(distance[target]):
         return None
     places = [target]
@@ -144,97 +143,6 @@ def _touched(steps: Ints) -> tuple[Ints, Floats]:
                     touched.setdefault(cell, 0.0)
         cells[k, : len(touched)], shares[k, : len(touched)] = list(touched), list(touched.values())
     return cells, shares
-
-
-@numba.njit(cache=True, nogil=True)
-def _dijkstra(
-    resistance: Any,
-    east: Any,
-    north: Any,
-    is_open: Any,
-    cell_m: float,
-    crawl: float,
-    steps: Any,
-    cells: Any,
-    shares: Any,
-    source: int,
-    target: int,
-    distance: Any,
-    before: Any,
-) -> None:
-    """Cost of the cheapest line from one cell to others, and the cell before each on it, until the target is reached.
-
-    Costs are made as they are needed: the graph of a square kilometre would take 300 MB. No lock of Python is held.
-    """
-    rows, columns = is_open.shape
-    norms = np.sqrt((steps * steps).sum(axis=1).astype(np.float64))
-    heap, place = np.empty(rows * columns, np.int32), np.full(rows * columns, -1, np.int32)  # -2: settled
-    distance[source], heap[0], place[source], size = 0.0, source, 0, 1
-    while size > 0:
-        node = heap[0]
-        if node == target:
-            return
-        size -= 1
-        place[node] = -2
-        if size > 0:
-            _sift_down(heap, place, distance, heap[size], size)
-        row, column = node // columns, node % columns
-        for k in range(len(steps)):
-            to_row, to_column = row + steps[k, 0], column + steps[k, 1]
-            if not (0 <= to_row < rows and 0 <= to_column < columns):
-                continue
-            to = to_row * columns + to_column
-            if place[to] == -2:
-                continue
-            x, y, total = steps[k, 1] / norms[k], steps[k, 0] / norms[k], 0.0
-            for i in range(shares.shape[1]):
-                share = shares[k, i]
-                if share < 0.0:
-                    break
-                r, c = row + cells[k, i, 0], column + cells[k, i, 1]
-                if not is_open[r, c]:
-                    total = math.inf
-                    break
-                climbs = resistance[r, c] + east[r, c] * x + north[r, c] * y
-                total += share * (max(climbs, LEAST_COST) if crawl == math.inf else max(climbs / crawl, 1.0))
-            there = distance[node] + total * norms[k] * cell_m
-            if there < distance[to]:
-                distance[to], before[to] = there, node
-                if place[to] < 0:
-                    place[to] = size
-                    size += 1
-                _sift_up(heap, place, distance, to)
-
-
-@numba.njit(cache=True, nogil=True)
-def _sift_up(heap: Any, place: Any, distance: Any, node: int) -> None:
-    """Bring a node to its place in the heap, which is no later than the one that it has."""
-    at, key = place[node], distance[node]
-    while at > 0:
-        parent = (at - 1) // 4
-        other = heap[parent]
-        if distance[other] <= key:
-            break
-        heap[at], place[other] = other, at
-        at = parent
-    heap[at], place[node] = node, at
-
-
-@numba.njit(cache=True, nogil=True)
-def _sift_down(heap: Any, place: Any, distance: Any, node: int, size: int) -> None:
-    """Bring a node from the top of the heap to its place."""
-    at, key = 0, distance[node]
-    while True:
-        least, best = -1, key
-        for child in range(4 * at + 1, min(4 * at + 5, size)):
-            if distance[heap[child]] < best:
-                least, best = child, distance[heap[child]]
-        if least < 0:
-            break
-        other = heap[least]
-        heap[at], place[other] = other, at
-        at = least
-    heap[at], place[node] = node, at
 
 
 @numba.njit(cache=True, nogil=True)

@@ -143,6 +143,9 @@ def test_tracks_are_the_true_ways_at_10_hz() -> None:
         assert track["mass"][-1] == simulator.state.mass_kg[i]
         moved = np.hypot(np.diff(track["x"]), np.diff(track["y"]))
         np.testing.assert_allclose(moved, 0.1 * track["speed"][1:], atol=0.02)
+        assert (np.diff(track["work"], prepend=0.0) >= 0).all()  # brakes give nothing back
+        kinetic_j = track["mass"][-1] * track["speed"][-1] ** 2 / 2
+        assert track["work"][-1] > kinetic_j > 0
 
 
 def test_recording_holds_the_same_readings_and_the_truth(tmp_path: Path) -> None:
