@@ -30,7 +30,7 @@ AROUND_M = 20.0  # so far around a line the map is read: it says what unknown gr
 DETOUR = 0.5
 LEAST_DETOUR_M = 60.0
 MAX_CELLS = 1_000_000  # of the window of a way: 1 x 1 km, searched in about a second, with 300 MB
-GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled")
+GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled", "visits")
 
 
 class Routes:
@@ -132,13 +132,16 @@ class Routes:
             for i, (x, y) in enumerate(read.places.tolist()):
                 for name, layer in values.items():
                     place_square(layer, window, (x, y), read.layers[name][i])
-        resistance, east, north = values.values()
-        known = np.isfinite(resistance + east)
+        resistance, east, north, visits = values.values()
+        measured, driven = np.isfinite(resistance), np.isfinite(visits)
+        known = measured | (driven & measured.any())
+        if (unmeasured := known & ~measured).any():
+            resistance = np.where(unmeasured, _nearest(resistance, measured), resistance)
         cost = query.unknown if isinstance(query.unknown, float) else dearest(resistance)
         if not known.any() and isinstance(query.unknown, str):
             raise _refusal("nobody has driven near these places yet: give `unknown` a resistance")
         crawl = machine.power_w / (machine.mass_kg * GRAVITY_MPS2 * machine.speed_mps)
-        filled = np.where(known, resistance, cost), np.where(known, east, 0.0), np.where(known, north, 0.0)
+        filled = np.where(known, resistance, cost), np.nan_to_num(east), np.nan_to_num(north)
         is_open = np.ones(shape, bool)
         return Terrain(*filled, is_open, self._site.cell_m, crawl if query.cost == TIME else math.inf), known
 
@@ -201,6 +204,16 @@ def _open(terrain: Terrain, known: Bools, query: WayQuery, window: CellWindow, c
         distance = cv2.distanceTransform(is_open.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         is_open &= distance * cell_m > query.margin_m
     return np.ascontiguousarray(is_open)
+
+
+def _nearest(values: Floats32, known: Bools) -> Floats32:
+    """Values (rows, columns), in each cell that of the nearest known one."""
+    _, label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    by_label = np.zeros(label.max() + 1, np.float32)
+    by_label[label[known]] = values[known]
+    return np.asarray(by_label[label], np.float32)
 
 
 def _steepness(terrain: Terrain) -> Floats:

@@ -89,8 +89,9 @@ class RouteSteps:
     """n steps along a route, in its direction.
 
     distance_m (n,): from the begin of the route to the end of each; length_m; x_m, y_m: of its begin, in `map`.
-    resistance, slope, their deviations and confidence: means, NaN where nothing is known of them; unknown: share of
-    its length of which nothing is. energy_j: what drives the wheels; braked_j: what brakes take; speed_mps: mean.
+    resistance, slope, their deviations and confidence: means, NaN where nothing is known of them. unknown: share of
+    its length where nobody was; unmeasured: where machines were and none could tell the resistance. energy_j: what
+    drives the wheels; braked_j: what brakes take; speed_mps: mean.
     """
 
     distance_m: Floats
@@ -103,6 +104,7 @@ class RouteSteps:
     slope_std: Floats
     confidence: Floats
     unknown: Floats
+    unmeasured: Floats
     energy_j: Floats
     braked_j: Floats
     time_s: Floats
@@ -111,7 +113,9 @@ class RouteSteps:
 
 @dataclass(frozen=True)
 class RouteTotals:
-    """All of a route. low, high: its 90 % interval. lift_m: how much higher its end is. unknown: share of its length.
+    """All of a route. low, high: its 90 % interval. lift_m: how much higher its end is.
+
+    unknown, unmeasured: shares of its length, as of the steps.
 
     energy_j: drive force times way. At the wheels it is more by their slip, which the map does not know: 1 to 4 % on
     firm ground, 10 % in sand. fuel_j: over the machine's efficiency.
@@ -120,6 +124,7 @@ class RouteTotals:
     length_m: float
     lift_m: float
     unknown: float
+    unmeasured: float
     energy_j: float
     energy_low_j: float
     energy_high_j: float

@@ -389,8 +389,9 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
     )
     kwh = f"{totals.energy_j / 3.6e6:.2f} kWh ({totals.energy_low_j / 3.6e6:.2f}..{totals.energy_high_j / 3.6e6:.2f})"
     taken = f"{totals.time_s:.0f} s ({totals.time_low_s:.0f}..{totals.time_high_s:.0f})"
+    ground = f"{totals.unknown:.0%} unknown, {totals.unmeasured:.0%} driven and not measured"
     lines = [
-        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {totals.unknown:.0%} unknown",
+        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {ground}",
         f"{machine.mass_kg / 1000:.1f} t, at most {machine.speed_mps:g} m/s, {machine.power_w / 1000:.0f} kW",
         f"{kwh}, {totals.litres:.2f} l of diesel, {totals.braked_j / 3.6e6:.2f} kWh braked, {taken}",
         *corners,

@@ -70,7 +70,7 @@ def test_the_true_map_costs_what_it_must():
     truth = TruthMap(0.0, 0.0, flat + 0.04, flat + 0.01, flat)
     _, totals = route(np.array([[5.0, 10.0], [45.0, 10.0]]), true_squares(truth), ways.SLOW, stops=(False, False))
     assert totals.energy_j == pytest.approx(ways.SLOW.mass_kg * GRAVITY_MPS2 * 0.05 * 40, rel=1e-5)
-    assert totals.energy_high_j == pytest.approx(totals.energy_low_j, rel=0.1)
+    assert totals.energy_high_j - totals.energy_low_j < 0.13 * totals.energy_j  # of drives alone: the ground is sure
     with pytest.raises(ValueError, match="begins at the origin"):
         true_squares(TruthMap(1.0, 0.0, flat, flat, flat))
 

@@ -16,7 +16,7 @@ from protocol.site.geometry import Bounds, CellWindow
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
-STAR = ((-30.0, -20.0), (0.0, -5.0), (30.0, -22.0), (12.0, 3.0), (28.0, 30.0), (0.5, 14.0), (-33.0, 25.0), (-10.0, 2.0))
+STAR = ((-30.0, -20.0), (0.0, -5.0), (30.0, -22.0), (12.0, 3.0), (28.0, 30.0), (0.5, 14.0), (-33.0, 25.0), (-10.0, 2.2))
 NAMES = ("resistance", "grade_east_filled", "visits")
 
 
@@ -154,7 +154,7 @@ def test_points_are_what_each_point_is(answers, when):
             assert many[name][i] == pytest.approx(one.values[name], nan_ok=True, abs=0)
             known += np.isfinite(many[name][i])
         assert (many.version, many.stamp_ns) == (one.version, one.stamp_ns)
-    assert known > 60
+    assert known > 40
 
 
 def test_points_without_names_have_all_layers_and_read_nothing_else(answers):

@@ -163,7 +163,7 @@ def test_a_route_is_its_totals_and_a_table_of_steps(session: Session, capsys):
     line = ((0.0, 0.0), (30.0, 40.0))
     assert session.asked[-1] == RouteQuery(line, truck, unknown="refuse", as_of_ns=T0, fresh=Freshness(3))
     length, machine, cost, names, first, last = capsys.readouterr().out.splitlines()
-    assert length == "50 m, +1.5 m up, 50% unknown"
+    assert length == "50 m, +1.5 m up, 50% unknown, 25% driven and not measured"
     assert machine == "22.0 t, at most 6 m/s, 140 kW"
     assert cost == "0.28 kWh (0.25..0.35), 0.11 l of diesel, 0.06 kWh braked, 20 s (20..21)"
     assert names.split()[:4] == ["m", "from", "resistance", "+-"]
