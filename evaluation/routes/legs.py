@@ -11,7 +11,7 @@ import numpy as np
 
 from evaluation.fleet.drives import FleetDrive, Scene
 from evaluation.ground.truth import LoadTrack
-from protocol.arrays import Floats, Table
+from protocol.arrays import Floats, Ints, Table
 from protocol.machine.log_folder import open_log
 from protocol.queries.routing import MACHINES, RouteMachine
 from sim.recorder import TRACKS_FOLDER
@@ -101,7 +101,7 @@ def _laps(track: LoadTrack, begin: int, end: int) -> Iterator[tuple[int, int]]:
         first = last
 
 
-def _stated_kg(samples: Table, span_ns: Floats, described_kg: float) -> float:
+def _stated_kg(samples: Table, span_ns: Ints, described_kg: float) -> float:
     """Median of the mass that samples of a time state; where none does, what the machine is described with."""
     own = samples["mass_kg"][(samples["stamp_ns"] >= span_ns[0]) & (samples["stamp_ns"] <= span_ns[1])]
     known = own[np.isfinite(own)]

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from mapserver.routes.least_cost import LEAST_COST, Cell, Terrain
+from mapserver.routes.grid_search import LEAST_COST
+from mapserver.routes.least_cost import Cell, Terrain
 from protocol.arrays import Floats, Ints
 
 POINTS = 480  # that the length of a step is divided into

@@ -96,9 +96,9 @@ def _sand(draw: np.random.Generator) -> Row:
 def _unknown(draw: np.random.Generator) -> Row:
     """What a server knows of a map where nobody drove on a third of it, rather where it is bad; by the truth."""
     terrain = drawn(draw)
-    truth = TruthMap(
-        0.0, 0.0, *(a.astype(np.float32) for a in (terrain.resistance, terrain.grade_east, terrain.grade_north))
-    )
+    layers = (terrain.resistance, terrain.grade_east, terrain.grade_north)
+    c_rr, east, north = (layer.astype(np.float32) for layer in layers)
+    truth = TruthMap(0.0, 0.0, c_rr, east, north)
     bad = np.log(terrain.resistance)
     shunned = _field(draw, PATCH_CELLS, SIZE) + SHUNNED * (bad - bad.mean()) / bad.std()
     known = shunned <= np.quantile(shunned, 1 - UNKNOWN)

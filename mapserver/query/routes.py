@@ -141,9 +141,10 @@ class Routes:
         if not known.any() and isinstance(query.unknown, str):
             raise _refusal("nobody has driven near these places yet: give `unknown` a resistance")
         crawl = machine.power_w / (machine.mass_kg * GRAVITY_MPS2 * machine.speed_mps)
-        filled = np.where(known, resistance, cost), np.nan_to_num(east), np.nan_to_num(north)
-        is_open = np.ones(shape, bool)
-        return Terrain(*filled, is_open, self._site.cell_m, crawl if query.cost == TIME else math.inf), known
+        priced = np.where(known, resistance, cost).astype(np.float64)
+        east_m, north_m = (np.nan_to_num(grade).astype(np.float64) for grade in (east, north))
+        crawl = crawl if query.cost == TIME else math.inf
+        return Terrain(priced, east_m, north_m, np.ones(shape, bool), self._site.cell_m, crawl), known
 
     def _window(self, query: WayQuery) -> CellWindow:
         """Where a way is looked for."""

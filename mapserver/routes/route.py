@@ -150,8 +150,9 @@ def route(
 
 def _totals(cut: Steps, ground: Ground, machine: RouteMachine, done: Drive, bounds: tuple[Drive, Drive]) -> RouteTotals:
     energy_j, time_s = float(done.energy_j.sum()), float(done.time_s.sum())
-    energy = _wider(energy_j, *(float(bound.energy_j.sum()) for bound in bounds), ENERGY_STD)
-    time = _wider(time_s, *(float(bound.time_s.sum()) for bound in bounds), TIME_STD)
+    low, high = bounds
+    energy = _wider(energy_j, (float(low.energy_j.sum()), float(high.energy_j.sum())), ENERGY_STD)
+    time = _wider(time_s, (float(low.time_s.sum()), float(high.time_s.sum())), TIME_STD)
     return RouteTotals(
         length_m=float(cut.length_m.sum()),
         lift_m=float((ground.slope * cut.length_m).sum()),
@@ -168,10 +169,11 @@ def _totals(cut: Steps, ground: Ground, machine: RouteMachine, done: Drive, boun
     )
 
 
-def _wider(value: float, low: float, high: float, share: float) -> tuple[float, float]:
+def _wider(value: float, bounds: tuple[float, float], share: float) -> tuple[float, float]:
     """An interval of what the map leaves open, with what drives differ by beside."""
     of_drives = NINETY * share * value
-    return value - math.hypot(value - low, of_drives), value + math.hypot(high - value, of_drives)
+    low, high = (math.hypot(bound - value, of_drives) for bound in bounds)
+    return value - low, value + high
 
 
 def _by_step(cut: Steps, ground: Ground, done: Drive, step_m: float) -> RouteSteps:

@@ -56,8 +56,8 @@ def check_outline(name: str, corners: Sequence[Place]) -> None:
         raise QueryError(Refusal.NOT_FINITE, f"parameter `{name}`: corner that is no number")
     side = np.roll(corner, -1, axis=0) - corner
     if (still := np.flatnonzero((side == 0).all(axis=1))).size:
-        i = int(still[0])
-        raise refusal(name, f"corners {i + 1} and {(i + 1) % len(corner) + 1} are the same")
+        same = int(still[0])
+        raise refusal(name, f"corners {same + 1} and {(same + 1) % len(corner) + 1} are the same")
     following = np.roll(side, -1, axis=0)
     if (back := np.flatnonzero((_cross(side, following) == 0) & ((side * following).sum(axis=1) < 0))).size:
         raise refusal(name, f"it turns back on itself at corner {(int(back[0]) + 1) % len(corner) + 1}")

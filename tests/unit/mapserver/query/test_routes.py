@@ -69,7 +69,7 @@ def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
         assert there.totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 40 + 0.06 * 40 + 0.015 * 80), rel=0.02)
         assert back.totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 40 + 0.06 * 40 - 0.015 * 80), rel=0.03)
         assert there.totals.energy_j - back.totals.energy_j == pytest.approx(2 * WEIGHT_N * 0.015 * 80, rel=0.01)
-        assert max(there.totals.braked_j, back.totals.braked_j) < 0.005 * back.totals.energy_j  # of one border
+        assert max(there.totals.braked_j, back.totals.braked_j) < 0.01 * back.totals.energy_j  # of one border
         assert there.totals.time_s == pytest.approx(80 / SLOW.speed_mps)
         assert there.machine == SLOW
 

@@ -8,7 +8,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from evaluation.routes.reference import graph, least_cost, neighbours
-from mapserver.routes.least_cost import LEAST_COST, Terrain, cost_of, least_cost_line, moves, reaches
+from mapserver.routes.grid_search import LEAST_COST
+from mapserver.routes.least_cost import Terrain, cost_of, least_cost_line, moves, reaches
 
 
 def even(size: int = 100, resistance: float = 0.02, crawl: float = math.inf) -> Terrain:
