@@ -1,4 +1,7 @@
-"""Map queries answered: pages come from whoever has the map, layers are derived here, on the asking thread."""
+"""Map queries answered: pages come from whoever has the map, layers are derived here, on the asking thread.
+
+It is one module because all queries about cells read them in the same few steps.
+"""
 
 from __future__ import annotations
 

@@ -58,8 +58,8 @@ class _Followed:
             old = self.slots.get((name, slot))
             self.slots[name, slot] = old.joined(seen) if old else seen
 
-    def of(self, name: str, until_ns: int) -> Seen | None:
-        """All that was seen of a machine in the time before."""
+    def before(self, name: str, until_ns: int) -> Seen | None:
+        """All that was seen of a machine in the hour before a time."""
         hashed, last = name_hash(name), until_ns // SLOT_NS
         slots = (self.slots.get((hashed, slot)) for slot in range(last - LOOK_BACK_NS // SLOT_NS, last + 1))
         out: Seen | None = None
@@ -108,14 +108,14 @@ class NamedMachines:
         if as_of_ns is not None:
             followed = _Followed()
             self._follow(followed, as_of_ns - LOOK_BACK_NS, as_of_ns, row)
-            return followed.of(name, as_of_ns)
+            return followed.before(name, as_of_ns)
         with self._lock:
             if self._now.store != store or self._now.row > row:  # another store, or one that was restored
                 self._now = _Followed(store)
             if self._now.row < row:
                 self._follow(self._now, newest_ns - LOOK_BACK_NS - SLOT_NS, MAX_STAMP_NS, row)
                 self._now.forget(newest_ns)
-            return self._now.of(name, newest_ns)
+            return self._now.before(name, newest_ns)
 
     def _follow(self, followed: _Followed, from_ns: int, to_ns: int, row: int) -> None:
         with self._source.location.reader() as reader:

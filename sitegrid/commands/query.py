@@ -413,8 +413,8 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
         for i in range(len(steps.distance_m))
     ]
     columns = {name: column.tolist() for name, column in vars(steps).items()}
-    told = {"line": answer.line_m.tolist(), "totals": asdict(totals), "steps": columns, "machine": asdict(machine)}
-    table = {**told, **_version(answer)}
+    shown = {"line": answer.line_m.tolist(), "totals": asdict(totals), "steps": columns, "machine": asdict(machine)}
+    table = {**shown, **_version(answer)}
     return table, [*lines, *_table(head, rows)]
 
 
