@@ -276,7 +276,11 @@ def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
         assert web.get("/healthz").status == 200
         assert web.get("info", Authorization=f"Bearer {token}").status == 200
         assert web.get("info", {"token": token}).status == 200
-        for name, parameters in (("worklist", {}), ("segments", {}), ("route", {"line": "80,80;120,120"})):
+        for name, parameters in (
+            ("worklist", {}),
+            ("segments", {}),
+            ("route", {"line": "80,80;120,120", "unknown": 0.05}),
+        ):
             assert web.get(name, parameters).status == 401
             assert web.get(name, {**parameters, "token": token}).status == 200
         tab = Tab(browser, f"{web.url}?token={token}").loaded()

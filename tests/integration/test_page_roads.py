@@ -91,7 +91,7 @@ def test_the_ten_stretches_that_cost_most_stand_in_their_order_with_reasons(tab:
     days = panel.locator("ol .stretch canvas").first.get_attribute("aria-label")
     assert days == "From 4.0 % on 9 Oct to 5.5 % on 12 Oct"
     assert "+0.5 %/day" in shown.first.inner_text()
-    assert "since before 9 Oct" in shown.first.inner_text()
+    assert "since the first drive" in shown.first.inner_text()
     repaired = panel.locator(".stretch.short").first.inner_text()
     assert "Repaired" in repaired
     assert "5.0 % → 3.0 %" in repaired
@@ -317,16 +317,31 @@ def test_the_cheapest_line_between_two_clicks_is_beside_the_straight_one(tab: Ta
     assert cheapest.totals.energy_j < straight.totals.energy_j
     text = panel.inner_text()
     assert figure(cheapest.totals.energy_j / 3.6e6) in text
-    more = round(100 * (straight.totals.energy_j / cheapest.totals.energy_j - 1))
-    unknown = round(100 * straight.totals.unknown)
-    sentence = f"The straight line would cost {figure(straight.totals.energy_j / 3.6e6)} kWh, {more} % more"
-    assert f"{sentence}, with {unknown} % of it unknown" in text
+    assert max(cheapest.steps.unknown) < 0.99, "so that nothing says what unknown ground is taken for"
+    assert f"Of the straight line {round(100 * straight.totals.unknown)} % is unknown ground" in text
     tab.page.locator("#cost-time").click()
     tab.until(f"sitegrid.route.cost === 'time' && {QUIET} && sitegrid.route.answer !== null")
     quickest = web.client.way(*ends, MACHINES["truck"], cost="time")
     assert tab.js("sitegrid.route.answer.totals.time_s") == pytest.approx(quickest.totals.time_s, rel=1e-6)
     tab.page.mouse.click(*tab.pixel_of(60, 10))  # a third click begins anew
     tab.until(f"sitegrid.route.places.length === 1 && sitegrid.route.answer === null && {QUIET}")
+    set_places(tab, (130, 10))
+    assert "The straight line costs the same." in panel.inner_text()
+
+
+def test_a_straight_line_is_compared_at_the_same_price_of_unknown_ground(tab: Tab, web: WebSite):
+    panel = opened(tab, "r")
+    tab.page.locator("#drive-cheapest").click()
+    tab.until(f"sitegrid.route.cheapest && {QUIET}")
+    set_places(tab, (25, 28), (25, 112))  # both off the roads
+    ends, step_m = places(tab), tab.js("sitegrid.route.answer.steps.length_m[0]")
+    cheapest = web.client.way(*ends, MACHINES["truck"], step_m=step_m)
+    price = cheapest.steps.resistance[cheapest.steps.unknown > 0.999][0]
+    straight = web.client.route(ends, MACHINES["truck"], unknown=float(price))
+    more = round(100 * (straight.totals.energy_j / cheapest.totals.energy_j - 1))
+    cost = figure(straight.totals.energy_j / 3.6e6)
+    assert more > 0
+    assert f"The straight line would cost {cost} kWh, {more} % more, with" in panel.inner_text()
 
 
 @pytest.mark.parametrize("cheapest", [False, True])
@@ -468,11 +483,11 @@ def test_a_phone_has_the_list_beneath_the_map_and_shows_what_is_tapped(browser, 
     row = listed(web)[0]
     row_of(tab, row).tap()
     tab.until("sitegrid.view.flight === null && sitegrid.view.moved")
-    sheet = tab.page.locator("#panel").bounding_box()
+    panel = tab.page.locator("#panel").bounding_box()
     for point in row.segment.line:
         left, top = tab.pixel_of(*point)
         assert 0 < left < 390
-        assert 130 < top < sheet["y"]
+        assert 130 < top < panel["y"]
     tab.page.get_by_role("button", name="Close").tap()
     tab.page.locator("#open-route").tap()
     tab.until(f"sitegrid.panel === 'route' && {QUIET}")

@@ -378,6 +378,7 @@ function help() {
 }
 
 function fit() {
+  Object.assign(view, { width: innerWidth, height: innerHeight }); // before the first picture too
   view.margins = margins(PANELS[page.panel]?.wholeSite);
   view.fit(page.map.bounds() ?? aroundMachines() ?? [-50, -50, 50, 50]);
   page.redraw();
@@ -385,7 +386,7 @@ function fit() {
 }
 
 const isPhone = () => innerWidth <= 720;
-const margins = (besidePanel) => (isPhone() ? [16, 150, 16, besidePanel ? PANEL_PART * innerHeight + 32 : 130] : [272, 66, besidePanel ? PANEL_PX : 24, 96]);
+const margins = (besidePanel) => (isPhone() ? [16, 172, 16, besidePanel ? PANEL_PART * innerHeight + 32 : 130] : [272, 66, besidePanel ? PANEL_PX : 24, 96]);
 function fly(box) {
   view.fly(box, margins(true), !matchMedia("(prefers-reduced-motion: reduce)").matches);
   page.redraw();

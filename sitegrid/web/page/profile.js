@@ -8,8 +8,9 @@ const GRADE_TOP_PX = CAPTION_PX + RESISTANCE_PX + 8 + CAPTION_PX, HEIGHT = GRADE
 // steps: columns of the answer. at(place): called with [x, y] of the step that is pointed at, null for none.
 export function profile({ steps }, ink, at) {
   const n = steps.length_m.length, length = steps.distance_m[n - 1], begin = (i) => (i ? steps.distance_m[i - 1] : 0);
-  const most = 1.15 * Math.max(0.03, ...steps.resistance.map((value, i) => value + (steps.unknown[i] < 0.5 ? steps.resistance_std[i] : 0)));
-  const steepest = 1.15 * Math.max(0.03, ...steps.slope.map((value, i) => Math.abs(value) + (steps.unknown[i] < 0.5 ? steps.slope_std[i] : 0)));
+  const known = [...steps.unknown.keys()].filter((i) => steps.unknown[i] < 0.5); // deviations of what is hardly known are cut
+  const most = 1.15 * Math.max(0.03, ...known.map((i) => steps.resistance[i] + Math.min(steps.resistance_std[i], steps.resistance[i] / 2)));
+  const steepest = 1.15 * Math.max(0.03, ...known.map((i) => Math.abs(steps.slope[i]) + Math.min(steps.slope_std[i], 0.03)));
   let chosen = null;
   const said = element("p", { className: "note said" }, "Point at the profile, or use the arrow keys on it.");
   const x = (metres, width) => LEFT_PX + (width - LEFT_PX - 2) * metres / length;

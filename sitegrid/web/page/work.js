@@ -53,7 +53,8 @@ function stretch(page, row, place) {
   const { segment } = row, [value, low, high] = row.kwh_ph, passes = segment.passes_ph[0] + segment.passes_ph[1];
   const kind = segment.resistance === null ? "not measured" : `${percent(segment.resistance)} ${KINDS[Math.min(KINDS.length - 1, kindOf(segment.resistance, page.boundaries))].name}`;
   const trend = segment.trend !== null && Math.abs(segment.trend) >= CLEAR_TREND ? `${segment.trend > 0 ? "+" : "−"}${percent(Math.abs(segment.trend))}/day` : null;
-  const history = row.before === null ? `since before ${when(page, row.since_ns)}` : `since ${when(page, row.since_ns)}, was ${percent(row.before)}`;
+  const first = row.since_ns <= page.time.first_ns ? "since the first drive" : `since before ${when(page, row.since_ns)}`;
+  const history = row.before === null ? first : `since ${when(page, row.since_ns)}, was ${percent(row.before)}`;
   const reasons = [`${Math.round(segment.length_m)} m, ${passes.toFixed(passes < 9.95 ? 1 : 0)} passes/h`, history];
   return element("button", { id: `stretch-${segment.id}`, className: "stretch", title: "Fly there", onclick: () => { light(page, segment.id); page.fly(around(segment.line)); }, ...lights(page, segment.id) },
     element("span", { className: "place" }, `${place}`),
