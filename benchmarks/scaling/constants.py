@@ -52,10 +52,10 @@ TAKEN = Measured(
 )
 TAKEN_CORES = Measured("the same", 1.02, "cores", "1.02", "ingest.md", FLEET)
 MACHINES = Measured("machines at one map server, with all its upkeep", 500, "", "500 machines", "ingest.md", FLEET)
-IN_POSTGRES = Measured("journal in PostgreSQL", 0.80, "of SQLite", "0.80;", "ingest.md", INGEST)
-REPLICATED = Measured("with a synchronous replica on the same disk", 0.38, "of SQLite", "0.38;", "ingest.md", INGEST)
+IN_POSTGRES = Measured("journal in PostgreSQL", 0.64, "of SQLite", "0.64;", "ingest.md", INGEST)
+REPLICATED = Measured("with a synchronous replica on the same disk", 0.59, "of SQLite", "0.59;", "ingest.md", INGEST)
 ANSWERS = Measured("two followers, 50 readers", 100, "answers/s", "| 100 |", "followers.md", FOLLOW)
-FOLLOWER_CORES = Measured("the same", 0.24, "cores", "0.24", "followers.md", FOLLOW)
+FOLLOWER_CORES = Measured("the same", 0.23, "cores", "0.23", "followers.md", FOLLOW)
 FOLDED = Measured("fold of a journal", 0.70e6, "samples/s of a core", "0.70", "refold.md", FOLD)
 CELL = Measured(
     "evidence in memory and snapshot", 50, "B per driven cell and bucket", "**50 bytes**", "merge.md", MEMORY

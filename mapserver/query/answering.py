@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from mapserver.change.detection import reach_blocks
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
+from mapserver.query import roads
 from mapserver.query.block_layers import BlockLayers, Look
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
-from mapserver.query.roads import RoadMaps
+from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource
 from mapserver.query.views import PastMaps, View, view_now, widened
@@ -100,9 +102,9 @@ class Answers:
         """Answers about roads and about lines over the map."""
         match query:
             case requests.SegmentsQuery():
-                return encode_segments(self._roads.segments(query))
+                return encode_segments(roads.segments(self._roads.read, query, self._site.extent_m))
             case requests.WorklistQuery():
-                return encode_worklist(self._roads.worklist(query))
+                return encode_worklist(roads.worklist(self._roads.read, query, self._site.extent_m))
             case RouteQuery():
                 return encode_answer(self._routes.route(query))
             case WayQuery():
@@ -197,12 +199,16 @@ class Answers:
 
     def _reading(self, window: CellWindow, names: tuple[str, ...], when: When) -> Reading:
         times = [when.as_of_ns] if when.minus_ns is None else [when.as_of_ns, when.minus_ns]
-        return Reading(window, names, tuple(self._look(window, names, as_of_ns) for as_of_ns in times))
+        looks = (self._look(window, names, as_of_ns, repairs=when.repairs) for as_of_ns in times)
+        return Reading(window, names, tuple(looks))
 
-    def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None) -> Look:
-        if as_of_ns is None:
+    def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool) -> Look:
+        if as_of_ns is None and not repairs:
             return self._source.run(lambda state: self._layers.look(state, window, names))
         wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
+        if repairs:
+            reach = reach_blocks(self._site.cell_m, self._config.change)
+            return self._layers.look_at(self._roads.view(wide, reach, as_of_ns))
         return self._layers.look_at(self._view(wide, as_of_ns))
 
     def _piece(self, reading: Reading, pieces: PieceGrid, number: int, cursor: int) -> Region:

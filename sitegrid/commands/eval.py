@@ -82,7 +82,8 @@ def add_options(parser: ArgumentParser) -> None:
     table.add_argument("--shares", type=shares, default=(None,), help=shared)
     judged = "compare the EKF of the profile default with the batch optimum of the same runs, by GTSAM (extra oracle)"
     table.add_argument("--oracle", action="store_true", help=judged)
-    merge.add_argument("--cases", default="", help="names, comma-separated; default all")
+    for action in (merge, roads):
+        action.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
 
@@ -219,7 +220,8 @@ def _fleet(arguments: Namespace) -> Report:
 def _roads(arguments: Namespace) -> Report:
     from evaluation.roads import experiment
 
-    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    cases = experiment.select([name for name in arguments.cases.split(",") if name])
+    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds, cases=cases)
     return _experiment(arguments, "machines drive on patches of soil, their samples show roads", work)
 
 
