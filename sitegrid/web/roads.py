@@ -22,6 +22,7 @@ from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters
 
 ROADS = {"from": "traffic of the hours that begin from then on", "to": "and before then", **AS_OF, **BOUNDS}
+ROADS |= {"machine": "traffic of this one alone, and what it measured"}
 WORK = {
     "target": "rolling resistance of good ground, above 0 and at most 1 (default 0.02)",
     "efficiency": "of engine and drive train, above 0 and at most 1 (default 0.35)",

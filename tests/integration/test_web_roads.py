@@ -38,6 +38,9 @@ def text_of(line: tuple[tuple[float, float], ...]) -> str:
 def test_roads_and_worklist_are_the_clients(web: WebSite):
     assert web.get("segments").json == values.plain(web.client.segments())
     assert web.get("worklist").json == values.plain(web.client.worklist())
+    one = web.get("segments", {"machine": "hauler-2"}).json
+    assert one == values.plain(web.client.segments(machine="hauler-2"))
+    assert one != web.get("segments").json
     bounds = Bounds(0.0, 0.0, 200.0, 40.0)
     asked = {"target": 0.03, "efficiency": 0.4, "limit": 3, "bounds": "0,0,200,40"}
     answer = web.get("worklist", asked).json
@@ -133,7 +136,8 @@ def test_what_nobody_knows_is_null_and_told(web: WebSite):
         ("worklist", {"limit": 0}, 400, "out_of_range", "limit"),
         ("worklist", {"limit": "2.5"}, 400, "out_of_range", "limit"),
         ("worklist", {"from": "2026-01-02", "to": "2026-01-01"}, 400, "out_of_range", "after"),
-        ("worklist", {"machine": "truck"}, 400, "unknown_parameter", "machine"),
+        ("worklist", {"machine": "hauler-9"}, 404, "unknown_machine", "hauler-9"),
+        ("worklist", {"colour": "red"}, 400, "unknown_parameter", "colour"),
         ("segments", {"bounds": "9e14,0,9.1e14,5"}, 400, "out_of_range", "off the site"),
         ("segments", {"bounds": "nan,0,1,5"}, 400, "not_finite", "bounds"),
         ("segments", {"bounds": "5,0,1,9"}, 400, "out_of_range", "bounds"),
