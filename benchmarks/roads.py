@@ -177,7 +177,7 @@ def _worklist(roads: Segments, traffic: Traffic) -> bytes:
 
     def read(*_: object) -> RoadMap:
         ledgers = Ledgers(roads)
-        changes, _ = repairs(traffic.passes.passes(ledgers))
+        changes = repairs(traffic.passes.passes(ledgers))[0]
         table = traffic.tally.table()
         return RoadMap(roads, ledgers, table, tuple(changes), {}, NO_FACTS, MapVersion("", 0, 0), END_NS)
 

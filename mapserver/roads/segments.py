@@ -75,11 +75,11 @@ def _ids(cell: Ints, octant: Ints, beside: Floats) -> tuple[str, ...]:
     bounds = [*np.flatnonzero((np.diff(key, axis=0, prepend=key[:1] - 1) != 0).any(axis=1)).tolist(), len(names)]
     for first, end in pairwise(bounds):
         if end - first > 1:
-            names[first:end] = _told_apart(names[first], beside[first:end])
+            names[first:end] = _distinct(names[first], beside[first:end])
     return tuple(names)
 
 
-def _told_apart(name: str, beside: AnyArray) -> list[str]:
+def _distinct(name: str, beside: AnyArray) -> list[str]:
     """Names of several segments of one cell and axis, which lie so far to the left of its middle."""
     nearest, used, names = int(np.argmin(np.abs(beside))), {name}, []
     for i, off in enumerate(beside.tolist()):

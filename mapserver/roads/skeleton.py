@@ -14,7 +14,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver.evidence import cells as ev
+from mapserver.evidence.cells import CELLS, HEADING
 from mapserver.evidence.timeline import Block, TimedPage, TimedPages, plane_counts
 from mapserver.roads.ridges import AXES, Blur, ridges
 from mapserver.roads.thinning import REACH, thinned
@@ -25,6 +25,9 @@ TILE = 128  # cells of the raster to a side
 RASTER_M = 1.0  # smaller cells are joined to about this size: positions are not known any better
 NEAR = 2  # cells to each side of a line whose metres are told beside it
 EDGE = REACH + 1  # cells of ridges around a tile that its lines depend on
+# Of a tile and EDGE cells around: where the tiles before it, itself and those after it lie, and which of their cells.
+_OF_WINDOW = {-1: slice(0, EDGE), 0: slice(EDGE, EDGE + TILE), 1: slice(EDGE + TILE, None)}
+_OF_TILE = {-1: slice(TILE - EDGE, None), 0: slice(None), 1: slice(0, EDGE)}
 
 Pages = Mapping[Block, Sequence[TimedPage]]
 Tile = tuple[int, int]  # column and row
@@ -119,12 +122,11 @@ class Skeletons:
         """Cells (n, 2) of a tile's lines."""
         if tile not in self._ridges:
             return np.zeros((0, 2), np.int64)
-        mask = np.zeros((3 * TILE, 3 * TILE), np.bool_)
+        mask = np.zeros((TILE + 2 * EDGE, TILE + 2 * EDGE), np.bool_)
         for dx, dy in product((-1, 0, 1), repeat=2):
             if (near := self._ridges.get((tile[0] + dx, tile[1] + dy))) is not None:
-                mask[(dy + 1) * TILE : (dy + 2) * TILE, (dx + 1) * TILE : (dx + 2) * TILE] = near
-        wide = slice(TILE - EDGE, 2 * TILE + EDGE)
-        lines = thinned(mask[wide, wide])[EDGE:-EDGE, EDGE:-EDGE]
+                mask[_OF_WINDOW[dy], _OF_WINDOW[dx]] = near[_OF_TILE[dy], _OF_TILE[dx]]
+        lines = thinned(mask)[EDGE:-EDGE, EDGE:-EDGE]
         return np.asarray(np.argwhere(lines) + np.array(tile[::-1]) * TILE, np.int64)
 
     def _axes(self, tile: Tile, margin: int) -> Ints:
@@ -150,13 +152,23 @@ def axis_metres(pages: Sequence[TimedPage]) -> tuple[Ints, Ints]:
     if isinstance(pages, TimedPages) and axis_metres in pages.derived:
         known: tuple[Ints, Ints] = pages.derived[axis_metres]
         return known
-    sectors = plane_counts(pages, ev.HEADING)
-    counts = np.ascontiguousarray((sectors[:AXES] + sectors[AXES:]).T).ravel()
-    codes = np.flatnonzero(counts)
-    metres = codes, counts[codes]
+    metres = _driven(plane_counts(pages, HEADING))
     if isinstance(pages, TimedPages):
         pages.derived[axis_metres] = metres  # few cells of a block are on a road
     return metres
+
+
+@numba.njit(cache=True, nogil=True)
+def _driven(sectors: Any) -> tuple[Any, Any]:
+    """Codes and metres, as of `axis_metres`, of counts (sectors, cells)."""
+    codes, metres, used = np.empty(CELLS * AXES, np.int64), np.empty(CELLS * AXES, np.int64), 0
+    for cell in range(CELLS):
+        for axis in range(AXES):
+            count = sectors[axis, cell] + sectors[axis + AXES, cell]
+            if count:
+                codes[used], metres[used] = cell * AXES + axis, count
+                used += 1
+    return codes[:used].copy(), metres[:used].copy()
 
 
 @numba.njit(cache=True, nogil=True)
