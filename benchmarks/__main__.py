@@ -17,6 +17,7 @@ from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 from benchmarks.scaling import sizes
 from benchmarks.web import pages as web
+from benchmarks.web import panels
 
 
 def _count(word: str) -> int:
@@ -90,6 +91,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         web.run,
         "the web server: what open pages cost, how soon they show what came in, tiles for other tools",
         {"hours": HOURS, "seconds": 20.0},
+    ),
+    "panels": (
+        panels.run,
+        "how soon the page shows worklist and routes, on the demo's site",
+        {"seconds": 240.0, "runs": 15},
     ),
     "sizes": (
         sizes.run,
