@@ -8,14 +8,16 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 
-from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, past, query, roads, sim
+from benchmarks import fold, ingest, live, merge, merge_memory, merge_restart, past, roads, sim
 from benchmarks.agents import filter as filters
+from benchmarks.asking import query
 from benchmarks.fleets import fleet, follow
 from benchmarks.folds import archive
 from benchmarks.measure import Report, table
 from benchmarks.merge_work import HOURS
 from benchmarks.scaling import sizes
 from benchmarks.web import pages as web
+from benchmarks.web import panels
 
 
 def _count(word: str) -> int:
@@ -64,7 +66,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         {"hours": 2.0, "seconds": 120.0},
     ),
     "past": (past.run, "checkpoints, maps of the past, the history of a point", {"hours": HOURS, "runs": 3}),
-    "query": (query.run, "queries of a real server, while samples come in", {"hours": HOURS, "queries": 200}),
+    "query": (
+        query.run,
+        "queries of a real server, while samples come in, and what 20 clients cost the machines",
+        {"hours": HOURS, "queries": 200, "seconds": 20.0, "runs": 3},
+    ),
     "roads": (
         roads.run,
         "roads of 40 km, the worklist of a day, and what asking for it costs a server that takes samples",
@@ -86,6 +92,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
         "the web server: what open pages cost, how soon they show what came in, tiles for other tools",
         {"hours": HOURS, "seconds": 20.0},
     ),
+    "panels": (
+        panels.run,
+        "how soon the page shows worklist and routes, on the demo's site",
+        {"seconds": 240.0, "runs": 15},
+    ),
     "sizes": (
         sizes.run,
         "bytes per sample on a link, in journal and archive, and what an agent's link carries",
@@ -105,7 +116,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = vars(_parser().parse_args(words))
     run, as_json = arguments.pop("run"), arguments.pop("json")
     result: Report = run(**arguments)
-    tables = [result[name] for name in ("rows", "decisions", "past", "smoother", "agent") if name in result]
+    tables = [result[name] for name in ("rows", "ingest", "decisions", "past", "smoother", "agent") if name in result]
     print(json.dumps(result) if as_json else "\n\n".join(map(table, tables)))
     for variant, remedy in result.get("missing", {}).items():
         print(f"not measured: {variant}; {remedy}", file=sys.stderr)

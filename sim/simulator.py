@@ -25,7 +25,7 @@ from sim.sensors.rigs import draw_bodies
 from sim.sensors.sensors import FleetReadings, Sensors
 from sim.state import STEP_S, FleetState, stack
 from sim.terrain.terrain import Terrain
-from sim.truth import TRACK_DTYPE, TRACK_EVERY, TRACK_VALUES, TruthMap, truth_map
+from sim.truth import TRACK_DTYPE, TRACK_EVERY, TRACK_VALUES, WORK, TruthMap, truth_map
 from sim.worlds.fast import FastWorld
 from sim.worlds.world import World
 
@@ -77,6 +77,7 @@ class Simulator:
             for i, base in enumerate(self.scenario.base_station)
         }
         self._steps = 0
+        self._work_j: Floats = np.zeros(len(starts))
         self._tracks: list[Table] = []
         self.former_truth_maps: list[tuple[float, TruthMap]] = []
 
@@ -116,8 +117,10 @@ class Simulator:
         steps = np.arange(self._steps - count + 1, self._steps + 1)
         stamps_ns = START_NS + steps * STEP_NS
         due = steps % TRACK_EVERY == 0
+        work_j = self._work_j + STEP_S * np.cumsum(np.maximum(states.drive_n * states.speed_mps, 0.0), axis=0)
+        self._work_j = work_j[-1]
         if due.any():
-            self._tracks.append(_track_rows(stamps_ns[due], states, due))
+            self._tracks.append(_track_rows(stamps_ns[due], states, work_j, due))
         return self._sensors.sample(steps, stamps_ns, states)
 
     def close(self) -> None:
@@ -179,9 +182,10 @@ def build_world(
     return BulletWorld(terrain, models, bodies, places)
 
 
-def _track_rows(stamps_ns: Ints, states: FleetState, due: Bools) -> Table:
+def _track_rows(stamps_ns: Ints, states: FleetState, work_j: Floats, due: Bools) -> Table:
     rows = np.empty(states.x_m[due].shape, TRACK_DTYPE)
     rows["stamp_ns"] = stamps_ns[:, None]
     for name, field in TRACK_VALUES.items():
         rows[name] = getattr(states, field)[due]
+    rows[WORK] = work_j[due]
     return rows

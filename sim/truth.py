@@ -19,7 +19,8 @@ TRACK_EVERY = 10  # steps: 10 Hz
 # Column of a track -> what it takes from the state record [m, rad, m/s, kg, -, m/m]
 TRACK_VALUES = {"x": "x_m", "y": "y_m", "z": "z_m", "yaw": "yaw_rad", "pitch": "pitch_rad", "roll": "roll_rad"}
 TRACK_VALUES |= {"speed": "speed_mps", "mass": "mass_kg", "c_rr": "c_rr", "grade_e": "grade_e", "grade_n": "grade_n"}
-TRACK_DTYPE = np.dtype([("stamp_ns", "<i8"), *((name, "<f8") for name in TRACK_VALUES)])
+WORK = "work"  # column: what the engine has done at the wheels so far, drive force times way [J]
+TRACK_DTYPE = np.dtype([("stamp_ns", "<i8"), *((name, "<f8") for name in (*TRACK_VALUES, WORK))])
 MAP_FILE = "truth_map.npz"
 
 
@@ -71,5 +72,5 @@ def save_tracks(folder: Path, tracks: Mapping[str, Table]) -> None:
     for name, track in tracks.items():
         with (folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as text:
             writer = csv.writer(text)
-            writer.writerow(["stamp_ns", *TRACK_VALUES])
+            writer.writerow(TRACK_DTYPE.names or ())
             writer.writerows([row[0], *map(repr, row[1:])] for row in track.tolist())

@@ -9,6 +9,7 @@ from protocol.queries.answers import (
     MapInfo,
     MapVersion,
     PointAnswer,
+    PointsAnswer,
     Region,
     SampleCounts,
     ServerAlive,
@@ -20,7 +21,7 @@ from protocol.queries.map_tiles import MapTile, TilesAnswer
 from protocol.queries.origin import Origin
 from protocol.queries.reasons import CellReasons, Votes
 from protocol.queries.roads import RoadChange, RoadSegment, Segments, Worklist, WorklistRow
-from protocol.queries.routing import LOADER, MACHINES, RouteAnswer, RouteMachine, RouteSteps, RouteTotals
+from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteAnswer, RouteMachine, RouteSteps, RouteTotals
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
 from protocol.version import package_version
@@ -29,10 +30,11 @@ from sitegrid.listener import Listener
 
 __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
-__all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "Region", "TrustAnswer"]
+__all__ += ["GroundChange", "HistorySpan", "MachineState", "MapInfo", "PointAnswer", "PointsAnswer"]
+__all__ += ["Region", "TrustAnswer"]
 __all__ += ["CalibrationAnswer", "CorrectedSpan", "MachineCalibration"]
 __all__ += ["CellReasons", "FollowerState", "MapTile", "MapVersion", "Origin", "TilesAnswer", "Votes"]
 __all__ += ["RoadChange", "RoadSegment", "Segments", "Worklist", "WorklistRow"]
-__all__ += ["LOADER", "MACHINES", "RouteAnswer", "RouteMachine", "RouteSteps", "RouteTotals"]
+__all__ += ["LOADER", "MACHINES", "NamedMachine", "RouteAnswer", "RouteMachine", "RouteSteps", "RouteTotals"]
 __all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __version__ = package_version()

@@ -37,8 +37,16 @@ FOLLOWER_WAIT_S = 1.0  # for a row, at a follower that lacks it: one that follow
 TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 # Refusals that are about who was asked, not about the question.
 ELSEWHERE = (Refusal.AFTER_TIMEOUT, Refusal.NOT_HERE, Refusal.OVERLOADED, Refusal.STORE, "internal")
-CELLS = (requests.PointQuery, requests.RegionQuery, requests.TilesQuery, requests.WhyQuery, requests.HistoryQuery)
-READ = (*CELLS, requests.SegmentsQuery, requests.WorklistQuery, RouteQuery, WayQuery)
+PLACES = (requests.PointQuery, requests.PointsQuery, requests.WhyQuery, requests.HistoryQuery)
+READ = (
+    *PLACES,
+    requests.RegionQuery,
+    requests.TilesQuery,
+    requests.SegmentsQuery,
+    requests.WorklistQuery,
+    RouteQuery,
+    WayQuery,
+)
 # A follower has these a moment later than the server, whose events tell of them: it is asked where no server is.
 SERVER_FIRST = (requests.InfoQuery, requests.ChangesQuery)
 

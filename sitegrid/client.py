@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import zenoh
 
 from protocol.errors import QueryError, Refusal
@@ -21,6 +22,7 @@ from protocol.queries.answers import (
     MapInfo,
     MapVersion,
     PointAnswer,
+    PointsAnswer,
     Region,
     ServerAlive,
     TrustAnswer,
@@ -31,10 +33,11 @@ from protocol.queries.map_tiles import TilesAnswer, decode_tiles
 from protocol.queries.origin import SERVER, Origin
 from protocol.queries.parameters import Freshness
 from protocol.queries.pieces import Progress, joined
+from protocol.queries.places import Place
 from protocol.queries.reasons import CellReasons, decode_why
 from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
-from protocol.queries.routing import LOADER, RouteAnswer, RouteMachine, decode_answer
+from protocol.queries.routing import LOADER, NamedMachine, RouteAnswer, RouteMachine, decode_answer, machine_of
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
@@ -82,9 +85,9 @@ class Client:
         query = requests.PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when)
         return answer_codec.decode_point(self._ask(query))
 
-    def region(
+    def points(
         self,
-        bounds: Bounds | tuple[float, float, float, float],
+        places: Sequence[Place],
         layers: Sequence[str] = (),
         *,
         as_of_ns: int | None = None,
@@ -92,15 +95,34 @@ class Client:
         repairs: bool = False,
         after: int = 0,
         wait_s: float = 10.0,
+    ) -> PointsAnswer:
+        """Layers of the cells at many places (x, y) in `map`, as arrays in their order; NaN is unknown."""
+        when, fresh = requests.When(as_of_ns, minus_ns, repairs), Freshness(after, wait_s)
+        query = requests.PointsQuery(tuple((float(x), float(y)) for x, y in places), tuple(layers), fresh, when)
+        return answer_codec.decode_points(self._ask(query))
+
+    def region(
+        self,
+        area: Bounds | tuple[float, float, float, float] | Sequence[Place],
+        layers: Sequence[str] = (),
+        *,
+        resolution_m: float | None = None,
+        as_of_ns: int | None = None,
+        minus_ns: int | None = None,
+        repairs: bool = False,
+        after: int = 0,
+        wait_s: float = 10.0,
         progress: Progress | None = None,
     ) -> Region:
-        """Layers of all cells that a rectangle (west, south, east, north) [m] touches, as arrays with coordinates.
+        """Layers of all cells of an area, as arrays with coordinates.
 
+        area: cells that a rectangle (west, south, east, north) [m] touches, or those whose centre lies in an outline of
+        corners (x, y) [m]; others are NaN. resolution_m: of larger cells, a multiple of the map's, each the mean of
+        what is known in it.
         A large region comes in pieces, all of one version of the map; progress is called with each, as (here, of all).
         """
-        box = bounds if isinstance(bounds, Bounds) else Bounds(*(float(v) for v in bounds))
         when, fresh = requests.When(as_of_ns, minus_ns, repairs), Freshness(after, wait_s)
-        query = requests.RegionQuery(box, tuple(layers), fresh, when)
+        query = requests.RegionQuery(_area(area), tuple(layers), fresh, when, resolution_m)
         for _ in range(REGION_ATTEMPTS - 1):
             try:
                 return joined(self._pieces(query), progress)
@@ -191,7 +213,7 @@ class Client:
     def route(
         self,
         line: Sequence[tuple[float, float]],
-        machine: RouteMachine = LOADER,
+        machine: RouteMachine | NamedMachine | str = LOADER,
         *,
         stops: tuple[bool, bool] = (True, True),
         step_m: float = 25.0,
@@ -202,19 +224,20 @@ class Client:
     ) -> RouteAnswer:
         """What a drive along a line of places in `map` [m] costs a machine: energy, time, speed, with 90 % intervals.
 
-        stops: whether it stands at the begin and at the end. step_m: of the steps that are answered. unknown: what
-        ground that nobody knows is taken for: "dearest" (the dearest tenth of the known ground around), "refuse", or a
+        machine: its values, the name of a kind (`MACHINES`), or its own name on the site. stops: whether it stands at
+        the begin and at the end. step_m: of the steps that are answered. unknown: what ground that nobody knows is
+        taken for: "dearest" (the dearest tenth of the known ground around), "refuse", or a
         rolling resistance coefficient.
         """
         fresh = Freshness(after, wait_s)
         places = tuple((float(x), float(y)) for x, y in line)
-        return self.drive(RouteQuery(places, machine, stops, step_m, unknown, as_of_ns, fresh))
+        return self.drive(RouteQuery(places, _machine(machine), stops, step_m, unknown, as_of_ns, fresh))
 
     def way(
         self,
         start: tuple[float, float],
         end: tuple[float, float],
-        machine: RouteMachine = LOADER,
+        machine: RouteMachine | NamedMachine | str = LOADER,
         *,
         cost: str = "energy",
         max_grade: float = 0.3,
@@ -236,7 +259,7 @@ class Client:
         query = WayQuery(
             ends[0],
             ends[1],
-            machine,
+            _machine(machine),
             cost,
             max_grade,
             margin_m,
@@ -370,6 +393,21 @@ class Client:
     def _calibrate(self, command: CalibrateCommand) -> CalibrationAnswer:
         key = keys.admin(self.site, command.name)
         return decode_calibration(self._asker.command(key, encode_command(command), SOLVE_S + command.wait_s))
+
+
+def _machine(machine: RouteMachine | NamedMachine | str) -> RouteMachine | NamedMachine:
+    return machine_of(machine) if isinstance(machine, str) else machine
+
+
+def _area(area: Bounds | Sequence[float] | Sequence[Place]) -> Bounds | tuple[Place, ...]:
+    if isinstance(area, Bounds):
+        return area
+    given = np.asarray(area, float)
+    if given.ndim == 1 and given.size == 4:
+        return Bounds(*given.tolist())
+    if given.ndim != 2 or given.shape[1] != 2:
+        raise ValueError("area: neither west, south, east, north nor corners x, y")
+    return tuple(map(tuple, given.tolist()))
 
 
 def _goes_back(first: TilesAnswer, answer: TilesAnswer) -> bool:

@@ -30,7 +30,8 @@ def is_samples(path: Path) -> bool:
 def read_map(path: Path, truth: TruthMap) -> Layers:
     """Layers (rows, columns) of a map file over the cells of a site; cells that it does not name are unknown.
 
-    A ConfigError names the line of a value that is none, of a place outside of the site, of a cell that comes twice.
+    Places outside of the site do not count: nobody knows where it ends. A ConfigError names the line of a value that is
+    none and of a cell that comes twice, or says that no place is on the site.
     """
     rows, columns = truth.c_rr.shape
     names = [*VALUES, *([CONFIDENCE] if CONFIDENCE in _header(path) else [])]
@@ -39,7 +40,7 @@ def read_map(path: Path, truth: TruthMap) -> Layers:
     for where, line in _lines(path, (*PLACE, *names)):
         x_m, y_m = (_number(where, line, axis) for axis in PLACE)
         if not (0 <= x_m - truth.west_m < columns * truth.cell_m and 0 <= y_m - truth.south_m < rows * truth.cell_m):
-            raise ConfigError(where, f"({x_m:g}, {y_m:g}) is outside of the site")
+            continue
         row, column = int((y_m - truth.south_m) / truth.cell_m), int((x_m - truth.west_m) / truth.cell_m)
         if seen[row, column]:
             raise ConfigError(where, f"the cell of ({x_m:g}, {y_m:g}) was named before")
@@ -48,6 +49,8 @@ def read_map(path: Path, truth: TruthMap) -> Layers:
             layers[name][row, column] = _number(where, line, name)
         if not 0 <= (said := layers.get(CONFIDENCE, seen)[row, column]) <= 1 and not math.isnan(said):
             raise ConfigError(where, f"{CONFIDENCE} {said:g} is not between 0 and 1")
+    if not seen.any():
+        raise ConfigError(path, "none of its places is on the site; x_m and y_m are metres in `map`")
     return layers
 
 

@@ -111,8 +111,8 @@ def figures_of(layers: Layers, true: Scene) -> Row:
 
 
 def _believed(layers: Layers, known: Bools, right: Bools) -> Believed | None:
-    """Confidence of the known cells, where a map states it; a cell without is as sure as a coin of two."""
-    if CONFIDENCE not in layers:
+    """Confidence of the known cells, where a map states any; a cell without is as sure as a coin of two."""
+    if CONFIDENCE not in layers or not np.isfinite(layers[CONFIDENCE]).any():
         return None
     return Believed(np.nan_to_num(layers[CONFIDENCE][known], nan=0.5), right[known])
 

@@ -30,6 +30,11 @@ MACHINE = "loader"
 _scenario = cache(load_scenario)
 ROOT = Path(__file__).parents[2]
 SUFFIXES = (".py", ".toml", ".urdf")  # of sources
+# Of the protocol, what machines and their simulation know: a change of the map's queries leaves recordings as they are.
+MACHINES_PROTOCOL = (
+    *(f"protocol/{folder}" for folder in ("machine", "site", "wire")),
+    *(f"protocol/{module}.py" for module in ("arrays", "config", "errors", "files", "rotations", "units")),
+)
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,7 @@ class PlannedDrive:
 
     def folder(self, cache_dir: Path) -> Path:
         """Where the recording lies; another simulator, another folder."""
-        key = digest(repr(self), self.scenario_toml, code_version("sim", "protocol"))
+        key = digest(repr(self), self.scenario_toml, code_version("sim", *MACHINES_PROTOCOL))
         return cache_dir / f"{self.preset}-seed{self.seed}-{self.seconds:g}s-{key}"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from evaluation.campaign.experiment import Experiment, Task
-from evaluation.campaign.recordings import PlannedDrive, Setup, toml_of
+from evaluation.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, toml_of
 from evaluation.ground.lag import all_samples
 from evaluation.ground.truth import LoadTrack, read_load_track
 from evaluation.positions.configurations import Configuration, select
@@ -25,7 +25,7 @@ from sim.scenario.file import load_scenario
 from sim.truth import MAP_FILE, TruthMap
 
 SOURCES = (
-    *("agents", "protocol"),
+    *("agents", *MACHINES_PROTOCOL),
     *(f"evaluation/{part}.py" for part in ("fleet/drives", "ground/lag", "positions/configurations")),
 )
 

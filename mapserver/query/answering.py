@@ -1,4 +1,7 @@
-"""Map queries answered: pages come from whoever has the map, layers are derived here, on the asking thread."""
+"""Map queries answered: pages come from whoever has the map, layers are derived here, on the asking thread.
+
+It is one module because all queries about cells read them in the same few steps.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
 from mapserver.query import roads
+from mapserver.query.areas import cells_to_a_side, finer, inside, means
 from mapserver.query.block_layers import BlockLayers, Look
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
@@ -21,10 +25,11 @@ from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource
 from mapserver.query.views import PastMaps, View, view_now, widened
 from mapserver.query.why import reasons
+from protocol.arrays import Floats32, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries import requests
-from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, Region
+from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, PointsAnswer, Region
 from protocol.queries.calibration import encode_calibration
 from protocol.queries.map_tiles import TilesAnswer, encode_tiles
 from protocol.queries.reasons import CellReasons, encode_why
@@ -33,6 +38,7 @@ from protocol.queries.requests import (
     HistoryQuery,
     MapQuery,
     PointQuery,
+    PointsQuery,
     RegionQuery,
     TilesQuery,
     When,
@@ -41,13 +47,14 @@ from protocol.queries.requests import (
 from protocol.queries.roads import encode_segments, encode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import encode_answer
-from protocol.site.geometry import Bounds, CellWindow
+from protocol.site.geometry import Bounds, CellWindow, GridGeometry
 
 SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
 WAY_BYTES = 2**23  # as much of the budget as a search for a way takes: four may wait or be in work
 # Counters of `info`: blocks and squares whose layers were kept from an earlier query, and were derived for one.
 LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
+WITHOUT_MEAN = ("heading", "resistance_class", "slope_class", "resistance_class_filled")
 
 
 class Answers:
@@ -71,11 +78,12 @@ class Answers:
         """About how many bytes the answer has."""
         if isinstance(query, WayQuery):
             return WAY_BYTES
-        if isinstance(query, requests.PieceQuery | TilesQuery | RouteQuery):
+        if isinstance(query, requests.PieceQuery | TilesQuery | RouteQuery | PointsQuery):
             return PIECE_BYTES
         if not isinstance(query, RegionQuery):
             return SMALL_BYTES
-        window, layers = self._site.geometry.window(query.bounds), len(query.layers or cell_layers.LAYERS)
+        window, _ = self._window(query)
+        layers = len(query.layers or cell_layers.LAYERS)
         return min(PIECE_BYTES, 4 * window.columns * window.rows * layers + SMALL_BYTES)
 
     def answer(self, query: MapQuery) -> bytes:
@@ -83,6 +91,8 @@ class Answers:
         match query:
             case PointQuery():
                 return codec.encode_point(self.point(query))
+            case PointsQuery():
+                return codec.encode_points(self.points(query))
             case RegionQuery():
                 return codec.encode_region(self.region(query))
             case requests.PieceQuery():
@@ -139,15 +149,33 @@ class Answers:
         values = {name: float(layer[0, 0]) for name, layer in region.layers.items()}
         return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.version, region.stamp_ns)
 
+    def points(self, query: PointsQuery) -> PointsAnswer:
+        """Layers of the cells that positions lie in."""
+        names, places = _names(query), np.array(query.places)
+        cells = self._site.geometry.cell_of(places)
+        newer, *others = (
+            self._look_at_cells(cells, names, as_of_ns, repairs=query.when.repairs) for as_of_ns in query.when.times
+        )
+        layers, look = {name: newer[0][name] for name in names}, newer[1]
+        version = look.version
+        for older, its_look in others:
+            layers = {name: values - older[name] for name, values in layers.items()}
+            version = replace(version, row=min(version.row, its_look.version.row))
+        x_m, y_m = ((cells + 0.5) * self._site.cell_m).T
+        return PointsAnswer(x_m, y_m, layers, version, look.stamp_ns)
+
     def region(self, query: RegionQuery) -> Region:
-        """Layers of all cells that a rectangle touches, or of the first piece of them: `piece` has the others."""
-        window, names = self._site.geometry.window(query.bounds), _names(query)
-        requests.check_size(window.columns, window.rows)
+        """Layers of all cells of an area, or of the first piece of them: `piece` has the others."""
+        (window, count), names = self._window(query), _names(query)
+        requests.check_size(window.columns * count, window.rows * count)
+        outline = () if isinstance(query.area, Bounds) else query.area
         pieces = PieceGrid.of_layers(window, len(names))
+        if pieces.count > 1:
+            self._open.make_room()
+        reading = replace(self._reading(finer(window, count), names, query.when), window=window)
+        reading = replace(reading, count=count, outline=outline)
         if pieces.count == 1:
-            return self._read(self._reading(window, names, query.when), window)
-        self._open.make_room()
-        reading = self._reading(window, names, query.when)
+            return self._read(reading, window)
         return self._piece(reading, pieces, 0, self._open.open(reading))
 
     def piece(self, query: requests.PieceQuery) -> Region:
@@ -197,10 +225,26 @@ class Answers:
         window = self._site.geometry.window(Bounds(x_m, y_m, np.nextafter(x_m, np.inf), np.nextafter(y_m, np.inf)))
         return CellWindow(window.column, window.row, 1, 1)
 
+    def _window(self, query: RegionQuery) -> tuple[CellWindow, int]:
+        """The cells of an answer, and how many of the map each has to a side."""
+        count = cells_to_a_side(query.resolution_m, self._site.cell_m)
+        return GridGeometry(count * self._site.cell_m).window(query.bounds), count
+
     def _reading(self, window: CellWindow, names: tuple[str, ...], when: When) -> Reading:
-        times = [when.as_of_ns] if when.minus_ns is None else [when.as_of_ns, when.minus_ns]
-        looks = (self._look(window, names, as_of_ns, repairs=when.repairs) for as_of_ns in times)
+        looks = (self._look(window, names, as_of_ns, repairs=when.repairs) for as_of_ns in when.times)
         return Reading(window, names, tuple(looks))
+
+    def _look_at_cells(
+        self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool = False
+    ) -> tuple[dict[str, Floats32], Look]:
+        """Layers (n,) of cells (n, 2), columns and rows, and what they were read from."""
+        if as_of_ns is None and not repairs:
+            look = self._source.run(lambda state: self._layers.look_cells(state, cells, names))
+        else:
+            first, last = cells.min(axis=0), cells.max(axis=0)
+            window = CellWindow(*first.tolist(), *(last - first + 1).tolist())
+            look = self._look(window, names, as_of_ns, repairs=repairs)
+        return self._layers.at_cells(look, cells, names), look
 
     def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool) -> Look:
         if as_of_ns is None and not repairs:
@@ -216,13 +260,26 @@ class Answers:
 
     def _read(self, reading: Reading, window: CellWindow) -> Region:
         """Layers of a window in that of the reading."""
-        newer, *others = (self._map(look, reading.layers, window) for look in reading.looks)
-        if not others:
-            return newer
-        (older,) = others
-        differences = {name: newer[name] - older[name] for name in reading.layers}
-        version = replace(newer.version, row=min(newer.merged, older.merged))
-        return replace(newer, layers=differences, version=version)
+        fine = finer(window, reading.count)
+        newer, *others = (self._map(look, reading.layers, fine) for look in reading.looks)
+        layers, version = dict(newer.layers), newer.version
+        for older in others:
+            layers = {name: values - older[name] for name, values in layers.items()}
+            version = replace(version, row=min(newer.merged, older.merged))
+        if reading.outline:
+            within = inside(reading.outline, fine, self._site.cell_m)
+            layers = {name: np.where(within, values, np.float32(np.nan)) for name, values in layers.items()}
+        if reading.count == 1:
+            return replace(newer, layers=layers, version=version)
+        geometry = GridGeometry(reading.count * self._site.cell_m)
+        return replace(
+            newer,
+            x_m=geometry.centres(window.column, window.columns),
+            y_m=geometry.centres(window.row, window.rows),
+            cell_m=geometry.cell_m,
+            layers={name: means(values, reading.count) for name, values in layers.items()},
+            version=version,
+        )
 
     def _map(self, look: Look, names: tuple[str, ...], window: CellWindow) -> Region:
         geometry = self._site.geometry
@@ -257,15 +314,21 @@ def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-def _names(query: PointQuery | RegionQuery) -> tuple[str, ...]:
-    """The layers of a query, checked; none means all, or all of which there is a difference."""
-    names = query.layers
-    if query.when.minus_ns is None:
-        return cell_layers.select(names)
-    if refused := [name for name in names if name in WITHOUT_DIFFERENCE]:
-        problem = f"layer `{refused[0]}` has no difference; ask for it without `minus`, as of each time"
-        raise QueryError(Refusal.OUT_OF_RANGE, problem)
-    return tuple(name for name in cell_layers.select(names) if name not in WITHOUT_DIFFERENCE)
+def _names(query: PointQuery | PointsQuery | RegionQuery) -> tuple[str, ...]:
+    """The layers of a query, checked; none means all, or all of which there is a difference, or a mean."""
+    without: tuple[str, ...] = ()
+    if query.when.minus_ns is not None:
+        without = WITHOUT_DIFFERENCE
+        _refuse_any(query.layers, without, "has no difference; ask for it without `minus`, as of each time")
+    if isinstance(query, RegionQuery) and query.resolution_m is not None:
+        without += WITHOUT_MEAN
+        _refuse_any(query.layers, WITHOUT_MEAN, "has no mean; ask for it without `resolution`")
+    return tuple(name for name in cell_layers.select(query.layers) if name not in without)
+
+
+def _refuse_any(names: tuple[str, ...], without: tuple[str, ...], problem: str) -> None:
+    if refused := [name for name in names if name in without]:
+        raise QueryError(Refusal.OUT_OF_RANGE, f"layer `{refused[0]}` {problem}")
 
 
 def _time_of(query: HistoryQuery, now_ns: int, span_s: float) -> tuple[int, int]:

@@ -29,7 +29,7 @@ from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.source import MapState
 from mapserver.query.views import View, place
-from protocol.arrays import AnyArray, Floats, Floats32
+from protocol.arrays import AnyArray, Floats, Floats32, Ints
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
@@ -96,6 +96,16 @@ class BlockLayers:
         rect = _of_squares((left, bottom, right - left + 1, top - bottom + 1))
         return self._look(state, rect, (), squares, tuple(names))
 
+    def look_cells(self, state: MapState, cells: Ints, names: Sequence[str]) -> Look:
+        """What these layers of cells (n, 2), columns and rows, are read from."""
+        area_names, blocks = _areas_of(names), _blocks_with(cells)
+        squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} if area_names else set[Block]()
+        (left, bottom), (right, top) = (
+            tuple(side(block[axis] for block in blocks) for axis in (0, 1)) for side in (min, max)
+        )
+        rect = (left, bottom, right - left + 1, top - bottom + 1)
+        return self._look(state, rect, _stored(names), squares, area_names, blocks)
+
     def _look(
         self,
         state: MapState,
@@ -103,8 +113,9 @@ class BlockLayers:
         cell_names: tuple[str, ...],
         squares: Set[Block],
         area_names: tuple[str, ...],
+        only: Set[Block] | None = None,
     ) -> Look:
-        """Layers of cells in a rectangle of blocks, and of areas in squares that touch it."""
+        """Layers of cells in a rectangle of blocks, or in some of it only, and of areas in squares that touch it."""
         grid, margin = state.grid, self._margin(area_names)
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
@@ -119,7 +130,8 @@ class BlockLayers:
             areas = _valid(self._areas, area_turns, area_names)
             needed = self._around(area_turns.keys() - areas.keys(), area_names)
             needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
-            wanted = {b: cell_turns[b] for b in own if b in needed or (cell_names and _is_in(b, inner))}
+            asked = own.keys() & only if only is not None else {b for b in own if _is_in(b, inner)}
+            wanted = {b: cell_turns[b] for b in own if b in needed or (cell_names and b in asked)}
             cells = _valid(self._cells, wanted, needed_names)
         missing = wanted.keys() - cells.keys()
         near = sorted({one for block in missing for one in around(block, self._reach) if one in own})
@@ -148,6 +160,26 @@ class BlockLayers:
             else:
                 for block, of_cells in cells.items():
                     place(layer, window, block, _at(of_cells.layers, name, look.stamp_ns))
+        return out
+
+    def at_cells(self, look: Look, cells: Ints, names: Sequence[str]) -> dict[str, Floats32]:
+        """Layers (n,) of cells (n, 2), columns and rows, among those of the look."""
+        cell_names, area_names, asked = _stored(names), _areas_of(names), _blocks_with(cells)
+        turns = {block: look.cell_turns[block] for block in asked if block in look.cell_turns}
+        blocks = self._cells_of(look, turns, cell_names) if cell_names else {}
+        of_blocks = {
+            block: {name: _at(kept.layers, name, look.stamp_ns) for name in names if name not in area_names}
+            for block, kept in blocks.items()
+        }
+        near = {(x // SQUARE, y // SQUARE) for x, y in asked}
+        squares = self.squares(look, near, area_names) if area_names else {}
+        out: dict[str, Floats32] = {name: np.full(len(cells), np.nan, np.float32) for name in names}
+        for name, values in out.items():
+            edge, kept = (SQUARE_CELLS, squares) if name in area_names else (BLOCK_CELLS, of_blocks)
+            for part, at in _by_part(cells, edge):
+                if part in kept:
+                    column, row = (cells[at] % edge).T
+                    values[at] = kept[part][name].reshape(edge, edge)[row, column]
         return out
 
     def squares(self, look: Look, squares: Set[Block], names: Sequence[str]) -> dict[Block, Layers]:
@@ -268,6 +300,19 @@ def _valid(kept: Mapping[Block, Kept], turns: Mapping[Block, int], names: Sequen
 
 
 Rect = tuple[int, int, int, int]
+
+
+def _blocks_with(cells: Ints) -> set[Block]:
+    """Blocks that have any of these cells (n, 2)."""
+    return {part for part, _ in _by_part(cells, BLOCK_CELLS)}
+
+
+def _by_part(cells: Ints, edge: int) -> list[tuple[Block, Ints]]:
+    """Squares of cells, edge to a side, and which of these cells (n, 2) lie in each."""
+    parts, of_cell = np.unique(cells // edge, axis=0, return_inverse=True)
+    order = np.argsort(of_cell, kind="stable")
+    ends = np.cumsum(np.bincount(of_cell.reshape(-1)))
+    return list(zip(map(tuple, parts.tolist()), np.split(order, ends[:-1]), strict=True))
 
 
 def _parts_of(rect: Rect, edge: int) -> Rect:

@@ -17,13 +17,15 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import encode_error
 from protocol.queries.origin import encode_origin
 from protocol.queries.parameters import split_selector
-from protocol.queries.requests import parse_query, reads_past
-from protocol.queries.route_requests import LINE_BYTES, RouteQuery, WayQuery
+from protocol.queries.places import PLACES_BYTES
+from protocol.queries.requests import PointsQuery, RegionQuery, parse_query, reads_past
+from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.wire import keys
 
 ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 pieces, or 2000 points
 MOST_PAST = 16  # that wait or are in work
 MAX_QUESTION = 4096  # bytes of a query's parameters
+WITH_PLACES = tuple(query.name for query in (PointsQuery, RegionQuery, RouteQuery, WayQuery))
 ANSWERED = "queries_answered"  # a counter of `info`
 log = logging.getLogger("mapserver.query.queryable")
 
@@ -106,7 +108,7 @@ class MapQueryable:
 def question(asked: zenoh.Query) -> tuple[str, dict[str, str]]:
     """Name and parameters. QueryError for what no client sends: what waits is kept in memory."""
     name, parameters = keys.query_of(str(asked.key_expr)), str(asked.parameters)
-    most = LINE_BYTES if name in (RouteQuery.name, WayQuery.name) else MAX_QUESTION
+    most = PLACES_BYTES if name in WITH_PLACES else MAX_QUESTION
     if len(parameters) > most or asked.payload:
         raise QueryError(Refusal.TOO_LARGE, f"`{name[:40]}` has at most {most} bytes of parameters, and no payload")
     return name, split_selector(parameters)

@@ -18,6 +18,7 @@ from itertools import pairwise
 from mapserver.query.block_layers import Look
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import Piece
+from protocol.queries.places import Place
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 PIECE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
@@ -29,11 +30,16 @@ RETRY_AFTER_S = 2.0
 
 @dataclass(frozen=True)
 class Reading:
-    """What a region is read from: layers, and the map that they are read from, less another one if there are two."""
+    """What a region is read from: layers, and the map that they are read from, less another one if there are two.
+
+    window: in cells of the answer, each of `count` cells of the map to a side. outline: outside of it nothing is known.
+    """
 
     window: CellWindow
     layers: tuple[str, ...]
     looks: tuple[Look, ...]
+    count: int = 1
+    outline: tuple[Place, ...] = ()
 
 
 @dataclass(frozen=True)

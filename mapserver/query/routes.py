@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from mapserver.query.block_layers import SQUARE_CELLS, BlockLayers, Look, place_square, squares_of
+from mapserver.query.named_machines import NamedMachines
 from mapserver.query.source import MapSource
 from mapserver.query.views import PastMaps
 from mapserver.routes.ground import Squares, dearest
@@ -17,8 +18,9 @@ from mapserver.routes.least_cost import Cell, Terrain, least_cost_line, reaches
 from mapserver.routes.route import LAYERS, route
 from protocol.arrays import Bools, Floats, Floats32, Ints
 from protocol.errors import QueryError, Refusal
-from protocol.queries.route_requests import DEAREST, REFUSE, TIME, Place, RouteQuery, WayQuery
-from protocol.queries.routing import RouteAnswer
+from protocol.queries.places import Place
+from protocol.queries.route_requests import DEAREST, REFUSE, TIME, RouteQuery, WayQuery
+from protocol.queries.routing import RouteAnswer, RouteMachine
 from protocol.site.geometry import Bounds, CellWindow
 from protocol.units import GRAVITY_MPS2
 
@@ -28,7 +30,7 @@ AROUND_M = 20.0  # so far around a line the map is read: it says what unknown gr
 DETOUR = 0.5
 LEAST_DETOUR_M = 60.0
 MAX_CELLS = 1_000_000  # of the window of a way: 1 x 1 km, searched in about a second, with 300 MB
-GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled")
+GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled", "visits")
 
 
 class Routes:
@@ -36,30 +38,31 @@ class Routes:
 
     def __init__(self, source: MapSource, layers: BlockLayers, past: Callable[[], PastMaps]) -> None:
         self._source, self._layers, self._past = source, layers, past
-        self._site = source.site
+        self._site, self._machines = source.site, NamedMachines(source)
 
     def route(self, query: RouteQuery) -> RouteAnswer:
         """What a drive along a line costs."""
         self._require_on_site("line", query.line)
+        machine = self._machines.resolve(query.machine, query.as_of_ns)
         line = np.array(query.line)
         squares = _squares_along(line, self._site.cell_m)
         look, read = self._read(squares, query.as_of_ns)
-        return self._answer(query, line, look, read)
+        return self._answer(query, machine, line, look, read)
 
     def way(self, query: WayQuery) -> RouteAnswer:
         """The line that costs least, and what it costs."""
         for name, ends in (("from", [query.start]), ("to", [query.end]), ("avoid", query.avoid)):
             self._require_on_site(name, ends)
-        window = self._window(query)
+        machine, window = self._machines.resolve(query.machine, query.as_of_ns), self._window(query)
         look, read = self._read(squares_of(window), query.as_of_ns)
-        terrain, known = self._terrain(query, window, read)
+        terrain, known = self._terrain(query, machine, window, read)
         start, end = (self._cell(place, window) for place in (query.start, query.end))
         is_open = _open(terrain, known, query, window, self._site.cell_m)
         line = self._line(query, replace(terrain, is_open=is_open), known, start, end)
         corner = np.array([window.column, window.row])
         places = np.asarray((line[:, ::-1] + 0.5 + corner) * self._site.cell_m, np.float64)
         places[0], places[-1] = query.start, query.end
-        return self._answer(query, places, look, read)
+        return self._answer(query, machine, places, look, read)
 
     def _line(self, query: WayQuery, terrain: Terrain, known: Bools, start: Cell, end: Cell) -> Ints:
         for name, cell in (("from", start), ("to", end)):
@@ -92,7 +95,9 @@ class Routes:
                 return f"`{name}` leaves none"
         return "`max_grade` and `unknown` together leave none"
 
-    def _answer(self, query: RouteQuery | WayQuery, line: Floats, look: Look, read: Squares | None) -> RouteAnswer:
+    def _answer(
+        self, query: RouteQuery | WayQuery, machine: RouteMachine, line: Floats, look: Look, read: Squares | None
+    ) -> RouteAnswer:
         unknown = None if isinstance(query.unknown, str) else query.unknown
         if read is None:  # no evidence anywhere near
             nothing = {name: np.full((1, 1), np.nan) for name in LAYERS}
@@ -100,13 +105,13 @@ class Routes:
         steps, totals = route(
             line,
             read,
-            query.machine,
+            machine,
             stops=query.stops,
             step_m=query.step_m,
             unknown_resistance=unknown,
             refuse_unknown=query.unknown == REFUSE,
         )
-        return RouteAnswer(look.version, look.stamp_ns, line, totals, steps)
+        return RouteAnswer(look.version, look.stamp_ns, line, totals, steps, machine)
 
     def _read(self, squares: Set[tuple[int, int]], as_of_ns: int | None) -> tuple[Look, Squares | None]:
         if as_of_ns is None:
@@ -117,7 +122,9 @@ class Routes:
         layers = self._layers.squares(look, squares, LAYERS)
         return look, Squares.stacked(self._site.cell_m, SQUARE_CELLS, layers) if layers else None
 
-    def _terrain(self, query: WayQuery, window: CellWindow, read: Squares | None) -> tuple[Terrain, Bools]:
+    def _terrain(
+        self, query: WayQuery, machine: RouteMachine, window: CellWindow, read: Squares | None
+    ) -> tuple[Terrain, Bools]:
         """Ground of a window, open everywhere, and which cells of it are known."""
         shape = (window.rows, window.columns)
         values: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in GROUND}
@@ -125,16 +132,19 @@ class Routes:
             for i, (x, y) in enumerate(read.places.tolist()):
                 for name, layer in values.items():
                     place_square(layer, window, (x, y), read.layers[name][i])
-        resistance, east, north = values.values()
-        known = np.isfinite(resistance + east)
+        resistance, east, north, visits = values.values()
+        measured, driven = np.isfinite(resistance), np.isfinite(visits)
+        known = measured | (driven & measured.any())
+        if (unmeasured := known & ~measured).any():
+            resistance = np.where(unmeasured, _nearest(resistance, measured), resistance)
         cost = query.unknown if isinstance(query.unknown, float) else dearest(resistance)
         if not known.any() and isinstance(query.unknown, str):
             raise _refusal("nobody has driven near these places yet: give `unknown` a resistance")
-        machine = query.machine
         crawl = machine.power_w / (machine.mass_kg * GRAVITY_MPS2 * machine.speed_mps)
-        filled = np.where(known, resistance, cost), np.where(known, east, 0.0), np.where(known, north, 0.0)
-        is_open = np.ones(shape, bool)
-        return Terrain(*filled, is_open, self._site.cell_m, crawl if query.cost == TIME else math.inf), known
+        priced = np.where(known, resistance, cost).astype(np.float64)
+        east_m, north_m = (np.nan_to_num(grade).astype(np.float64) for grade in (east, north))
+        crawl = crawl if query.cost == TIME else math.inf
+        return Terrain(priced, east_m, north_m, np.ones(shape, bool), self._site.cell_m, crawl), known
 
     def _window(self, query: WayQuery) -> CellWindow:
         """Where a way is looked for."""
@@ -195,6 +205,16 @@ def _open(terrain: Terrain, known: Bools, query: WayQuery, window: CellWindow, c
         distance = cv2.distanceTransform(is_open.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         is_open &= distance * cell_m > query.margin_m
     return np.ascontiguousarray(is_open)
+
+
+def _nearest(values: Floats32, known: Bools) -> Floats32:
+    """Values (rows, columns), in each cell that of the nearest known one."""
+    _, label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    by_label = np.zeros(label.max() + 1, np.float32)
+    by_label[label[known]] = values[known]
+    return np.asarray(by_label[label], np.float32)
 
 
 def _steepness(terrain: Terrain) -> Floats:

@@ -7,6 +7,9 @@ as its power goes, and brakes in time. Per step of length d,
 
 with the rolling resistance c, the slope s along the line, the acceleration a and the factor k >= 1 of what rotates with
 it. What F > 0 does is work of the engine, what F < 0 does is lost in brakes; nothing is stored but by speed and height.
+
+Nobody holds a speed where the ground changes: a driver answers a change of m g (c + s) LATE_S late. What the machine
+gains or lacks by then is made up for, and half of it, 1/2 v LATE_S |change|, is work that brakes take.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from protocol.queries.routing import RouteMachine
 from protocol.units import GRAVITY_MPS2
 
 CREEP_MPS = 0.3  # no machine is driven more slowly: what its power cannot do at this speed, it cannot do
+LATE_S = 0.3  # found on drives of the simulator over patches of soil: without it energies are 3 % too low
 SMOOTH_M = 9.0  # force is smoothed over about the length of a machine, which stands on all of it at once
 
 
@@ -59,7 +63,7 @@ def drive(step_m: Floats, resistance: Floats, slope: Floats, limit_mps: Floats, 
     force_n = machine.mass_kg * GRAVITY_MPS2 * (resistance + slope)
     limit = np.minimum(limit_mps, machine.speed_mps)
     inertia_kg = machine.mass_kg * machine.rotating
-    limits = machine.power_w, machine.accelerate_mps2, machine.brake_mps2
+    limits = machine.power_w, machine.accelerate_mps2, machine.brake_mps2, LATE_S
     speed, energy, braked, time = (np.zeros(len(step_m) + extra) for extra in (1, 0, 0, 0))
     stalls = _drive(step_m, force_n, limit, inertia_kg, limits, speed, energy, braked, time)
     return Drive(speed, energy, braked, time, stalls)
@@ -77,7 +81,7 @@ def _drive(
     braked: Any,
     time: Any,
 ) -> int:
-    power_w, accelerate, brake = limits
+    power_w, accelerate, brake, late = limits
     n = len(step_m)
     # from the end back: no faster than brakes stop in time
     speed[n] = limit[n]
@@ -97,6 +101,9 @@ def _drive(
         speed[i + 1] = reached
         work = force_n[i] * d + 0.5 * inertia_kg * (reached * reached - v * v)
         energy[i], braked[i] = max(work, 0.0), max(-work, 0.0)
+        if i > 0 and max(force_n[i], force_n[i - 1]) > 0.0:
+            lost = 0.5 * late * v * abs(force_n[i] - force_n[i - 1])
+            energy[i], braked[i] = energy[i] + lost, braked[i] + lost
         time[i] = 2 * d / max(v + reached, CREEP_MPS)
     return stalls
 

@@ -17,15 +17,12 @@ from typing import Any
 import cv2
 import numba
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
+from mapserver.routes.grid_search import LEAST_COST, dijkstra
 from protocol.arrays import Bools, Floats, Ints
 
 Cell = tuple[int, int]  # row and column in a window
 
-# Scipy takes negative costs and gives wrong distances for them: downhill a metre costs this, not less. As resistance.
-LEAST_COST = 0.002
 LOOK_AHEAD = 64  # places of a line that a straight piece may skip at a time; the next pass skips as many of the rest
 BAND = 8  # cells: lines that were found in a wider one cost the same
 
@@ -62,9 +59,10 @@ def least_cost_line(terrain: Terrain, start: Cell, end: Cell) -> tuple[Ints, flo
 
 def _search(terrain: Terrain, start: Cell, end: Cell, steps: Ints) -> Ints | None:
     """Cells (n, 2) of the cheapest line in steps (k, 2)."""
-    columns = terrain.is_open.shape[1]
+    columns, cells = terrain.is_open.shape[1], terrain.is_open.size
     source, target = start[0] * columns + start[1], end[0] * columns + end[1]
-    distance, before = dijkstra(graph(terrain, steps), indices=source, return_predecessors=True)
+    distance, before = np.full(cells, math.inf), np.full(cells, -1, np.int32)
+    dijkstra(*_arrays(terrain), steps, *_touched(steps), source, target, distance, before)
     if not math.isfinite(distance[target]):
         return None
     places = [target]
@@ -83,9 +81,9 @@ def _band(shape: tuple[int, int], line: Ints) -> Bools:
 
 def reaches(terrain: Terrain, start: Cell, end: Cell) -> bool:
     """Whether any line leads from one cell to the other."""
-    columns = terrain.is_open.shape[1]
-    source, target = start[0] * columns + start[1], end[0] * columns + end[1]
-    return math.isfinite(dijkstra(graph(terrain, moves(1)), indices=source, unweighted=True)[target])
+    # a line goes through a corner only where both cells beside it are open
+    _, part = cv2.connectedComponents(terrain.is_open.astype(np.uint8), connectivity=4)
+    return bool(terrain.is_open[start] and terrain.is_open[end] and part[start] == part[end])
 
 
 @lru_cache
@@ -104,16 +102,6 @@ def moves(order: int) -> Ints:
         whole += turned
         turned = [(-column, row) for row, column in turned]
     return np.array(whole)
-
-
-def graph(terrain: Terrain, steps: Ints) -> csr_matrix:
-    """Costs of all steps (k, 2) from all open cells to open ones over open ones."""
-    rows, columns = terrain.is_open.shape
-    starts = np.zeros(rows * columns + 1, np.int32)
-    edges = int(terrain.is_open.sum()) * len(steps)
-    targets, costs = np.empty(edges, np.int32), np.empty(edges)
-    used = _graph(*_arrays(terrain), steps, *_touched(steps), starts, targets, costs)
-    return csr_matrix((costs[:used], targets[:used], starts), shape=(rows * columns, rows * columns))
 
 
 def cost_of(terrain: Terrain, line: Ints) -> float:
@@ -155,49 +143,6 @@ def _touched(steps: Ints) -> tuple[Ints, Floats]:
                     touched.setdefault(cell, 0.0)
         cells[k, : len(touched)], shares[k, : len(touched)] = list(touched), list(touched.values())
     return cells, shares
-
-
-@numba.njit(cache=True, nogil=True)
-def _graph(
-    resistance: Any,
-    east: Any,
-    north: Any,
-    is_open: Any,
-    cell_m: float,
-    crawl: float,
-    steps: Any,
-    cells: Any,
-    shares: Any,
-    starts: Any,
-    targets: Any,
-    costs: Any,
-) -> int:
-    rows, columns = is_open.shape
-    at = 0
-    norms = np.sqrt((steps * steps).sum(axis=1).astype(np.float64))
-    for row in range(rows):
-        for column in range(columns):
-            if is_open[row, column]:
-                for k in range(len(steps)):
-                    to_row, to_column = row + steps[k, 0], column + steps[k, 1]
-                    if not (0 <= to_row < rows and 0 <= to_column < columns):
-                        continue
-                    x, y, total = steps[k, 1] / norms[k], steps[k, 0] / norms[k], 0.0
-                    for i in range(shares.shape[1]):
-                        share = shares[k, i]
-                        if share < 0.0:
-                            break
-                        r, c = row + cells[k, i, 0], column + cells[k, i, 1]
-                        if not is_open[r, c]:
-                            total = math.inf
-                            break
-                        climbs = resistance[r, c] + east[r, c] * x + north[r, c] * y
-                        total += share * (max(climbs, LEAST_COST) if crawl == math.inf else max(climbs / crawl, 1.0))
-                    if total < math.inf:
-                        targets[at], costs[at] = to_row * columns + to_column, total * norms[k] * cell_m
-                        at += 1
-            starts[row * columns + column + 1] = at
-    return at
 
 
 @numba.njit(cache=True, nogil=True)

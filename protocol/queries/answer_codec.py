@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from protocol.arrays import Floats32
+from protocol.arrays import Floats, Floats32
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.queries import answers
 from protocol.site.geometry import MAX_CELLS
@@ -44,6 +44,32 @@ def decode_point(data: bytes) -> answers.PointAnswer:
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
     x, y, values = take(table, "x_m", float), take(table, "y_m", float), _take_values(table)
     return answers.PointAnswer(x, y, values, decode_version(table), take(table, "stamp_ns", int))
+
+
+def encode_points(answer: answers.PointsAnswer) -> bytes:
+    """Answer of `points`: centres as float64, layers as float32, little-endian."""
+    place = {name: np.ascontiguousarray(getattr(answer, name), "<f8").tobytes() for name in ("x_m", "y_m")}
+    layers = {name: np.ascontiguousarray(values, "<f4").tobytes() for name, values in answer.layers.items()}
+    return pack({**place, "layers": layers, **encode_version(answer.version), "stamp_ns": answer.stamp_ns})
+
+
+def decode_points(data: bytes) -> answers.PointsAnswer:
+    """Undo `encode_points`."""
+    table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
+    x_m, y_m = (take_column(table, name) for name in ("x_m", "y_m"))
+    if len(x_m) != len(y_m):
+        raise MessageError(Refusal.COLUMN_LENGTH, f"{len(x_m)} places, and {len(y_m)}", field="y_m")
+    tables = take(table, "layers", dict)
+    layers = {name: _decode_layer(tables, name, 1, len(x_m))[0] for name in tables}
+    return answers.PointsAnswer(x_m, y_m, layers, decode_version(table), take(table, "stamp_ns", int))
+
+
+def take_column(table: dict[str, Any], name: str) -> Floats:
+    """Take the field `name` as numbers (n,), float64 little-endian; at least one."""
+    data: bytes = take(table, name, bytes)
+    if not data or len(data) % 8:
+        raise MessageError(Refusal.COLUMN_LENGTH, f"{len(data)} bytes are no numbers of 8", field=name)
+    return np.frombuffer(data, "<f8")
 
 
 def encode_region(region: answers.Region) -> bytes:

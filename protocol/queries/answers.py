@@ -48,6 +48,20 @@ class PointAnswer(_OfVersion):
 
 
 @dataclass(frozen=True)
+class PointsAnswer(_OfVersion):
+    """Layers of n cells: x_m, y_m (n,) their centres; layers: name -> float32 (n,), NaN where unknown."""
+
+    x_m: Floats
+    y_m: Floats
+    layers: Mapping[str, Floats32]
+    version: MapVersion
+    stamp_ns: int
+
+    def __getitem__(self, layer: str) -> Floats32:
+        return self.layers[layer]
+
+
+@dataclass(frozen=True)
 class Piece:
     """Where a piece lies in the region that was asked for.
 

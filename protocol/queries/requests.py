@@ -11,12 +11,14 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries import parameters as ps
 from protocol.queries.answers import MapVersion
 from protocol.queries.parameters import ANY_ROW, Freshness
+from protocol.queries.places import MAX_CORNERS, Place, check_count, check_outline, refusal, take_places, text_of_places
 from protocol.queries.route_requests import ROUTE, WAY, RouteQuery, WayQuery, encode_route, parse_route, parse_way
 from protocol.site.geometry import MAX_CELLS, Bounds
 
 MAX_SPANS = 2000  # of one history
 MAX_SPAN_S = 1e9
 MAX_LIMIT = 1000  # stretches of one worklist
+MAX_RESOLUTION_M = 1000.0
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,11 @@ class When:
     as_of_ns: int | None = None
     minus_ns: int | None = None
     repairs: bool = False
+
+    @property
+    def times(self) -> tuple[int | None, ...]:
+        """Times of the maps that are read: this one, and that which is taken off it."""
+        return (self.as_of_ns,) if self.minus_ns is None else (self.as_of_ns, self.minus_ns)
 
 
 NOW = When()
@@ -48,15 +55,52 @@ class PointQuery:
 
 
 @dataclass(frozen=True)
-class RegionQuery:
-    """All cells that a rectangle touches; no layers means all of them."""
+class PointsQuery:
+    """The cells at many places in `map` [m]; no layers means all of them."""
 
-    bounds: Bounds
+    places: tuple[Place, ...]
     layers: tuple[str, ...] = ()
     fresh: Freshness = ANY_ROW
     when: When = NOW
 
+    name = "points"
+
+    def __post_init__(self) -> None:
+        if not self.places:
+            raise refusal("places", "there is none")
+        check_count("places", len(self.places))
+
+
+@dataclass(frozen=True)
+class RegionQuery:
+    """All cells that a rectangle touches, or those whose centre lies in an outline; no layers means all of them.
+
+    area: the outline, by its corners in either direction. resolution_m: of larger cells, a multiple of the map's, each
+    the mean of what is known in it; None for the cells of the map.
+    """
+
+    area: Bounds | tuple[Place, ...]
+    layers: tuple[str, ...] = ()
+    fresh: Freshness = ANY_ROW
+    when: When = NOW
+    resolution_m: float | None = None
+
     name = "region"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.area, Bounds):
+            check_outline("polygon", self.area)
+        if self.resolution_m is not None and not 0 < self.resolution_m <= MAX_RESOLUTION_M:
+            problem = f"{self.resolution_m:g} m is not above 0 and at most {MAX_RESOLUTION_M:g} m"
+            raise refusal("resolution", problem)
+
+    @property
+    def bounds(self) -> Bounds:
+        """The rectangle, or that around the outline."""
+        if isinstance(self.area, Bounds):
+            return self.area
+        x_m, y_m = zip(*self.area, strict=True)
+        return Bounds(min(x_m), min(y_m), max(x_m), max(y_m))
 
 
 @dataclass(frozen=True)
@@ -211,7 +255,7 @@ class WorklistQuery:
             raise QueryError(Refusal.OUT_OF_RANGE, problem)
 
 
-CellQuery = PointQuery | RegionQuery | PieceQuery | HistoryQuery | WhyQuery
+CellQuery = PointQuery | PointsQuery | RegionQuery | PieceQuery | HistoryQuery | WhyQuery
 RoadQuery = SegmentsQuery | WorklistQuery
 LineQuery = RouteQuery | WayQuery
 MapQuery = (
@@ -250,7 +294,7 @@ def encode_query(query: MapQuery) -> dict[str, str]:
         case WhyQuery():
             return {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m), **_stamps({"as_of": query.as_of_ns})}
     parameters = {}
-    if isinstance(query, PointQuery | RegionQuery | HistoryQuery):
+    if isinstance(query, PointQuery | PointsQuery | RegionQuery | HistoryQuery):
         parameters = _of_map(query)
     elif isinstance(query, SegmentsQuery | WorklistQuery):
         parameters = _of_roads(query)
@@ -267,7 +311,7 @@ def reads_past(query: MapQuery) -> bool:
         return True
     if isinstance(query, TilesQuery | WhyQuery | RouteQuery | WayQuery):
         return query.as_of_ns is not None
-    if isinstance(query, PointQuery | RegionQuery):
+    if isinstance(query, PointQuery | PointsQuery | RegionQuery):
         return query.when != NOW
     return isinstance(query, HistoryQuery)
 
@@ -279,10 +323,12 @@ def _of_tiles(query: TilesQuery) -> dict[str, str]:
     return parameters | ({"place": f"{query.place[0]},{query.place[1]}"} if query.place else {})
 
 
-def _of_map(query: PointQuery | RegionQuery | HistoryQuery) -> dict[str, str]:
+def _of_map(query: PointQuery | PointsQuery | RegionQuery | HistoryQuery) -> dict[str, str]:
     parameters = {"layers": ",".join(query.layers)} if query.layers else {}
     if isinstance(query, RegionQuery):
-        parameters["bounds"] = _text_of_bounds(query.bounds)
+        parameters |= _of_region(query)
+    elif isinstance(query, PointsQuery):
+        parameters["places"] = text_of_places(query.places)
     else:
         parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
     if isinstance(query, HistoryQuery):
@@ -290,6 +336,13 @@ def _of_map(query: PointQuery | RegionQuery | HistoryQuery) -> dict[str, str]:
         return parameters | ({"span": ps.text_of(query.span_s)} if query.span_s is not None else {})
     parameters |= _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
     return parameters | ({"repairs": "1"} if query.when.repairs else {})
+
+
+def _of_region(query: RegionQuery) -> dict[str, str]:
+    resolution = {"resolution": ps.text_of(query.resolution_m)} if query.resolution_m is not None else {}
+    if isinstance(query.area, Bounds):
+        return {"bounds": _text_of_bounds(query.area), **resolution}
+    return {"polygon": text_of_places(query.area), **resolution}
 
 
 def _of_roads(query: RoadQuery) -> dict[str, str]:
@@ -329,7 +382,18 @@ def _parse_point(parameters: ps.Parameters) -> PointQuery:
 
 
 def _parse_region(parameters: ps.Parameters) -> RegionQuery:
-    return RegionQuery(_bounds(parameters), _layers(parameters), ps.freshness(parameters), _when(parameters))
+    if {"bounds", "polygon"} <= set(parameters):
+        raise refusal("polygon", "given with `bounds`: a region is a rectangle or an outline")
+    outline = "polygon" in parameters
+    area = take_places(parameters, "polygon", MAX_CORNERS) if outline else _bounds(parameters)
+    resolution_m = ps.number(parameters, "resolution") if "resolution" in parameters else None
+    same = _layers(parameters), ps.freshness(parameters), _when(parameters)
+    return RegionQuery(area, *same, resolution_m)
+
+
+def _parse_points(parameters: ps.Parameters) -> PointsQuery:
+    places = take_places(parameters, "places")
+    return PointsQuery(places, _layers(parameters), ps.freshness(parameters), _when(parameters))
 
 
 def _parse_piece(parameters: ps.Parameters) -> PieceQuery:
@@ -385,7 +449,8 @@ _ROADS = ("from", "to", "as_of", "bounds", "machine")
 _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
     "point": (("x", "y", "layers", "as_of", "minus", "repairs", *_FRESH), _parse_point),
-    "region": (("bounds", "layers", "as_of", "minus", "repairs", *_FRESH), _parse_region),
+    "points": (("places", "layers", "as_of", "minus", "repairs", *_FRESH), _parse_points),
+    "region": (("bounds", "polygon", "resolution", "layers", "as_of", "minus", "repairs", *_FRESH), _parse_region),
     "piece": (("cursor", "number"), _parse_piece),
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(ps.freshness(parameters))),

@@ -12,11 +12,10 @@ from itertools import pairwise
 from protocol.errors import QueryError, Refusal
 from protocol.queries import parameters as ps
 from protocol.queries.parameters import ANY_ROW, Freshness
-from protocol.queries.routing import LOADER, MACHINES, RouteMachine
+from protocol.queries.places import Place, check_count, refusal, take_place, take_places, text_of_places
+from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteMachine
+from protocol.site.site_config import NAME
 
-Place = tuple[float, float]
-
-MAX_PLACES = 10_000  # of one line
 MAX_LENGTH_M = 100_000.0
 MIN_STEP_M, MAX_STEP_M = 1.0, 10_000.0
 MAX_STEPS = 10_000
@@ -24,7 +23,6 @@ MAX_GRADE = 1.0
 MAX_MARGIN_M = 100.0
 ENERGY, TIME = "energy", "time"
 DEAREST, REFUSE = "dearest", "refuse"  # of unknown ground: as dear as the dearest tenth of the known; or not at all
-LINE_BYTES = 2**19  # of the parameters of a route: MAX_PLACES places with all their digits
 
 # Parameters of a machine, and its attributes.
 _MACHINE = {
@@ -47,11 +45,11 @@ class RouteQuery:
     """What a drive along a line [m] costs a machine.
 
     stops: whether it stands at the begin and at the end. step_m: of the steps that are answered. unknown: what ground
-    that nobody knows is taken for: DEAREST, REFUSE or a rolling resistance coefficient.
+    that nobody knows is taken for: DEAREST, REFUSE or a rolling resistance coefficient. machine: also one of the site.
     """
 
     line: tuple[Place, ...]
-    machine: RouteMachine = LOADER
+    machine: RouteMachine | NamedMachine = LOADER
     stops: tuple[bool, bool] = (True, True)
     step_m: float = 25.0
     unknown: str | float = DEAREST
@@ -62,12 +60,11 @@ class RouteQuery:
 
     def __post_init__(self) -> None:
         if len(self.line) < 2:
-            raise _refusal("line", f"{len(self.line)} places; a line has at least two")
-        if len(self.line) > MAX_PLACES:
-            raise QueryError(Refusal.TOO_LARGE, f"parameter `line`: {len(self.line)} places, over {MAX_PLACES}")
+            raise refusal("line", f"{len(self.line)} places; a line has at least two")
+        check_count("line", len(self.line))
         for i, (a, b) in enumerate(pairwise(self.line)):
             if a == b:
-                raise _refusal("line", f"places {i + 1} and {i + 2} are the same")
+                raise refusal("line", f"places {i + 1} and {i + 2} are the same")
         length_m = sum(math.dist(a, b) for a, b in pairwise(self.line))
         if length_m > MAX_LENGTH_M:
             raise QueryError(Refusal.TOO_LARGE, f"parameter `line`: {length_m / 1000:.0f} km, over 100 km")
@@ -85,7 +82,7 @@ class WayQuery:
 
     start: Place
     end: Place
-    machine: RouteMachine = LOADER
+    machine: RouteMachine | NamedMachine = LOADER
     cost: str = ENERGY
     max_grade: float = 0.3
     margin_m: float = 0.0
@@ -100,15 +97,14 @@ class WayQuery:
 
     def __post_init__(self) -> None:
         if self.start == self.end:
-            raise _refusal("to", "the same place as `from`")
+            raise refusal("to", "the same place as `from`")
         if self.cost not in (ENERGY, TIME):
-            raise _refusal("cost", f"{self.cost[:40]!r} is neither {ENERGY} nor {TIME}")
+            raise refusal("cost", f"{self.cost[:40]!r} is neither {ENERGY} nor {TIME}")
         if not 0 < self.max_grade <= MAX_GRADE:
-            raise _refusal("max_grade", f"{self.max_grade:g} is not above 0 and at most {MAX_GRADE:g}")
+            raise refusal("max_grade", f"{self.max_grade:g} is not above 0 and at most {MAX_GRADE:g}")
         if not 0 <= self.margin_m <= MAX_MARGIN_M:
-            raise _refusal("margin", f"{self.margin_m:g} m is not between 0 and {MAX_MARGIN_M:g} m")
-        if len(self.avoid) > MAX_PLACES:
-            raise QueryError(Refusal.TOO_LARGE, f"parameter `avoid`: {len(self.avoid)} places, over {MAX_PLACES}")
+            raise refusal("margin", f"{self.margin_m:g} m is not between 0 and {MAX_MARGIN_M:g} m")
+        check_count("avoid", len(self.avoid))
         _check_steps(self.step_m, math.dist(self.start, self.end))
         _check_unknown(self.unknown)
 
@@ -116,12 +112,12 @@ class WayQuery:
 def encode_route(query: RouteQuery | WayQuery) -> dict[str, str]:
     """Selector parameters."""
     if isinstance(query, RouteQuery):
-        out = {"line": _text(query.line)}
+        out = {"line": text_of_places(query.line)}
     else:
-        out = {"from": _text([query.start]), "to": _text([query.end]), "cost": query.cost}
+        out = {"from": text_of_places([query.start]), "to": text_of_places([query.end]), "cost": query.cost}
         out |= {"max_grade": ps.text_of(query.max_grade), "margin": ps.text_of(query.margin_m)}
-        out |= {"avoid": _text(query.avoid)} if query.avoid else {}
-    out |= {name: ps.text_of(getattr(query.machine, attribute)) for name, attribute in _MACHINE.items()}
+        out |= {"avoid": text_of_places(query.avoid)} if query.avoid else {}
+    out |= _of_machine(query.machine)
     stops = ",".join(name for name, is_one in zip(("begin", "end"), query.stops, strict=True) if is_one)
     unknown = query.unknown if isinstance(query.unknown, str) else ps.text_of(query.unknown)
     out |= {"stops": stops or "none", "step": ps.text_of(query.step_m), "unknown": unknown}
@@ -130,23 +126,23 @@ def encode_route(query: RouteQuery | WayQuery) -> dict[str, str]:
 
 def parse_route(parameters: ps.Parameters) -> RouteQuery:
     """Undo `encode_route` of a route; QueryError names what is wrong."""
-    return RouteQuery(_places(parameters, "line"), *_same(parameters))
+    return RouteQuery(take_places(parameters, "line"), *_same(parameters))
 
 
 def parse_way(parameters: ps.Parameters) -> WayQuery:
     """Undo `encode_route` of a way; QueryError names what is wrong."""
-    start, end = (_place(parameters, name) for name in ("from", "to"))
+    start, end = (take_place(parameters, name) for name in ("from", "to"))
     same = _same(parameters)
     usual = {"max_grade": "0.3", "margin": "0"}
     max_grade, margin_m = (ps.number({**usual, **parameters}, name) for name in usual)
-    avoid = _places(parameters, "avoid") if "avoid" in parameters else ()
+    avoid = take_places(parameters, "avoid") if "avoid" in parameters else ()
     cost = parameters.get("cost", ENERGY)
     return WayQuery(start, end, same[0], cost, max_grade, margin_m, avoid, *same[1:])
 
 
 def _same(
     parameters: ps.Parameters,
-) -> tuple[RouteMachine, tuple[bool, bool], float, str | float, int | None, Freshness]:
+) -> tuple[RouteMachine | NamedMachine, tuple[bool, bool], float, str | float, int | None, Freshness]:
     step_m = ps.number({"step": "25", **parameters}, "step")
     unknown: str | float = parameters.get("unknown", DEAREST)
     if unknown not in (DEAREST, REFUSE):
@@ -161,52 +157,39 @@ def _same(
     )
 
 
-def _machine(parameters: ps.Parameters) -> RouteMachine:
-    """A machine by the name of its kind, with those of its values that are given."""
-    kind = parameters.get("machine", next(iter(MACHINES)))
-    if kind not in MACHINES:
-        raise _refusal("machine", f"{kind[:40]!r} is not known; known: {', '.join(MACHINES)}; or give its values")
-    given = {attribute: ps.number(parameters, name) for name, attribute in _MACHINE.items() if name in parameters}
+def _of_machine(machine: RouteMachine | NamedMachine) -> dict[str, str]:
+    if isinstance(machine, NamedMachine):
+        of_attribute = {attribute: name for name, attribute in _MACHINE.items()}
+        return {"machine": machine.name, **{of_attribute[a]: ps.text_of(value) for a, value in machine.given}}
+    return {name: ps.text_of(getattr(machine, attribute)) for name, attribute in _MACHINE.items()}
+
+
+def _machine(parameters: ps.Parameters) -> RouteMachine | NamedMachine:
+    """A machine by the name of its kind or by its own, with those of its values that are given."""
+    name = parameters.get("machine", next(iter(MACHINES)))
+    given = {attribute: ps.number(parameters, value) for value, attribute in _MACHINE.items() if value in parameters}
+    if name not in MACHINES and not NAME.fullmatch(name):
+        raise refusal("machine", f"{name[:40]!r} is no name; kinds are {', '.join(MACHINES)}")
     try:
-        return replace(MACHINES[kind], **given)
+        if name in MACHINES:
+            return replace(MACHINES[name], **given)
+        return NamedMachine(name, tuple(sorted(given.items())))
     except ValueError as error:
         wrong, _, problem = str(error).partition(": ")
-        raise _refusal(next(name for name, attribute in _MACHINE.items() if attribute == wrong), problem) from None
+        raise refusal(next(name for name, attribute in _MACHINE.items() if attribute == wrong), problem) from None
 
 
 def _stops(parameters: ps.Parameters) -> tuple[bool, bool]:
     text = parameters.get("stops", "begin,end")
     parts = {part for part in text.split(",") if part} - {"none"}
     if not parts <= {"begin", "end"}:
-        raise _refusal("stops", f"{text[:40]!r} is not begin, end, both or none")
+        raise refusal("stops", f"{text[:40]!r} is not begin, end, both or none")
     return "begin" in parts, "end" in parts
-
-
-def _places(parameters: ps.Parameters, name: str) -> tuple[Place, ...]:
-    """Places x, y, x, y, ... [m]."""
-    parts = ps.required(parameters, name).split(",")
-    if len(parts) % 2:
-        raise _refusal(name, f"{len(parts)} numbers; places are pairs x,y in metres")
-    if len(parts) > 2 * MAX_PLACES:
-        raise QueryError(Refusal.TOO_LARGE, f"parameter `{name}`: {len(parts) // 2} places, over {MAX_PLACES}")
-    numbers = [ps.number({name: part}, name) for part in parts]
-    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
-
-
-def _place(parameters: ps.Parameters, name: str) -> Place:
-    places = _places(parameters, name)
-    if len(places) != 1:
-        raise _refusal(name, f"{len(places)} places; it is one, x,y in metres")
-    return places[0]
-
-
-def _text(places: tuple[Place, ...] | list[Place]) -> str:
-    return ",".join(ps.text_of(value) for place in places for value in place)
 
 
 def _check_steps(step_m: float, length_m: float) -> None:
     if not MIN_STEP_M <= step_m <= MAX_STEP_M:
-        raise _refusal("step", f"{step_m:g} m is not between {MIN_STEP_M:g} and {MAX_STEP_M:g} m")
+        raise refusal("step", f"{step_m:g} m is not between {MIN_STEP_M:g} and {MAX_STEP_M:g} m")
     if length_m > step_m * MAX_STEPS:
         problem = f"parameter `step`: {length_m:.0f} m in steps of {step_m:g} m are over {MAX_STEPS}"
         raise QueryError(Refusal.TOO_LARGE, problem)
@@ -215,10 +198,6 @@ def _check_steps(step_m: float, length_m: float) -> None:
 def _check_unknown(unknown: str | float) -> None:
     if isinstance(unknown, str):
         if unknown not in (DEAREST, REFUSE):
-            raise _refusal("unknown", f"{unknown[:40]!r} is not {DEAREST}, {REFUSE} or a resistance")
+            raise refusal("unknown", f"{unknown[:40]!r} is not {DEAREST}, {REFUSE} or a resistance")
     elif not 0 < unknown <= 1:
-        raise _refusal("unknown", f"a resistance of {unknown:g} is not above 0 and at most 1")
-
-
-def _refusal(parameter: str, problem: str) -> QueryError:
-    return QueryError(Refusal.OUT_OF_RANGE, f"parameter `{parameter}`: {problem}")
+        raise refusal("unknown", f"a resistance of {unknown:g} is not above 0 and at most 1")

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
 from protocol.arrays import Floats
 from protocol.errors import MessageError, Refusal
-from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, decode_version, encode_version, take_record
+from protocol.queries.answer_codec import (
+    MAX_ITEMS,
+    MAX_REPLY_BYTES,
+    decode_version,
+    encode_version,
+    take_column,
+    take_record,
+)
 from protocol.queries.answers import MapVersion
 from protocol.units import DIESEL_J_PER_L
 from protocol.wire.codec import pack, take, unpack
@@ -60,12 +66,32 @@ MACHINES = {
 
 
 @dataclass(frozen=True)
+class NamedMachine:
+    """A machine of the site, by its name: its mass is what its newest samples state, see docs/protocol.md.
+
+    given: attributes of a RouteMachine and their values, by name, which hold whatever is known. ValueError as there.
+    """
+
+    name: str
+    given: tuple[tuple[str, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        replace(LOADER, **dict(self.given))
+
+
+def machine_of(named: str) -> RouteMachine | NamedMachine:
+    """A machine by the name of its kind, or by its own."""
+    return MACHINES.get(named) or NamedMachine(named)
+
+
+@dataclass(frozen=True)
 class RouteSteps:
     """n steps along a route, in its direction.
 
     distance_m (n,): from the begin of the route to the end of each; length_m; x_m, y_m: of its begin, in `map`.
-    resistance, slope, their deviations and confidence: means, NaN where nothing is known of them; unknown: share of
-    its length of which nothing is. energy_j: what drives the wheels; braked_j: what brakes take; speed_mps: mean.
+    resistance, slope, their deviations and confidence: means, NaN where nothing is known of them. unknown: share of
+    its length where nobody was; unmeasured: where machines were and none could tell the resistance. energy_j: what
+    drives the wheels; braked_j: what brakes take; speed_mps: mean.
     """
 
     distance_m: Floats
@@ -78,6 +104,7 @@ class RouteSteps:
     slope_std: Floats
     confidence: Floats
     unknown: Floats
+    unmeasured: Floats
     energy_j: Floats
     braked_j: Floats
     time_s: Floats
@@ -86,7 +113,9 @@ class RouteSteps:
 
 @dataclass(frozen=True)
 class RouteTotals:
-    """All of a route. low, high: its 90 % interval. lift_m: how much higher its end is. unknown: share of its length.
+    """All of a route. low, high: its 90 % interval. lift_m: how much higher its end is.
+
+    unknown, unmeasured: shares of its length, as of the steps.
 
     energy_j: drive force times way. At the wheels it is more by their slip, which the map does not know: 1 to 4 % on
     firm ground, 10 % in sand. fuel_j: over the machine's efficiency.
@@ -95,6 +124,7 @@ class RouteTotals:
     length_m: float
     lift_m: float
     unknown: float
+    unmeasured: float
     energy_j: float
     energy_low_j: float
     energy_high_j: float
@@ -112,13 +142,17 @@ class RouteTotals:
 
 @dataclass(frozen=True)
 class RouteAnswer:
-    """What a route costs. line_m (k, 2): where it leads. stamp_ns: the site's now, or the time that the map is of."""
+    """What a route costs this machine.
+
+    line_m (k, 2): where it leads. stamp_ns: the site's now, or the time that the map is of.
+    """
 
     version: MapVersion
     stamp_ns: int
     line_m: Floats
     totals: RouteTotals
     steps: RouteSteps
+    machine: RouteMachine
 
     @property
     def merged(self) -> int:
@@ -130,25 +164,18 @@ def encode_answer(answer: RouteAnswer) -> bytes:
     """Answer of `route` and `way`: columns as float64 little-endian."""
     steps = {name: np.ascontiguousarray(values, "<f8").tobytes() for name, values in vars(answer.steps).items()}
     line = np.ascontiguousarray(answer.line_m, "<f8").tobytes()
-    plain = {"line": line, "totals": asdict(answer.totals), "steps": steps, "stamp_ns": answer.stamp_ns}
-    return pack({**plain, **encode_version(answer.version)})
+    tables = {"totals": asdict(answer.totals), "steps": steps, "machine": asdict(answer.machine)}
+    return pack({"line": line, **tables, "stamp_ns": answer.stamp_ns, **encode_version(answer.version)})
 
 
 def decode_answer(data: bytes) -> RouteAnswer:
     """Undo `encode_answer`."""
     table = unpack(data, MAX_REPLY_BYTES, MAX_ITEMS)
-    line = _column(table, "line")
+    line = take_column(table, "line")
     tables = take(table, "steps", dict)
-    columns = {field.name: _column(tables, field.name) for field in fields(RouteSteps)}
+    columns = {field.name: take_column(tables, field.name) for field in fields(RouteSteps)}
     if len(line) % 2 or len({len(values) for values in columns.values()}) != 1:
         raise MessageError(Refusal.COLUMN_LENGTH, "columns of a route differ in length", field="steps")
-    totals = take_record(RouteTotals, table, "totals")
+    totals, machine = take_record(RouteTotals, table, "totals"), take_record(RouteMachine, table, "machine")
     version, stamp_ns = decode_version(table), take(table, "stamp_ns", int)
-    return RouteAnswer(version, stamp_ns, line.reshape(-1, 2), totals, RouteSteps(**columns))
-
-
-def _column(table: dict[str, Any], name: str) -> Floats:
-    data: bytes = take(table, name, bytes)
-    if not data or len(data) % 8:
-        raise MessageError(Refusal.COLUMN_LENGTH, f"{len(data)} bytes are no numbers of 8", field=name)
-    return np.frombuffer(data, "<f8")
+    return RouteAnswer(version, stamp_ns, line.reshape(-1, 2), totals, RouteSteps(**columns), machine)

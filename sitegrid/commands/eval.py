@@ -53,13 +53,14 @@ def add_options(parser: ArgumentParser) -> None:
         what, "fleet", "measure what calibration of machines by each other and by the ground gives the map"
     )
     roads = add_action(what, "roads", "measure roads, traffic, losses and repairs on random patches of soil")
-    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads):
+    routes = add_action(what, "routes", "compare routes with what machines spent, and ways with a finer search")
+    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
         action.add_argument("--seeds", type=count, default=DEFAULT_SEEDS, help="number of seeds (default %(default)s)")
     physics.add_argument("--seeds", type=count, default=3, help="number of seeds (default %(default)s)")
-    for action in (physics, table, paper, blackout, budget, ground, base, merge, lag, fleet, roads):
+    for action in (physics, table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
-    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads):
+    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
@@ -81,6 +82,7 @@ def add_options(parser: ArgumentParser) -> None:
         (lag, 900.0),
         (fleet, 900.0),
         (roads, 900.0),
+        (routes, 900.0),
     ):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
@@ -98,7 +100,7 @@ def add_options(parser: ArgumentParser) -> None:
     paper.add_argument("--tensor", type=OutputFile((".npy",)), metavar="FILE", help=tensor)
     quick = "short drives of its own without PyBullet, and few rows: to see that all works"
     paper.add_argument("--quick", action="store_true", help=quick)
-    for action in (merge, roads):
+    for action in (merge, roads, routes):
         action.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
@@ -136,6 +138,7 @@ def run(arguments: Namespace) -> int:
         "lag": _lag,
         "fleet": _fleet,
         "roads": _roads,
+        "routes": _routes,
         "log": _log,
         "parity": _parity,
     }
@@ -261,6 +264,14 @@ def _roads(arguments: Namespace) -> Report:
     cases = experiment.select([name for name in arguments.cases.split(",") if name])
     work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds, cases=cases)
     return _experiment(arguments, "machines drive on patches of soil, their samples show roads", work)
+
+
+def _routes(arguments: Namespace) -> Report:
+    from evaluation.routes import experiment
+
+    cases = experiment.select([name for name in arguments.cases.split(",") if name])
+    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds, cases=cases)
+    return _experiment(arguments, "machines drive on patches of soil, their samples price routes", work)
 
 
 def _experiment(

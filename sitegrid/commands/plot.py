@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sitegrid.options.groups import add_network, add_site
 from sitegrid.options.outputs import PICTURE
-from sitegrid.options.values import positive
+from sitegrid.options.values import named_text, positive
 
 HELP = "draw the map, once or live"
 EXTRA = "server"
@@ -23,6 +23,13 @@ def add_options(parser: ArgumentParser) -> None:
     add("--bounds", type=float, nargs=4, metavar=("W", "S", "E", "N"), help=sides)
     add("--truth", type=Path, help="true map of a simulation (truth_map.npz): also draw the difference")
     add("--worklist", action="store_true", help="draw roads, and the ten stretches where work pays most, instead")
+    drawn = parser.add_mutually_exclusive_group()
+    line = "draw a drive over these places, and what it costs along the way, instead"
+    drawn.add_argument("--line", type=float, nargs="+", metavar="M", help=line)
+    ends = ("X1", "Y1", "X2", "Y2")
+    drawn.add_argument("--between", type=float, nargs=4, metavar=ends, help="the same of the line that costs least")
+    values = "a value of the drive, as machine=truck or cost=time: as `sitegrid query way` takes it; may be repeated"
+    add("--set", action="append", type=named_text, default=[], metavar="NAME=VALUE", help=values)
     add("--follow", action="store_true", help="redraw while machines drive, until stopped")
     add("--every", type=positive, default=1.0, help="seconds between two pictures (default %(default)s)")
     add("--pictures", type=int, default=0, help="with --follow: exit after this many pictures")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.files import whole_file
-from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, Region
+from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, PointsAnswer, Region
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
 from protocol.queries.explanations import calibrated, why
 from protocol.queries.parameters import Freshness, text_of
@@ -32,7 +32,7 @@ from sitegrid.options.groups import Subparsers, add_action, add_network, add_sit
 from sitegrid.options.outputs import OutputFile
 from sitegrid.options.times import HELP as TIME_HELP
 from sitegrid.options.times import SiteTime, parse_time, utc_text
-from sitegrid.options.values import positive
+from sitegrid.options.values import named_text, positive
 from sitegrid.process import streams
 from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
 from sitegrid.process.progress import EVERY_S
@@ -54,8 +54,14 @@ def add_options(parser: ArgumentParser) -> None:
     point = _add_query(queries, _point, "the cell at a position, in metres")
     _add_numbers(point, "x_m", "y_m")
     _add_when(point)
-    region = _add_query(queries, _region, "a rectangle of cells, in metres")
-    _add_numbers(region, "west_m", "south_m", "east_m", "north_m")
+    points = _add_query(queries, _points, "the cells at many positions, in metres")
+    points.add_argument("places", type=float, nargs="+", metavar="X_M Y_M", help="positions, in metres")
+    _add_when(points)
+    region = _add_query(queries, _region, "the cells of a rectangle or an outline, in metres")
+    area = "west, south, east, north; or the corners x y x y x y ... of an outline"
+    region.add_argument("area", type=float, nargs="+", metavar="M", help=area)
+    larger = "edge of larger cells in metres, a multiple of the map's: means of what is known in each"
+    region.add_argument("--resolution", type=positive, metavar="M", help=larger)
     region.add_argument("--out", type=OutputFile((".npz",)), help="write coordinates and layers into this .npz file")
     _add_when(region)
     history = _add_query(queries, _history, "the cell at a position over time")
@@ -100,18 +106,12 @@ def _add_numbers(query: ArgumentParser, *names: str) -> None:
 
 def _add_drive(query: ArgumentParser) -> None:
     examples = (
-        "machine=truck, mass=30000, speed=6, unknown=refuse, step=50; of a way cost=time, margin=5, max_grade=0.1"
+        "machine=truck (a kind, or a machine's name), mass=30000, speed=6, unknown=refuse, step=50; "
+        "of a way cost=time, margin=5, max_grade=0.1"
     )
     option = f"anything that docs/protocol.md (Routes) lists, as {examples}; may be repeated"
-    query.add_argument("--set", action="append", type=_named, default=[], metavar="NAME=VALUE", help=option)
+    query.add_argument("--set", action="append", type=named_text, default=[], metavar="NAME=VALUE", help=option)
     _add_times(query, ("as-of", "the map as of this time"))
-
-
-def _named(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE")
-    return name, value
 
 
 def _add_when(query: ArgumentParser) -> None:
@@ -148,12 +148,32 @@ def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Ans
     return table, [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
 
 
+def _points(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
+    when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
+    answer = client.points(
+        _places_of(arguments.places), layers, **when, repairs=arguments.repairs, after=arguments.after
+    )
+    places = {"x_m": answer.x_m.tolist(), "y_m": answer.y_m.tolist()}
+    table = {**places, **{name: values.tolist() for name, values in answer.layers.items()}, **_version(answer)}
+    rows = (
+        [f"{x:g}", f"{y:g}", *(_value(float(values[i])) for values in answer.layers.values())]
+        for i, (x, y) in enumerate(zip(answer.x_m, answer.y_m, strict=True))
+    )
+    return table, _table(["x", "y", *answer.layers], rows)
+
+
+def _places_of(numbers: Sequence[float]) -> list[tuple[float, float]]:
+    if len(numbers) % 2:
+        raise ConfigError("sitegrid query", f"{len(numbers)} numbers; places are pairs x y in metres")
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
+
+
 def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
-    sides = (arguments.west_m, arguments.south_m, arguments.east_m, arguments.north_m)
+    area = arguments.area if len(arguments.area) == 4 else _places_of(arguments.area)
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
     try:
-        rest = {"repairs": arguments.repairs, "after": arguments.after}
-        region = client.region(sides, layers, **when, **rest, progress=_pieces_shown())
+        rest = {"repairs": arguments.repairs, "after": arguments.after, "resolution_m": arguments.resolution}
+        region = client.region(area, layers, **when, **rest, progress=_pieces_shown())
     except ValueError as error:
         raise ConfigError("sitegrid query region", str(error)) from None
     if arguments.out:
@@ -175,7 +195,7 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     return table, lines
 
 
-def _version(answer: PointAnswer | Region | RouteAnswer) -> dict[str, Any]:
+def _version(answer: PointAnswer | PointsAnswer | Region | RouteAnswer) -> dict[str, Any]:
     version = answer.version
     return {"store": version.store, "merged": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
 
@@ -371,7 +391,7 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
     query = parse_query(name, {**places, **dict(arguments.set), **{k.removesuffix("_ns"): v for k, v in times.items()}})
     assert isinstance(query, RouteQuery | WayQuery)
     answer = client.drive(replace(query, fresh=Freshness(arguments.after)))
-    totals, steps = answer.totals, answer.steps
+    totals, steps, machine = answer.totals, answer.steps, answer.machine
     corners = (
         []
         if name == "route"
@@ -379,8 +399,10 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
     )
     kwh = f"{totals.energy_j / 3.6e6:.2f} kWh ({totals.energy_low_j / 3.6e6:.2f}..{totals.energy_high_j / 3.6e6:.2f})"
     taken = f"{totals.time_s:.0f} s ({totals.time_low_s:.0f}..{totals.time_high_s:.0f})"
+    ground = f"{totals.unknown:.0%} unknown, {totals.unmeasured:.0%} driven and not measured"
     lines = [
-        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {totals.unknown:.0%} unknown",
+        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {ground}",
+        f"{machine.mass_kg / 1000:.1f} t, at most {machine.speed_mps:g} m/s, {machine.power_w / 1000:.0f} kW",
         f"{kwh}, {totals.litres:.2f} l of diesel, {totals.braked_j / 3.6e6:.2f} kWh braked, {taken}",
         *corners,
     ]
@@ -401,7 +423,8 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
         for i in range(len(steps.distance_m))
     ]
     columns = {name: column.tolist() for name, column in vars(steps).items()}
-    table = {"line": answer.line_m.tolist(), "totals": asdict(totals), "steps": columns, **_version(answer)}
+    shown = {"line": answer.line_m.tolist(), "totals": asdict(totals), "steps": columns, "machine": asdict(machine)}
+    table = {**shown, **_version(answer)}
     return table, [*lines, *_table(head, rows)]
 
 

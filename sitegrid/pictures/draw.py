@@ -12,11 +12,15 @@ import zenoh
 
 from mapserver.pictures.frame import Image
 from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from mapserver.pictures.profile import draw_drive
 from mapserver.pictures.worklist import draw_worklist
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError
 from protocol.queries.answers import MachineState, Region
 from protocol.queries.explanations import calibrations
+from protocol.queries.parameters import text_of
+from protocol.queries.requests import parse_query
+from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_pose
@@ -25,6 +29,7 @@ from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.process.lifetime import note, say, stop_flag
 
+AROUND_M = 30.0  # of the map around a drive
 MAX_POSES = 50_000  # of one machine: nearly three hours at 5 Hz
 LAYERS = ("resistance", "grade_east", "grade_north")
 SAMPLES_FOLLOW = "samples follow a minute or two behind"  # the smoother's lag, which only agents know
@@ -53,7 +58,9 @@ def run(arguments: Namespace) -> int:
 def _draw_if_possible(client: Client, arguments: Namespace, tracks: list[Track]) -> int:
     """Draw one picture; with --follow, wait for a server that does not answer."""
     try:
-        if arguments.worklist:
+        if query := _query(arguments):
+            draw_line(client, arguments.out, query, arguments.bounds)
+        elif arguments.worklist:
             draw_roads(client, arguments.out, arguments.bounds)
         else:
             draw(client, arguments.out, arguments.bounds, tracks, arguments.truth)
@@ -63,6 +70,34 @@ def _draw_if_possible(client: Client, arguments: Namespace, tracks: list[Track])
         note(f"sitegrid plot: {error}; trying again")
         return 0
     return 1
+
+
+def _query(arguments: Namespace) -> RouteQuery | WayQuery | None:
+    """What is asked of a drive, if one is to be drawn."""
+    if arguments.line:
+        query = parse_query("route", {"line": _text(arguments.line), **dict(arguments.set)})
+    elif arguments.between:
+        ends = {"from": _text(arguments.between[:2]), "to": _text(arguments.between[2:])}
+        query = parse_query("way", {**ends, **dict(arguments.set)})
+    elif arguments.set:
+        raise ConfigError("--set", "is of a drive: give `--line` or `--between` too")
+    else:
+        return None
+    assert isinstance(query, RouteQuery | WayQuery)
+    return query
+
+
+def _text(values: Sequence[float]) -> str:
+    return ",".join(map(text_of, values))
+
+
+def draw_line(client: Client, out: Path, query: RouteQuery | WayQuery, bounds: list[float] | None) -> None:
+    """Ask for a drive and the map around it, and write their picture."""
+    answer = client.drive(query)
+    low, high = answer.line_m.min(axis=0) - AROUND_M, answer.line_m.max(axis=0) + AROUND_M
+    chosen = _bounds(client, bounds) if bounds else Bounds(*low.tolist(), *high.tolist())
+    region = client.region(chosen, ("resistance",), as_of_ns=query.as_of_ns)
+    write_image(out, draw_drive(region, answer))
 
 
 def draw_roads(client: Client, out: Path, bounds: list[float] | None) -> None:

@@ -1,8 +1,9 @@
-"""GeoJSON (RFC 7946) for GIS: areas of one kind of ground, changes, machines; longitude and latitude in degrees."""
+"""GeoJSON (RFC 7946) for GIS: areas of one kind of ground, changes, machines, roads; longitude, latitude in degrees."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 from protocol.arrays import AnyArray, Bools, Floats
 from protocol.queries.answers import GroundChange
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, TilesAnswer
+from protocol.queries.roads import RoadSegment, WorklistRow
 from protocol.site.ground_classes import ZONES
 from protocol.site.site_config import Projection
 from protocol.wire.messages import Pose
@@ -73,6 +75,26 @@ def tracks(tracks_of: Mapping[str, Sequence[Pose]], projection: Projection) -> d
     return _collection(out)
 
 
+def segments(roads: Iterable[RoadSegment], projection: Projection) -> dict[str, Any]:
+    """Lines of roads, in the direction that is the first of each pair."""
+    return _collection([_road(one, {}, projection) for one in roads])
+
+
+def worklist(rows: Iterable[WorklistRow], projection: Projection) -> dict[str, Any]:
+    """Lines of the stretches where work pays; of what is lost its value, `_low` and `_high` (90 %)."""
+    out = []
+    for row in rows:
+        lost = {"kwh_ph": row.kwh_ph, "litres_ph": row.litres_ph, "seconds_ph": row.seconds_ph}
+        ends = {
+            f"{name}{end}": value
+            for name, three in lost.items()
+            for end, value in zip(("", "_low", "_high"), three, strict=True)
+        }
+        since = {"since_time": iso(row.since_ns), "resistance_before": row.before, "saved_kwh_ph": row.saved_kwh_ph}
+        out.append(_road(row.segment, {"rank": row.rank, **ends, **since}, projection))
+    return _collection(out)
+
+
 def inside(outline: Sequence[Corner], x_m: Floats, y_m: Floats) -> Bools:
     """Which cell centres (rows, columns) lie in a polygon."""
     x, y = np.meshgrid(x_m, y_m)
@@ -118,6 +140,15 @@ def _polygons(mask: AnyArray) -> Iterable[list[list[Corner]]]:
             rings.append(contours[hole])
             hole = order[0][hole][0]
         yield [[(float(x) / 2, float(y) / 2) for x, y in ring[:, 0].tolist()] for ring in rings if len(ring) >= 3]
+
+
+def _road(road: RoadSegment, more: dict[str, Any], projection: Projection) -> dict[str, Any]:
+    """A stretch as a line. Pairs become two properties, since few programs read lists."""
+    properties = {name: value for name, value in asdict(road).items() if name not in ("line", "passes_ph", "tonnes_ph")}
+    for name, (there, back) in (("passes_ph", road.passes_ph), ("tonnes_ph", road.tonnes_ph)):
+        properties |= {name: there, f"{name}_back": back}
+    line = [_corner(x, y, 1.0, projection) for x, y in road.line]
+    return _feature("LineString", line, {**more, **properties})
 
 
 def _corner(x: float, y: float, scale: float, projection: Projection) -> list[float]:

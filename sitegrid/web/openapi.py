@@ -5,10 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from protocol.version import package_version
-from sitegrid.web.resources import RESOURCES, Resource
+from sitegrid.web.resource import Resource
+from sitegrid.web.resources import RESOURCES
 
 PREFIX = "/api/v1"
-NUMBERS = ("x", "y", "lat", "lon", "span", "after", "row", "fact")
+NUMBERS = (
+    *("x", "y", "lat", "lon", "span", "after", "row", "fact", "target", "efficiency", "limit", "mass", "speed"),
+    *("power", "accelerate", "brake", "lateral", "rotating", "step", "max_grade", "margin"),
+)
 PROBLEM = {
     "description": "Refused, or not possible now",
     "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},

@@ -25,6 +25,7 @@ from sitegrid.web.site import SiteFeed
 FIRST_S = 10.0  # until a new connection has sent its first request; a slow one holds a place that others need
 CONNECTIONS = 500
 MESSAGE_BYTES = 4096  # of what a page says
+ADDRESS_BYTES = 2**18  # that are read, to be refused by name: a line of 10,000 places; beyond, the connection ends
 
 
 class PatientProtocol(H11Protocol):
@@ -59,6 +60,7 @@ def serve(
             http=PatientProtocol,
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
+            h11_max_incomplete_event_size=ADDRESS_BYTES,
             limit_concurrency=CONNECTIONS,
             log_config=None,
             access_log=False,

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
-from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from starlette.responses import Response
@@ -14,31 +10,25 @@ from starlette.responses import Response
 from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import Bounds
-from sitegrid.web import features, values
+from sitegrid.web import features, roads, values
 from sitegrid.web.problems import bad
+from sitegrid.web.resource import (
+    AS_OF,
+    BOUNDS,
+    GEOJSON,
+    LAYERS,
+    PLACE,
+    Resource,
+    as_geojson,
+    as_json,
+    version_of,
+)
 from sitegrid.web.site import SiteFeed, frame
 from sitegrid.web.values import Parameters
 
 MAX_CELLS_JSON = 250_000  # of a region as text: 2 MB a layer
 MAX_CELLS_NPZ = 4_000_000
 AGES = ("age_s", "changed_s")  # layers that change with the site's now
-Answer = Callable[[SiteFeed, Parameters], Awaitable[Response]]
-
-PLACE = {"x": "east of the site's origin [m]", "y": "north of it [m]"}
-PLACE |= {"lat": "latitude [deg], with lon in place of x and y", "lon": "longitude [deg]"}
-AS_OF = {"as_of": "the map as of this time, ISO 8601 or nanoseconds since 1970 (UTC)"}
-LAYERS = {"layers": "names, comma-separated; without it all"}
-
-
-@dataclass(frozen=True)
-class Resource:
-    """What a path answers. parameters: name -> meaning. media: what it may answer with."""
-
-    answer: Answer
-    summary: str
-    parameters: Mapping[str, str]
-    media: tuple[str, ...] = ("application/json",)
-    follows_now: bool = False  # whether it changes with the site's now, not with the map alone
 
 
 async def point(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -48,13 +38,13 @@ async def point(feed: SiteFeed, parameters: Parameters) -> Response:
     answer = await feed.ask(feed.client.point, x_m, y_m, values.layers(parameters), as_of_ns=as_of_ns)
     lat_deg, lon_deg, _ = (await feed.projection()).to_geodetic(answer.x_m, answer.y_m)
     place = {"x_m": answer.x_m, "y_m": answer.y_m, "lat_deg": lat_deg, "lon_deg": lon_deg}
-    return _json({**place, "values": answer.values, **_version(answer.version), "stamp_ns": answer.stamp_ns})
+    return as_json({**place, "values": answer.values, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
 
 
 async def why(feed: SiteFeed, parameters: Parameters) -> Response:
     """Everything that is known of the cell at a position."""
     x_m, y_m = values.place(parameters, await feed.projection())
-    return _json(await feed.ask(feed.client.why, x_m, y_m, as_of_ns=values.stamp(parameters, "as_of")))
+    return as_json(await feed.ask(feed.client.why, x_m, y_m, as_of_ns=values.stamp(parameters, "as_of")))
 
 
 async def region(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -81,7 +71,7 @@ async def region(feed: SiteFeed, parameters: Parameters) -> Response:
         np.savez_compressed(file, x_m=answer.x_m, y_m=answer.y_m, version=version, **layers)  # type: ignore[arg-type]
         return Response(file.getvalue(), media_type="application/x-npz")
     axes = {"x_m": answer.x_m, "y_m": answer.y_m, "cell_m": answer.cell_m}
-    return _json({**axes, "layers": layers, **_version(answer.version), "stamp_ns": answer.stamp_ns})
+    return as_json({**axes, "layers": layers, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
 
 
 async def history(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -90,22 +80,22 @@ async def history(feed: SiteFeed, parameters: Parameters) -> Response:
     times = {"from_ns": values.stamp(parameters, "from"), "to_ns": values.stamp(parameters, "to")}
     span_s = values.number(parameters, "span") if "span" in parameters else None
     spans = await feed.ask(feed.client.history, x_m, y_m, values.layers(parameters), **times, span_s=span_s)
-    return _json({"spans": spans})
+    return as_json({"spans": spans})
 
 
 async def info(feed: SiteFeed, _: Parameters) -> Response:
     """State of the map and of its server."""
-    return _json(await feed.info(0.0))
+    return as_json(await feed.info(0.0))
 
 
 async def machines(feed: SiteFeed, _: Parameters) -> Response:
     """What the map server knows of each machine."""
-    return _json({"machines": await feed.ask(feed.client.machines)})
+    return as_json({"machines": await feed.ask(feed.client.machines)})
 
 
 async def calibration(feed: SiteFeed, _: Parameters) -> Response:
     """What is taken off the samples of each machine, and what is known of its calibration."""
-    return _json(await feed.ask(feed.client.calibration))
+    return as_json(await feed.ask(feed.client.calibration))
 
 
 async def changes(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -113,7 +103,7 @@ async def changes(feed: SiteFeed, parameters: Parameters) -> Response:
     after = values.number(parameters, "after", 0.0)
     if after < 0 or after != int(after):
         raise bad(Refusal.OUT_OF_RANGE, f"parameter `after`: {after:g} is no whole number from 0 on")
-    return _json({"changes": await feed.ask(feed.client.changes, int(after))})
+    return as_json({"changes": await feed.ask(feed.client.changes, int(after))})
 
 
 async def tiles(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -133,27 +123,27 @@ async def zones(feed: SiteFeed, _: Parameters) -> Response:
     """Areas of one kind of ground, as features."""
     info_now = await feed.info()
     answer = await feed.ask(feed.client.tiles)
-    return _geojson(features.zones(answer, info_now.boundaries, await feed.projection()))
+    return as_geojson(features.zones(answer, info_now.boundaries, await feed.projection()))
 
 
 async def change_features(feed: SiteFeed, _: Parameters) -> Response:
     """Changes of the ground, as features."""
     ground_changes = await feed.ask(feed.client.changes)
-    return _geojson(features.changes(ground_changes, await feed.projection()))
+    return as_geojson(features.changes(ground_changes, await feed.projection()))
 
 
 async def machine_features(feed: SiteFeed, _: Parameters) -> Response:
     """Where machines are, as features: those that said so while somebody looks."""
     async with feed.watched():
         await feed.heard()
-        return _geojson(features.machines(feed.poses(), await feed.projection()))
+        return as_geojson(features.machines(feed.poses(), await feed.projection()))
 
 
 async def track_features(feed: SiteFeed, _: Parameters) -> Response:
     """Where machines drove while somebody looked, as features."""
     async with feed.watched():
         await feed.heard()
-        return _geojson(features.tracks(feed.tracks(), await feed.projection()))
+        return as_geojson(features.tracks(feed.tracks(), await feed.projection()))
 
 
 RESOURCES: dict[str, Resource] = {
@@ -164,7 +154,7 @@ RESOURCES: dict[str, Resource] = {
         region,
         "Layers of a rectangle or a polygon of cells",
         {
-            "bounds": "west,south,east,north [m]",
+            **BOUNDS,
             "polygon": "in place of bounds: x,y;x,y;... [m]",
             **LAYERS,
             **AS_OF,
@@ -188,16 +178,11 @@ RESOURCES: dict[str, Resource] = {
         ("application/octet-stream",),
         follows_now=True,
     ),
-    "features/zones": Resource(zones, "Areas of one kind of ground", {}, ("application/geo+json",)),
-    "features/changes": Resource(
-        change_features, "Changes of the ground as areas", {}, ("application/geo+json",), follows_now=True
-    ),
-    "features/machines": Resource(
-        machine_features, "Positions of machines", {}, ("application/geo+json",), follows_now=True
-    ),
-    "features/tracks": Resource(
-        track_features, "Lines that machines drove", {}, ("application/geo+json",), follows_now=True
-    ),
+    **roads.RESOURCES,
+    "features/zones": Resource(zones, "Areas of one kind of ground", {}, GEOJSON),
+    "features/changes": Resource(change_features, "Changes of the ground as areas", {}, GEOJSON, follows_now=True),
+    "features/machines": Resource(machine_features, "Positions of machines", {}, GEOJSON, follows_now=True),
+    "features/tracks": Resource(track_features, "Lines that machines drove", {}, GEOJSON, follows_now=True),
 }
 
 
@@ -206,18 +191,6 @@ def follows_now(resource: Resource, parameters: Parameters) -> bool:
     names = values.layers(parameters)
     ages = "layers" in resource.parameters and (not names or any(name in AGES for name in names))
     return "as_of" not in parameters and (resource.follows_now or ages)
-
-
-def _json(value: Any) -> Response:
-    return Response(json.dumps(values.plain(value), allow_nan=False), media_type="application/json")
-
-
-def _geojson(value: Any) -> Response:
-    return Response(json.dumps(value, allow_nan=False), media_type="application/geo+json")
-
-
-def _version(version: MapVersion) -> dict[str, Any]:
-    return {"store": version.store, "merged": version.row, "fact": version.fact}
 
 
 def _bounds(parameters: Parameters) -> Bounds:

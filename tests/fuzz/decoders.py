@@ -40,6 +40,8 @@ from protocol.queries import requests
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.routing import NamedMachine
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
@@ -137,6 +139,10 @@ def _selectors() -> Iterator[Decoder]:
     asked = (
         requests.PointQuery(12.0, -40.5, ("resistance", "visits"), fresh, when),
         requests.RegionQuery(Bounds(0.0, 0.0, 200.0, 150.0), ("resistance",), fresh, when),
+        requests.RegionQuery(((0.0, 0.0), (9.0, 0.5), (3.0, 8.0)), (), fresh, when, 2.0),
+        requests.PointsQuery(((1.5, -2.0), (3.0, 4.0)), ("visits",), fresh, when),
+        RouteQuery(((0.0, 0.0), (30.0, 40.0)), NamedMachine("truck-1", (("mass_kg", 3e4),)), fresh=fresh),
+        WayQuery((0.0, 0.0), (30.0, 40.0), avoid=((3.0, 4.0),), unknown=0.05, as_of_ns=T0, fresh=fresh),
         requests.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
         requests.TilesQuery(MapVersion("0123456789abcdef", 17, 3)),
         requests.TilesQuery(as_of_ns=T0, place=(-3, 12)),

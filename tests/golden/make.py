@@ -57,7 +57,7 @@ from protocol.queries.roads import (
     encode_segments,
     encode_worklist,
 )
-from protocol.queries.routing import RouteAnswer, RouteSteps, RouteTotals, decode_answer, encode_answer
+from protocol.queries.routing import RouteAnswer, RouteMachine, RouteSteps, RouteTotals, decode_answer, encode_answer
 from protocol.wire import codec, correction_codec
 from protocol.wire.messages import (
     Ack,
@@ -131,6 +131,12 @@ def region() -> records.Region:
         version=VERSION,
         stamp_ns=T0,
     )
+
+
+def points() -> records.PointsAnswer:
+    """Three places, one of them unknown."""
+    layers = {"resistance": np.array([0.02, NAN, 0.25], np.float32), "visits": np.arange(3, dtype=np.float32)}
+    return records.PointsAnswer(np.array([0.5, 1.5, -3.5]), np.array([2.5, 2.5, 0.5]), layers, VERSION, T0)
 
 
 def piece() -> records.Region:
@@ -290,8 +296,9 @@ ROUTE = RouteAnswer(
     version=records.MapVersion(STORE, 17, 3),
     stamp_ns=T0 + 9,
     line_m=np.array([[0.0, 0.0], [30.0, 40.0]]),
-    totals=RouteTotals(50.0, 1.5, 0.5, 1e6, 9e5, 1.25e6, 2e5, 4e6, 20.0, 19.5, 21.0),
-    steps=RouteSteps(*(np.array([i + 0.5, i - 0.25]) for i in range(8)), np.array([0.75, np.nan]), *np.ones((5, 2))),
+    totals=RouteTotals(50.0, 1.5, 0.5, 0.25, 1e6, 9e5, 1.25e6, 2e5, 4e6, 20.0, 19.5, 21.0),
+    steps=RouteSteps(*(np.array([i + 0.5, i - 0.25]) for i in range(8)), np.array([0.75, np.nan]), *np.ones((6, 2))),
+    machine=RouteMachine(22_000.0, 6.0),
 )
 
 GOLDEN: dict[str, Golden] = {
@@ -316,6 +323,7 @@ GOLDEN: dict[str, Golden] = {
     "correction.bin": Golden(CORRECTION, correction_codec.encode_correction, decode_correction),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
+    "points.bin": Golden(points(), answers.encode_points, answers.decode_points),
     "region.bin": Golden(region(), answers.encode_region, answers.decode_region),
     "tiles.bin": Golden(TILES, encode_tiles, decode_tiles),
     "why.bin": Golden(WHY, encode_why, decode_why),

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.process.children import Children
+from tests.integration.browser_tab import launched
 from tests.integration.site_run import SiteRun  # beside this file
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    yield from launched()
 
 
 @pytest.fixture

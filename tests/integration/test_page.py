@@ -8,7 +8,6 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,28 +18,12 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_pose
 from protocol.wire.messages import Pose, SampleBatch
 from sitegrid.process.children import Children, wait_until
+from tests.integration.browser_tab import WAIT_MS, Tab, needs_browser
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, START_NS, WebSite
 from tests.soak import BATCH_S
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-NO_BROWSER = "no Chromium: install it, for example with `apt-get install chromium`"
-pytestmark = [pytest.mark.processes, pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)]
-WAIT_MS = 20_000
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    from playwright.sync_api import Error, sync_playwright
-
-    with sync_playwright() as playwright:
-        try:  # in containers: no user namespaces, little shared memory
-            arguments = ["--no-sandbox", "--disable-dev-shm-usage"]
-            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        except Error as error:
-            pytest.skip(f"Chromium does not start here: {str(error).splitlines()[0]}")
-        yield browser
-        browser.close()
+pytestmark = needs_browser
 
 
 @pytest.fixture(scope="module")
@@ -50,48 +33,6 @@ def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
         site = WebSite(folder, children)
         site.drive(60)
         yield site
-
-
-class Tab:
-    """A page, and what its browser complained of."""
-
-    def __init__(self, browser: Any, url: str, **options: Any) -> None:
-        self.complaints: list[str] = []
-        self.asked: list[str] = []
-        self.context = browser.new_context(**({"viewport": {"width": 1280, "height": 800}} | options))
-        self.page = self.context.new_page()
-        self.page.on("console", lambda message: self._note(message.type, message.text))
-        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.goto(url)
-
-    def _note(self, kind: str, text: str) -> None:
-        if kind in ("error", "warning"):
-            self.complaints.append(text)
-
-    def js(self, expression: str) -> Any:
-        return self.page.evaluate(expression)
-
-    def until(self, expression: str, timeout_ms: float = WAIT_MS) -> None:
-        """Wait until an expression holds; the page's own rules forbid the browser's way to wait."""
-        for _ in range(int(timeout_ms / 50)):
-            if self.js(expression):
-                return
-            self.page.wait_for_timeout(50)
-        raise AssertionError(f"did not come true: {expression}; {self.complaints}")
-
-    def loaded(self) -> Tab:
-        self.until(
-            "window.sitegrid && sitegrid.map.tiles.size > 0 && sitegrid.state === 'live' && sitegrid.time.step_ns > 0"
-        )
-        return self
-
-    def pixel_of(self, x_m: float, y_m: float) -> tuple[float, float]:
-        left, top = self.js(f"sitegrid.view.toScreen({x_m}, {y_m})")
-        return left, top
-
-    def close(self) -> None:
-        self.context.close()
 
 
 @pytest.fixture
@@ -335,6 +276,13 @@ def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
         assert web.get("/healthz").status == 200
         assert web.get("info", Authorization=f"Bearer {token}").status == 200
         assert web.get("info", {"token": token}).status == 200
+        for name, parameters in (
+            ("worklist", {}),
+            ("segments", {}),
+            ("route", {"line": "80,80;120,120", "unknown": 0.05}),
+        ):
+            assert web.get(name, parameters).status == 401
+            assert web.get(name, {**parameters, "token": token}).status == 200
         tab = Tab(browser, f"{web.url}?token={token}").loaded()
         assert "token" not in tab.page.url, "it stays in no history"
         tab.page.reload()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from protocol.errors import QueryError
-from protocol.queries.route_requests import MAX_PLACES
+from protocol.queries.places import MAX_PLACES
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid import MACHINES

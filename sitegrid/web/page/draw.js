@@ -125,6 +125,52 @@ export function drawCell(context, view, [column, row], cell_m, ink) {
   stroke(context, ink.text, 2);
 }
 
+// A line on the site, with a halo unless `ink` is null; dashes in pixels.
+export function drawLine(context, view, line, colour, width, ink, dashes = []) {
+  context.lineCap = context.lineJoin = "round";
+  context.beginPath();
+  line.forEach((point, i) => context[i ? "lineTo" : "moveTo"](...view.toScreen(...point)));
+  if (ink) stroke(context, ink.halo, width + 3, 0.9);
+  context.setLineDash(dashes);
+  stroke(context, colour, width);
+  context.setLineDash([]);
+}
+
+// A word on a place; it keeps off the rectangles in `taken`, and off the map where none of its places is free.
+export function drawBadge(context, view, text, place, colour, ink, taken) {
+  context.font = `600 12px ${getComputedStyle(document.body).fontFamily}`;
+  const width = Math.max(20, context.measureText(text).width + 12), [left, top] = view.toScreen(...place);
+  const free = ([right, down]) => taken.every((other) => Math.abs(top + down - other.y) > 21 || Math.abs(left + right - other.x) > (width + other.width) / 2 + 1);
+  const by = [[0, 0], [0, -22], [0, 22], [24, 0], [-24, 0], [24, -22], [-24, 22]].find(free);
+  if (!by) return;
+  const [x, y] = [left + by[0], top + by[1]];
+  taken.push({ x, y, width });
+  context.beginPath();
+  context.roundRect(x - width / 2, y - 10, width, 20, 6);
+  stroke(context, ink.halo, 2, 0.9);
+  context.fillStyle = colour;
+  context.fill();
+  context.fillStyle = ink.surface;
+  context.textAlign = "center";
+  context.fillText(text, x, y + 4.2);
+}
+
+// A place of a line, with its name; what is pointed at is a dot.
+export function drawPlace(context, view, place, name, ink, pointed = false) {
+  const [x, y] = view.toScreen(...place);
+  context.beginPath();
+  context.arc(x, y, pointed ? 6 : name ? 10 : 5, 0, 2 * Math.PI);
+  stroke(context, ink.halo, 4, 0.9);
+  context.fillStyle = pointed ? ink.alarm : name ? ink.accent : ink.surface;
+  context.fill();
+  if (!pointed && !name) stroke(context, ink.accent, 2.5);
+  if (!name) return;
+  context.font = `600 12px ${getComputedStyle(document.body).fontFamily}`;
+  context.fillStyle = ink.surface;
+  context.textAlign = "center";
+  context.fillText(name, x, y + 4.2);
+}
+
 export function drawCross(context, view, ink) {
   const x = view.width / 2, y = view.height / 2;
   context.beginPath();

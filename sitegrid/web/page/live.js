@@ -5,13 +5,13 @@ const AGAIN_S = 2;
 
 export class Refused extends Error { constructor(status, problem) { super(problem.detail ?? problem.title ?? `refused with ${status}`); this.status = status; } }
 
-export async function get(path, parameters = {}) {
+export async function get(path, parameters = {}, signal = undefined) {
   const query = new URLSearchParams(Object.entries(parameters).filter(([, value]) => value !== undefined && value !== null));
-  const answer = await fetch(`${path}${query.size ? `?${query}` : ""}`, { credentials: "same-origin" });
+  const answer = await fetch(`${path}${query.size ? `?${query}` : ""}`, { credentials: "same-origin", signal });
   if (!answer.ok) throw new Refused(answer.status, await answer.json().catch(() => ({})));
   return answer;
 }
-export const getJson = async (path, parameters) => (await get(path, parameters)).json();
+export const getJson = async (path, parameters, signal) => (await get(path, parameters, signal)).json();
 export const getFrame = async (path, parameters) => readFrame(await (await get(path, parameters)).arrayBuffer());
 
 // Keeps a live connection. on.state("live" | "away" | "refused" | "offline"), on.frame(frame), on.poses(list), on.site(table).

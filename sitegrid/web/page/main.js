@@ -1,9 +1,9 @@
 // The page: what is shown, how it is chosen, and a link that holds it.
-import { drawCell, drawChanges, drawCross, drawGround, drawMachine, drawPlan, inkOf, roundLength } from "./draw.js";
+import { drawChanges, drawCross, drawGround, drawMachine, drawPlan, inkOf, roundLength } from "./draw.js";
 import { Refused, connect, getJson } from "./live.js";
 import { KINDS, LAYERS, css, differenceOf, kindOf, layerOf, percent } from "./palette.js";
 import { PANELS } from "./panels.js";
-import { byId, element } from "./parts.js";
+import { byId, element, failure, swap } from "./parts.js";
 import { readPlan } from "./plan.js";
 import { TileMap, difference } from "./tiles.js";
 import { TimeBar } from "./time.js";
@@ -19,24 +19,28 @@ const NOTICES = {
   refused: ["This link has no permission", "Ask the office for a visitor's token, then open the new link."],
 };
 const QUIET_MS = 400; // a page that loads faster than this says nothing about it
-const PANEL_PX = 420; // of the window's right that the panel covers
+const PANEL_PX = 420, PANEL_PART = 0.62; // of the window's right that the panel covers; of a phone's height
 const HOLD_PX = 14; // beside the line between two times, where it can be taken
 const SAID_MS = 6000; // how long what just failed is shown
+const AGAIN_MS = 2000; // before a panel that could not be read is asked for again
 const REST_MS = 120; // a pointer that stays so long asks for the value
 
 const asked = new URLSearchParams(location.search);
 const page = {
   site: "", map: new TileMap(), machines: new Map(), changes: [], boundaries: [], ink: null, palette: asked.get("palette") ?? "ordered",
   layer: layerOf(asked.get("layer")), shows: { machines: true, tracks: true, changes: true, plan: true, unsure: true, old: false },
-  state: "loading", panel: null, cell: null, keyboard: false, picture: null, info: null, frames: 0,
+  state: "loading", panel: null, failed: false, cell: null, keyboard: false, picture: null, info: null, frames: 0,
   path: (name) => `/api/v1/sites/${page.site}/${name}`,
   asOf: () => page.cellTime ?? page.time.at ?? undefined,
   redraw: () => { page.dirty = true; },
   mapChanged: () => { buildLegend(); page.redraw(); panelFollows(); },
   say: (title, text) => say(title, text),
+  openPanel: (name) => openPanel(name),
+  fly: (box) => fly(box),
   compareWith: (ns) => page.time.compareWith(ns),
   timeMoved: () => { if (page.site) { showStatus(); keepLink(); } },
 };
+for (const [name, panel] of Object.entries(PANELS)) page[name] = panel.begin?.();
 window.sitegrid = page; // for tests, and for people with a console
 const canvas = byId("map"), view = new View();
 page.view = view;
@@ -50,6 +54,7 @@ function frames() {
   frame();
 }
 function frame() {
+  if (view.advance(performance.now())) { page.dirty = true; if (!view.flight) keepLink(); }
   if (!page.dirty && !page.machines.size) return;
   page.dirty = false;
   const ratio = Math.min(2, devicePixelRatio || 1), [width, height] = [innerWidth, innerHeight];
@@ -64,7 +69,7 @@ function frame() {
   drawTiles(context, ratio);
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   if (page.shows.changes) drawChanges(context, view, page.changes.filter((change) => change.first_ns <= nowSite_ns()), page.ink);
-  if (page.cell) drawCell(context, view, page.cell, page.map.cell_m, page.ink);
+  if (page.panel) PANELS[page.panel].draw?.(page, context, view);
   const labels = [];
   if (page.shows.machines && page.time.at === null) for (const machine of page.machines.values()) drawMachine(context, view, { ...machine, trusted: page.info?.trusted[machine.machine] }, performance.now() / 1000, page.shows, page.ink, labels);
   showSides();
@@ -172,14 +177,11 @@ function buildLegend() {
     pen.fillRect(i * one + 1, 50 - tall, one - 2, tall);
   }
   const ticks = element("div", { className: "ticks" }, layer.ticks.map(([at, text]) => { const tick = element("span", {}, text); tick.style.left = `${100 * at}%`; tick.className = at < 0.08 ? "first" : at > 0.92 ? "last" : ""; return tick; }));
-  const swap = element("div", { className: "swap", hidden: layer.id !== "resistance" }, ["ordered", "kinds"].map((name) => {
-    const button = element("button", { onclick: () => { page.palette = name; buildLegend(); page.redraw(); keepLink(); } }, name === "ordered" ? "Ordered" : "Kinds of ground");
-    button.setAttribute("aria-pressed", page.palette === name);
-    return button;
-  }));
+  const palettes = swap("palette", [["ordered", "Ordered"], ["kinds", "Kinds of ground"]], page.palette, (name) => { page.palette = name; buildLegend(); page.redraw(); keepLink(); });
+  palettes.hidden = layer.id !== "resistance";
   const names = kinds ? element("ul", { className: "kinds" }, KINDS.map((kind) => { const swatch = element("i"); swatch.style.background = css(kind.rgb); return element("li", {}, swatch, kind.name, element("span", {}, percent(kind.value, kind.value < 0.01 ? 1 : 0))); })) : null;
   const unknown = element("p", { className: "unknown" }, element("i", {}), "Unknown", ...(differs ? [" at one of the times"] : [element("i", { className: "driven" }), "Driven only"]));
-  byId("legend").replaceChildren(element("h2", { className: "cap" }, differs ? "Difference" : layer.name, element("b", {}, differs ? `${page.time.words(page.time.other)} to ${page.time.words(page.time.at)}` : layer.unit)), strip, ticks, ...[names].filter(Boolean), unknown, swap);
+  byId("legend").replaceChildren(element("h2", { className: "cap" }, differs ? "Difference" : layer.name, element("b", {}, differs ? `${page.time.words(page.time.other)} to ${page.time.words(page.time.at)}` : layer.unit)), strip, ticks, ...[names].filter(Boolean), unknown, palettes);
   byId("known").textContent = known ? `${Math.round(known * page.map.cell_m ** 2).toLocaleString("en")} m² known${differs ? " at both times" : ""}` : "";
 }
 
@@ -226,26 +228,33 @@ function say(title, text) {
 }
 
 // --- choosing
-async function openPanel(name, subject) {
+async function openPanel(name) {
   const panel = byId("panel"), again = page.panel === name;
-  const body = again ? panel.lastElementChild : element("div", {}, element("p", { className: "part note" }, "One moment."));
+  const body = again ? panel.lastElementChild : element("div", { className: name }, element("p", { className: "part note" }, "One moment."));
   const close = element("button", { className: "icon", onclick: closePanel, ariaLabel: "Close" }, "×");
-  close.setAttribute("aria-label", "Close");
-  if (!again) panel.replaceChildren(element("header", {}, element("h2", {}, PANELS[name].title), close), body);
+  if (!again) panel.replaceChildren(element("header", {}, element("h2", {}, PANELS[name].title), element("small", { role: "status" }), close), body);
+  if (name !== "why") page.cell = page.cellTime = null;
   body.classList.add("asking");
   panel.hidden = false;
   document.body.classList.add("open");
-  Object.assign(page, { panel: name, panelAt: page.time.at });
+  page.opening?.abort(); // nobody waits for what was asked before
+  const mine = new AbortController();
+  Object.assign(page, { panel: name, panelAt: page.time.at, panelMade_ms: performance.now(), failed: false, opening: mine });
+  showTools();
+  if (!view.moved && !again && PANELS[name].wholeSite) fit();
   keepLink();
-  const mine = Symbol(name);
-  page.opening = mine;
+  let parts;
   try {
-    const parts = await PANELS[name].build(page, subject);
-    if (page.opening === mine) body.replaceChildren(...parts.filter(Boolean));
+    parts = await PANELS[name].build(page, mine.signal);
   } catch (error) {
-    if (page.opening === mine) body.replaceChildren(element("p", { className: "part note" }, error instanceof Refused ? error.message : `This could not be read: ${error.message}`));
+    if (page.opening === mine) parts = [failure(page, error)];
   }
-  if (page.opening === mine) body.classList.remove("asking");
+  if (page.opening !== mine) return;
+  const focused = body.contains(document.activeElement) ? document.activeElement.id : "";
+  body.replaceChildren(...parts.filter(Boolean));
+  if (focused) byId(focused)?.focus({ preventScroll: true });
+  page.opening = null;
+  body.classList.remove("asking");
   page.redraw();
 }
 
@@ -253,16 +262,35 @@ async function openPanel(name, subject) {
 function panelFollows() {
   if (!page.panel || page.time.playing || page.panelAt === page.time.at) return;
   page.cellTime = null;
-  openPanel(page.panel, page.cell);
+  openPanel(page.panel);
+}
+
+// What is on the page while the map changes is made anew now and then.
+function panelAges() {
+  const seconds = PANELS[page.panel]?.everySeconds;
+  if (seconds && !page.opening && page.time.at === null && performance.now() - page.panelMade_ms > 1000 * seconds) openPanel(page.panel);
+}
+
+// What could not be read is asked for again once the map server is there.
+function panelFailed() {
+  if (page.failed && page.panel && !page.opening && page.state === "live" && performance.now() - page.panelMade_ms > AGAIN_MS) openPanel(page.panel);
 }
 
 function closePanel() {
+  page.opening?.abort();
   byId("panel").hidden = true;
   document.body.classList.remove("open");
-  page.panel = page.cell = page.cellTime = null;
+  page.panel = page.cell = page.cellTime = page.opening = null;
+  showTools();
+  if (!view.moved) fit();
   page.redraw();
   keepLink();
   canvas.focus({ preventScroll: true });
+}
+
+const togglePanel = (name) => (page.panel === name ? closePanel() : openPanel(name));
+function showTools() {
+  for (const name of ["work", "route"]) byId(`open-${name}`).setAttribute("aria-pressed", page.panel === name);
 }
 
 const cellAt = (left, top) => view.toSite(left, top).map((v) => Math.floor(v / page.map.cell_m));
@@ -270,13 +298,18 @@ const cellAt = (left, top) => view.toSite(left, top).map((v) => Math.floor(v / p
 const timeAt = (left) => (besides() && left < divider() ? page.time.other : page.time.at) ?? undefined;
 const mapAt = (left) => (besides() && left < divider() ? page.time.otherMap : page.time.map ?? page.map);
 
+// A place that was chosen: the panel's, or a cell to explain.
+function choose(left, top) {
+  if (!page.panel || !PANELS[page.panel].pick?.(page, view.toSite(left, top), [left, top])) explain(left, top);
+}
+
 function explain(left, top) {
   page.cellTime = timeAt(left);
   rest(null);
   page.cell = cellAt(left, top);
-  if (innerWidth <= 720) { view.shift(view.width / 2 - left, view.height * 0.28 - top); page.redraw(); } // above the panel
+  if (isPhone()) { view.shift(view.width / 2 - left, view.height * 0.28 - top); page.redraw(); } // above the panel
   else if (left > innerWidth - PANEL_PX) { view.shift(innerWidth - PANEL_PX - left, 0); page.redraw(); } // beside it
-  openPanel("why", page.cell);
+  openPanel("why");
 }
 
 function rest(left, top) {
@@ -307,14 +340,17 @@ async function showValue(left, top) {
 }
 
 // --- keys
-const KEYS = [["1 to 5", "Layer"], ["M T G P U O", "Show and hide"], ["Arrows, + −", "Move, zoom"], ["0", "Fit the site"], ["Enter", "Explain the cell at the cross"], ["Space, [ ]", "Play, step in time"], ["L", "Back to now"], ["C", "Compare two times"], ["D", "Light or dark"], ["Esc", "Close"]];
+const KEYS = [["1 to 5", "Layer"], ["M T G P U O", "Show and hide"], ["Arrows, + −", "Move, zoom"], ["0", "Fit the site"], ["W, R", "Where to send the grader, what a drive costs"], ["Enter", "Explain the cell at the cross"], ["Space, [ ]", "Play, step in time"], ["L", "Back to now"], ["C", "Compare two times"], ["D", "Light or dark"], ["Esc", "Close"]];
 function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || /^(select|textarea)$/i.test(event.target.tagName)) return;
+  const inField = event.target.type === "number"; // its keys are its own, but for the one that closes
+  if (inField && event.key !== "Escape") return;
   const inRange = event.target.type === "range", onButton = event.target.tagName === "BUTTON" || event.target.type === "checkbox" || event.target.type === "radio";
   const key = event.key.length === 1 ? event.key.toUpperCase() : event.key, move = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] }[key];
   const layer = LAYERS.find((one) => one.key === key), show = SHOWS.find(([, , letter]) => letter === key);
   if (move && document.activeElement === canvas) { view.shift(...move); page.keyboard = true; page.redraw(); keepLink(); }
-  else if (key === "Enter" && event.target === canvas) explain(view.width / 2, view.height / 2);
+  else if (page.panel && !inField && PANELS[page.panel].press?.(page, key)) page.redraw();
+  else if (key === "Enter" && event.target === canvas) choose(view.width / 2, view.height / 2);
   else if (key === "+" || key === "=") zoomBy(1.4);
   else if (key === "-" || key === "−") zoomBy(1 / 1.4);
   else if (key === "0") fit();
@@ -325,6 +361,8 @@ function onKey(event) {
   else if (key === "]") page.time.step(1);
   else if (key === "L") page.time.goLive();
   else if (key === "C") page.time.nextMode();
+  else if (key === "W") togglePanel("work");
+  else if (key === "R") togglePanel("route");
   else if (key === "D") setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
   else if (key === "?") help();
   else if (key === "Escape" && page.panel) closePanel();
@@ -340,11 +378,18 @@ function help() {
 }
 
 function fit() {
-  const phone = innerWidth <= 720;
-  view.margins = phone ? [16, 150, 16, 130] : [272, 66, 24, 96];
+  Object.assign(view, { width: innerWidth, height: innerHeight }); // before the first picture too
+  view.margins = margins(PANELS[page.panel]?.wholeSite);
   view.fit(page.map.bounds() ?? aroundMachines() ?? [-50, -50, 50, 50]);
   page.redraw();
   keepLink();
+}
+
+const isPhone = () => innerWidth <= 720;
+const margins = (besidePanel) => (isPhone() ? [16, 172, 16, besidePanel ? PANEL_PART * innerHeight + 32 : 130] : [272, 66, besidePanel ? PANEL_PX : 24, 96]);
+function fly(box) {
+  view.fly(box, margins(true), !matchMedia("(prefers-reduced-motion: reduce)").matches);
+  page.redraw();
 }
 
 function setTheme(name) {
@@ -352,7 +397,7 @@ function setTheme(name) {
   try { localStorage.setItem("theme", name); } catch { /* a browser that keeps nothing */ }
   page.ink = inkOf(document.documentElement);
   page.time.show();
-  if (page.panel && page.cell) openPanel(page.panel, page.cell);
+  if (page.panel) openPanel(page.panel);
   page.redraw();
 }
 
@@ -376,7 +421,7 @@ function linkOf() {
   const parts = { site: page.site, layer: page.layer.id, palette: page.palette, at: `${view.x.toFixed(1)},${view.y.toFixed(1)},${view.scale.toFixed(2)}` };
   if (page.time.at !== null) parts.time = new Date(page.time.at / 1e6).toISOString();
   if (page.time.other !== null) Object.assign(parts, { other: new Date(page.time.other / 1e6).toISOString(), mode: page.time.mode });
-  if (page.cell && page.panel === "why") parts.cell = page.cell.join();
+  if (page.panel) Object.assign(parts, PANELS[page.panel].link(page));
   return `${location.pathname}?${new URLSearchParams(parts)}`;
 }
 
@@ -390,8 +435,8 @@ function restoreLink() {
   if (at?.length === 3 && at.every(Number.isFinite)) { [view.x, view.y, view.scale] = at; view.moved = true; } else fit();
   if (!Number.isNaN(time)) page.time.go(time * 1e6);
   if (!Number.isNaN(other)) { page.time.mode = asked.get("mode") === "difference" ? "difference" : "beside"; page.time.compareWith(other * 1e6); }
-  const cell = asked.get("cell")?.split(",").map(Number);
-  if (cell?.length === 2 && cell.every(Number.isInteger)) { page.cell = cell; openPanel("why", cell); }
+  const open = Object.keys(PANELS).find((name) => PANELS[name].restore(page, asked));
+  if (open) openPanel(open);
 }
 
 // --- what the door sends
@@ -405,6 +450,7 @@ const on = {
     if (first && !page.restored) { page.restored = true; restoreLink(); }
     page.received = performance.now();
     buildLegend();
+    panelAges();
     page.redraw();
   },
   poses(poses) {
@@ -440,13 +486,14 @@ async function start() {
   buildRail();
   setLayer(page.layer);
   setTimeout(() => { if (page.state === "loading" && !page.map.tiles.size) { page.state = ""; setState("loading"); } }, QUIET_MS);
-  follow(canvas, view, { changed: () => { page.redraw(); keepLink(); }, rest, choose: explain,
+  follow(canvas, view, { changed: () => { page.redraw(); keepLink(); }, rest, choose,
     holds: (left) => besides() && Math.abs(left - divider()) < HOLD_PX,
     divide: (left) => { page.time.split = Math.min(0.98, Math.max(0.02, left / innerWidth)); page.redraw(); } });
   addEventListener("beforeprint", () => printed(true));
   addEventListener("afterprint", () => printed(false));
   addEventListener("keydown", onKey);
   addEventListener("resize", () => { if (!view.moved) fit(); page.time.drawStrip(); page.redraw(); });
+  for (const name of ["work", "route"]) byId(`open-${name}`).onclick = () => togglePanel(name);
   byId("fit").onclick = fit;
   byId("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
   byId("keys").onclick = help;
@@ -455,17 +502,17 @@ async function start() {
   byId("plan-file").onchange = async (event) => { try { page.picture = await readPlan([...event.target.files]); setShow("plan", true); } catch (error) { say("This picture cannot be shown", error.message); } event.target.value = ""; };
   byId("drawer").onclick = () => { const open = byId("rail").classList.toggle("full"); byId("drawer").setAttribute("aria-expanded", open); };
   requestAnimationFrame(frames);
-  setInterval(() => { showStatus(); page.redraw(); }, 1000);
-  await choose();
+  setInterval(() => { showStatus(); page.redraw(); panelFailed(); }, 1000);
+  await chooseSite();
 }
 
-async function choose() {
+async function chooseSite() {
   let sites;
   try {
     ({ sites } = await getJson("/api/v1/sites"));
   } catch (error) {
     setState(error instanceof Refused && [401, 403].includes(error.status) ? "refused" : "offline");
-    return void setTimeout(choose, 2000);
+    return void setTimeout(chooseSite, 2000);
   }
   const names = sites.map((site) => site.name);
   page.site = names.includes(asked.get("site")) ? asked.get("site") : names[0];

@@ -49,6 +49,7 @@ export const kindOf = (value, boundaries) => boundaries.filter((boundary) => val
 const SHOWN = { low: 0.006, high: 0.3 }; // ends of the ordered palette
 export const place = (value) => Math.log(value / SHOWN.low) / Math.log(SHOWN.high / SHOWN.low);
 export const percent = (value, digits = 1) => `${(100 * value).toFixed(digits)} %`;
+export const figure = (value) => value.toFixed(value < 9.95 ? 2 : value < 99.5 ? 1 : 0);
 export const span = (s) => (s < 90 ? `${Math.round(s)} s` : s < 5400 ? `${Math.round(s / 60)} min` : s < 172800 ? `${Math.round(s / 3600)} h` : `${Math.round(s / 86400)} d`);
 export const ago = (s) => (s < 5 ? "just now" : `${span(s)} ago`);
 

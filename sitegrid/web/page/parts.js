@@ -1,4 +1,5 @@
 // Pieces of the page: elements without markup in strings, so that no machine's name becomes markup; small charts.
+import { Refused } from "./live.js";
 import { KINDS, css, kindOf, ordered, place } from "./palette.js";
 
 export const byId = (id) => document.getElementById(id);
@@ -20,13 +21,31 @@ export const part = (title, note, ...children) =>
 export const facts = (rows) =>
   element("dl", { className: "facts" }, rows.filter(Boolean).flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
 
-// A chart: a canvas of the given height that `draw(context, width)` fills; its figures also stand in `label`.
+// A figure that is an answer, its unit, and a line beneath.
+export const amount = (value, unit, note) => element("div", {}, element("b", {}, `${value}`, element("em", {}, ` ${unit}`)), element("span", {}, note));
+
+// One of a few choices; ids are NAME-CHOICE.
+export const swap = (name, choices, chosen, choose) =>
+  element("div", { className: "swap", role: "group" }, choices.map(([choice, text]) => {
+    const button = element("button", { id: `${name}-${choice}`, onclick: () => choose(choice) }, text);
+    button.setAttribute("aria-pressed", choice === chosen);
+    return button;
+  }));
+
+// What could not be read, and why; the page asks again by itself once the server is back.
+export function failure(page, error) {
+  page.failed = !(error instanceof Refused) || error.status >= 500;
+  const text = error instanceof Refused ? error.message : "The page's server does not answer. It is asked again when it is back.";
+  return element("section", { className: "part" }, element("p", { className: "say failed", role: "alert" }, text), element("button", { id: "again", className: "act", onclick: () => page.openPanel(page.panel) }, "Try again"));
+}
+
+// A chart: a canvas of the given height that `draw(context, width)` fills, again with `redraw`; its figures also stand in `label`.
 export function chart(height, label, draw) {
   const canvas = element("canvas");
   canvas.setAttribute("role", "img");
   canvas.setAttribute("aria-label", label);
   canvas.style.height = `${height}px`;
-  const watch = new ResizeObserver(() => { // also when it is first on the page: only then it has a width
+  canvas.redraw = () => {
     const ratio = Math.min(2, devicePixelRatio || 1), width = canvas.clientWidth;
     if (!width) return;
     canvas.width = width * ratio;
@@ -35,8 +54,8 @@ export function chart(height, label, draw) {
     context.scale(ratio, ratio);
     context.font = `11px ${getComputedStyle(document.body).fontFamily}`;
     draw(context, width);
-  });
-  watch.observe(canvas);
+  };
+  new ResizeObserver(canvas.redraw).observe(canvas); // also when it is first on the page: only then it has a width
   return canvas;
 }
 

@@ -1,9 +1,10 @@
 // The view: where on the screen a place of the site is; and the fingers, wheel and keys that move it.
 
 const CLOSEST = 80, FARTHEST = 0.05; // pixels per metre
+const FLIGHT_MS = 420;
 
 export class View {
-  constructor() { Object.assign(this, { x: 0, y: 0, scale: 4, width: 1, height: 1, margins: [0, 0, 0, 0], moved: false }); }
+  constructor() { Object.assign(this, { x: 0, y: 0, scale: 4, width: 1, height: 1, margins: [0, 0, 0, 0], moved: false, flight: null }); }
 
   toScreen(x, y) { return [this.width / 2 + (x - this.x) * this.scale, this.height / 2 - (y - this.y) * this.scale]; }
   toSite(left, top) { return [this.x + (left - this.width / 2) / this.scale, this.y - (top - this.height / 2) / this.scale]; }
@@ -14,18 +15,35 @@ export class View {
     this.x = x - (left - this.width / 2) / this.scale;
     this.y = y + (top - this.height / 2) / this.scale;
     this.moved = true;
+    this.flight = null;
   }
 
-  shift(right, down) { this.x -= right / this.scale; this.y += down / this.scale; this.moved = true; }
+  shift(right, down) { this.flight = null; this.x -= right / this.scale; this.y += down / this.scale; this.moved = true; }
 
   // Show a box of the site within the margins (left, top, right, bottom) that cards leave free.
-  fit([west, south, east, north]) {
-    const [left, top, right, bottom] = this.margins;
+  fit(box) { Object.assign(this, this.fitted(box, this.margins), { moved: false, flight: null }); }
+
+  fitted([west, south, east, north], [left, top, right, bottom]) {
     const width = Math.max(50, this.width - left - right), height = Math.max(50, this.height - top - bottom);
-    this.scale = Math.min(20, Math.max(FARTHEST, Math.min(width / (east - west), height / (north - south))));
-    this.x = (west + east) / 2 - (left - right) / 2 / this.scale;
-    this.y = (south + north) / 2 + (top - bottom) / 2 / this.scale;
-    this.moved = false;
+    const scale = Math.min(20, Math.max(FARTHEST, Math.min(width / (east - west), height / (north - south))));
+    return { scale, x: (west + east) / 2 - (left - right) / 2 / scale, y: (south + north) / 2 + (top - bottom) / 2 / scale };
+  }
+
+  // Go to a box within margins, in a moment or, where nothing is to move, at once.
+  fly(box, margins, moves) {
+    this.flight = { from: { x: this.x, y: this.y, scale: this.scale }, to: this.fitted(box, margins), began_ms: performance.now(), ms: moves ? FLIGHT_MS : 0 };
+    this.moved = true;
+  }
+
+  // The next picture of a flight; false where there is none.
+  advance(now_ms) {
+    if (!this.flight) return false;
+    const { from, to, began_ms, ms } = this.flight, u = ms ? Math.min(1, Math.max(0, (now_ms - began_ms) / ms)) : 1, part = 1 - (1 - u) ** 3;
+    this.scale = from.scale * (to.scale / from.scale) ** part;
+    this.x = from.x + part * (to.x - from.x);
+    this.y = from.y + part * (to.y - from.y);
+    if (u === 1) this.flight = null;
+    return true;
   }
 }
 

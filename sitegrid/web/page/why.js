@@ -1,18 +1,20 @@
 // Panel: why a cell has its value.
+import { drawCell } from "./draw.js";
 import { Refused, getJson } from "./live.js";
 import { KINDS, ago, css, kindOf, ordered, percent, place } from "./palette.js";
 import { chart, clock, element, facts, part, roseChart, timeChart, voteChart } from "./parts.js";
 
 export const title = "Why this value?";
 
-export async function build(page, [column, row]) {
+export async function build(page, signal) {
+  const [column, row] = page.cell;
   const at = { x: (column + 0.5) * page.map.cell_m, y: (row + 0.5) * page.map.cell_m, as_of: page.asOf() };
-  const why = await getJson(page.path("why"), at);
+  const why = await getJson(page.path("why"), at, signal);
   const where = `${(column * why.cell_m).toFixed(0)} to ${((column + 1) * why.cell_m).toFixed(0)} m E, ${(row * why.cell_m).toFixed(0)} to ${((row + 1) * why.cell_m).toFixed(0)} m N`;
   if (!why.metres) {
     return [element("section", { className: "part" }, element("p", { className: "say" }, "Nobody has driven over this cell. It stays hatched until a machine crosses it."), element("p", { className: "note" }, where))];
   }
-  return [head(page, why, where), changed(page, why), votes(page, why), counts(page, why), machines(why), await overTime(page, at, why)];
+  return [head(page, why, where), changed(page, why), votes(page, why), counts(page, why), machines(why), await overTime(page, at, why, signal)];
 }
 
 function head(page, why, where) {
@@ -57,9 +59,9 @@ function machines(why) {
   return part("Machines", `${why.machines.length || Math.round(why.values.machines ?? 0)}`, element("p", { className: "say" }, why.machines.length ? why.machines.join(", ") : "Not known by name."));
 }
 
-async function overTime(page, at, why) {
+async function overTime(page, at, why, signal) {
   try {
-    const { spans } = await getJson(page.path("history"), { x: at.x, y: at.y, layers: "resistance", to: at.as_of });
+    const { spans } = await getJson(page.path("history"), { x: at.x, y: at.y, layers: "resistance", to: at.as_of }, signal);
     const known = spans.filter((span) => span.values.resistance !== null).map((span) => ({ ...span, value: span.values.resistance }));
     if (known.length < 2) return null;
     return part("Over time", "rolling resistance, % of weight", timeChart(known, why.changed_ns, page.ink));
@@ -67,4 +69,15 @@ async function overTime(page, at, why) {
     if (!(error instanceof Refused)) throw error;
     return part("Over time", "", element("p", { className: "note" }, error.message));
   }
+}
+
+export function draw(page, context, view) {
+  drawCell(context, view, page.cell, page.map.cell_m, page.ink);
+}
+
+export const link = (page) => ({ cell: page.cell.join() });
+export function restore(page, parameters) {
+  const cell = parameters.get("cell")?.split(",").map(Number), usable = cell?.length === 2 && cell.every(Number.isInteger);
+  if (usable) page.cell = cell;
+  return usable;
 }

@@ -17,7 +17,7 @@ from protocol.site.site_config import Projection
 from sim.config import SimConfig
 from sim.recorder import record
 from sim.simulator import BUNDLE_MS, START_NS, Simulator
-from sim.truth import TRACK_VALUES, TruthMap
+from sim.truth import TRACK_DTYPE, TruthMap
 
 CONFIG = SimConfig(seed=11, seconds=1.6, world="fast")
 
@@ -143,6 +143,9 @@ def test_tracks_are_the_true_ways_at_10_hz() -> None:
         assert track["mass"][-1] == simulator.state.mass_kg[i]
         moved = np.hypot(np.diff(track["x"]), np.diff(track["y"]))
         np.testing.assert_allclose(moved, 0.1 * track["speed"][1:], atol=0.02)
+        assert (np.diff(track["work"], prepend=0.0) >= 0).all()  # brakes give nothing back
+        kinetic_j = track["mass"][-1] * track["speed"][-1] ** 2 / 2
+        assert track["work"][-1] > kinetic_j > 0
 
 
 def test_recording_holds_the_same_readings_and_the_truth(tmp_path: Path) -> None:
@@ -156,7 +159,7 @@ def test_recording_holds_the_same_readings_and_the_truth(tmp_path: Path) -> None
     for f in fields(TruthMap):
         assert np.array_equal(getattr(truth, f.name), getattr(simulator.truth_map, f.name))
     lines = (tmp_path / "truth" / "tracks" / "loader-1.csv").read_text().splitlines()
-    assert lines[0] == ",".join(("stamp_ns", *TRACK_VALUES))
+    assert lines[0] == ",".join(TRACK_DTYPE.names)
     assert len(lines) == 17
     assert tuple(map(float, lines[-1].split(",")[1:])) == tuple(simulator.tracks()["loader-1"][-1].tolist()[1:])
 

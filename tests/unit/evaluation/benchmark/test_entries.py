@@ -39,10 +39,10 @@ def test_a_map_has_its_values_where_they_were_put_and_nothing_elsewhere(tmp_path
 @pytest.mark.parametrize(
     ("line", "problem"),
     [
-        ("13.0,20.5,0.04,0,0", r"line 2: \(13, 20.5\) is outside of the site"),
-        ("9.99,20.5,0.04,0,0", "outside of the site"),
-        ("nan,20.5,0.04,0,0", "outside of the site"),
-        ("10.5,1e300,0.04,0,0", "outside of the site"),
+        ("13.0,20.5,0.04,0,0", "none of its places is on the site"),
+        ("9.99,20.5,0.04,0,0", "none of its places is on the site"),
+        ("nan,20.5,0.04,0,0", "none of its places is on the site"),
+        ("10.5,1e300,0.04,0,0", "none of its places is on the site"),
         ("10.5,20.5,soft,0,0", "line 2: resistance is 'soft', which is no number"),
         ("10.5,20.5,inf,0,0", "line 2: resistance is infinite"),
         ("10.5,20.5,0.04,0,0\n10.1,20.1,0.05,0,0", "line 3: the cell of .10.1, 20.1. was named before"),
@@ -52,6 +52,11 @@ def test_a_map_has_its_values_where_they_were_put_and_nothing_elsewhere(tmp_path
 def test_a_wrong_line_of_a_map_is_named(tmp_path: Path, line: str, problem: str):
     with pytest.raises(ConfigError, match=problem):
         read_map(written(tmp_path, HEADER, line), TRUTH)
+
+
+def test_places_outside_of_the_site_do_not_count(tmp_path: Path):
+    layers = read_map(written(tmp_path, HEADER, "10.5,20.5,0.04,0,0", "9.5,20.5,0.25,0,0"), TRUTH)
+    assert np.nansum(layers["resistance"]) == 0.04
 
 
 @pytest.mark.parametrize("said", ["1.01", "-0.1"])

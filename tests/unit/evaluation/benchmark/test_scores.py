@@ -59,8 +59,10 @@ def test_errors_of_values_are_relative_and_of_gradients_in_percent(true: Scene):
 def test_confidence_counts_where_it_is_stated(true: Scene):
     layers = layers_of(true) | {"confidence": np.full(true.truth.c_rr.shape, 0.9)}
     assert figures_of(layers, true)["calibration_error"] == pytest.approx(0.1)
+    layers["confidence"][:30] = np.nan
+    assert 0.1 < figures_of(layers, true)["calibration_error"] < 0.5
     layers["confidence"][:] = np.nan
-    assert figures_of(layers, true)["calibration_error"] == pytest.approx(0.5)
+    assert figures_of(layers, true)["calibration_error"] is None
 
 
 def test_rows_are_means_over_recordings():

@@ -58,6 +58,22 @@ def test_a_route_costs_resistance_and_height_and_says_which_map_it_is_of(tmp_pat
         assert there.line_m.tolist() == [[-50, 3], [50, 3]]
 
 
+def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
+    """Half of it gravel and half wet dirt, on a plane that rises: the sum of both, and brakes take nothing."""
+    soils = lambda x, y: np.where(x < 0, 0.02, 0.06)  # noqa: E731
+    closer, answers = answers_on(tmp_path, ground(soils, lambda x, y: 0.015 + 0 * x))
+    with closer:
+        there, back = (
+            ask(answers, RouteQuery(line, SLOW, ROLLING)) for line in (((-40, 5.0), (40, 5.0)), ((40, 5.0), (-40, 5.0)))
+        )
+        assert there.totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 40 + 0.06 * 40 + 0.015 * 80), rel=0.02)
+        assert back.totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 40 + 0.06 * 40 - 0.015 * 80), rel=0.03)
+        assert there.totals.energy_j - back.totals.energy_j == pytest.approx(2 * WEIGHT_N * 0.015 * 80, rel=0.01)
+        assert max(there.totals.braked_j, back.totals.braked_j) < 0.01 * back.totals.energy_j  # of one border
+        assert there.totals.time_s == pytest.approx(80 / SLOW.speed_mps)
+        assert there.machine == SLOW
+
+
 def test_a_way_leads_around_sand_and_costs_less_than_straight(tmp_path):
     sand = lambda x, y: (abs(x) < 15) & (y < 25)  # noqa: E731
     closer, answers = answers_on(tmp_path, ground(lambda x, y: np.where(sand(x, y), 0.25, 0.02)))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mapserver.routes.drive import CREEP_MPS, Drive, drive, smoothed
+from mapserver.routes.drive import CREEP_MPS, LATE_S, Drive, drive, smoothed
 from protocol.arrays import Floats
 from protocol.queries.routing import RouteMachine
 from protocol.units import GRAVITY_MPS2
@@ -109,3 +109,20 @@ def test_smoothing_keeps_what_is_even_and_the_length_of_the_line() -> None:
 def test_machines_that_cannot_be_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"^{name}: "):
         RouteMachine(**{name: value})
+
+
+def test_changes_of_the_ground_cost_what_drivers_answer_late() -> None:
+    """By the size of the change, there and back alike; where brakes hold all the time, nothing."""
+    n = 200
+    step, limit = np.ones(n), np.full(n + 1, np.inf)
+    plain = RouteMachine(mass_kg=20_000.0, speed_mps=5.0, power_w=1e6)
+    force = 20_000 * GRAVITY_MPS2 * 0.06
+    soils = np.where(np.arange(n) < 100, 0.02, 0.08)
+    level = np.zeros(n)
+    for ground in (soils, soils[::-1]):
+        done = drive(step, ground, level, limit, plain)
+        late_j = 0.5 * LATE_S * 5.0 * force
+        assert done.braked_j.sum() == pytest.approx(late_j)
+        assert done.energy_j.sum() - late_j == pytest.approx(20_000 * GRAVITY_MPS2 * soils.sum())
+    down = drive(step, soils, level - 0.2, limit, plain)
+    assert down.energy_j.sum() == 0.0

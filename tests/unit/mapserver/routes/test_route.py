@@ -47,14 +47,14 @@ def test_on_a_plane_a_route_costs_resistance_and_height() -> None:
     assert totals.lift_m == pytest.approx(160 * 0.004 + 120 * 0.01)
     assert totals.energy_j == pytest.approx(WEIGHT_N * (0.03 * 200 + totals.lift_m))
     assert totals.fuel_j == pytest.approx(totals.energy_j / SLOW.efficiency)
-    assert (totals.time_s, totals.unknown, totals.braked_j) == pytest.approx((100, 0, 0))
+    assert (totals.time_s, totals.unknown, totals.braked_j) == pytest.approx((100, 0, 0), abs=1e-6)
     assert steps.slope == pytest.approx(np.full(8, totals.lift_m / 200))
 
 
 def test_there_less_back_is_twice_the_height() -> None:
     ahead, layers = line((10, 10), (170, 10), (170, 150)), fields(0.03, east=0.004, north=0.01)
     there, back = (route(way, layers, SLOW, stops=ROLLING)[1] for way in (ahead, ahead[::-1]))
-    assert there.braked_j == back.braked_j == 0
+    assert max(there.braked_j, back.braked_j) < 1e-3 * back.energy_j  # where it turns, the slope along is another one
     assert there.energy_j - back.energy_j == pytest.approx(2 * WEIGHT_N * there.lift_m)
     assert there.lift_m == pytest.approx(-back.lift_m)
 
@@ -62,7 +62,7 @@ def test_there_less_back_is_twice_the_height() -> None:
 def test_two_soils_cost_what_each_costs_and_stand_in_their_steps() -> None:
     soils = np.where(np.arange(SIZE) < 110, 0.02, 0.06) + np.zeros((SIZE, 1))
     steps, totals = route(line((10, 50), (210, 50)), fields(soils), SLOW, stops=ROLLING)
-    assert totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 100 + 0.06 * 100), rel=1e-3)
+    assert totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 100 + 0.06 * 100), rel=2e-3)
     assert steps.resistance[[0, -1]] == pytest.approx([0.02, 0.06])
     assert steps.energy_j.sum() == pytest.approx(totals.energy_j)
     assert steps.time_s.sum() == pytest.approx(totals.time_s)
@@ -89,13 +89,33 @@ def test_unknown_ground_counts_as_the_dearest_and_is_said() -> None:
     soils = np.where(np.arange(SIZE) < 150, 0.02, 0.08) + np.zeros((SIZE, 1))
     soils[:, 80:120] = np.nan
     layers = fields(soils)
+    layers.layers["visits"][0, :, 80:120] = np.nan
     steps, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, step_m=10)
-    assert totals.unknown == pytest.approx(40 / 130, abs=0.02)
+    assert (totals.unknown, totals.unmeasured) == (pytest.approx(40 / 130, abs=0.02), 0.0)
     assert steps.resistance[8] == pytest.approx(0.08)
     assert np.isnan(steps.confidence[8])
     _, given = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, unknown_resistance=0.02)
     assert given.energy_j == pytest.approx(WEIGHT_N * 0.02 * 130, rel=0.01)
     assert totals.energy_high_j - totals.energy_low_j > given.energy_high_j - given.energy_low_j
+
+
+def test_what_was_driven_on_and_not_measured_lies_between_what_was() -> None:
+    """Half as sure as its ends differ; its slope is known."""
+    soils = np.where(np.arange(SIZE) < 100, 0.01, 0.09) + np.zeros((SIZE, 1))
+    soils[:, 80:121] = np.nan
+    layers = fields(soils, east=0.01)
+    steps, totals = route(line((10, 50), (190, 50)), layers, SLOW, stops=ROLLING, step_m=10)
+    assert (totals.unknown, totals.unmeasured) == (0.0, pytest.approx(41 / 180, abs=0.01))
+    assert (np.diff(steps.resistance) >= -1e-9).all()
+    assert steps.resistance[8:10].mean() == pytest.approx(0.03, rel=0.1)  # in the middle, of the logarithm
+    assert totals.lift_m == pytest.approx(1.8)
+    even = fields(np.where(np.isnan(soils), np.nan, 0.02), east=0.01)
+    _, sure = route(line((10, 50), (190, 50)), even, SLOW, stops=ROLLING)
+    assert sure.energy_j == pytest.approx(WEIGHT_N * (0.02 + 0.01) * 180, rel=1e-3)
+    assert (totals.energy_high_j - totals.energy_low_j) > 3 * (sure.energy_high_j - sure.energy_low_j)
+    beyond = fields(np.where(np.arange(SIZE) < 100, 0.01, np.nan) + np.zeros((SIZE, 1)))
+    last, _ = route(line((10, 50), (190, 50)), beyond, SLOW, stops=ROLLING)
+    assert last.resistance[-1] == pytest.approx(0.01)
 
 
 def test_where_nothing_is_known_a_route_has_no_cost_unless_it_is_said() -> None:

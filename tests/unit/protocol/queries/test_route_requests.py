@@ -6,8 +6,9 @@ import pytest
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries.parameters import Freshness, selector_of, split_selector
+from protocol.queries.places import MAX_PLACES
 from protocol.queries.requests import encode_query, parse_query
-from protocol.queries.route_requests import MAX_PLACES, REFUSE, TIME, RouteQuery, WayQuery
+from protocol.queries.route_requests import REFUSE, TIME, RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES, RouteMachine
 
 LINE = {"line": "0,0,30,40"}
@@ -58,7 +59,7 @@ def test_as_many_places_as_a_line_may_have():
         ("route", {**LINE, "efficiency": "1.01"}, Refusal.OUT_OF_RANGE, "`efficiency`: 1.01 is over 1"),
         ("route", {**LINE, "rotating": "0.9"}, Refusal.OUT_OF_RANGE, "`rotating`: 0.9 is not between 1 and 2"),
         ("route", {**LINE, "power": "inf"}, Refusal.NOT_FINITE, "`power`: inf"),
-        ("route", {**LINE, "machine": "ox"}, Refusal.OUT_OF_RANGE, "`machine`: 'ox' is not known; known: loader"),
+        ("route", {**LINE, "machine": "Ox"}, Refusal.OUT_OF_RANGE, "`machine`: 'Ox' is no name; kinds are loader"),
         ("route", {**LINE, "stops": "often"}, Refusal.OUT_OF_RANGE, "`stops`: 'often'"),
         ("route", {**LINE, "step": "0.5"}, Refusal.OUT_OF_RANGE, "`step`: 0.5 m is not between 1"),
         ("route", {"line": "0,0,20000,0", "step": "1"}, Refusal.TOO_LARGE, "`step`: 20000 m in steps of 1 m"),

@@ -23,6 +23,7 @@ from protocol.queries.requests import (
     InfoQuery,
     MapQuery,
     PointQuery,
+    PointsQuery,
     RegionQuery,
     SegmentsQuery,
     When,
@@ -31,7 +32,7 @@ from protocol.queries.requests import (
 )
 from protocol.queries.roads import Segments, Worklist, encode_segments, encode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
-from protocol.queries.routing import MACHINES
+from protocol.queries.routing import MACHINES, NamedMachine
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
 from sitegrid.asking import PAST_S
@@ -79,6 +80,8 @@ class Session:
             return (GOLDEN / f"{asked.name}.bin").read_bytes() if asked.from_ns is None else self._no_roads(asked)
         if isinstance(asked, RouteQuery | WayQuery):
             return (GOLDEN / "route.bin").read_bytes()
+        if isinstance(asked, PointsQuery):
+            return (GOLDEN / "points.bin").read_bytes()
         assert isinstance(asked, PointQuery | RegionQuery)
         stamp_ns = asked.when.as_of_ns or self.now_ns
         if isinstance(asked, PointQuery):
@@ -159,8 +162,9 @@ def test_a_route_is_its_totals_and_a_table_of_steps(session: Session, capsys):
     truck = replace(MACHINES["truck"], mass_kg=30_000.0)
     line = ((0.0, 0.0), (30.0, 40.0))
     assert session.asked[-1] == RouteQuery(line, truck, unknown="refuse", as_of_ns=T0, fresh=Freshness(3))
-    length, cost, names, first, last = capsys.readouterr().out.splitlines()
-    assert length == "50 m, +1.5 m up, 50% unknown"
+    length, machine, cost, names, first, last = capsys.readouterr().out.splitlines()
+    assert length == "50 m, +1.5 m up, 50% unknown, 25% driven and not measured"
+    assert machine == "22.0 t, at most 6 m/s, 140 kW"
     assert cost == "0.28 kWh (0.25..0.35), 0.11 l of diesel, 0.06 kWh braked, 20 s (20..21)"
     assert names.split()[:4] == ["m", "from", "resistance", "+-"]
     assert (first.split()[0], last.split()[1]) == ("0", "2,3")
@@ -168,6 +172,9 @@ def test_a_route_is_its_totals_and_a_table_of_steps(session: Session, capsys):
     table = json.loads(capsys.readouterr().out)
     assert table["totals"]["energy_j"] == 1e6
     assert table["steps"]["confidence"] == [0.75, None]
+    assert table["machine"]["mass_kg"] == 22_000.0
+    assert main(["query", "route", "0", "0", "30", "40", "--set", "machine=truck-1"]) == 0
+    assert session.asked[-1] == RouteQuery(line, NamedMachine("truck-1"))
 
 
 def test_a_way_names_its_places(session: Session, capsys):
@@ -190,6 +197,33 @@ def test_a_drive_that_cannot_be_is_refused_before_anybody_is_asked(session: Sess
     assert main(["query", *words]) == 1
     assert problem in capsys.readouterr().err
     assert session.asked == []
+
+
+def test_points_are_a_table_in_their_order(session: Session, capsys):
+    assert main(["query", "--layers", "resistance,visits", "points", "0", "2", "1.5", "2", "-4", "0"]) == 0
+    places = ((0.0, 2.0), (1.5, 2.0), (-4.0, 0.0))
+    assert session.asked[-1] == PointsQuery(places, ("resistance", "visits"))
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split() == ["x", "y", "resistance", "visits"]
+    assert [row.split()[2] for row in rows] == ["0.02", "unknown", "0.25"]
+    assert main(["query", "points", "0", "2", "--as-of", str(T0), "--json"]) == 0
+    assert session.asked[-1] == PointsQuery(((0.0, 2.0),), when=When(T0))
+    assert json.loads(capsys.readouterr().out)["resistance"][1] is None
+    assert main(["query", "points", "0", "2", "1"]) == 1
+    assert "3 numbers; places are pairs x y" in capsys.readouterr().err
+
+
+def test_a_region_may_be_an_outline_and_have_larger_cells(session: Session, capsys):
+    corners = ((0.0, 0.0), (10.0, -5.0), (5.0, 9.0))
+    words = ["0", "0", "10", "-5", "5", "9"]
+    assert main(["query", "region", *words, "--resolution", "2"]) == 0
+    assert session.asked[-1] == RegionQuery(corners, resolution_m=2.0)
+    asked = len(session.asked)
+    assert main(["query", "region", "0", "0", "10", "10", "10", "0", "0", "10"]) == 1
+    assert "parameter `polygon`: its sides from corners 1 and 3 on cross each other" in capsys.readouterr().err
+    assert main(["query", "region", "0", "0"]) == 1
+    assert "parameter `polygon`: 1 corners; an outline has at least three" in capsys.readouterr().err
+    assert len(session.asked) == asked
 
 
 def test_segments_are_a_table(session: Session, capsys):
@@ -244,10 +278,14 @@ def test_the_python_client_passes_every_argument(session: Session):
     fresh = Freshness(3, 4.0)
     client.point(1, 2, ["a"], as_of_ns=5, minus_ns=6, after=3, wait_s=4.0)
     client.region((0, 1, 2, 3), ["a"], as_of_ns=5, minus_ns=6, after=3, wait_s=4.0)
+    client.points([(1, 2)], ["a"], as_of_ns=5, minus_ns=6, after=3, wait_s=4.0)
+    client.region([(0, 0), (3, 0), (0, 3)], ["a"], resolution_m=2, as_of_ns=5, minus_ns=6, after=3, wait_s=4.0)
     spans = client.history(1, 2, ["a"], from_ns=5, to_ns=6, span_s=7.0, after=3, wait_s=4.0)
     assert session.asked == [
         PointQuery(1.0, 2.0, ("a",), fresh, When(5, 6)),
         RegionQuery(Bounds(0, 1, 2, 3), ("a",), fresh, When(5, 6)),
+        PointsQuery(((1.0, 2.0),), ("a",), fresh, When(5, 6)),
+        RegionQuery(((0.0, 0.0), (3.0, 0.0), (0.0, 3.0)), ("a",), fresh, When(5, 6), 2.0),
         HistoryQuery(1.0, 2.0, ("a",), 5, 6, 7.0, fresh),
     ]
     assert [span.first_ns for span in spans] == [T0, T0 + 300 * S]

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapserver.pictures.plotter import Track
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, QueryError
 from protocol.queries.answers import Region
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.routing import MACHINES
 from sim.truth import TruthMap
-from sitegrid.pictures.draw import _title, truth_layers
+from sitegrid.pictures.draw import _query, _title, truth_layers
 from tests.unit.records import version
 
 
@@ -62,3 +67,20 @@ def test_a_map_without_resistance_says_why(resistance: float, grade: float, trac
         known.x_m, known.y_m, 1.0, {k: np.full((2, 2), v, np.float32) for k, v in layers.items()}, version(), 0
     )
     assert _title(known, tracks, "samples follow after 90 s") == title
+
+
+def arguments(**given):
+    return Namespace(**{"line": None, "between": None, "set": [], **given})
+
+
+def test_a_drive_is_asked_as_the_options_say():
+    assert _query(arguments()) is None
+    line = _query(arguments(line=[0.0, 1.0, 30.0, 40.0], set=[("machine", "truck"), ("mass", "30000")]))
+    assert line == RouteQuery(((0.0, 1.0), (30.0, 40.0)), replace(MACHINES["truck"], mass_kg=30_000.0))
+    assert _query(arguments(between=[0.0, 1.0, 30.0, 40.0], set=[("cost", "time")])) == WayQuery(
+        (0.0, 1.0), (30.0, 40.0), cost="time"
+    )
+    with pytest.raises(ConfigError, match="--set: is of a drive"):
+        _query(arguments(set=[("mass", "3")]))
+    with pytest.raises(QueryError, match="parameter `line`: 3 numbers"):
+        _query(arguments(line=[0.0, 1.0, 2.0]))

@@ -1,0 +1,1 @@
+"""Methods from outside of this project, entered like anybody's: they read samples and write maps."""

@@ -1,0 +1,82 @@
+"""Routes of complete legs: by the map, by the true map, and as the simulator's machines drove them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from evaluation.campaign.figures import root_mean_square
+from evaluation.fleet.drives import FleetDrive, Scene
+from evaluation.roads.score import Recorded
+from evaluation.routes.legs import Leg, legs_of
+from evaluation.routes.maps import KnownMap, true_squares
+from mapserver.routes.ground import Squares
+from mapserver.routes.route import route
+from protocol.arrays import Floats
+from protocol.queries.route_requests import RouteQuery
+from protocol.queries.routing import RouteTotals
+from protocol.units import GRAVITY_MPS2
+
+Judged = dict[str, float]
+
+
+def judged_legs(drive: FleetDrive, recorded: Recorded, scene: Scene, cache: Path) -> list[Judged]:
+    """Figures of every leg: shares that the route is off, and whether its interval holds the truth."""
+    known, truth = KnownMap(recorded.rows), true_squares(scene.truth)
+    routes = known.routes()
+
+    def asked(leg: Leg, line: Floats) -> RouteTotals:
+        places = tuple(map(tuple, line.tolist()))
+        return routes.route(RouteQuery(places, leg.machine, leg.stops)).totals
+
+    return [
+        _judged(leg, asked(leg, leg.line_m), asked(leg, leg.line_m[::-1]), truth)
+        for leg in legs_of(drive, scene, dict(recorded.rows), cache)
+    ]
+
+
+def _judged(leg: Leg, there: RouteTotals, back: RouteTotals, truth: Squares) -> Judged:
+    """back: nobody drove it; its truth is the same drive over the true map."""
+    _, true_there = route(leg.line_m, truth, leg.machine, stops=leg.stops)
+    _, true_back = route(leg.line_m[::-1], truth, leg.machine, stops=leg.stops)
+    steady_j = leg.machine.mass_kg * GRAVITY_MPS2 * (_rolling(leg, truth) + true_there.lift_m)
+    return {
+        "length_m": leg.length_m,
+        "energy": there.energy_j / leg.energy_j - 1,
+        "time": there.time_s / leg.time_s - 1,
+        "model": true_there.energy_j / leg.energy_j - 1,
+        "steady": steady_j / leg.energy_j - 1,
+        "map": there.energy_j / true_there.energy_j - 1,
+        "back": back.energy_j / true_back.energy_j - 1,
+        "energy_inside": float(there.energy_low_j <= leg.energy_j <= there.energy_high_j),
+        "time_inside": float(there.time_low_s <= leg.time_s <= there.time_high_s),
+        "back_inside": float(back.energy_low_j <= true_back.energy_j <= back.energy_high_j),
+        "width": (there.energy_high_j - there.energy_low_j) / there.energy_j,
+    }
+
+
+def _rolling(leg: Leg, truth: Squares) -> float:
+    """Resistance times way [m]: what a drive costs that neither starts nor brakes, and rises nowhere."""
+    middles = 0.5 * (leg.line_m[1:] + leg.line_m[:-1])
+    return float((truth.at(middles)["resistance_filled"] * np.hypot(*np.diff(leg.line_m, axis=0).T)).sum())
+
+
+def seed_figures(legs: Sequence[Judged]) -> dict[str, float]:
+    """Of one recording, in percent: root mean square over its legs, means, the worst leg, and shares inside."""
+    column = {name: np.array([leg[name] for leg in legs]) for name in legs[0]}
+    return {
+        "legs": len(legs),
+        "km": float(column["length_m"].sum() / 1000),
+        **{
+            f"{name}_pct": 100.0 * root_mean_square(column[name]) for name in ("energy", "back", "time", "model", "map")
+        },
+        "energy_mean_pct": 100.0 * float(column["energy"].mean()),
+        "energy_worst_pct": 100.0 * float(np.abs(column["energy"]).max()),
+        "time_mean_pct": 100.0 * float(column["time"].mean()),
+        "model_mean_pct": 100.0 * float(column["model"].mean()),
+        "steady_mean_pct": 100.0 * float(column["steady"].mean()),
+        **{f"{name}_inside_pct": 100.0 * float(column[f"{name}_inside"].mean()) for name in ("energy", "back", "time")},
+        "width_pct": 100.0 * float(column["width"].mean()),
+    }

@@ -1,0 +1,74 @@
+"""Maps to ask for routes: what a server makes of samples, and the truth in the same form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import TypeVar
+
+import numpy as np
+
+from mapserver.config import ServerConfig
+from mapserver.evidence.grid import Grid
+from mapserver.journal.facts import NO_FACTS
+from mapserver.query.block_layers import BlockLayers
+from mapserver.query.routes import Routes
+from mapserver.routes.ground import Squares
+from mapserver.routes.route import LAYERS, SURE_VISITS
+from protocol.arrays import Floats32, Table
+from protocol.queries.answers import MapVersion
+from protocol.site.site_config import SiteConfig
+from sim.truth import TruthMap
+
+T = TypeVar("T")
+SITE = SiteConfig("judged", 48.0, 9.0)
+
+
+class KnownMap:
+    """The map that a server would have of samples, with the parts of a source that routes ask."""
+
+    def __init__(self, samples: Mapping[str, Table], site: SiteConfig = SITE) -> None:
+        self.site, self.config = site, ServerConfig()
+        self.grid = Grid(site.cell_m, self.config.fold)
+        for name, table in samples.items():
+            self.grid.fold(table, name)
+        self.version, self.facts = MapVersion("", 1, 0), NO_FACTS
+        self.newest_ns = self.grid.newest_ns
+        self._names = tuple(samples)
+
+    def run(self, work: Callable[[KnownMap], T]) -> T:
+        """See `MapSource`."""
+        return work(self)
+
+    def machines(self) -> Collection[str]:
+        """See `MapState`."""
+        return self._names
+
+    def routes(self) -> Routes:
+        """What answers queries for routes."""
+        return Routes(self, BlockLayers(self.site.cell_m, self.config), _no_past)  # type: ignore[arg-type]
+
+
+def true_squares(truth: TruthMap) -> Squares:
+    """A true map as a route reads it: known everywhere, without doubt."""
+    rows, columns = truth.c_rr.shape
+    edge = max(rows, columns)
+
+    def square(values: Floats32 | float) -> Floats32:
+        out = np.full((edge, edge), np.nan, np.float32)
+        out[:rows, :columns] = values
+        return out
+
+    layers = dict.fromkeys(LAYERS, square(0.0)) | {
+        "resistance_filled": square(truth.c_rr),
+        "grade_east_filled": square(truth.grade_east),
+        "grade_north_filled": square(truth.grade_north),
+        "visits": square(SURE_VISITS),
+        "confidence": square(1.0),
+    }
+    if (truth.west_m, truth.south_m) != (0.0, 0.0):
+        raise ValueError("a true map begins at the origin")
+    return Squares.stacked(truth.cell_m, edge, {(0, 0): layers})
+
+
+def _no_past() -> None:
+    raise NotImplementedError("nobody asks for the past here")

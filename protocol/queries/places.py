@@ -1,0 +1,97 @@
+"""Places, lines and outlines as selector parameters: x,y,x,y,... in metres of `map`; QueryError names what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from protocol.arrays import Bools, Floats, Ints
+from protocol.errors import QueryError, Refusal
+from protocol.queries import parameters as ps
+
+Place = tuple[float, float]
+
+MAX_PLACES = 10_000  # of one line or list
+MAX_CORNERS = 500  # of one outline: each of its sides is compared with each other one
+PLACES_BYTES = 2**19  # of the parameters of a query with places: MAX_PLACES of them with all their digits
+
+
+def take_places(parameters: ps.Parameters, name: str, most: int = MAX_PLACES) -> tuple[Place, ...]:
+    """A list of places."""
+    parts = ps.required(parameters, name).split(",")
+    if len(parts) % 2:
+        raise refusal(name, f"{len(parts)} numbers; places are pairs x,y in metres")
+    check_count(name, len(parts) // 2, most)
+    numbers = [ps.number({name: part}, name) for part in parts]
+    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
+
+
+def take_place(parameters: ps.Parameters, name: str) -> Place:
+    """A single place."""
+    places = take_places(parameters, name)
+    if len(places) != 1:
+        raise refusal(name, f"{len(places)} places; it is one, x,y in metres")
+    return places[0]
+
+
+def text_of_places(places: Sequence[Place]) -> str:
+    """Undo `take_places`."""
+    return ",".join(ps.text_of(value) for place in places for value in place)
+
+
+def check_count(name: str, count: int, most: int = MAX_PLACES) -> None:
+    """Refuse too many places."""
+    if count > most:
+        raise QueryError(Refusal.TOO_LARGE, f"parameter `{name}`: {count} places, over {most}")
+
+
+def check_outline(name: str, corners: Sequence[Place]) -> None:
+    """Refuse what is no simple polygon: too few corners or too many, no numbers, sides that meet but at corners."""
+    if len(corners) < 3:
+        raise refusal(name, f"{len(corners)} corners; an outline has at least three")
+    check_count(name, len(corners), MAX_CORNERS)
+    corner = np.array(corners, np.float64)
+    if not np.isfinite(corner).all():
+        raise QueryError(Refusal.NOT_FINITE, f"parameter `{name}`: corner that is no number")
+    side = np.roll(corner, -1, axis=0) - corner
+    if (still := np.flatnonzero((side == 0).all(axis=1))).size:
+        same = int(still[0])
+        raise refusal(name, f"corners {same + 1} and {(same + 1) % len(corner) + 1} are the same")
+    following = np.roll(side, -1, axis=0)
+    if (back := np.flatnonzero((_cross(side, following) == 0) & ((side * following).sum(axis=1) < 0))).size:
+        raise refusal(name, f"it turns back on itself at corner {(int(back[0]) + 1) % len(corner) + 1}")
+    i, j = _near(corner, side)
+    if (meet := np.flatnonzero(_meet(corner, side, i, j))).size:
+        first, second = int(i[meet[0]]), int(j[meet[0]])
+        raise refusal(name, f"its sides from corners {first + 1} and {second + 1} on cross each other")
+
+
+def refusal(parameter: str, problem: str) -> QueryError:
+    """What is wrong with a parameter."""
+    return QueryError(Refusal.OUT_OF_RANGE, f"parameter `{parameter}`: {problem}")
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _near(corner: Floats, side: Floats) -> tuple[Ints, Ints]:
+    """Pairs of sides whose rectangles have a point in common, but for those that share a corner."""
+    low, high = np.minimum(corner, corner + side), np.maximum(corner, corner + side)
+    over = (low[:, None] <= high[None]).all(axis=2)
+    i, j = np.nonzero(np.triu(over & over.T, 2))
+    apart: Bools = (i != 0) | (j != len(corner) - 1)
+    return i[apart], j[apart]
+
+
+def _meet(corner: Floats, side: Floats, i: Ints, j: Ints) -> Bools:
+    """Whether sides i and j (k,) have a point in common."""
+    between = corner[j] - corner[i]
+    # the ends of each on which side of the other
+    ends = (
+        (_cross(side[i], between), _cross(side[i], between + side[j])),
+        (_cross(side[j], -between), _cross(side[j], side[i] - between)),
+    )
+    apart = [np.sign(one) * np.sign(other) > 0 for one, other in ends]  # of sides on one line their rectangles decide
+    return np.asarray(~apart[0] & ~apart[1])

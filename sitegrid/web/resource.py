@@ -1,0 +1,50 @@
+"""What a resource of the API is, what parameters several of them have in common, and how answers become JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from starlette.responses import Response
+
+from protocol.queries.answers import MapVersion
+from sitegrid.web import values
+from sitegrid.web.site import SiteFeed
+from sitegrid.web.values import Parameters
+
+Answer = Callable[[SiteFeed, Parameters], Awaitable[Response]]
+
+PLACE = {"x": "east of the site's origin [m]", "y": "north of it [m]"}
+PLACE |= {"lat": "latitude [deg], with lon in place of x and y", "lon": "longitude [deg]"}
+AS_OF = {"as_of": "the map as of this time, ISO 8601 or nanoseconds since 1970 (UTC)"}
+LAYERS = {"layers": "names, comma-separated; without it all"}
+BOUNDS = {"bounds": "west,south,east,north [m]"}
+GEOJSON = ("application/geo+json",)
+
+
+@dataclass(frozen=True)
+class Resource:
+    """What a path answers. parameters: name -> meaning. media: what it may answer with."""
+
+    answer: Answer
+    summary: str
+    parameters: Mapping[str, str]
+    media: tuple[str, ...] = ("application/json",)
+    follows_now: bool = False  # whether it changes with the site's now, not with the map alone
+
+
+def as_json(value: Any) -> Response:
+    """Records, arrays and tables as JSON."""
+    return Response(json.dumps(values.plain(value), allow_nan=False), media_type="application/json")
+
+
+def as_geojson(value: Any) -> Response:
+    """A collection of features."""
+    return Response(json.dumps(value, allow_nan=False), media_type=GEOJSON[0])
+
+
+def version_of(version: MapVersion) -> dict[str, Any]:
+    """The map that an answer is of, as all answers name it."""
+    return {"store": version.store, "merged": version.row, "fact": version.fact}

@@ -1,0 +1,70 @@
+"""The live page in a browser that tests drive, and what it complained of. Needs Chromium (Debian: `chromium`)."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+NO_BROWSER = "no Chromium: install it, for example with `apt-get install chromium`"
+needs_browser = [pytest.mark.processes, pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)]
+WAIT_MS = 20_000
+
+
+def launched() -> Iterator[Any]:
+    """A browser that is closed at the end."""
+    from playwright.sync_api import Error, sync_playwright
+
+    with sync_playwright() as playwright:
+        try:  # in containers: no user namespaces, little shared memory
+            arguments = ["--no-sandbox", "--disable-dev-shm-usage"]
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        except Error as error:
+            pytest.skip(f"Chromium does not start here: {str(error).splitlines()[0]}")
+        yield browser
+        browser.close()
+
+
+class Tab:
+    """A page, and what its browser complained of."""
+
+    def __init__(self, browser: Any, url: str, **options: Any) -> None:
+        self.complaints: list[str] = []
+        self.asked: list[str] = []
+        self.context = browser.new_context(**({"viewport": {"width": 1280, "height": 800}} | options))
+        self.page = self.context.new_page()
+        self.page.on("console", lambda message: self._note(message.type, message.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.goto(url)
+
+    def _note(self, kind: str, text: str) -> None:
+        if kind in ("error", "warning"):
+            self.complaints.append(text)
+
+    def js(self, expression: str) -> Any:
+        return self.page.evaluate(expression)
+
+    def until(self, expression: str, timeout_ms: float = WAIT_MS) -> None:
+        """Wait until an expression holds; the page's own rules forbid the browser's way to wait."""
+        for _ in range(int(timeout_ms / 50)):
+            if self.js(expression):
+                return
+            self.page.wait_for_timeout(50)
+        raise AssertionError(f"did not come true: {expression}; {self.complaints}")
+
+    def loaded(self) -> Tab:
+        self.until(
+            "window.sitegrid && sitegrid.map.tiles.size > 0 && sitegrid.state === 'live' && sitegrid.time.step_ns > 0"
+        )
+        return self
+
+    def pixel_of(self, x_m: float, y_m: float) -> tuple[float, float]:
+        left, top = self.js(f"sitegrid.view.toScreen({x_m}, {y_m})")
+        return left, top
+
+    def close(self) -> None:
+        self.context.close()

@@ -1,0 +1,528 @@
+"""The live page's worklist and routes in a browser, on a running site. Needs Chromium (Debian: `chromium`)."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import cv2
+import numpy as np
+import pytest
+
+from protocol.queries.roads import WorklistRow
+from protocol.queries.routing import MACHINES
+from sitegrid.process.children import Children
+from tests.integration.browser_tab import Tab, needs_browser
+from tests.integration.hauling_site import DAY_NS, FIRST_NS, hauling_site
+from tests.integration.site_run import kill
+from tests.integration.web_site import WebSite
+
+pytestmark = needs_browser
+PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+QUIET = "document.querySelector('#panel .asking') === null"
+
+
+@pytest.fixture(scope="module")
+def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
+    folder = tmp_path_factory.mktemp("page-roads")
+    with Children(folder) as children:
+        yield hauling_site(folder, children)
+
+
+@pytest.fixture
+def tab(browser, web: WebSite) -> Iterator[Tab]:
+    tab = Tab(browser, web.url).loaded()
+    yield tab
+    assert tab.complaints == []
+    assert all(url.startswith((web.url, "data:")) for url in tab.asked), "nobody else was asked"
+    tab.close()
+
+
+def opened(tab: Tab, key: str = "w") -> Any:
+    """The panel of a key, once it has its answer."""
+    tab.page.keyboard.press(key)
+    tab.until(f"sitegrid.panel !== null && {QUIET}")
+    return tab.page.locator("#panel")
+
+
+def figure(value: float) -> str:
+    return f"{value:.2f}" if value < 9.95 else f"{value:.1f}" if value < 99.5 else f"{value:.0f}"
+
+
+def listed(web: WebSite) -> tuple[WorklistRow, ...]:
+    return web.client.worklist(limit=10).rows
+
+
+def row_of(tab: Tab, row: WorklistRow) -> Any:
+    return tab.page.locator(f'[id="stretch-{row.segment.id}"]')
+
+
+def pixel(tab: Tab, x_m: float, y_m: float) -> list[int]:
+    """What is painted at a place of the site: red, green, blue."""
+    left, top = tab.pixel_of(x_m, y_m)
+    image = tab.page.screenshot(clip={"x": round(left), "y": round(top), "width": 1, "height": 1})
+    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR_RGB)[0, 0].tolist()
+
+
+# --- where to send the grader
+
+
+def test_the_ten_stretches_that_cost_most_stand_in_their_order_with_reasons(tab: Tab, web: WebSite):
+    panel, rows = opened(tab), listed(web)
+    assert panel.locator("h2").inner_text() == "Where to send the grader"
+    shown = panel.locator("ol .stretch")
+    assert shown.count() == len(rows) == 10
+    for i, row in enumerate(rows):
+        text = shown.nth(i).inner_text()
+        value, low, high = row.kwh_ph
+        guess = "~" if row.segment.guessed else ""
+        assert f"{guess}{figure(value)}" in text
+        assert f"{figure(low)} to {figure(high)}" in text
+        assert f"{100 * row.segment.resistance:.1f} %" in text
+        assert f"{sum(row.segment.passes_ph):.1f} passes/h" in text
+    total = panel.locator(".totals").inner_text()
+    assert figure(sum(row.kwh_ph[0] for row in rows)) in total
+    days = panel.locator("ol .stretch canvas").first.get_attribute("aria-label")
+    assert days == "From 4.0 % on 9 Oct to 5.5 % on 12 Oct"
+    assert "+0.5 %/day" in shown.first.inner_text()
+    assert "since the first drive" in shown.first.inner_text()
+    repaired = panel.locator(".stretch.short").first.inner_text()
+    assert "Repaired" in repaired
+    assert "5.0 % → 3.0 %" in repaired
+
+
+def test_a_mass_that_nobody_stated_is_called_a_guess(tab: Tab, web: WebSite):
+    panel = opened(tab)
+    assert not any(row.segment.guessed for row in listed(web))
+    assert panel.locator(".guess").count() == 0
+    tab.page.keyboard.press("Escape")
+    guessed = [row for row in web.get("worklist").json["rows"] if row["segment"]["guessed"]]
+    answers(tab, "worklist", {**answer_of(web), "rows": guessed[:10]})
+    panel = opened(tab)
+    assert "guess" in panel.locator(".guess").inner_text()
+    shown = panel.locator("ol .lost b").all_inner_texts()
+    assert shown
+    assert all(text.startswith("~") for text in shown)
+
+
+def answer_of(web: WebSite) -> dict[str, Any]:
+    return web.get("worklist", {"limit": 10}).json
+
+
+def answers(tab: Tab, resource: str, body: Any, status: int = 200) -> None:
+    """From now on, in place of the server."""
+    tab.page.route(f"**/{resource}?**", lambda route: route.fulfill(status=status, json=body))
+
+
+def test_resting_on_a_row_lights_its_stretch_on_the_map(tab: Tab, web: WebSite):
+    opened(tab)
+    row = listed(web)[2]
+    x_m, y_m = row.segment.line[1]
+    tab.js("(sitegrid.shows.machines = false)")
+    dim = pixel(tab, x_m, y_m)
+    row_of(tab, row).hover()
+    tab.until(f"sitegrid.work.lit === '{row.segment.id}' && !sitegrid.dirty")
+    lit = pixel(tab, x_m, y_m)
+    assert lit != dim
+    assert lit == [0xB3, 0x36, 0x1C], "the colour of alarms"
+    tab.page.mouse.move(640, 300)
+    tab.until("sitegrid.work.lit === null && !sitegrid.dirty")
+    assert pixel(tab, x_m, y_m) == dim
+
+
+def test_a_click_on_a_row_flies_to_its_stretch_beside_the_panel(tab: Tab, web: WebSite):
+    opened(tab)
+    row = listed(web)[9]
+    scale = tab.js("sitegrid.view.scale")
+    row_of(tab, row).click()
+    tab.until("sitegrid.view.flight === null && sitegrid.view.moved")
+    assert tab.js("sitegrid.view.scale") > scale
+    for point in row.segment.line:
+        left, top = tab.pixel_of(*point)
+        assert 250 < left < 1280 - 380
+        assert 60 < top < 720
+
+
+def test_keys_alone_find_a_stretch_and_fly_to_it(tab: Tab, web: WebSite):
+    tab.page.locator("#open-work").focus()
+    tab.page.keyboard.press("Enter")
+    tab.until(f"sitegrid.panel === 'work' && {QUIET}")
+    assert tab.page.locator("#open-work").get_attribute("aria-pressed") == "true"
+    first = f"stretch-{listed(web)[0].segment.id}"
+    for _ in range(12):
+        tab.page.keyboard.press("Tab")
+        if tab.js("document.activeElement.id") == first:
+            break
+    assert tab.js("document.activeElement.id") == first
+    assert tab.js("sitegrid.work.lit") == listed(web)[0].segment.id
+    tab.page.keyboard.press("Enter")
+    tab.until("sitegrid.view.flight === null && sitegrid.view.moved")
+    tab.js("sitegrid.openPanel('work')")
+    tab.until(QUIET)
+    assert tab.js("document.activeElement.id") == first, "a list that is made anew keeps the place of who reads it"
+    tab.page.keyboard.press("Escape")
+    assert tab.page.locator("#panel").is_hidden()
+
+
+def test_a_click_on_a_stretch_finds_its_row(tab: Tab, web: WebSite):
+    opened(tab)
+    row = listed(web)[4]
+    tab.page.mouse.click(*tab.pixel_of(*row.segment.line[1]))
+    tab.until(f"document.activeElement.id === 'stretch-{row.segment.id}'")
+    tab.page.mouse.click(*tab.pixel_of(85.0, 100.0))  # none is near
+    tab.until("sitegrid.panel === 'why'")
+
+
+def test_the_target_is_chosen_and_a_link_keeps_it(tab: Tab, browser, web: WebSite):
+    panel = opened(tab)
+    tab.page.locator("#target").fill("5")
+    tab.page.keyboard.press("Enter")
+    rows = web.client.worklist(0.05, limit=10).rows
+    tab.until(f"sitegrid.work.rows.length === {len(rows)}")
+    tab.until("location.search.includes('panel=work') && location.search.includes('target=0.05')")
+    shown = panel.inner_text()
+    other = Tab(browser, tab.page.url).loaded()
+    other.until(f"sitegrid.panel === 'work' && {QUIET}")
+    assert other.page.locator("#panel").inner_text() == shown
+    assert other.js("sitegrid.view.x.toFixed(1)") == tab.js("sitegrid.view.x.toFixed(1)")
+    other.close()
+    tab.page.locator("#target").fill("29")
+    tab.page.keyboard.press("Enter")
+    tab.until("document.querySelector('#panel .empty') !== null")
+    assert "beyond doubt" in panel.inner_text()
+    tab.page.locator("#target").fill("-3")
+    tab.page.keyboard.press("Enter")
+    assert tab.js("sitegrid.work.target") == 0.29, "what is no target is not asked"
+
+
+def test_the_list_is_of_the_time_that_is_shown(tab: Tab, web: WebSite):
+    panel = opened(tab)
+    assert panel.locator(".stretch.short").count() > 0
+    at_ns = FIRST_NS + DAY_NS
+    tab.js(f"sitegrid.time.go({at_ns})")
+    rows = web.client.worklist(limit=10, as_of_ns=at_ns).rows
+    tab.until(f"sitegrid.time.map !== null && sitegrid.panelAt === {at_ns} && {QUIET}")
+    assert panel.locator("ol .stretch").count() == len(rows)
+    assert figure(rows[0].kwh_ph[0]) in panel.locator("ol .stretch").first.inner_text()
+    assert panel.locator(".stretch.short").count() == 0, "the repair came later"
+
+
+def test_an_empty_map_has_no_roads_and_says_so(browser, tmp_path: Path):
+    with Children(tmp_path) as children:
+        web = WebSite(tmp_path, children)
+        tab = Tab(browser, web.url)
+        tab.until("document.getElementById('notice').textContent.includes('No ground known yet')")
+        panel = opened(tab)
+        assert "No roads are known yet" in panel.inner_text()
+        tab.page.keyboard.press("r")
+        tab.until(f"sitegrid.panel === 'route' && {QUIET}")
+        for place in ((300, 650), (500, 700)):  # beside the notice
+            tab.page.mouse.click(*place)
+        tab.until("document.querySelector('#panel .failed') !== null")
+        assert "nobody has driven near this line yet" in panel.inner_text()
+        tab.close()
+
+
+# --- what a drive costs
+
+
+def set_places(tab: Tab, *places: tuple[float, float]) -> None:
+    for place in places:
+        before = tab.js("sitegrid.route.places.length")
+        tab.page.mouse.click(*tab.pixel_of(*place))
+        tab.until(f"sitegrid.route.places.length !== {before}")
+    tab.until(f"{QUIET} && (sitegrid.route.answer !== null || document.querySelector('#panel .failed') !== null)")
+
+
+def places(tab: Tab) -> list[tuple[float, float]]:
+    return [(x, y) for x, y in tab.js("sitegrid.route.places")]
+
+
+def test_a_line_on_the_map_says_what_its_drive_costs(tab: Tab, web: WebSite):
+    panel = opened(tab, "r")
+    assert "Click two places or more" in panel.inner_text()
+    set_places(tab, (20, 10), (90, 10), (150, 10))
+    drive = web.client.route(places(tab), MACHINES["truck"], step_m=tab.js("sitegrid.route.answer.steps.length_m[0]"))
+    totals = panel.locator(".totals").inner_text()
+    assert figure(drive.totals.energy_j / 3.6e6) in totals
+    assert f"{figure(drive.totals.energy_low_j / 3.6e6)} to {figure(drive.totals.energy_high_j / 3.6e6)}" in totals
+    minutes, seconds = divmod(round(drive.totals.time_s), 60)
+    assert f"{minutes}:{seconds:02}" in totals
+    assert f"{round(drive.totals.length_m)} m" in totals
+    tab.page.locator("#machine").select_option("loader")
+    tab.until(f"sitegrid.route.machine === 'loader' && {QUIET} && sitegrid.route.answer !== null")
+    light = web.client.route(places(tab), MACHINES["loader"])
+    assert figure(light.totals.energy_j / 3.6e6) in panel.locator(".totals").inner_text()
+    tab.page.locator("#mass").fill("60")
+    tab.page.keyboard.press("Enter")
+    tab.until(f"sitegrid.route.mass_t === 60 && {QUIET} && sitegrid.route.answer !== null")
+    assert tab.js("sitegrid.route.answer.totals.energy_j") > 2 * light.totals.energy_j
+    tab.page.locator("#undo").click()
+    tab.until(f"sitegrid.route.places.length === 2 && {QUIET}")
+    tab.page.locator("#clear").click()
+    tab.until(f"sitegrid.route.places.length === 0 && {QUIET}")
+    assert "Click two places or more" in panel.inner_text()
+
+
+def test_the_profile_tells_each_place_by_pointer_and_keys(tab: Tab):
+    opened(tab, "r")
+    set_places(tab, (20, 10), (20, 40), (60, 70))
+    profile, said = tab.page.locator("#profile"), tab.page.locator(".said")
+    box = profile.bounding_box()
+    tab.page.mouse.move(box["x"] + 37, box["y"] + 40)
+    tab.until("sitegrid.route.at !== null")
+    assert "± " in said.inner_text()
+    assert "km/h" in said.inner_text()
+    profile.focus()
+    tab.page.keyboard.press("Home")
+    assert tab.js("sitegrid.route.at") == tab.js(
+        "[sitegrid.route.answer.steps.x_m[0], sitegrid.route.answer.steps.y_m[0]]"
+    )
+    unknown = tab.js("sitegrid.route.answer.steps.unknown.findIndex((share) => share >= 0.5)")
+    for _ in range(unknown):
+        tab.page.keyboard.press("ArrowRight")
+    assert "nobody drove here" in said.inner_text()
+    assert profile.get_attribute("aria-valuetext") == said.inner_text()
+    assert "unknown" in tab.page.locator(".unsure").inner_text()
+    tab.page.mouse.move(640, 300)
+    tab.page.locator("#mass").focus()
+    tab.until("sitegrid.route.at === null")
+
+
+def test_there_and_back_cost_different_things(tab: Tab, web: WebSite):
+    opened(tab, "r")
+    set_places(tab, (20, 10), (150, 10))
+    line = places(tab)
+    tab.page.locator("#turn").click()
+    tab.until(f"sitegrid.route.places[0][0] > 100 && {QUIET} && sitegrid.route.answer !== null")
+    assert places(tab) == line[::-1]
+    back = web.client.route(line[::-1], MACHINES["truck"])
+    assert tab.js("sitegrid.route.answer.totals.energy_j") == pytest.approx(back.totals.energy_j, rel=1e-6)
+
+
+def test_the_cheapest_line_between_two_clicks_is_beside_the_straight_one(tab: Tab, web: WebSite):
+    panel = opened(tab, "r")
+    tab.page.locator("#drive-cheapest").click()
+    tab.until(f"sitegrid.route.cheapest && {QUIET}")
+    set_places(tab, (25, 10), (25, 130))
+    ends = places(tab)
+    cheapest, straight = web.client.way(*ends, MACHINES["truck"]), web.client.route(ends, MACHINES["truck"])
+    assert tab.js("sitegrid.route.answer.line") == cheapest.line_m.tolist()
+    assert cheapest.totals.energy_j < straight.totals.energy_j
+    text = panel.inner_text()
+    assert figure(cheapest.totals.energy_j / 3.6e6) in text
+    assert max(cheapest.steps.unknown) < 0.99, "so that nothing says what unknown ground is taken for"
+    assert f"Of the straight line {round(100 * straight.totals.unknown)} % is unknown ground" in text
+    tab.page.locator("#cost-time").click()
+    tab.until(f"sitegrid.route.cost === 'time' && {QUIET} && sitegrid.route.answer !== null")
+    quickest = web.client.way(*ends, MACHINES["truck"], cost="time")
+    assert tab.js("sitegrid.route.answer.totals.time_s") == pytest.approx(quickest.totals.time_s, rel=1e-6)
+    tab.page.mouse.click(*tab.pixel_of(60, 10))  # a third click begins anew
+    tab.until(f"sitegrid.route.places.length === 1 && sitegrid.route.answer === null && {QUIET}")
+    set_places(tab, (130, 10))
+    assert "The straight line costs the same." in panel.inner_text()
+
+
+def test_a_straight_line_is_compared_at_the_same_price_of_unknown_ground(tab: Tab, web: WebSite):
+    panel = opened(tab, "r")
+    tab.page.locator("#drive-cheapest").click()
+    tab.until(f"sitegrid.route.cheapest && {QUIET}")
+    set_places(tab, (25, 28), (25, 112))  # both off the roads
+    ends, step_m = places(tab), tab.js("sitegrid.route.answer.steps.length_m[0]")
+    cheapest = web.client.way(*ends, MACHINES["truck"], step_m=step_m)
+    price = cheapest.steps.resistance[cheapest.steps.unknown > 0.999][0]
+    straight = web.client.route(ends, MACHINES["truck"], unknown=float(price))
+    more = round(100 * (straight.totals.energy_j / cheapest.totals.energy_j - 1))
+    cost = figure(straight.totals.energy_j / 3.6e6)
+    assert more > 0
+    assert f"The straight line would cost {cost} kWh, {more} % more, with" in panel.inner_text()
+
+
+@pytest.mark.parametrize("cheapest", [False, True])
+def test_a_link_opens_the_same_drive(tab: Tab, browser, cheapest: bool):
+    panel = opened(tab, "r")
+    if cheapest:
+        tab.page.locator("#drive-cheapest").click()
+        tab.page.locator("#cost-time").click()
+        tab.until(f"sitegrid.route.cost === 'time' && {QUIET}")
+    tab.page.locator("#machine").select_option("empty_truck")
+    set_places(tab, (20, 10), (120, 10))
+    tab.until("location.search.includes('line=')")
+    tab.page.wait_for_timeout(300)
+    other = Tab(browser, tab.page.url).loaded()
+    other.until(f"sitegrid.panel === 'route' && {QUIET} && sitegrid.route.answer !== null")
+    assert other.page.locator("#panel .totals").inner_text() == panel.locator(".totals").inner_text()
+    for name in ("cheapest", "machine", "places"):
+        assert other.js(f"sitegrid.route.{name}") == tab.js(f"sitegrid.route.{name}")
+    other.close()
+
+
+def test_places_are_set_with_the_keyboard(tab: Tab):
+    opened(tab, "r")
+    tab.page.locator("#map").focus()
+    tab.page.keyboard.press("Enter")
+    tab.until("sitegrid.route.places.length === 1")
+    tab.page.keyboard.press("Enter")  # twice at the same place is one
+    for _ in range(2):
+        tab.page.keyboard.press("ArrowRight")
+    tab.page.keyboard.press("Enter")
+    tab.until(f"sitegrid.route.places.length === 2 && {QUIET}")
+    tab.page.keyboard.press("Backspace")
+    tab.until("sitegrid.route.places.length === 1")
+
+
+# --- what goes wrong
+
+
+def test_names_from_elsewhere_are_text_and_never_markup(tab: Tab, web: WebSite):
+    evil = '"><img src=x onerror="window.hacked = 1"><script>window.hacked = 1</script>'
+    answer = answer_of(web)
+    for row in answer["rows"]:
+        row["segment"]["id"] += evil
+    for change in answer["changes"]:
+        change["id"] += evil
+    answers(tab, "worklist", answer)
+    panel = opened(tab)
+    assert panel.locator("ol .stretch").count() == 10
+    panel.locator("ol .stretch").first.click()
+    tab.page.keyboard.press("Escape")
+    answers(tab, "route", {"detail": evil, "status": 400}, status=400)
+    opened(tab, "r")
+    set_places(tab, (20, 10), (90, 10))
+    assert evil in panel.locator(".failed").inner_text()
+    assert tab.js("window.hacked") is None
+    assert tab.js("document.querySelectorAll('#panel img, #panel script').length") == 0
+    tab.complaints[:] = [text for text in tab.complaints if "400" not in text]  # the browser's own word on the refusal
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "panel=route&line=1e999,NaN;2,3",
+        "panel=route&line=" + ";".join(["1,1", "2,2"] * 5000),
+        "panel=route&line=%3Cimg%20src=x%3E&machine=%3Cb%3E&mass=-1&cost=money",
+        "panel=work&target=NaN",
+        "panel=elsewhere&cell=a,b",
+    ],
+)
+def test_a_link_that_makes_no_sense_breaks_nothing(browser, web: WebSite, words: str):
+    tab = Tab(browser, f"{web.url}?{words}")
+    if len(words) > 32_000:
+        assert tab.js("document.body.textContent").count("too_large") == 1
+        return tab.close()
+    tab.loaded()
+    tab.until(QUIET)
+    assert tab.js("sitegrid.route.places") == []
+    assert tab.js("[sitegrid.route.machine, sitegrid.work.target]") == ["truck", 0.02]
+    assert tab.complaints == []
+    return tab.close()
+
+
+def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
+    opened(tab, "r")
+    held: list[Any] = []
+
+    def hold_the_first(route: Any) -> None:
+        if held:
+            route.continue_()
+        else:
+            held.append(route)
+
+    tab.page.route("**/route?**", hold_the_first)
+    for place in ((20, 10), (90, 10)):
+        tab.page.mouse.click(*tab.pixel_of(*place))
+    tab.until("sitegrid.route.places.length === 2")
+    tab.page.wait_for_timeout(1000)
+    frames, x = tab.js("[sitegrid.frames, sitegrid.view.x]")
+    tab.page.locator("#map").focus()
+    tab.page.keyboard.press("ArrowRight")
+    tab.until(f"sitegrid.frames > {frames} && sitegrid.view.x > {x}")
+    assert tab.js("document.querySelector('#panel .asking') !== null"), "it says that it works"
+    tab.page.mouse.click(*tab.pixel_of(140, 10))
+    tab.until(f"{QUIET} && sitegrid.route.answer !== null && sitegrid.route.places.length === 3")
+    assert held
+    with contextlib.suppress(Exception):  # the page has dropped the question already
+        held[0].continue_()
+    tab.page.wait_for_timeout(500)
+    assert tab.js("sitegrid.route.answer.line.length") == 3
+
+
+def test_a_server_that_goes_in_the_middle_is_named_and_the_panel_comes_back(browser, web: WebSite):
+    tab = Tab(browser, web.url).loaded()
+    opened(tab)
+    kill(web.server)
+    tab.page.keyboard.press("r")
+    tab.until(f"sitegrid.panel === 'route' && {QUIET}")
+    for place in ((20, 10), (90, 10)):
+        tab.page.mouse.click(*tab.pixel_of(*place))
+    tab.until("document.querySelector('#panel .failed') !== null", 40_000)
+    assert "no map server answers" in tab.page.locator("#panel .failed").inner_text()
+    assert tab.page.locator("#machine").is_visible(), "what was chosen stays"
+    web.server = web.start_server()
+    tab.until(f"sitegrid.route.answer !== null && {QUIET}", 60_000)
+    port = web.port
+    kill(web.web)
+    tab.page.keyboard.press("w")
+    tab.until("document.querySelector('#panel .failed') !== null", 40_000)
+    assert "page's server does not answer" in tab.page.locator("#panel .failed").inner_text()
+    web.web = web.start_web(port=port)
+    tab.until(f"sitegrid.panel === 'work' && sitegrid.work.rows.length === 10 && {QUIET}", 60_000)
+    tab.close()
+
+
+def test_a_phone_has_the_list_beneath_the_map_and_shows_what_is_tapped(browser, web: WebSite):
+    tab = Tab(browser, web.url, **PHONE).loaded()
+    tab.page.locator("#open-work").tap()
+    tab.until(f"sitegrid.panel === 'work' && {QUIET}")
+    row = listed(web)[0]
+    row_of(tab, row).tap()
+    tab.until("sitegrid.view.flight === null && sitegrid.view.moved")
+    panel = tab.page.locator("#panel").bounding_box()
+    for point in row.segment.line:
+        left, top = tab.pixel_of(*point)
+        assert 0 < left < 390
+        assert 130 < top < panel["y"]
+    tab.page.get_by_role("button", name="Close").tap()
+    tab.page.locator("#open-route").tap()
+    tab.until(f"sitegrid.panel === 'route' && {QUIET}")
+    for left, top in ((120, 200), (270, 300)):
+        tab.page.touchscreen.tap(left, top)
+        tab.page.wait_for_timeout(400)
+    tab.until(f"{QUIET} && sitegrid.route.answer !== null")
+    small = "(b) => b.offsetParent && b.offsetHeight < 44"
+    assert (
+        tab.js(f"[...document.querySelectorAll('#panel button, #panel select, #panel input')].filter({small}).length")
+        == 0
+    )
+    assert tab.js("document.documentElement.scrollWidth") <= 390
+    assert tab.complaints == []
+    tab.close()
+
+
+def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("no npm: axe-core is installed by it")
+    command = [npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(tmp_path), "axe-core"]
+    if subprocess.run(command, capture_output=True, timeout=120, check=False).returncode:
+        pytest.skip("axe-core cannot be installed here")
+    axe = (tmp_path / "node_modules" / "axe-core" / "axe.min.js").read_text()
+    for theme in ("light", "dark"):
+        for words in ("panel=work", "panel=route&line=20,10;20,60;90,70&cost=energy"):
+            tab = Tab(browser, f"{web.url}?theme={theme}&{words}", bypass_csp=True).loaded()
+            tab.until(f"sitegrid.panel !== null && {QUIET}")
+            tab.page.wait_for_timeout(400)
+            tab.page.evaluate(axe)
+            faults = tab.page.evaluate(
+                "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
+            )
+            serious = [violation for violation in faults if violation[1] in ("serious", "critical")]
+            assert not serious, json.dumps(serious, indent=1)
+            assert "panel" in parse_qs(urlsplit(tab.page.url).query)
+            tab.close()

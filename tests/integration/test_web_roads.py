@@ -1,0 +1,197 @@
+"""Roads, worklist, routes and cheapest lines over HTTP: the client's own numbers; every process is a real one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pyogrio
+import pytest
+
+from protocol.queries.routing import MACHINES
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import Projection
+from protocol.site.site_file import load_site
+from sitegrid.process.children import Children
+from sitegrid.web import values
+from tests.integration.hauling_site import DAY_NS, DAYS, FIRST_NS, hauling_site
+from tests.integration.web_site import NAME, WebSite
+
+pytestmark = pytest.mark.processes
+LINE = ((20.0, 10.0), (90.0, 10.0), (150.0, 12.5))
+
+
+@pytest.fixture(scope="module")
+def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
+    folder = tmp_path_factory.mktemp("roads")
+    with Children(folder) as children:
+        site = hauling_site(folder, children)
+        assert all(child.pid for child in (site.server, site.web))
+        yield site
+
+
+def text_of(line: tuple[tuple[float, float], ...]) -> str:
+    return ";".join(f"{x},{y}" for x, y in line)
+
+
+def test_roads_and_worklist_are_the_clients(web: WebSite):
+    assert web.get("segments").json == values.plain(web.client.segments())
+    assert web.get("worklist").json == values.plain(web.client.worklist())
+    one = web.get("segments", {"machine": "hauler-2"}).json
+    assert one == values.plain(web.client.segments(machine="hauler-2"))
+    assert one != web.get("segments").json
+    bounds = Bounds(0.0, 0.0, 200.0, 40.0)
+    asked = {"target": 0.03, "efficiency": 0.4, "limit": 3, "bounds": "0,0,200,40"}
+    answer = web.get("worklist", asked).json
+    assert answer == values.plain(web.client.worklist(0.03, efficiency=0.4, limit=3, bounds=bounds))
+    assert len(answer["rows"]) == 3
+    some = web.get("segments", {"bounds": "0,0,200,40"}).json["segments"]
+    assert 0 < len(some) < len(web.get("segments").json["segments"])
+
+
+def test_the_worklist_tells_days_a_repair_and_guessed_masses(web: WebSite):
+    answer = web.get("worklist").json
+    worse = next(row for row in answer["rows"] if abs(row["segment"]["line"][0][1] - 10) < 5)
+    assert worse["day_ns"] == [FIRST_NS + i * DAY_NS for i in range(DAYS)]
+    assert worse["day_resistance"] == pytest.approx([0.04, 0.045, 0.05, 0.055], rel=0.06)
+    assert worse["since_time"] == values.iso(worse["since_ns"])
+    assert worse["segment"]["trend"] == pytest.approx(0.005, rel=0.2)
+    by_road = {round(row["segment"]["line"][0][1] / 60): row["segment"]["guessed"] for row in answer["rows"]}
+    assert by_road[2] is True
+    assert by_road[0] is False
+    assert answer["changes"], "one road was repaired"
+    for change in answer["changes"]:
+        assert (change["before"], change["after"]) == pytest.approx((0.05, 0.03), rel=0.06)
+        assert change["saved_kwh_ph"] > 0
+
+
+def test_the_worklist_of_a_time_is_of_what_was_known_then(web: WebSite):
+    first = FIRST_NS + DAY_NS
+    then = web.get("worklist", {"as_of": values.iso(first)}).json
+    assert then == web.get("worklist", {"as_of": first}).json == values.plain(web.client.worklist(as_of_ns=first))
+    assert not then["changes"]
+    assert all(len(row["day_ns"]) == 1 for row in then["rows"])
+    hours = web.get("segments", {"from": values.iso(first), "to": values.iso(first + DAY_NS)}).json
+    assert hours == values.plain(web.client.segments(from_ns=first, to_ns=first + DAY_NS))
+
+
+def test_lines_of_roads_are_where_gis_look_for_them(web: WebSite):
+    projection = Projection(load_site(web.folder / "site.toml"))
+    roads = web.client.segments().segments
+    listed = web.get("features/segments").json["features"]
+    assert [feature["properties"]["id"] for feature in listed] == [road.id for road in roads]
+    for feature, road in zip(listed, roads, strict=True):
+        line = [projection.to_map(lat, lon, 0.0)[:2] for lon, lat in feature["geometry"]["coordinates"]]
+        assert np.array(line) == pytest.approx(np.array(road.line), abs=2e-3)
+    meta, _, geometry, columns = pyogrio.raw.read(f"{web.url}api/v1/sites/{NAME}/features/worklist?limit=5")
+    table = dict(zip(meta["fields"], columns, strict=True))
+    rows = web.client.worklist(limit=5).rows
+    assert (meta["geometry_type"], len(geometry)) == ("LineString", 5)
+    assert table["kwh_ph_low"] == pytest.approx([row.kwh_ph[1] for row in rows])
+    assert list(table["id"]) == [row.segment.id for row in rows]
+    assert web.get("features/segments").headers["content-type"] == "application/geo+json"
+
+
+def test_a_route_and_the_cheapest_line_are_the_clients(web: WebSite):
+    asked = {"line": text_of(LINE), "machine": "truck", "mass": 30_000, "step": 10, "stops": "begin"}
+    answer = web.get("route", asked).json
+    machine = replace(MACHINES["truck"], mass_kg=30_000.0)
+    ours = web.client.route(LINE, machine, step_m=10.0, stops=(True, False))
+    assert answer["steps"] == values.plain(vars(ours.steps))
+    assert answer["line"] == ours.line_m.tolist()
+    assert answer["totals"].pop("litres") == pytest.approx(ours.totals.litres)
+    assert answer["totals"] == values.plain(ours.totals)
+    assert (answer["store"], answer["merged"]) == (ours.version.store, ours.version.row)
+    assert web.get("route", {**asked, "line": asked["line"].replace(";", ",")}).json["steps"] == answer["steps"]
+    ends = {"from": "20,10", "to": "20,130", "machine": "loader", "cost": "time", "avoid": "60,70;80,70"}
+    cheapest = web.get("way", ends).json
+    avoid = ((60.0, 70.0), (80.0, 70.0))
+    theirs = web.client.way((20.0, 10.0), (20.0, 130.0), cost="time", avoid=avoid)
+    assert cheapest["line"] == theirs.line_m.tolist()
+    assert cheapest["totals"]["time_s"] == theirs.totals.time_s
+    first = FIRST_NS + DAY_NS
+    then = web.get("route", {**asked, "as_of": values.iso(first)}).json
+    assert then["stamp_ns"] == first
+    assert then["totals"]["energy_j"] < answer["totals"]["energy_j"], "the road became worse since"
+
+
+def test_what_nobody_knows_is_null_and_told(web: WebSite):
+    answer = web.get("route", {"line": "20,10;20,60"}).json
+    unknown = answer["steps"]["unknown"]
+    assert 0 < answer["totals"]["unknown"] < 1
+    confidence = answer["steps"]["confidence"]
+    assert [value is None for value in confidence] == [share == 1.0 for share in unknown]
+    refused = web.get("route", {"line": "20,10;20,60", "unknown": "refuse"})
+    assert (refused.status, refused.json["reason"]) == (400, "out_of_range")
+    assert "unknown ground at 20" in refused.json["detail"]
+
+
+@pytest.mark.parametrize(
+    ("path", "parameters", "status", "reason", "word"),
+    [
+        ("worklist", {"target": 0}, 400, "out_of_range", "target"),
+        ("worklist", {"target": "nan"}, 400, "not_finite", "target"),
+        ("worklist", {"efficiency": 1.5}, 400, "out_of_range", "efficiency"),
+        ("worklist", {"limit": 0}, 400, "out_of_range", "limit"),
+        ("worklist", {"limit": "2.5"}, 400, "out_of_range", "limit"),
+        ("worklist", {"from": "2026-01-02", "to": "2026-01-01"}, 400, "out_of_range", "after"),
+        ("worklist", {"machine": "hauler-9"}, 404, "unknown_machine", "hauler-9"),
+        ("worklist", {"colour": "red"}, 400, "unknown_parameter", "colour"),
+        ("segments", {"bounds": "9e14,0,9.1e14,5"}, 400, "out_of_range", "off the site"),
+        ("segments", {"bounds": "nan,0,1,5"}, 400, "not_finite", "bounds"),
+        ("segments", {"bounds": "5,0,1,9"}, 400, "out_of_range", "bounds"),
+        ("features/segments", {"as_of": "yesterday"}, 400, "wrong_type", "as_of"),
+        ("route", {}, 400, "missing_field", "line"),
+        ("route", {"line": "1,1"}, 400, "out_of_range", "line"),
+        ("route", {"line": "1,1;1,1"}, 400, "out_of_range", "same"),
+        ("route", {"line": "1,1;nan,2"}, 400, "not_finite", "line"),
+        ("route", {"line": "1,1;inf,2"}, 400, "not_finite", "line"),
+        ("route", {"line": "1,1;east,2"}, 400, "wrong_type", "line"),
+        ("route", {"line": "1,1;2"}, 400, "out_of_range", "pairs"),
+        ("route", {"line": "0,0;1e14,0"}, 413, "too_large", "km"),
+        ("route", {"line": "0,0;9e4,0"}, 400, "out_of_range", "off the site"),
+        ("route", {"line": "20,10;90,10", "mass": 0}, 400, "out_of_range", "mass"),
+        ("route", {"line": "20,10;90,10", "mass": "2e6"}, 400, "out_of_range", "mass"),
+        ("route", {"line": "20,10;90,10", "efficiency": 1.1}, 400, "out_of_range", "efficiency"),
+        ("route", {"line": "20,10;90,10", "machine": "<img src=x>"}, 400, "out_of_range", "machine"),
+        ("route", {"line": "20,10;90,10", "colour": 1}, 400, "unknown_parameter", "colour"),
+        ("way", {"from": "20,10"}, 400, "missing_field", "to"),
+        ("way", {"from": "20,10", "to": "20,10"}, 400, "out_of_range", "to"),
+        ("way", {"from": "20,10;30,10", "to": "20,10"}, 400, "out_of_range", "from"),
+        ("way", {"from": "20,10", "to": "90,10", "cost": "money"}, 400, "out_of_range", "cost"),
+        ("way", {"from": "20,40", "to": "90,40", "unknown": "refuse"}, 400, "out_of_range", "unknown ground"),
+        ("way", {"from": "20,10", "to": "90,10", "as_of": "1890-01-01"}, 400, "out_of_range", "as_of"),
+    ],
+)
+def test_bad_input_is_one_clear_problem(web: WebSite, path, parameters, status, reason, word):
+    answer = web.get(path, parameters)
+    assert (answer.status, answer.json["reason"]) == (status, reason), answer.json["detail"]
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert word in answer.json["detail"]
+    assert "\n" not in answer.json["detail"]
+
+
+def test_a_long_line_is_answered_or_named(web: WebSite):
+    x = np.linspace(12.0, 158.0, 1500)
+    line = ";".join(f"{a:.1f},{10 + 2 * (i % 2)}" for i, a in enumerate(x))
+    assert web.get("route", {"line": line}).json["totals"]["length_m"] > 2500
+    longer = web.get("route", {"line": ";".join([line] * 7)})  # 10 500 places
+    assert (longer.status, longer.json["reason"]) == (414, "too_large")
+
+
+def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
+    for path, parameters in (("worklist", {}), ("segments", {}), ("route", {"line": "20,10;90,10"})):
+        first = web.get(path, parameters)
+        assert (first.status, first.headers["cache-control"]) == (200, "private, no-cache")
+        again = web.get(path, parameters, If_None_Match=first.headers["etag"])
+        assert (again.status, again.body) == (304, b"")
+
+
+def test_everything_is_in_the_description(web: WebSite):
+    paths = web.get("/api/v1/openapi.json").json["paths"]
+    for name in ("segments", "worklist", "route", "way", "features/segments", "features/worklist"):
+        assert f"/api/v1/sites/{{site}}/{name}" in paths
+    route = paths["/api/v1/sites/{site}/route"]["get"]
+    kinds = {one["name"]: one["schema"]["type"] for one in route["parameters"]}
+    assert (kinds["line"], kinds["mass"], kinds["step"]) == ("string", "number", "number")
