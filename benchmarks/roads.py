@@ -17,7 +17,7 @@ import zenoh
 
 from benchmarks.measure import START_NS, Report, machine, medians, timed
 from benchmarks.merge_work import batches
-from benchmarks.processes import ask, send, served, session
+from benchmarks.processes import ask, processor_s, send, served, session
 from mapserver.evidence.fold_config import FoldConfig, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS
@@ -97,22 +97,26 @@ def _ingest(seconds: float) -> Report:
     counts, ended = [0], threading.Event()
     with ExitStack() as opened:
         folder = opened.enter_context(tempfile.TemporaryDirectory())
-        endpoint, _ = opened.enter_context(served(Path(folder), INGEST_SITE))
+        endpoint, server = opened.enter_context(served(Path(folder), INGEST_SITE))
         link, asker = (opened.enter_context(session(endpoint)) for _ in range(2))
         opened.enter_context(_sending(link, counts, ended))
         rates: dict[bool, list[float]] = {False: [], True: []}
+        cpu_us: dict[bool, list[float]] = {False: [], True: []}
         answer_s: list[float] = []
         for _ in range(max(1, round(seconds / (2 * WINDOW_S)))):
             for asks in rates:
-                sent, began_s = counts[0], time.perf_counter()
+                sent, began_s, cpu_s = counts[0], time.perf_counter(), processor_s(server)
                 if asks:
                     answer_s.append(timed(lambda: ask(asker, keys.map_query(INGEST_SITE.name, "worklist"))))
                 ended.wait(max(0.0, WINDOW_S - (time.perf_counter() - began_s)))
                 rates[asks].append((counts[0] - sent) / (time.perf_counter() - began_s))
+                cpu_us[asks].append(1e6 * (processor_s(server) - cpu_s) / max(counts[0] - sent, 1))
     ratios = [asked / alone for alone, asked in zip(rates[False], rates[True], strict=True)]
     return {
         "samples_per_s": round(statistics.median(rates[False])),
         "samples_per_s_asked": round(statistics.median(rates[True])),
+        "cpu_us_per_sample": round(statistics.median(cpu_us[False]), 1),
+        "cpu_us_per_sample_asked": round(statistics.median(cpu_us[True]), 1),
         "lost_pct": round(100 * (1 - statistics.median(ratios)), 1),
         "answer_s": round(statistics.median(answer_s), 2),
         "goal": MOST_LOST_PCT,
