@@ -2,45 +2,69 @@
 
 from __future__ import annotations
 
+import statistics
+import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import product
+from pathlib import Path
 
 import numpy as np
+import zenoh
 
-from benchmarks.measure import START_NS, Report, machine, medians
-from mapserver.evidence.fold_config import FoldConfig
+from benchmarks.measure import START_NS, Report, machine, medians, timed
+from benchmarks.merge_work import batches
+from benchmarks.processes import ask, send, served, session
+from mapserver.evidence.fold_config import FoldConfig, name_hash
 from mapserver.evidence.grid import Grid
+from mapserver.journal.facts import NO_FACTS
+from mapserver.query.road_maps import RoadMap, Traffic
+from mapserver.query.roads import worklist
 from mapserver.roads.ledger import Ledgers
-from mapserver.roads.loss import losses
 from mapserver.roads.network import network
+from mapserver.roads.repairs import repairs
 from mapserver.roads.segments import Segments, segments
 from mapserver.roads.skeleton import Pages, Skeletons
-from mapserver.roads.tally import HOUR_NS, Tally
-from mapserver.roads.trend import trends
-from mapserver.roads.worklist import ranked
+from mapserver.roads.tally import HOUR_NS
 from protocol.arrays import Table
 from protocol.machine.samples import empty
+from protocol.queries.answers import MapVersion
+from protocol.queries.requests import WorklistQuery
+from protocol.queries.roads import encode_worklist
 from protocol.site.geometry import CellWindow
+from protocol.site.site_config import SiteConfig
+from protocol.wire import keys
+from protocol.wire.messages import SampleBatch
 
 GOALS_MS = {"minute": 50.0, "worklist": 300.0}
 ROADS, LENGTH_M, APART_M, STEP_M = 20, 1000.0, 50.0, 0.5  # as many along either axis: 40 km, 400 crossings
 TRUCKS, MINUTE_M = 10, 480.0  # at 8 m/s
-TARGET = 0.02
+PASSES = 3  # of each road, an hour
+TARGET, END_NS = 0.02, START_NS + 1000 * HOUR_NS
 SITE = CellWindow(-100, -100, 1300, 1300)
+INGEST_SITE, WINDOW_S, MOST_LOST_PCT = SiteConfig("bench", 48.0, 11.0), 10.0, 5.0
 
 
-def run(hours: float, runs: int) -> Report:
-    """Rows: what is made, and the median of its processor time in ms; counts of what there is."""
-    grid, tally = Grid(1.0, FoldConfig()), Tally()
+def run(hours: float, runs: int, seconds: float) -> Report:
+    """Rows: what is made, and the median of its processor time in ms; counts of what there is.
+
+    whole, minute: roads from nothing, and after a minute of ten machines; worklist: all else that one takes, up to its
+    bytes. ingest: samples a second that a real server takes, with nobody asking and with a worklist asked for in
+    windows of WINDOW_S, in turn, over so many seconds.
+    """
+    grid, traffic = Grid(1.0, FoldConfig()), Traffic()
     for hour in range(round(hours)):
-        for road in range(2 * ROADS):
-            rows = _pass(road, hour)
+        for road, turn in product(range(2 * ROADS), range(PASSES)):
+            rows, name = _pass(road, hour, turn), f"truck-{(road + turn) % TRUCKS}"
             if hour < 2:
-                grid.fold(rows, f"truck-{road % TRUCKS}")
-            tally.add(rows, np.full(len(rows), np.uint64(road % TRUCKS) << np.uint64(58)))
+                grid.fold(rows, name)
+            traffic.add(rows, np.full(len(rows), name_hash(name), np.uint64))
     skeletons = Skeletons(1.0)
     roads = _roads(skeletons, grid)
-    ledgers = Ledgers(roads)
+    traffic.tally.table()
 
     def minute() -> float:
         first = skeletons.made % (2 * ROADS)
@@ -49,14 +73,10 @@ def run(hours: float, runs: int) -> Report:
         pages = _pages(grid)  # folded before it is timed: that is the fold's work
         return _timed(lambda: segments(network(skeletons.skeleton(pages))))
 
-    def worklist() -> float:
-        return _timed(lambda: _worklist(ledgers, tally))
-
-    variants = {
+    variants: dict[str, Callable[[], float]] = {
         "whole": lambda: _timed(lambda: _roads(Skeletons(1.0), grid)),
         "minute": minute,
-        "ledgers": lambda: _timed(lambda: Ledgers(roads)),
-        "worklist": worklist,
+        "worklist": lambda: _timed(lambda: _worklist(roads, traffic)),
     }
     for variant in variants.values():
         variant()  # compiled
@@ -64,16 +84,73 @@ def run(hours: float, runs: int) -> Report:
     counts = {
         "km": round(float(roads.length_m.sum()) / 1000, 2),
         "segments": len(roads.ids),
-        "tally_rows": len(tally.table()),
-        "tally_mb": round(tally.table().nbytes / 1e6, 1),
+        "passes_looked_at": repairs(traffic.passes.passes(Ledgers(roads)))[1],
+        "tally_rows": len(traffic.tally.table()),
+        "tally_mb": round(traffic.tally.table().nbytes / 1e6, 1),
     }
     table = [{"made": name, "cpu_ms": round(ms, 1), "goal": GOALS_MS.get(name)} for name, ms in found_ms.items()]
-    return {"benchmark": "roads", "hours": hours, **machine(), **counts, "rows": table}
+    return {"benchmark": "roads", "hours": hours, **machine(), **counts, "rows": table, "ingest": _ingest(seconds)}
 
 
-def _pass(road: int, hour: int) -> Table:
+def _ingest(seconds: float) -> Report:
+    """What a server takes from machines that send as fast as they are answered, and what asking costs of it."""
+    counts, ended = [0], threading.Event()
+    with ExitStack() as opened:
+        folder = opened.enter_context(tempfile.TemporaryDirectory())
+        endpoint, _ = opened.enter_context(served(Path(folder), INGEST_SITE))
+        link, asker = (opened.enter_context(session(endpoint)) for _ in range(2))
+        opened.enter_context(_sending(link, counts, ended))
+        rates: dict[bool, list[float]] = {False: [], True: []}
+        answer_s: list[float] = []
+        for _ in range(max(1, round(seconds / (2 * WINDOW_S)))):
+            for asks in rates:
+                sent, began_s = counts[0], time.perf_counter()
+                if asks:
+                    answer_s.append(timed(lambda: ask(asker, keys.map_query(INGEST_SITE.name, "worklist"))))
+                ended.wait(max(0.0, WINDOW_S - (time.perf_counter() - began_s)))
+                rates[asks].append((counts[0] - sent) / (time.perf_counter() - began_s))
+    ratios = [asked / alone for alone, asked in zip(rates[False], rates[True], strict=True)]
+    return {
+        "samples_per_s": round(statistics.median(rates[False])),
+        "samples_per_s_asked": round(statistics.median(rates[True])),
+        "lost_pct": round(100 * (1 - statistics.median(ratios)), 1),
+        "answer_s": round(statistics.median(answer_s), 2),
+        "goal": MOST_LOST_PCT,
+    }
+
+
+@contextmanager
+def _sending(link: zenoh.Session, counts: list[int], ended: threading.Event) -> Iterator[None]:
+    """Ten machines at work, whose batches are sent one after the other until left; counts[0]: samples taken."""
+    problems: list[Exception] = []
+
+    def drive() -> None:
+        sent: Counter[str] = Counter()
+        try:
+            for name, rows in batches():
+                if ended.is_set():
+                    return
+                send(link, INGEST_SITE, SampleBatch(name, 1, sent[name] + 1, rows, INGEST_SITE.frame))
+                sent[name] += len(rows)
+                counts[0] += len(rows)
+        except Exception as error:  # handed on below
+            problems.append(error)
+            ended.set()
+
+    driver = threading.Thread(target=drive)
+    driver.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        driver.join()
+    if problems:
+        raise RuntimeError("the machines stopped sending") from problems[0]
+
+
+def _pass(road: int, hour: int, turn: int = 0) -> Table:
     """Samples along one road, two metres from the last pass at most."""
-    draw = np.random.default_rng([road, hour])
+    draw = np.random.default_rng([road, hour, turn])
     along = np.arange(0.0, LENGTH_M, STEP_M)
     beside = np.full(len(along), road % ROADS * APART_M + 25.0 + draw.normal(0.0, 0.4))
     rows = empty(len(along))
@@ -82,7 +159,7 @@ def _pass(road: int, hour: int) -> Table:
     rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.25
     rows["speed_mps"], rows["distance_m"], rows["mass_kg"] = 8.0, STEP_M, 40_000.0
     rows["c_rr"] = 0.02 + 0.02 * draw.random() + draw.normal(0.0, 0.003, len(along))
-    rows["stamp_ns"] = START_NS + hour * HOUR_NS + np.arange(len(along)) * 62_500_000
+    rows["stamp_ns"] = START_NS + hour * HOUR_NS + turn * HOUR_NS // PASSES + np.arange(len(along)) * 62_500_000
     return rows
 
 
@@ -95,10 +172,16 @@ def _roads(skeletons: Skeletons, grid: Grid) -> Segments:
     return segments(network(skeletons.skeleton(_pages(grid))))
 
 
-def _worklist(ledgers: Ledgers, tally: Tally) -> None:
-    ledger = ledgers.ledger(tally.table(), HOUR_NS)
-    ranked(losses(ledger, ledgers.segments, TARGET))
-    trends(ledger)
+def _worklist(roads: Segments, traffic: Traffic) -> bytes:
+    """All but the roads themselves."""
+
+    def read(*_: object) -> RoadMap:
+        ledgers = Ledgers(roads)
+        changes = repairs(traffic.passes.passes(ledgers))[0]
+        table = traffic.tally.table()
+        return RoadMap(roads, ledgers, table, tuple(changes), {}, NO_FACTS, MapVersion("", 0, 0), END_NS)
+
+    return encode_worklist(worklist(read, WorklistQuery(TARGET), INGEST_SITE.extent_m))
 
 
 def _timed(work: Callable[[], object]) -> float:

@@ -58,6 +58,7 @@ class Client:
     as an answer that comes later.
     Arguments of several methods: layers: names, none for all. after: answer once this journal row is merged, and wait
     for it at most wait_s [s]. as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
+    repairs: cells of a road whose ground changed, as `worklist` shows it, are read from the samples since.
     Times are stamps, UTC in nanoseconds.
     """
 
@@ -75,11 +76,12 @@ class Client:
         *,
         as_of_ns: int | None = None,
         minus_ns: int | None = None,
+        repairs: bool = False,
         after: int = 0,
         wait_s: float = 10.0,
     ) -> PointAnswer:
         """Layers of the cell at a position in `map`; NaN is unknown."""
-        when, fresh = requests.When(as_of_ns, minus_ns), Freshness(after, wait_s)
+        when, fresh = requests.When(as_of_ns, minus_ns, repairs), Freshness(after, wait_s)
         query = requests.PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when)
         return answer_codec.decode_point(self._ask(query))
 
@@ -90,11 +92,12 @@ class Client:
         *,
         as_of_ns: int | None = None,
         minus_ns: int | None = None,
+        repairs: bool = False,
         after: int = 0,
         wait_s: float = 10.0,
     ) -> PointsAnswer:
         """Layers of the cells at many places (x, y) in `map`, as arrays in their order; NaN is unknown."""
-        when, fresh = requests.When(as_of_ns, minus_ns), Freshness(after, wait_s)
+        when, fresh = requests.When(as_of_ns, minus_ns, repairs), Freshness(after, wait_s)
         query = requests.PointsQuery(tuple((float(x), float(y)) for x, y in places), tuple(layers), fresh, when)
         return answer_codec.decode_points(self._ask(query))
 
@@ -106,6 +109,7 @@ class Client:
         resolution_m: float | None = None,
         as_of_ns: int | None = None,
         minus_ns: int | None = None,
+        repairs: bool = False,
         after: int = 0,
         wait_s: float = 10.0,
         progress: Progress | None = None,
@@ -117,7 +121,7 @@ class Client:
         what is known in it.
         A large region comes in pieces, all of one version of the map; progress is called with each, as (here, of all).
         """
-        when, fresh = requests.When(as_of_ns, minus_ns), Freshness(after, wait_s)
+        when, fresh = requests.When(as_of_ns, minus_ns, repairs), Freshness(after, wait_s)
         query = requests.RegionQuery(_area(area), tuple(layers), fresh, when, resolution_m)
         for _ in range(REGION_ATTEMPTS - 1):
             try:
@@ -172,12 +176,16 @@ class Client:
         to_ns: int | None = None,
         as_of_ns: int | None = None,
         bounds: Bounds | None = None,
+        machine: str = "",
         after: int = 0,
         wait_s: float = 10.0,
     ) -> Segments:
-        """Roads that the map shows, segment by segment, and what drove on them from one hour to another."""
+        """Roads that the map shows, segment by segment, and what drove on them from one hour to another.
+
+        machine: traffic of this one alone, and what it measured.
+        """
         fresh = Freshness(after, wait_s)
-        return decode_segments(self._ask(requests.SegmentsQuery(from_ns, to_ns, as_of_ns, bounds, fresh)))
+        return decode_segments(self._ask(requests.SegmentsQuery(from_ns, to_ns, as_of_ns, bounds, machine, fresh)))
 
     def worklist(
         self,
@@ -189,15 +197,17 @@ class Client:
         to_ns: int | None = None,
         as_of_ns: int | None = None,
         bounds: Bounds | None = None,
+        machine: str = "",
         after: int = 0,
         wait_s: float = 10.0,
     ) -> Worklist:
         """Stretches of road that cost more than ground of a target c_rr would, the dearest first.
 
-        efficiency: of engine and drive train, for litres of diesel.
+        efficiency: of engine and drive train, for litres of diesel. machine: what this one alone loses.
         """
-        fresh = Freshness(after, wait_s)
-        query = requests.WorklistQuery(target, efficiency, limit, from_ns, to_ns, as_of_ns, bounds, fresh)
+        query = requests.WorklistQuery(
+            target, efficiency, limit, from_ns, to_ns, as_of_ns, bounds, machine, Freshness(after, wait_s)
+        )
         return decode_worklist(self._ask(query))
 
     def route(

@@ -13,8 +13,9 @@ from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline, PipelineConfig
 from evaluation.campaign.experiment import Experiment, Task
 from evaluation.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, toml_of
-from evaluation.ground.lag import final_samples
+from evaluation.ground.lag import all_samples
 from evaluation.ground.truth import LoadTrack, read_load_track
+from evaluation.positions.configurations import Configuration, select
 from protocol.arrays import Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
@@ -23,7 +24,10 @@ from sim.recorder import TRACKS_FOLDER
 from sim.scenario.file import load_scenario
 from sim.truth import MAP_FILE, TruthMap
 
-SOURCES = ("agents", *MACHINES_PROTOCOL, "evaluation/fleet/drives.py", "evaluation/ground/lag.py")
+SOURCES = (
+    *("agents", *MACHINES_PROTOCOL),
+    *(f"evaluation/{part}.py" for part in ("fleet/drives", "ground/lag", "positions/configurations")),
+)
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,12 @@ class FleetDrive(PlannedDrive):
         return self.count or sum(fleet.size for fleet in load_scenario(self.setup.scenario).fleet)
 
 
-def planned(scenario: str, seed: int, seconds: float, count: int = 0, preset: str = "") -> FleetDrive:
-    """A drive of a scenario with the sensors of a preset, or with those that its file has."""
+def planned(
+    scenario: str, seed: int, seconds: float, count: int = 0, preset: str = "", world: str | None = None
+) -> FleetDrive:
+    """A drive of a scenario with the sensors of a preset, or with those that its file has, in a world or in its own."""
     preset = preset or load_scenario(scenario).fleet[0].preset
-    return FleetDrive(seed, seconds, preset, Setup(scenario, (), (), ()), count)
+    return FleetDrive(seed, seconds, preset, Setup(scenario, (), (), (), world=world), count)
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,7 @@ class Agent:
     """One machine of a drive, by its place among the names.
 
     calibrates: by its own work; closed_tours: by these as well; first_s: of the recording; bad: see `spoiled`.
+    configuration: its filter and sensors, None for those that it has.
     """
 
     index: int
@@ -65,6 +72,7 @@ class Agent:
     closed_tours: bool = False
     first_s: float = 0.0
     bad: bool = False
+    configuration: Configuration | None = None
 
     @property
     def name(self) -> str:
@@ -76,14 +84,16 @@ class Agent:
             + "-tours" * self.closed_tours
             + "-bad" * self.bad
             + first
+            + (f"-{self.configuration.name}" if self.configuration else "")
         )
 
 
 @dataclass(frozen=True)
 class AgentSamples:
-    """What an agent made of a recording."""
+    """What an agent made of a recording. live: the same samples (n,) at the places that were known at once."""
 
     samples: Table
+    live: Table
 
 
 @dataclass(frozen=True)
@@ -95,7 +105,7 @@ class Scene:
 
 
 @lru_cache(maxsize=4)  # the cases of a drive come one after the other
-def scene(drive: FleetDrive, cache: Path) -> Scene:
+def scene(drive: PlannedDrive, cache: Path) -> Scene:
     """The truth of a recorded drive."""
     folder = drive.folder(cache)
     tracks = {
@@ -126,8 +136,12 @@ def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
     if task.variant.bad:
         machine, readings = spoiled(machine, readings)
     estimation = EstimationConfig(calibrate=task.variant.calibrates, closed_tours=task.variant.closed_tours)
-    pipeline = Pipeline(log.site, machine, PipelineConfig(estimation=estimation))
-    return AgentSamples(np.asarray(final_samples(pipeline, readings)))
+    options = PipelineConfig(estimation=estimation)
+    if chosen := task.variant.configuration:
+        machine = select(machine, chosen.gps, chosen.imu)
+        options = replace(chosen.options, estimation=estimation)
+    made = all_samples(Pipeline(log.site, machine, options), readings)
+    return AgentSamples(np.asarray(made.final), np.asarray(made.pending))
 
 
 def spoiled(machine: MachineConfig, readings: Iterable[Reading]) -> tuple[MachineConfig, tuple[Reading, ...]]:

@@ -12,19 +12,16 @@ from evaluation.fleet.cases import FleetCase, Rows, Tampered, tampered
 from evaluation.fleet.drives import Scene
 from evaluation.fleet.true_errors import INTERIOR_M, TrueError, true_errors
 from evaluation.maps.cases import CELL_M
-from evaluation.maps.score import border_distance, driven_cells
+from evaluation.maps.methods import folded
+from evaluation.maps.score import border_distance, driven_cells, region_of, window_of
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
-from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import Correction, corrected
 from mapserver.fleet.ledger import Ledger
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
-from mapserver.query.views import read_cells, view_of
 from mapserver.trust.auditor import Auditor
 from protocol.arrays import Bools, Floats, Ints, Table
-from protocol.queries.answers import MapVersion, Region
-from protocol.site.geometry import CellWindow
 from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
 
 MAPS = ("before", "after", "oracle")
@@ -68,7 +65,7 @@ def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
     let_in = {names[index] for index in case.let_in}
     shown = [name for name in names if name in let_in or name not in distrusted]
     errors = {name: true_errors(data, name, true, case.spans) for name in shown}
-    by_truth = {name: [_as_correction(name, error) for error in errors[name]] for name in shown}
+    by_truth = {name: [as_correction(name, error) for error in errors[name]] for name in shown}
     own = {name: of_machine(result, name) for name in shown}
     of_maps: tuple[Mapping[str, Sequence[Correction]], ...] = (dict.fromkeys(shown, ()), own, by_truth)
     maps = {
@@ -81,6 +78,13 @@ def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
     applied = np.array([data.rows[name]["applied_zero"][-1] - errors[name][-1].zero for name in shown], np.float64)
     common = result.common.observed, result.common.reason
     return CaseResult(maps, zeros, scales, normalised, applied, common, distrusted)
+
+
+def served(rows: Rows) -> dict[str, Table]:
+    """The samples that the server folds: of the machines that it trusts, corrected by its calibration."""
+    distrusted = accused(rows, calibrated(rows))
+    result = calibrated(rows, distrusted)
+    return {name: corrected(rows[name], of_machine(result, name)) for name in sorted(rows) if name not in distrusted}
 
 
 def of_machine(result: Calibration, name: str) -> list[Correction]:
@@ -111,17 +115,11 @@ def calibrated(rows: Rows, excluded: Collection[str] = ()) -> Calibration:
 
 def judged(rows: Rows, data: Tampered, true: Scene) -> JudgedMap:
     """The server's map of these samples, over the cells that the machines truly passed."""
-    truth, config, c_rr = true.truth, ServerConfig(), data.c_rr
-    lines, columns = c_rr.shape
-    window = CellWindow(round(truth.west_m / truth.cell_m), round(truth.south_m / truth.cell_m), columns, lines)
-    grid = Grid(truth.cell_m, config.fold)
-    for name, table in rows.items():
-        grid.fold(table, name)
-    layers = read_cells(view_of(grid, window, config), window, ("resistance",), truth.cell_m, config)
+    truth, c_rr = true.truth, data.c_rr
+    layers = folded(rows.items(), window_of(truth), ("resistance",))
     estimated, classes = resistance_class(layers["resistance"]), resistance_class(c_rr)
-    passed = driven_cells(_region(true), [true.tracks[name].place_m for name in data.passed_by or rows]) & (
-        classes != UNKNOWN
-    )
+    tracks_m = [true.tracks[name].place_m for name in data.passed_by or rows]
+    passed = driven_cells(region_of(truth, {}), tracks_m) & (classes != UNKNOWN)
     inner = passed & (border_distance(classes, truth.cell_m) > INTERIOR_M)
     steep = passed & (slope_class(truth.grade_east, truth.grade_north) == SLOPE)
 
@@ -132,18 +130,7 @@ def judged(rows: Rows, data: Tampered, true: Scene) -> JudgedMap:
     return JudgedMap(figures, estimated, classes, passed)
 
 
-def _region(true: Scene) -> Region:
-    """The cells of a scene, without layers."""
-    truth = true.truth
-    lines, columns = truth.c_rr.shape
-    x_m, y_m = (
-        np.asarray(corner + (np.arange(n) + 0.5) * truth.cell_m, np.float64)
-        for corner, n in ((truth.west_m, columns), (truth.south_m, lines))
-    )
-    return Region(x_m, y_m, truth.cell_m, {}, MapVersion("", 0, 0), 0)
-
-
-def _as_correction(name: str, error: TrueError) -> Correction:
+def as_correction(name: str, error: TrueError) -> Correction:
     """What takes the true error off."""
     scale = error.scale / (1 + error.scale)
     return Correction(name, error.from_ns, error.to_ns, error.zero, scale, error.across, ())

@@ -16,18 +16,18 @@ import numpy as np
 
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline, PipelineConfig
+from agents.sampling import Samples, joined
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Goal, Report, Row, half_width, judge, root_mean_square, rounded
 from evaluation.campaign.recordings import PlannedDrive, Setup
 from evaluation.ground.truth import LoadTrack, read_load_track
 from evaluation.maps.methods import soft_votes
 from evaluation.maps.samples import Delivery
-from evaluation.maps.score import score_driven
+from evaluation.maps.score import pooled_by_border, region_of, score_driven, true_layers, window_of
 from protocol.arrays import Bools, Floats, Floats32, Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.readings import Reading
-from protocol.queries.answers import MapVersion, Region
-from protocol.site.geometry import CellWindow
+from protocol.queries.answers import Region
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import MAP_FILE, TruthMap
 
@@ -117,23 +117,10 @@ def summarise(row: LagConfiguration, results: Sequence[LagResult], first: Sequen
             "fall_ci95": half_width(known),
             "wrong_by_seed_pct": wrong.tolist(),
             "fall_by_seed_pct": fall.tolist(),
-            "by_border": [_mean_bin([r.by_border[i] for r in results]) for i in range(len(results[0].by_border))],
+            "by_border": pooled_by_border([r.by_border for r in results]),
         },
         DIGITS,
     )
-
-
-def _mean_bin(bins: Sequence[Row]) -> Row:
-    """One bin of distances over the seeds: its cells in all, and how many of those that are known are wrong."""
-    known = np.array([row["cells"] * row["known_pct"] / 100 if row["cells"] else 0.0 for row in bins])
-    wrong = np.array([row["wrong_pct"] if n else 0.0 for row, n in zip(bins, known, strict=True)])
-    share = float((known * wrong).sum() / known.sum()) if known.sum() else math.nan
-    return {
-        "from_m": bins[0]["from_m"],
-        "to_m": bins[0]["to_m"],
-        "cells": sum(r["cells"] for r in bins),
-        "wrong_pct": share,
-    }
 
 
 # --- in the worker processes -----------------------------------------------------------------------------------------
@@ -148,7 +135,7 @@ def _solve(task: Task[LagConfiguration], cache: Path) -> LagResult:
     off_m: list[Floats] = []
     for logs in sorted(path for path in (folder / "logs").iterdir() if path.is_dir()):
         log = open_log(logs)
-        rows = final_samples(Pipeline(log.site, log.machine, task.variant.options), tuple(log.readings()))
+        rows = all_samples(Pipeline(log.site, log.machine, task.variant.options), tuple(log.readings())).final
         track = read_load_track(folder / "truth" / TRACKS_FOLDER / f"{logs.name}.csv", log.machine.load_centre_m)
         if task.variant.lag_s is None:
             rows = at_places(rows, track.at(rows["stamp_ns"]).place_m)
@@ -161,10 +148,10 @@ def _solve(task: Task[LagConfiguration], cache: Path) -> LagResult:
     return LagResult(samples=len(off), place_off_m=root_mean_square(off[np.isfinite(off)]), **score)
 
 
-def final_samples(pipeline: Pipeline, readings: Sequence[Reading]) -> Table:
-    """All samples that a pipeline makes of readings, at their final places."""
-    made = [pipeline.step(readings[i : i + CHUNK]).final for i in range(0, len(readings), CHUNK)]
-    return np.concatenate([*made, pipeline.finish().final])
+def all_samples(pipeline: Pipeline, readings: Sequence[Reading]) -> Samples:
+    """All samples that a pipeline makes of readings, as they were known at once, and the same ones final."""
+    made = [pipeline.step(readings[i : i + CHUNK]) for i in range(0, len(readings), CHUNK)]
+    return joined([*made, pipeline.finish()])
 
 
 def distance_m(rows: Table, track: LoadTrack) -> Floats:
@@ -192,17 +179,8 @@ def batches(machine: str, rows: Table) -> Iterator[Delivery]:
 
 def merged(deliveries: Sequence[Delivery], truth: TruthMap) -> tuple[Region, dict[str, Floats32]]:
     """The server's map of samples on the cells of a true map, and the true layers."""
-    rows, columns = truth.c_rr.shape
-    window = CellWindow(round(truth.west_m / truth.cell_m), round(truth.south_m / truth.cell_m), columns, rows)
-    layers, _ = soft_votes(sorted(deliveries, key=lambda delivery: delivery.received_ns), window)
-    x_m, y_m = (
-        np.asarray(corner_m + (np.arange(n) + 0.5) * truth.cell_m, np.float64)
-        for corner_m, n in ((truth.west_m, columns), (truth.south_m, rows))
-    )
-    shown = {name: values.astype(np.float32) for name, values in layers.items()}
-    region = Region(x_m, y_m, truth.cell_m, shown, MapVersion("", 0, 0), 0)
-    true = {"resistance": truth.c_rr, "grade_east": truth.grade_east, "grade_north": truth.grade_north}
-    return region, true
+    layers, _ = soft_votes(sorted(deliveries, key=lambda delivery: delivery.received_ns), window_of(truth))
+    return region_of(truth, layers), true_layers(truth)
 
 
 EXPERIMENT = Experiment("lag", LagResult, SOURCES, _solve)

@@ -194,7 +194,7 @@ def solve(case: MapCase, seed: int) -> Maps:
     scene = simulate(case, seed)
     window = CellWindow(0, 0, case.columns, case.rows)
     names = GRADE if case.judges_grade else RESISTANCE
-    rows = in_order(scene.deliveries)
+    rows = in_order(delivery.rows for delivery in scene.deliveries)
     maps, seconds = {}, {}
     (maps[SERVER], distrusted), seconds[SERVER] = _timed(partial(soft_votes, scene.deliveries, window))
     for name, method in METHODS.items():

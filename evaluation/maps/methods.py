@@ -5,7 +5,7 @@ The others assign a sample to the one cell that its stated position lies in, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,13 +39,16 @@ def soft_votes(deliveries: Sequence[Delivery], window: CellWindow) -> tuple[Laye
     Returns its layers, and the machines that it excluded because they contradict all others.
     """
     bad = contradicting(deliveries)
-    grid = Grid(CELL_M, FoldConfig())
-    for delivery in deliveries:
-        if delivery.machine not in bad:
-            grid.fold(delivery.rows, delivery.machine)
-    config = ServerConfig()
-    values = read_cells(view_of(grid, window, config), window, SERVER_LAYERS, CELL_M, config)
-    return {name: layer.astype(np.float64) for name, layer in values.items()}, bad
+    return folded([(d.machine, d.rows) for d in deliveries if d.machine not in bad], window), bad
+
+
+def folded(samples: Iterable[tuple[str, Table]], window: CellWindow, names: tuple[str, ...] = SERVER_LAYERS) -> Layers:
+    """What the map server makes of samples, machine by machine, all of which it trusts: its fold, change test, read."""
+    grid, config = Grid(CELL_M, FoldConfig()), ServerConfig()
+    for machine, rows in samples:
+        grid.fold(rows, machine)
+    values = read_cells(view_of(grid, window, config), window, names, CELL_M, config)
+    return {name: layer.astype(np.float64) for name, layer in values.items()}
 
 
 def contradicting(deliveries: Sequence[Delivery]) -> tuple[str, ...]:
@@ -132,9 +135,9 @@ def _turns(cell: Ints) -> list[Ints]:
 METHODS: dict[str, Method] = {"last_write": last_write, "mean": mean, "median": median, "kalman": kalman}
 
 
-def in_order(deliveries: Sequence[Delivery]) -> Table:
-    """All samples, oldest first."""
-    rows = np.concatenate([delivery.rows for delivery in deliveries])
+def in_order(tables: Iterable[Table]) -> Table:
+    """All samples of some tables, oldest first."""
+    rows = np.concatenate(list(tables))
     return rows[np.argsort(rows["stamp_ns"], kind="stable")]
 
 

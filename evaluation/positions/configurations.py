@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import PipelineConfig
+from evaluation.positions.published import POSITIONS, Group
 from protocol.errors import SitegridError
 from protocol.machine.machine_config import MachineConfig
 
@@ -14,15 +15,6 @@ FILTERS = ("ekf", "ukf")
 PROFILES = ("paper", "default")
 SENSORS = ((0, 1), (1, 1), (1, 2), (1, 3), (2, 1), (2, 2), (2, 3), (3, 3), (3, 1))  # GPS, IMU; the last is ours
 HEADLINE = ((1, 1), (2, 1), (3, 1))
-
-# The paper's tables 1 and 2: net RMSE [m] by filter, GPS receivers and IMUs.
-PAPER = {
-    "ekf": (75.3671, 3.7363, 3.2963, 3.7660, 2.7474, 2.6517, 2.4747, 2.2980),
-    "ukf": (65.4774, 2.3234, 2.2781, 2.5742, 1.7217, 1.5460, 1.4024, 1.2458),
-}
-PAPER_NET_M = {
-    (name, *sensors): net for name, nets in PAPER.items() for sensors, net in zip(SENSORS[:-1], nets, strict=True)
-}
 
 
 class UnsupportedError(SitegridError):
@@ -49,6 +41,11 @@ class Configuration:
         return f"{self.filter}-{self.profile}-{self.gps}gps-{self.imu}imu{share}"
 
     @property
+    def group(self) -> Group:
+        """As the paper groups them."""
+        return self.filter, self.gps, self.imu
+
+    @property
     def sensors(self) -> tuple[int, int, float | None]:
         """Number of GPS receivers and of IMUs, and what the receivers share."""
         return self.gps, self.imu, self.machine_share
@@ -61,7 +58,8 @@ class Configuration:
     @property
     def published_net_m(self) -> float | None:
         """Net RMSE [m] that the paper reports, with either profile; None where it has no such row."""
-        return PAPER_NET_M.get((self.filter, self.gps, self.imu))
+        published = POSITIONS.get(self.group)
+        return published.net_m if published else None
 
 
 def configurations(

@@ -64,8 +64,8 @@ def run(
 ) -> tuple[Report, list[Outcome]]:
     """Record, replay and score all configurations with all seeds; `missing`: those that the pipeline cannot run."""
     drives = [PlannedDrive(seed, seconds, setup.preset, setup) for seed in seeds]
-    machine, recorded = drives[0].machine, _gps(drives[0]).machine_share
-    rows = [replace(row, machine_share=recorded) if row.machine_share is None else row for row in rows]
+    machine = drives[0].machine
+    rows = [as_recorded(row, drives[0]) for row in rows]
     refusals = {row: _why_not(machine, row) for row in rows}
     runnable = [row for row, why in refusals.items() if not why]
     pairs = [(drive, row) for drive in drives for row in runnable]
@@ -82,6 +82,11 @@ def run(
         "missing": [{**vars(row), "why": why} for row, why in refusals.items() if why],
     }
     return report, outcomes
+
+
+def as_recorded(row: Configuration, drive: PlannedDrive) -> Configuration:
+    """A row with the share of slow GPS errors of a recording, where it names none."""
+    return row if row.machine_share is not None else replace(row, machine_share=_gps(drive).machine_share)
 
 
 def gps_error(drive: PlannedDrive) -> Row:

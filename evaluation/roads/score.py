@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +14,22 @@ from evaluation.fleet.cases import Rows
 from evaluation.fleet.drives import FleetDrive, Scene
 from evaluation.fleet.solving import calibrated, of_machine
 from evaluation.roads.truth import TrueTrack, TrueTraffic, true_passes, true_tracks, true_traffic
+from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import corrected
+from mapserver.query.views import read_cells, view_of
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.loss import SIGMA_90, Losses, losses
 from mapserver.roads.network import network
 from mapserver.roads.passes import PassTally
-from mapserver.roads.repairs import repairs
+from mapserver.roads.repairs import Repair, ages, repairs
 from mapserver.roads.segments import Segments, segments
 from mapserver.roads.skeleton import Skeletons
 from mapserver.roads.tally import PER_M, Tally
 from mapserver.roads.worklist import TIE_SHARE
-from protocol.arrays import Bools, Floats
-from protocol.site.geometry import CellWindow
+from protocol.arrays import Bools, Floats, Ints
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 TARGET = 0.02
 NEAR_M = 3.0  # of a road
@@ -37,7 +40,7 @@ CHANGED = (1.5, 4.0)  # factors of c_rr that a repair is judged by
 UNTOUCHED = 1.1  # less is no change: its share of a segment lies at a border
 SEEN = (2, 3)  # passes after which a repair should be seen
 SHARE_OFF = 0.1  # of metres that go in one direction: more is the wrong direction
-MINUTE_NS = 60_000_000_000
+MINUTE_NS, DAY_NS = 60_000_000_000, 86_400_000_000_000
 STEP_M = 0.02  # in a tenth of a second: a machine that moves
 EVERYWHERE = CellWindow(-20_000, -20_000, 40_000, 40_000)
 
@@ -75,11 +78,17 @@ class Recorded:
         }
 
 
-def roads(rows: Rows) -> Segments:
-    """The roads that a server would have."""
+def grid_of(rows: Rows) -> Grid:
+    """The evidence that a server would have."""
     grid = Grid(1.0, FoldConfig())
     for name, table in rows.items():
         grid.fold(table, name)
+    return grid
+
+
+def roads(rows: Rows) -> Segments:
+    """The roads that a server would have."""
+    grid = grid_of(rows)
     blocks = grid.blocks_in(EVERYWHERE)
     pages = dict(zip(blocks, grid.pages(blocks), strict=True))
     return segments(network(Skeletons(1.0).skeleton(pages)))
@@ -109,6 +118,22 @@ def road_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
         "kept_half_pct": min(_kept(part, whole) for part in halves),
         "kept_machines_pct": min(_kept(part, whole) for part in fleets),
     }
+
+
+def kept_after(recorded: Recorded, later: Recorded, whole: Segments) -> float:
+    """Percent of the length of roads that keeps its names once another day is in the map, with other ground."""
+    names = recorded.rows.keys() | later.rows.keys()
+    after_ns = DAY_NS + recorded.start_ns - later.start_ns
+    both = {}
+    for name in sorted(names):
+        own, next_day = (each.rows.get(name) for each in (recorded, later))
+        parts = [] if own is None else [own]
+        if next_day is not None:
+            moved = next_day.copy()
+            moved["stamp_ns"] += after_ns
+            parts.append(moved)
+        both[name] = np.concatenate(parts)
+    return _kept(whole, roads(both))
 
 
 def _dense(line: Floats) -> Floats:
@@ -183,13 +208,14 @@ def repair_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
     half_minute = half_ns // MINUTE_NS
     repaired = np.flatnonzero((factor >= CHANGED[0]) & (factor <= CHANGED[1]))
     seen_by = {each.segment: each.seen for each in reversed(shown) if each.minute >= half_minute - 1}
+    names = sorted(recorded.rows, key=name_hash)  # in the order of their numbers
     needed, judged = [], []
     for segment in repaired.tolist():
-        later_ns = np.sort(np.concatenate([true_passes(track, ledgers, segment, half_ns) for track in tracks]))
-        if len(later_ns) > SEEN[-1]:
+        later = {name: true_passes(track, ledgers, segment, half_ns) for name, track in recorded.tracks.items()}
+        if sum(map(len, later.values())) > SEEN[-1]:
             judged.append(segment)
-            seen_ns = (seen_by[segment] + 1) * MINUTE_NS if segment in seen_by else half_ns
-            needed.append(int((later_ns < seen_ns).sum()) or len(later_ns) + 1)
+            last = (passes.segment == segment) & (passes.minute == seen_by.get(segment, -1))
+            needed.append(_needed(later, [names[i] for i in passes.machine[last]], seen_by.get(segment)))
     false = [each for each in shown if factor[each.segment] < UNTOUCHED or each.minute < half_minute - 1]
     saved = [
         losses(Ledgers(whole).ledger(tally_of(part).table(), Tally().slot_ns), whole, TARGET).work_j
@@ -200,6 +226,50 @@ def repair_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
         **{f"seen_{most}": int(sum(count <= most for count in needed)) for most in SEEN},
         "looks": looks,
         "false_alarms": len(false),
+        **_cells_shown(recorded, whole, shown, (before.c_rr, after.c_rr), judged),
         "saved_j": float((saved[0] - saved[1])[repaired].sum()),
         "true_saved_j": float((before.work_j - after.work_j)[repaired].sum()),
     }
+
+
+def _needed(later: Mapping[str, Ints], machines: Collection[str], seen: int | None) -> float:
+    """How many true passes there were until, and with, the one that showed a change: in this minute, by one of these.
+
+    later: stamps at which each machine had passed, after the change.
+    """
+    if seen is None:
+        return math.inf
+    ends_ns = [stamp for name in machines for stamp in later[name].tolist() if stamp >= seen * MINUTE_NS]
+    shown_ns = min(ends_ns, default=(seen + 1) * MINUTE_NS)
+    return sum(int((stamps <= shown_ns).sum()) for stamps in later.values())
+
+
+def _cells_shown(
+    recorded: Recorded, whole: Segments, shown: Sequence[Repair], true: tuple[Floats, Floats], judged: Sequence[int]
+) -> dict[str, float]:
+    """How many cells judged segments have, and how many are nearer to what is true after the repair than to before.
+
+    changed: read by changes of cells alone; since: as well as by those of segments.
+    """
+    grid, config = grid_of(recorded.rows), ServerConfig()
+    everything = [Repair(segment, 1, 1, 0.0, 0.0) for segment in judged]
+    blocks = ages(whole, everything, 1.0)
+    out = {"cells": 0.0, "cells_changed": 0.0, "cells_since": 0.0}
+    if not blocks:
+        return out
+    n = BLOCK_CELLS
+    places = np.concatenate([np.argwhere(own.reshape(n, n))[:, ::-1] + n * np.array(at) for at, own in blocks.items()])
+    left, bottom = places.min(axis=0).tolist()
+    columns, rows = (places.max(axis=0) + 1 - places.min(axis=0)).tolist()
+    window = CellWindow(left, bottom, columns, rows)
+    middles = np.concatenate([whole.line(i) for i in judged])
+    owner = np.repeat(judged, [len(whole.line(i)) for i in judged])
+    own = owner[cKDTree(middles).query(places + 0.5)[1]]
+    for name, known in (("cells_changed", {}), ("cells_since", ages(whole, shown, 1.0))):
+        view = replace(view_of(grid, window, config), ages=known)
+        c_rr = read_cells(view, window, ("resistance",), 1.0, config)["resistance"]
+        values = c_rr[places[:, 1] - bottom, places[:, 0] - left].astype(np.float64)
+        before, after = (values_of[own] for values_of in true)
+        out[name] = float((np.abs(values - after) < np.abs(values - before)).sum())
+        out["cells"] = float(np.isfinite(values).sum())
+    return out

@@ -13,13 +13,15 @@ from protocol.arrays import AnyArray, Floats, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
 Pages = Mapping[Block, Sequence[TimedPage]]
+Ages = Mapping[Block, Ints]  # since when (256,) the ground of cells is as it is [ns], 0 for ever; blocks with any
 T = TypeVar("T")
 
 
-def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block, Ints]:
+def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig, ages: Ages | None = None) -> dict[Block, Ints]:
     """For each block, index (256,) of the first page that holds now in each of its cells, 0 where nothing changed.
 
-    Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted.
+    Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted. ages: what
+    is known of changes beside that.
     """
     last = {block: _cuts(block_pages, config) for block, block_pages in pages.items()}
     first = {block: last[block].first for block in pages}
@@ -34,7 +36,24 @@ def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig) -> dict[Block
         holds = credible(image, kind, now, cell_m, config)
         for block in some:
             valid[block] = np.where(cells_of(holds, corner, block), first[block], 0)
+    for block in (ages or {}).keys() & pages.keys():
+        valid[block] = np.maximum(valid[block], _since(pages[block], ages[block]))  # type: ignore[index]
     return valid
+
+
+def _since(pages: Sequence[TimedPage], age_ns: Ints) -> Ints:
+    """Index (256,) of the first page with evidence of a cell that begins in its age.
+
+    Where there is none, of the page that it begins in, which has older evidence as well: better than to know nothing.
+    """
+    whole, part = np.zeros((2, len(age_ns)), np.int64)
+    for index in range(len(pages) - 1, -1, -1):
+        timed = pages[index]
+        known = np.zeros(len(age_ns), np.bool_)
+        known[timed.page.cells["cell"]] = age_ns[timed.page.cells["cell"]] > 0
+        whole[known & (timed.first_ns >= age_ns)] = index
+        part[known & (timed.end_ns > age_ns)] = index
+    return np.where(whole > 0, whole, part)
 
 
 def clusters(blocks: Iterable[Block], reach: int) -> list[list[Block]]:

@@ -64,6 +64,21 @@ def expand_votes(table: Any, runs: Any, cells: Any, counts: Any, high: Any, out:
 
 
 @numba.njit(cache=True, nogil=True)
+def sum_planes(runs: Any, cells: Any, counts: Any, high: Any, first: int, out: Any) -> None:
+    """Add the votes of planes from `first` on to out (planes, 256). runs, cells, counts, high: of CompactPages."""
+    at = np.int64(0)
+    for r in range(len(runs)):
+        plane, end = np.int64(runs[r, 0]) - first, at + np.int64(runs[r, 1]) + 1
+        if 0 <= plane < len(out):
+            for i in range(at, end):
+                out[plane, cells[i]] += np.int64(counts[i])
+            if len(high):
+                for i in range(at, end):
+                    out[plane, cells[i]] += np.int64(high[i]) << 16
+        at = end
+
+
+@numba.njit(cache=True, nogil=True)
 def compact_cells(table: Any, cells: Any, out: Any, words: Any, ends: Any) -> None:
     """Replace bitmaps and stamps of cells by numbers of words: each page has its own, all different, in one list.
 

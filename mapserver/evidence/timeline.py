@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.page_kernels import note, sum_pages
+from mapserver.evidence.page_kernels import note, sum_pages, sum_planes
 from mapserver.evidence.pages import EMPTY, CompactPages, PackedPages, Page, pick
 from mapserver.evidence.settling import Space, Tiers, settled
 from protocol.arrays import Bools, Ints
@@ -63,6 +63,12 @@ class TimedPages(Sequence[TimedPage]):
         parts = [votes[first:end] for first, end in table[:, 2:4].tolist()]
         return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(table[:, 3] - table[:, 2])
 
+    def plane_counts(self, planes: slice) -> Ints:
+        """As the function of this name."""
+        pages, out = self._pages, np.zeros((planes.stop - planes.start, ev.CELLS), np.int64)
+        sum_planes(pages.runs, pages.cells, pages.counts, pages.high, planes.start, out)
+        return out
+
     def add_to(self, start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints) -> None:
         """Add what counts from page `start` (256,) of each cell on, as `sum_pages` does."""
         pages = self._pages.expanded()
@@ -88,6 +94,16 @@ def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
     columns = ((timed.page.votes["place"], timed.page.votes["count"].astype(np.uint64)) for timed in pages)
     parts = [count << np.uint64(16) | place for place, count in columns]
     return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum([len(part) for part in parts], dtype=np.int64)
+
+
+def plane_counts(pages: Sequence[TimedPage], planes: slice) -> Ints:
+    """Counts (planes, 256) of some planes, of all pages together: quicker than all that there is of them."""
+    if isinstance(pages, TimedPages):
+        return pages.plane_counts(planes)
+    packed, _ = packed_votes(pages)
+    counts = np.zeros(ev.COUNTS * ev.CELLS, np.int64)
+    np.add.at(counts, (packed & np.uint64(0xFFFF)).astype(np.int64), (packed >> np.uint64(16)).astype(np.int64))
+    return counts.reshape(ev.COUNTS, ev.CELLS)[planes]
 
 
 class Timeline:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
 import cv2
 import numpy as np
@@ -65,7 +66,16 @@ def _notes(worklist: Worklist) -> Sequence[str]:
         known = f"{one.resistance:.3f} +- {one.resistance_std:.3f}" if one.resistance and one.resistance_std else "?"
         notes.append(f"{place}  {value:.2f} kWh/h ({low:.2f} to {high:.2f}), {row.litres_ph[0]:.1f} l/h")
         notes.append(f"     resistance {known}, {sum(one.passes_ph):.0f} passes/h" + " (mass guessed)" * one.guessed)
+        was = "" if row.before is None else f", {row.before:.3f} before"
+        notes.append(f"     since {_time(row.since_ns)}{was}")
+    saved = [change.saved_kwh_ph for change in worklist.changes]
+    if saved:
+        notes.append(f"{len(saved)} stretches changed: {sum(saved):.1f} kWh an hour saved")
     return notes
+
+
+def _time(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%d %b %H:%M UTC")
 
 
 def _colour(one: RoadSegment, target: float) -> Colour:

@@ -11,14 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from mapserver.change.detection import reach_blocks
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
+from mapserver.query import roads
 from mapserver.query.areas import cells_to_a_side, finer, inside, means
 from mapserver.query.block_layers import BlockLayers, Look
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
-from mapserver.query.roads import RoadMaps
+from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource
 from mapserver.query.views import PastMaps, View, view_now, widened
@@ -110,9 +112,9 @@ class Answers:
         """Answers about roads and about lines over the map."""
         match query:
             case requests.SegmentsQuery():
-                return encode_segments(self._roads.segments(query))
+                return encode_segments(roads.segments(self._roads.read, query, self._site.extent_m))
             case requests.WorklistQuery():
-                return encode_worklist(self._roads.worklist(query))
+                return encode_worklist(roads.worklist(self._roads.read, query, self._site.extent_m))
             case RouteQuery():
                 return encode_answer(self._routes.route(query))
             case WayQuery():
@@ -151,7 +153,8 @@ class Answers:
         """Layers of the cells that positions lie in."""
         names, places = _names(query), np.array(query.places)
         cells = self._site.geometry.cell_of(places)
-        newer, *others = (self._look_at_cells(cells, names, as_of_ns) for as_of_ns in query.when.times)
+        times, repairs = query.when.times, query.when.repairs
+        newer, *others = (self._look_at_cells(cells, names, as_of_ns, repairs=repairs) for as_of_ns in times)
         layers, look = {name: newer[0][name] for name in names}, newer[1]
         version = look.version
         for older, its_look in others:
@@ -227,24 +230,28 @@ class Answers:
         return GridGeometry(count * self._site.cell_m).window(query.bounds), count
 
     def _reading(self, window: CellWindow, names: tuple[str, ...], when: When) -> Reading:
-        return Reading(window, names, tuple(self._look(window, names, as_of_ns) for as_of_ns in when.times))
+        looks = (self._look(window, names, as_of_ns, repairs=when.repairs) for as_of_ns in when.times)
+        return Reading(window, names, tuple(looks))
 
     def _look_at_cells(
-        self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None
+        self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
     ) -> tuple[dict[str, Floats32], Look]:
         """Layers (n,) of cells (n, 2), columns and rows, and what they were read from."""
-        if as_of_ns is None:
+        if as_of_ns is None and not repairs:
             look = self._source.run(lambda state: self._layers.look_cells(state, cells, names))
         else:
             first, last = cells.min(axis=0), cells.max(axis=0)
             window = CellWindow(*first.tolist(), *(last - first + 1).tolist())
-            look = self._look(window, names, as_of_ns)
+            look = self._look(window, names, as_of_ns, repairs=repairs)
         return self._layers.at_cells(look, cells, names), look
 
-    def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None) -> Look:
-        if as_of_ns is None:
+    def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool) -> Look:
+        if as_of_ns is None and not repairs:
             return self._source.run(lambda state: self._layers.look(state, window, names))
         wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
+        if repairs:
+            reach = reach_blocks(self._site.cell_m, self._config.change)
+            return self._layers.look_at(self._roads.view(wide, reach, as_of_ns))
         return self._layers.look_at(self._view(wide, as_of_ns))
 
     def _piece(self, reading: Reading, pieces: PieceGrid, number: int, cursor: int) -> Region:

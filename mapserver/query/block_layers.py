@@ -13,7 +13,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from weakref import ReferenceType, ref
 
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Pages, around, valid_pages
+from mapserver.change.validity import Ages, Pages, around, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block, evidence
@@ -56,7 +56,7 @@ class Look:
 
     cells, areas: what is kept of blocks and of squares, as of these turns; cell_turns: of all blocks with evidence,
     area_turns: of all squares that have or are near any. pages: of the blocks whose layers of cells are to be derived,
-    and of those around them.
+    and of those around them. ages: as in View.
     """
 
     version: MapVersion
@@ -67,6 +67,7 @@ class Look:
     area_turns: Mapping[Block, int]
     pages: Pages
     grid: ReferenceType[Grid] | None = None
+    ages: Ages = field(default_factory=dict)
 
 
 class BlockLayers:
@@ -143,7 +144,7 @@ class BlockLayers:
         turns = {block: 0 for block, pages in view.pages.items() if pages}
         near = {one for block in turns for one in around(block, self._margin(tuple(AREA_LAYERS)))}
         squares = {(x // SQUARE, y // SQUARE) for x, y in near}
-        return Look(view.version, view.stamp_ns, {}, {}, turns, dict.fromkeys(squares, 0), view.pages)
+        return Look(view.version, view.stamp_ns, {}, {}, turns, dict.fromkeys(squares, 0), view.pages, ages=view.ages)
 
     def read(self, look: Look, window: CellWindow, names: Sequence[str]) -> dict[str, Floats32]:
         """Layers (rows, columns) of a window within that of the look."""
@@ -203,7 +204,8 @@ class BlockLayers:
         cells = _valid(look.cells, blocks, names)
         missing = [block for block in blocks if block not in cells]
         near = {one for block in missing for one in around(block, self._reach) if one in look.pages}
-        first = valid_pages({block: look.pages[block] for block in sorted(near)}, self._cell_m, self._config.change)
+        pages = {block: look.pages[block] for block in sorted(near)}
+        first = valid_pages(pages, self._cell_m, self._config.change, look.ages)
         made: dict[Block, Kept] = {}
         for some in chunks(missing):
             sums = evidence([look.pages[block] for block in some], [first[block] for block in some])

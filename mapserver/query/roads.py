@@ -1,190 +1,73 @@
-"""Queries about roads answered: the tally of what drove follows the journal, roads and ledgers are made as asked."""
+"""Queries about roads answered: segments with what drove on them, and the worklist."""
 
 from __future__ import annotations
 
 import math
-import threading
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
-from mapserver.evidence.fold_config import is_foldable
-from mapserver.evidence.grid import Grid
-from mapserver.journal.facts import NO_FACTS, Facts
-from mapserver.journal.rows import Selection
-from mapserver.query.source import MapSource, MapState
-from mapserver.roads.ledger import Ledger, Ledgers
+from mapserver.query.road_maps import RoadMap
+from mapserver.roads.ledger import Ledger
 from mapserver.roads.loss import Losses, losses
-from mapserver.roads.network import network
-from mapserver.roads.passes import MINUTE_NS, PassTally
-from mapserver.roads.repairs import Repair, repairs
-from mapserver.roads.segments import Segments, segments
-from mapserver.roads.skeleton import Pages, Skeletons
-from mapserver.roads.tally import HOUR_NS, Tally, slot
-from mapserver.roads.trend import trends
+from mapserver.roads.repairs import Repair
+from mapserver.roads.segments import Segments
+from mapserver.roads.tally import HOUR_NS
+from mapserver.roads.trend import DAY_NS, Daily, daily, trends
 from mapserver.roads.worklist import litres, ranked, seconds
-from protocol.arrays import Floats, Ints, Table
-from protocol.errors import QueryError, Refusal, StoreError
-from protocol.machine.readings import MAX_STAMP_NS
+from protocol.arrays import Floats, Ints
+from protocol.errors import QueryError, Refusal
 from protocol.queries import roads as answers
-from protocol.queries.answers import MapVersion
 from protocol.queries.requests import RoadQuery, SegmentsQuery, WorklistQuery
-from protocol.site.geometry import Bounds, CellWindow
+from protocol.site.geometry import Bounds
 
-LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older journals are not read for it
 MOST_SEGMENTS = 10_000  # of one answer: 250 km of roads, 3 MB
 MOST_CHANGES = 1000  # of one worklist, the newest
 LINE_POINTS = 5  # a point of a line is a metre from the next; one in so many is told
+KWH = 3.6e6  # J
+Read = Callable[[int | None, str], RoadMap]  # as of a time, with the traffic of one machine: as `RoadMaps.read`
 
 
-@dataclass(frozen=True)
-class RoadMap:
-    """Roads of one version of the map, and the tally that goes with it."""
-
-    segments: Segments
-    ledgers: Ledgers
-    tally: Table
-    changes: tuple[Repair, ...]
-    version: MapVersion
-    stamp_ns: int
-
-
-class _Traffic:
-    """What drove, in sums by hour and by pass."""
-
-    def __init__(self) -> None:
-        self.tally, self.passes = Tally(), PassTally()
+def segments(read: Read, query: SegmentsQuery, extent_m: float) -> answers.Segments:
+    """Roads, and what drove on them."""
+    roads, traffic, hours = _read(read, query, extent_m)
+    rows = _Records(roads, traffic, _lost(roads, traffic, 0.0), hours)
+    chosen = _inside(roads.segments, query.bounds)
+    if len(chosen) > MOST_SEGMENTS:
+        problem = f"{len(chosen)} segments; at most {MOST_SEGMENTS} are answered: ask for less with `bounds`"
+        raise QueryError(Refusal.TOO_LARGE, problem)
+    return answers.Segments(*_version(roads), hours, traffic.placed, tuple(map(rows, sorted(chosen))))
 
 
-class RoadMaps:
-    """Makes road maps of one source. For any thread; one at a time works."""
-
-    def __init__(self, source: MapSource) -> None:
-        self._source, self._cell_m, self._config = source, source.site.cell_m, source.config
-        self._lock = threading.Lock()
-        self._skeletons = Skeletons(self._cell_m)
-        self._made: RoadMap | None = None
-        self._begin("", NO_FACTS)
-
-    def _begin(self, store: str, facts: Facts) -> None:
-        """Follow the journal anew."""
-        self._traffic, self._followed, self._with = _Traffic(), 0, (store, facts)
-
-    def segments(self, query: SegmentsQuery) -> answers.Segments:
-        """Roads, and what drove on them."""
-        roads = self._read(query)
-        traffic, hours = _traffic(roads, query)
-        rows = _Records(roads.segments, traffic, losses(traffic, roads.segments, 0.0), hours)
-        chosen = _inside(roads.segments, query.bounds)
-        if len(chosen) > MOST_SEGMENTS:
-            problem = f"{len(chosen)} segments; at most {MOST_SEGMENTS} are answered: ask for less with `bounds`"
-            raise QueryError(Refusal.TOO_LARGE, problem)
-        version = (roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns)
-        return answers.Segments(*version, hours, traffic.placed, tuple(rows(i) for i in chosen))
-
-    def worklist(self, query: WorklistQuery) -> answers.Worklist:
-        """Where work pays."""
-        roads = self._read(query)
-        traffic, hours = _traffic(roads, query)
-        before, after = _levels(roads)
-        lost = losses(traffic, roads.segments, query.target, after)
-        saved_j = losses(traffic, roads.segments, query.target, before).work_j - lost.work_j
-        rows, listed, inside = (
-            _Records(roads.segments, traffic, lost, hours),
-            ranked(lost),
-            _inside(roads.segments, query.bounds),
-        )
-        work = np.stack([lost.work_j, lost.low_j, lost.high_j]) / max(hours, 1e-9)
-        kg = lost.kg.mean(axis=1)
-        out: list[answers.WorklistRow] = []
-        for i, rank in zip(listed.order.tolist(), listed.rank.tolist(), strict=True):
-            if i in inside and len(out) < query.limit:
-                of_it = (work[:, i] / 3.6e6, litres(work[:, i], query.efficiency), seconds(work[:, i], kg[i]))
-                out.append(answers.WorklistRow(rank, rows(i), *(tuple(values.tolist()) for values in of_it)))
-        version = (roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns)
-        total = float(work[0, sorted(inside)].sum() / 3.6e6)
-        changes = [
-            answers.RoadChange(
-                roads.segments.ids[change.segment],
-                rows(change.segment).line,
-                change.minute * MINUTE_NS,
-                (change.seen + 1) * MINUTE_NS,
-                change.before,
-                change.after,
-                float(saved_j[change.segment] / max(hours, 1e-9) / 3.6e6),
-            )
-            for change in roads.changes
-            if change.segment in inside
-        ]
-        shown = tuple(changes[:MOST_CHANGES])
-        return answers.Worklist(*version, hours, query.target, total, tuple(out), shown)
-
-    def _read(self, query: RoadQuery) -> RoadMap:
-        _require_on_site(query.bounds, self._source.site.extent_m)
-        try:
-            if query.as_of_ns is not None:
-                return self._as_of(query.as_of_ns)
-            with self._lock:
-                return self._now()
-        except StoreError as error:
-            raise QueryError(Refusal.STORE, str(error)) from None
-
-    def _now(self) -> RoadMap:
-        pages, version, facts, newest_ns = self._source.run(_all)
-        if self._made and self._made.version == version:
-            return self._made
-        if self._with != (version.store, facts):
-            self._begin(version.store, facts)
-        self._follow(self._traffic, facts, newest_ns, self._followed, version.row)
-        self._followed = version.row
-        roads = segments(network(self._skeletons.skeleton(pages)))
-        self._made = self._map(roads, self._traffic, version, newest_ns)
-        return self._made
-
-    def _as_of(self, as_of_ns: int) -> RoadMap:
-        version, facts = self._source.run(lambda state: (state.version, state.facts))
-        traffic = _Traffic()
-        with self._source.location.reader() as reader:
-            grid = self._source.past.grid_as_of(reader, as_of_ns, None, facts)
-            self._follow(traffic, facts, as_of_ns, 0, version.row, as_of_ns)
-        roads = segments(network(Skeletons(self._cell_m).skeleton(_pages(grid))))
-        return self._map(roads, traffic, version, as_of_ns)
-
-    def _follow(
-        self, traffic: _Traffic, facts: Facts, newest_ns: int, after: int, until: int, to_ns: int = MAX_STAMP_NS
-    ) -> None:
-        """Take journal rows after < row <= until into the traffic, of samples up to `to_ns`."""
-        if after >= until:
-            return
-        begin_ns = max(0, newest_ns - LOOK_BACK_NS) // HOUR_NS * HOUR_NS
-        with self._source.location.reader() as reader:
-            selection = Selection.by(facts, begin_ns, to_ns)
-            for samples, names in self._source.past.samples(reader, selection, after, until):
-                sure = is_foldable(samples, self._config.fold)
-                traffic.tally.add(samples[sure], names[sure])
-                traffic.passes.add(samples[sure], names[sure])
-
-    def _map(self, roads: Segments, traffic: _Traffic, version: MapVersion, stamp_ns: int) -> RoadMap:
-        """Put together; the look back is cut here, where it does not depend on when the journal was followed."""
-        table, ledgers = traffic.tally.table(), Ledgers(roads)
-        first = max(0, stamp_ns - LOOK_BACK_NS) // HOUR_NS
-        table = table[slot(table["key"]) >= first]
-        changes, _ = repairs(traffic.passes.passes(ledgers, first * HOUR_NS))
-        newest_first = tuple(sorted(changes, key=lambda change: (-change.seen, change.segment)))
-        return RoadMap(roads, ledgers, table, newest_first, version, stamp_ns)
+def worklist(read: Read, query: WorklistQuery, extent_m: float) -> answers.Worklist:
+    """Where work pays."""
+    roads, traffic, hours = _read(read, query, extent_m)
+    lost, saved_j = _lost(roads, traffic, query.target), _saved_j(roads, traffic, query.target)
+    saved_kwh_ph = {change: joules / max(hours, 1e-9) / KWH for change, joules in saved_j.items()}
+    rows = _Rows(_Records(roads, traffic, lost, hours), roads, daily(traffic), saved_kwh_ph, query.efficiency)
+    listed, inside = ranked(lost), _inside(roads.segments, query.bounds)
+    ranks = [(i, rank) for i, rank in zip(listed.order.tolist(), listed.rank.tolist(), strict=True) if i in inside]
+    changes = [change for change in roads.changes if change.segment in inside]
+    return answers.Worklist(
+        *_version(roads),
+        hours,
+        query.target,
+        float(lost.work_j[sorted(inside)].sum() / max(hours, 1e-9) / KWH),
+        tuple(rows.row(i, rank) for i, rank in ranks[: query.limit]),
+        tuple(map(rows.change, changes[:MOST_CHANGES])),
+    )
 
 
-def _all(state: MapState) -> tuple[Pages, MapVersion, Facts, int]:
-    return _pages(state.grid), state.version, state.facts, state.newest_ns
+def _read(read: Read, query: RoadQuery, extent_m: float) -> tuple[RoadMap, Ledger, float]:
+    """The roads that a query is about, the ledger of its hours, and how many hours these are."""
+    _require_on_site(query.bounds, extent_m)
+    roads = read(query.as_of_ns, query.machine)
+    from_ns, to_ns = query.from_ns or 0, query.to_ns or 2**62
+    return roads, *roads.hours_with_driving(from_ns // HOUR_NS * HOUR_NS, to_ns)
 
 
-def _pages(grid: Grid) -> Pages:
-    bounds = grid.bounds()
-    if bounds is None:
-        return {}
-    west, south, east, north = bounds
-    blocks = grid.blocks_in(CellWindow(west, south, east - west, north - south))
-    return dict(zip(blocks, grid.pages(blocks), strict=True))
+def _version(roads: RoadMap) -> tuple[str, int, int, int]:
+    return roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns
 
 
 def _require_on_site(bounds: Bounds | None, extent_m: float) -> None:
@@ -196,20 +79,30 @@ def _require_on_site(bounds: Bounds | None, extent_m: float) -> None:
         raise QueryError(Refusal.OUT_OF_RANGE, problem)
 
 
-def _traffic(roads: RoadMap, query: RoadQuery) -> tuple[Ledger, float]:
-    """The ledger of a query's hours, and how many hours with driving these are, the running one in part."""
-    from_ns, to_ns = query.from_ns or 0, query.to_ns or 2**62
-    traffic = roads.ledgers.ledger(roads.tally, HOUR_NS, from_ns // HOUR_NS * HOUR_NS, to_ns)
-    slots = np.unique(traffic.rows["slot"])
-    ends = np.minimum((slots + 1) * HOUR_NS, max(roads.stamp_ns, 1))
-    hours = float(np.maximum(ends - slots * HOUR_NS, 0).sum() / HOUR_NS)
-    return traffic, hours
+def _lost(roads: RoadMap, traffic: Ledger, target: float) -> Losses:
+    """What is lost with this traffic, on ground as it is since its last change."""
+    _, after = _levels(roads.segments, roads.last_changes.values())
+    return losses(traffic, roads.segments, target, after)
 
 
-def _levels(roads: RoadMap) -> tuple[Floats, Floats]:
-    """c_rr of segments (k,) before and after their last change, NaN where there was none."""
-    before, after = np.full((2, len(roads.segments.ids)), np.nan)
-    for change in reversed(roads.changes):  # the newest last
+def _saved_j(roads: RoadMap, traffic: Ledger, target: float) -> dict[Repair, float]:
+    """Work that each change saves of the same traffic [J]: one change of each segment at a time."""
+    out: dict[Repair, float] = {}
+    left = list(roads.changes)
+    while left:
+        some = {change.segment: change for change in left}
+        before, after = (
+            losses(traffic, roads.segments, target, level).work_j for level in _levels(roads.segments, some.values())
+        )
+        out |= {change: float(before[segment] - after[segment]) for segment, change in some.items()}
+        left = [change for change in left if change not in out]
+    return out
+
+
+def _levels(roads: Segments, changes: Iterable[Repair]) -> tuple[Floats, Floats]:
+    """c_rr of segments (k,) before and after these changes, NaN where there is none."""
+    before, after = np.full((2, len(roads.ids)), np.nan)
+    for change in changes:
         before[change.segment], after[change.segment] = change.before, change.after
     return before, after
 
@@ -225,21 +118,19 @@ def _inside(roads: Segments, bounds: Bounds | None) -> set[int]:
 
 
 class _Records:
-    """Records of segments, by number."""
+    """Records of segments, by number. lost: on them, in so many hours."""
 
-    def __init__(self, roads: Segments, traffic: Ledger, lost: Losses, hours: float) -> None:
-        self._segments, self._lost, self._hours = roads, lost, max(hours, 1e-9)
+    def __init__(self, roads: RoadMap, traffic: Ledger, lost: Losses, hours: float) -> None:
+        self._segments, self.lost, self.hours = roads.segments, lost, max(hours, 1e-9)
         self._trends = trends(traffic)
         machines = traffic.totals()["machines"]
         self._machines: Ints = np.bitwise_count(machines[:, 0] | machines[:, 1]).astype(np.int64)
 
     def __call__(self, i: int) -> answers.RoadSegment:
-        lost, line = self._lost, self._segments.line(i)
-        passes = lost.passes[i] / self._hours
-        some = np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2)
+        lost, passes = self.lost, self.lost.passes[i] / self.hours
         return answers.RoadSegment(
             id=self._segments.ids[i],
-            line=tuple(tuple(point) for point in some.tolist()),
+            line=self.line(i),
             length_m=float(self._segments.length_m[i]),
             resistance=_known(lost.c_rr[i]),
             resistance_std=_known(lost.c_std[i]),
@@ -251,6 +142,55 @@ class _Records:
             guessed=bool(lost.guessed[i]),
             machines=int(self._machines[i]),
         )
+
+    def line(self, i: int) -> answers.Line:
+        """Some points of a segment's line."""
+        line = self._segments.line(i)
+        some = np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2)
+        return tuple(tuple(point) for point in some.tolist())
+
+
+class _Rows:
+    """Rows of a worklist, and changes, by number of their segment. saved_kwh_ph: by each change."""
+
+    def __init__(
+        self,
+        records: _Records,
+        roads: RoadMap,
+        days: Daily,
+        saved_kwh_ph: Mapping[Repair, float],
+        efficiency: float,
+    ) -> None:
+        self._records, self._ids, self._days = records, roads.segments.ids, days
+        self._saved_kwh_ph, self._efficiency = saved_kwh_ph, efficiency
+        self._last, self._since_ns = roads.last_changes, roads.since_ns()
+        lost = records.lost
+        self._work = np.stack([lost.work_j, lost.low_j, lost.high_j]) / records.hours
+        self._kg = lost.kg.mean(axis=1)
+
+    def row(self, i: int, rank: int) -> answers.WorklistRow:
+        """A row of this rank."""
+        work, change = self._work[:, i], self._last.get(i)
+        kwh, of_diesel, of_driving = work / KWH, litres(work, self._efficiency), seconds(work, self._kg[i])
+        days = slice(*np.searchsorted(self._days.segment, [i, i + 1]).tolist())
+        return answers.WorklistRow(
+            rank,
+            self._records(i),
+            tuple(kwh.tolist()),
+            tuple(of_diesel.tolist()),
+            tuple(of_driving.tolist()),
+            since_ns=int(self._since_ns[i]),
+            before=change.before if change else None,
+            saved_kwh_ph=self._saved_kwh_ph[change] if change else None,
+            day_ns=tuple((self._days.day[days] * DAY_NS).tolist()),
+            day_resistance=tuple(self._days.c_rr[days].tolist()),
+        )
+
+    def change(self, change: Repair) -> answers.RoadChange:
+        """A change of the ground."""
+        times, levels = (change.first_ns, change.seen_ns), (change.before, change.after)
+        line = self._records.line(change.segment)
+        return answers.RoadChange(self._ids[change.segment], line, *times, *levels, self._saved_kwh_ph[change])
 
 
 def _known(value: float) -> float | None:

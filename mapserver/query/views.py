@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Pages, valid_pages
+from mapserver.change.validity import Ages, Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block, evidence
@@ -32,12 +32,14 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 class View:
     """Pages of a window's blocks and of those around them: a change is seen with its surroundings.
 
-    version: of the map that they are of. stamp_ns: the time that they are as of.
+    version: of the map that they are of. stamp_ns: the time that they are as of. ages: of ground whose change is known
+    otherwise.
     """
 
     pages: Pages
     version: MapVersion
     stamp_ns: int
+    ages: Ages = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class PastMaps:
         """The map from samples stamped so or earlier; journal rows that are committed meanwhile may be in it."""
         reach = reach_blocks(self.past.cell_m, self.config.change)
         with self._reader(facts) as (reader, version):
-            grid = self.past.grid_as_of(reader, stamp_ns, _surroundings(window, reach), facts)
+            grid = self.past.grid_as_of(reader, stamp_ns, surroundings(window, reach), facts)
         return View(_pages(grid, window, reach), version, stamp_ns)
 
     def history(
@@ -86,7 +88,7 @@ def read_cells(
     view: View, window: CellWindow, names: tuple[str, ...], cell_m: float, config: ServerConfig
 ) -> dict[str, Floats32]:
     """Layers of cells (rows, columns) of a window."""
-    first = valid_pages(view.pages, cell_m, config.change)
+    first = valid_pages(view.pages, cell_m, config.change, view.ages)
     shape = (window.rows, window.columns)
     out: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in names}
     for some in chunks([block for block in view.pages if _touches(block, window)]):
@@ -113,11 +115,11 @@ def widened(window: CellWindow, cells: int) -> CellWindow:
 
 
 def _pages(grid: Grid, window: CellWindow, reach: int) -> Pages:
-    blocks = grid.blocks_in(_surroundings(window, reach))
+    blocks = grid.blocks_in(surroundings(window, reach))
     return dict(zip(blocks, grid.pages(blocks), strict=True))
 
 
-def _surroundings(window: CellWindow, reach: int) -> CellWindow:
+def surroundings(window: CellWindow, reach: int) -> CellWindow:
     """All cells of the blocks that a window touches, and of `reach` blocks to every side."""
     n = BLOCK_CELLS
     left, bottom = window.column // n - reach, window.row // n - reach

@@ -12,8 +12,8 @@ import numpy as np
 
 from protocol.arrays import Ints
 
-_STRAIGHT = ((0, 1), (1, 0), (0, -1), (-1, 0))
-_DIAGONAL = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # each between the straight ones beside it in their order
+# Four straight steps, and four diagonal ones, each between the straight ones beside it in their order: row, column.
+_STEPS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])
 _ROW_BITS = 32
 
 
@@ -42,19 +42,26 @@ def chains(places: Ints) -> Chains:
     return Chains(cells[:used].copy(), ends[: count + 1].copy(), degree)
 
 
-def neighbours(places: Ints) -> Ints:
-    """Numbers (n, 8) of the cells beside each cell, -1 for none."""
+@numba.njit(cache=True, nogil=True)
+def neighbours(places: Any) -> Any:
+    """Numbers (n, 8) of the cells beside each cell (n, 2) [row, column], sorted by these; -1 for none."""
+    count = len(places)
     keys = (places[:, 0] << _ROW_BITS) + places[:, 1]
-    straight = np.stack([_number(keys, (dy << _ROW_BITS) + dx) for dy, dx in _STRAIGHT], axis=1).reshape(-1, 4)
-    diagonal = np.stack([_number(keys, (dy << _ROW_BITS) + dx) for dy, dx in _DIAGONAL], axis=1).reshape(-1, 4)
-    taken = (straight >= 0) | (np.roll(straight, -1, axis=1) >= 0)
-    return np.concatenate([straight, np.where(taken, -1, diagonal)], axis=1)
-
-
-def _number(keys: Ints, offset: int) -> Ints:
-    """Numbers of the cells so far from each one, -1 for none."""
-    at = np.minimum(np.searchsorted(keys, keys + offset), max(len(keys) - 1, 0))
-    return np.where(keys[at] == keys + offset, at, -1) if len(keys) else np.zeros(0, np.int64)
+    links = np.full((count, 8), -1, np.int64)
+    for k in range(8):
+        dy, dx = _STEPS[k, 0], _STEPS[k, 1]
+        offset, at = (dy << _ROW_BITS) + dx, 0
+        for i in range(count):  # what is sought grows as i does, so that one run through all is enough
+            sought = keys[i] + offset
+            while at < count and keys[at] < sought:
+                at += 1
+            if at < count and keys[at] == sought:
+                links[i, k] = at
+    for i in range(count):
+        for k in range(4):
+            if links[i, k] >= 0 or links[i, (k + 1) % 4] >= 0:
+                links[i, 4 + k] = -1
+    return links
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.roads.placing import Placing
+from mapserver.roads.placing import Placed, Placing
 from mapserver.roads.segments import Segments
 from mapserver.roads.tally import CELL_M, PER_C, PER_M, SUMS, corner_m, heading_rad, place, slot
 from protocol.arrays import AnyArray, Floats, Ints, Table
@@ -68,10 +68,7 @@ class Ledgers:
         """Sum up rows of TALLY, of slots that begin in from_ns <= time < to_ns."""
         begins = slot(tally["key"]) * slot_ns
         tally = tally[(begins >= from_ns) & (begins < to_ns)]
-        numbers, which = np.unique(place(tally["key"]), return_inverse=True)
-        places_m = corner_m(numbers, cell_m) + _inside_m(tally, which, len(numbers))
-        placed = self.place(places_m, heading_rad(numbers))
-        segment, inner, direction = (part[which] for part in placed)
+        segment, inner, direction = self.placed(tally, cell_m)
         own = segment >= 0
         rows, kept = tally[own], np.stack([segment, slot(tally["key"]), direction], axis=1)[own]
         slices = np.zeros((len(PLACED), int(self.slices[-1]), DIRECTIONS), np.int64)
@@ -80,6 +77,12 @@ class Ledgers:
         total = int(tally["metres"].sum())
         share = int(rows["metres"].sum()) / total if total else 1.0
         return Ledger(_grouped(kept, rows), slices, self.slices, slot_ns, share)
+
+    def placed(self, tally: Table, cell_m: float) -> Placed:
+        """Where rows of TALLY lie: what was driven in one cell and sector is at one place, the mean of it."""
+        numbers, which = np.unique(place(tally["key"]), return_inverse=True)
+        places_m = corner_m(numbers, cell_m) + _inside_m(tally, which, len(numbers))
+        return Placed(*(part[which] for part in self.place(places_m, heading_rad(numbers))))
 
 
 def _inside_m(tally: Table, which: Ints, count: int) -> Floats:

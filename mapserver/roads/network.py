@@ -6,6 +6,7 @@ All rules look at places and metres alone, never at what was there before.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -14,7 +15,7 @@ from mapserver.evidence.cells import WEIGHT_UNITS_PER_M
 from mapserver.roads.chains import Chains, chains
 from mapserver.roads.ridges import AXES
 from mapserver.roads.skeleton import Skeleton
-from protocol.arrays import AnyArray, Bools, Floats, Ints
+from protocol.arrays import AnyArray, Floats, Ints
 
 SPUR_M = 10.0  # shorter dead ends at a junction are the width of a road, not a road
 LEAST_ROAD_M = 15.0  # a road by itself is no shorter than a machine and its position error
@@ -45,7 +46,7 @@ def network(skeleton: Skeleton) -> Network:
     places, metres = skeleton.places, skeleton.metres
     traced = chains(places)
     for _ in range(ROUNDS):
-        gone = _superfluous(places, metres, traced, skeleton.raster_m)
+        gone = _superfluous(places, metres, *traced, skeleton.raster_m)
         if not gone.any():
             break
         places, metres = places[~gone], metres[~gone]
@@ -53,38 +54,62 @@ def network(skeleton: Skeleton) -> Network:
     return _lines(places, traced, skeleton.raster_m)
 
 
-def _superfluous(places: Ints, metres: Ints, traced: Chains, raster_m: float) -> Bools:
-    """Which cells are no road."""
-    cells, ends, degree = traced
-    gone: Bools = degree == 0
-    if not len(cells):
-        return gone
-    length_m = _lengths(places, cells, ends, raster_m)
-    along = _along(places, metres, cells, ends)
-    driven = along >= DRIVEN_M * WEIGHT_UNITS_PER_M
-    first, last = cells[ends[:-1]], cells[ends[1:] - 1]
-    free = (degree[first] == 1).astype(np.int64) + (degree[last] == 1)
-    share = np.add.reduceat(driven, ends[:-1]) / np.diff(ends)
-    out = (free == 1) & (length_m < SPUR_M) | (free == 2) & (length_m < LEAST_ROAD_M)
-    out |= (first == last) & (length_m < LEAST_ROAD_M) | (share < DRIVEN_SHARE) & (length_m > JOIN_M)
-    of_cell = np.repeat(out, np.diff(ends))
-    gone[cells[of_cell & (degree[cells] <= 2)]] = True
-    # Ends that nobody drove: the blur makes lines longer than they are.
-    for at, begins in ((ends[:-1], True), (ends[1:] - 1, False)):
-        loose = np.flatnonzero(degree[cells[at]] == 1)
-        _trim(along, cells, ends, loose, begins, gone)
+@numba.njit(cache=True, nogil=True)
+def _superfluous(
+    places: AnyArray, metres: AnyArray, cells: AnyArray, ends: AnyArray, degree: AnyArray, raster_m: float
+) -> Any:
+    """Which cells (n,) are no road; cells, ends, degree: as in Chains."""
+    gone = degree == 0
+    along = np.empty(len(cells), np.int64)
+    for chain in range(len(ends) - 1):
+        first, last = ends[chain], ends[chain + 1] - 1
+        length_m, driven = 0.0, 0
+        for at in range(first, last + 1):
+            along[at] = _along(places, metres, cells, first, last, at)
+            driven += along[at] >= DRIVEN_M * WEIGHT_UNITS_PER_M
+            if at > first:
+                length_m += _step(places[cells[at]], places[cells[at - 1]]) * raster_m
+        loose_first, loose_last = degree[cells[first]] == 1, degree[cells[last]] == 1
+        out = cells[first] == cells[last] and length_m < LEAST_ROAD_M
+        if loose_first and loose_last:
+            out = out or length_m < LEAST_ROAD_M
+        elif loose_first or loose_last:
+            out = out or length_m < SPUR_M
+        out = out or (driven < DRIVEN_SHARE * (last + 1 - first) and length_m > JOIN_M)
+        for at in range(first, last + 1):
+            if out and degree[cells[at]] <= 2:
+                gone[cells[at]] = True
+        # Ends that nobody drove: the blur makes lines longer than they are.
+        if loose_first:
+            _trim(along, cells, first, last, 1, gone)
+        if loose_last:
+            _trim(along, cells, first, last, -1, gone)
     return gone
 
 
 @numba.njit(cache=True, nogil=True)
-def _trim(along: AnyArray, cells: AnyArray, ends: AnyArray, loose: AnyArray, begins: bool, gone: AnyArray) -> None:  # noqa: FBT001
-    """Take cells off the dead ends of some chains, until there is about half of what is driven farther in."""
-    for chain in loose:
-        step = 1 if begins else -1
-        at = ends[chain] if begins else ends[chain + 1] - 1
-        while ends[chain] <= at + INWARD * step < ends[chain + 1] and along[at] < END_SHARE * along[at + INWARD * step]:
-            gone[cells[at]] = True
-            at += step
+def _step(one: AnyArray, other: AnyArray) -> float:
+    """Cells from one to the next one of a chain."""
+    return 1.4142135623730951 if abs(one[0] - other[0]) + abs(one[1] - other[1]) == 2 else 1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _trim(along: AnyArray, cells: AnyArray, first: int, last: int, step: int, gone: AnyArray) -> None:
+    """Take cells off a dead end of a chain, until there is about half of what is driven farther in."""
+    at = first if step > 0 else last
+    while first <= at + INWARD * step <= last and along[at] < END_SHARE * along[at + INWARD * step]:
+        gone[cells[at]] = True
+        at += step
+
+
+@numba.njit(cache=True, nogil=True)
+def _along(places: AnyArray, metres: AnyArray, cells: AnyArray, first: int, last: int, at: int) -> int:
+    """Metres driven along a chain around one of its cells, in 1/4096 m."""
+    before, after = places[cells[max(at - TANGENT, first)]], places[cells[min(at + TANGENT, last)]]
+    turn = np.arctan2(float(after[0] - before[0]), float(after[1] - before[1]))
+    axis = int(np.rint(turn * AXES / np.pi))
+    own = metres[cells[at]]
+    return int(own[(axis - 1) % AXES] + own[axis % AXES] + own[(axis + 1) % AXES])
 
 
 def _lengths(places: Ints, cells: Ints, ends: Ints, raster_m: float) -> Floats:
@@ -93,18 +118,6 @@ def _lengths(places: Ints, cells: Ints, ends: Ints, raster_m: float) -> Floats:
     step = np.where(steps.sum(axis=1) == 2, np.sqrt(2.0), 1.0)
     step[ends[:-1]] = 0.0
     return np.asarray(np.add.reduceat(step, ends[:-1]) * raster_m, np.float64)
-
-
-def _along(places: Ints, metres: Ints, cells: Ints, ends: Ints) -> Ints:
-    """Metres driven along the chains around each of their cells, in 1/4096 m."""
-    number = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
-    at = np.arange(len(cells))
-    before = np.maximum(at - TANGENT, ends[:-1][number])
-    after = np.minimum(at + TANGENT, ends[1:][number] - 1)
-    rise, run = (places[cells[after]] - places[cells[before]]).T.astype(np.float64)
-    axis = np.rint(np.arctan2(rise, run) * AXES / np.pi).astype(np.int64) % AXES
-    own = metres[cells]
-    return np.asarray(sum(own[at, (axis + turn) % AXES] for turn in (-1, 0, 1)), np.int64)
 
 
 def _lines(places: Ints, traced: Chains, raster_m: float) -> Network:

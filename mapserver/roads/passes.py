@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence.fold_config import VISIT_NS
-from mapserver.roads.ledger import PLACED, Ledgers
-from mapserver.roads.segments import LATTICE_M
-from mapserver.roads.tally import PER_C, PER_M, Tally
+from mapserver.roads.cutting import LATTICE_M
+from mapserver.roads.ledger import Ledgers
+from mapserver.roads.tally import PER_C, PER_M, TALLY, Tally, slot
 from protocol.arrays import Floats, Ints, Table
 
-MINUTE_NS = VISIT_NS
+MINUTE_NS, CELL_M = VISIT_NS, LATTICE_M / 2
 MINUTES = 3 * 24 * 60  # with driving, of each machine, that are remembered
 ONE_PASS = 1.3  # of a segment's length: more in two minutes are two passes
 LEAST_M = 8.0  # measured on a segment, for a pass to say what its c_rr is
@@ -43,37 +43,39 @@ class PassTally:
     def add(self, rows: Table, names: NDArray[np.uint64]) -> None:
         """Add samples (n,) as `Tally.add`."""
         for name in np.unique(names).tolist():
-            own = self._machines.setdefault(name, Tally(MINUTE_NS, MINUTES, LATTICE_M / 2))
+            own = self._machines.setdefault(name, Tally(MINUTE_NS, MINUTES, CELL_M))
             own.add(rows[names == name], names[names == name])
 
     def passes(self, ledgers: Ledgers, from_ns: int = 0) -> Passes:
         """All passes over these segments, from a time on, of which c_rr is known."""
-        parts = []
-        for number, (_, tally) in enumerate(sorted(self._machines.items())):
-            ledger = ledgers.ledger(tally.table(), tally.slot_ns, from_ns, cell_m=tally.cell_m)
-            rows = _joined(ledger.rows, ledgers.segments.length_m)
-            rows = rows[rows["measured"] >= LEAST_M * PER_M]
-            c_rr = rows["c"] / (rows["measured"] * float(PER_C))
-            columns = (rows["segment"], rows["slot"], rows["direction"], np.full(len(rows), number))
-            parts.append((*columns, rows["metres"] / float(PER_M), c_rr))
-        if not parts:
-            nothing = np.zeros(0, np.int64)
-            return Passes(nothing, nothing, nothing, nothing, np.zeros(0), np.zeros(0))
-        joined = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        order = np.lexsort((joined[3], joined[2], joined[1], joined[0]))
-        return Passes(*(column[order] for column in joined))
+        tables = [tally.table() for _, tally in sorted(self._machines.items())]
+        rows: Table = np.concatenate([np.zeros(0, TALLY), *tables])
+        machine = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+        segment, _, direction = ledgers.placed(rows, CELL_M)
+        minute = slot(rows["key"])
+        order = np.lexsort((minute, direction, machine, segment))
+        order = order[(segment[order] >= 0) & (minute[order] * MINUTE_NS >= from_ns)]
+        keys = np.stack([segment, machine, direction, minute])[:, order]
+        sums = np.stack([rows[name][order] for name in ("metres", "measured", "c")])
+        (segment, machine, direction, minute), (metres, measured, c) = _joined(keys, sums, ledgers.segments.length_m)
+        known = np.flatnonzero(measured >= LEAST_M * PER_M)
+        known = known[np.lexsort((machine[known], direction[known], minute[known], segment[known]))]
+        segment, minute, direction, machine = (column[known] for column in (segment, minute, direction, machine))
+        metres_m, c_rr = metres[known] / float(PER_M), c[known] / (measured[known] * float(PER_C))
+        return Passes(segment, minute, direction, machine, metres_m, c_rr)
 
 
-def _joined(rows: Table, length_m: Floats) -> Table:
-    """Rows of LEDGER of one machine; one pass that reaches from a minute into the next is one row, of the first."""
-    rows = rows[np.lexsort((rows["slot"], rows["direction"], rows["segment"]))]
-    if len(rows) < 2:
-        return rows
-    same = (np.diff(rows["segment"]) == 0) & (np.diff(rows["direction"]) == 0) & (np.diff(rows["slot"]) == 1)
-    both_m = (rows["metres"][1:] + rows["metres"][:-1]) / float(PER_M)
-    goes_on = same & (both_m <= ONE_PASS * length_m[rows["segment"][1:]])
-    first = np.flatnonzero(np.append(True, ~goes_on))
-    out = rows[first].copy()
-    for name in PLACED:
-        out[name] = np.add.reduceat(rows[name], first)
-    return out
+def _joined(keys: Ints, sums: Ints, length_m: Floats) -> tuple[Ints, Ints]:
+    """Sum what has the same keys (4, n): segment, machine, direction, minute; sorted by these.
+
+    One pass that reaches from a minute into the next is one, of the first.
+    """
+    for most in (0, 1):
+        same = (np.diff(keys[:3], axis=1) == 0).all(axis=0) & (np.diff(keys[3]) == most)
+        if most:
+            both_m = (sums[0, 1:] + sums[0, :-1]) / float(PER_M)
+            same &= both_m <= ONE_PASS * length_m[keys[0, 1:]]
+        if keys.shape[1]:
+            first = np.flatnonzero(np.append(True, ~same))
+            keys, sums = keys[:, first], np.add.reduceat(sums, first, axis=1)
+    return keys, sums

@@ -8,23 +8,35 @@ machines must agree wherever more than one drives.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
+import numba
 import numpy as np
+from scipy.spatial import cKDTree
 
-from mapserver.roads.passes import Passes
-from protocol.arrays import Bools, Floats, Ints
+from mapserver.evidence.timeline import Block
+from mapserver.roads.passes import MINUTE_NS, Passes
+from mapserver.roads.segments import Segments
+from protocol.arrays import Ints
+from protocol.site.geometry import BLOCK_CELLS
 
 BEFORE = 4  # passes, at least, that a segment is known by
+KNOWN_BY = 32  # passes, at most: the newest ones, as ground wears
 AGREE = 2  # passes in a row that must differ alike
 SIGMAS = 4.0  # robust, of the passes before
 SHARE = 0.25  # of the median before
+HALF_WIDTH_M = 3.0  # of the strip that is driven, with the errors of positions; half the distance of two lanes
 FLOOR_SHARE, FLOOR = 0.05, 0.001  # of the median, and least standard deviation of passes
 
 
 @dataclass(frozen=True)
 class Repair:
-    """A change of a segment's ground. minute: of the first pass that saw it; before, after: medians of c_rr."""
+    """A change of a segment's ground.
+
+    minute, seen: of the first pass that saw it, and of the one that showed it; before, after: medians of c_rr.
+    """
 
     segment: int
     minute: int
@@ -32,50 +44,88 @@ class Repair:
     before: float
     after: float
 
+    @property
+    def first_ns(self) -> int:
+        """When the first pass that saw it began, to the minute."""
+        return self.minute * MINUTE_NS
+
+    @property
+    def seen_ns(self) -> int:
+        """When it was sure."""
+        return (self.seen + 1) * MINUTE_NS
+
 
 def repairs(passes: Passes) -> tuple[list[Repair], int]:
     """All changes, and how many passes were looked at. After one, a segment is known by later passes alone."""
     out: list[Repair] = []
-    looks = 0
     bounds = np.flatnonzero(np.diff(passes.segment, prepend=-1, append=-1))
-    for first, end in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
-        own = slice(first, end)
-        changes, looked = _of_segment(passes.c_rr[own], passes.machine[own])
-        looks += looked
-        for at, seen, begin, stop in changes:
-            before, after = passes.c_rr[own][begin:at], passes.c_rr[own][at:stop]
-            minute, seen_minute = passes.minute[own][[at, seen]].tolist()
-            segment = int(passes.segment[first])
-            out.append(Repair(segment, minute, seen_minute, float(np.median(before)), float(np.median(after))))
+    cuts, looks = _cuts(passes.c_rr, passes.machine, bounds)
+    for first, at, end in cuts.tolist():
+        before, after = (float(np.median(passes.c_rr[part])) for part in (slice(first, at), slice(at, end)))
+        minute, seen = passes.minute[[at, at + AGREE - 1]].tolist()
+        out.append(Repair(int(passes.segment[at]), minute, seen, before, after))
     return out, looks
 
 
-def _of_segment(c_rr: Floats, machine: Ints) -> tuple[list[tuple[int, int, int, int]], int]:
-    """Of each change the first pass after it, the one that showed it, and first and end of the passes around it."""
-    cuts: list[tuple[int, int]] = []
-    begin, looks = 0, 0
-    for last in range(AGREE - 1, len(c_rr)):
-        at = last - AGREE + 1
-        if at - begin < BEFORE:
-            continue
-        looks += 1
-        if _differs(c_rr[begin:at], c_rr[at : last + 1]) and _agree(machine[begin:at], machine[at : last + 1]):
-            cuts.append((at, last))
-            begin = at
-    begins = [0, *(at for at, _ in cuts)]
-    ends = [*(at for at, _ in cuts[1:]), len(c_rr)]
-    return [(at, seen, first, end) for (at, seen), first, end in zip(cuts, begins, ends, strict=False)], looks
+@numba.njit(cache=True, nogil=True)
+def _cuts(c_rr: Any, machine: Any, bounds: Any) -> tuple[Any, int]:
+    """Of each change, the first pass before it, the first after it, and the end of those that are like this (n, 3).
+
+    bounds: where the passes of each segment begin, and the end of all.
+    """
+    cuts, count, looks = np.empty((len(c_rr), 3), np.int64), 0, 0
+    for k in range(len(bounds) - 1):
+        begin, first_cut = bounds[k], count
+        for at in range(bounds[k] + BEFORE, bounds[k + 1] - AGREE + 1):
+            if at - begin < BEFORE:
+                continue
+            looks += 1
+            before = slice(max(begin, at - KNOWN_BY), at)
+            after = slice(at, at + AGREE)
+            if _differs(c_rr[before], c_rr[after]) and _agree(machine[before], machine[after]):
+                cuts[count, 0], cuts[count, 1] = begin, at
+                count += 1
+                begin = at
+        for i in range(first_cut, count):
+            cuts[i, 2] = cuts[i + 1, 1] if i + 1 < count else bounds[k + 1]
+    return cuts[:count], looks
 
 
-def _differs(before: Floats, after: Floats) -> bool:
+@numba.njit(cache=True, nogil=True)
+def _differs(before: Any, after: Any) -> bool:
     """Whether all passes after differ alike from the median of those before, beyond noise and by enough."""
-    median = float(np.median(before))
-    spread = max(1.4826 * float(np.median(np.abs(before - median))), FLOOR_SHARE * median, FLOOR)
-    off = after - median
-    beyond: Bools = np.abs(off) > max(SIGMAS * spread, SHARE * max(median, FLOOR))
-    return bool(beyond.all()) and bool((off > 0).all() or (off < 0).all())
+    median = np.median(before)
+    spread = max(1.4826 * np.median(np.abs(before - median)), FLOOR_SHARE * median, FLOOR)
+    least = max(SIGMAS * spread, SHARE * max(median, FLOOR))
+    return bool((after - median > least).all() or (median - after > least).all())
 
 
-def _agree(before: Ints, after: Ints) -> bool:
+@numba.njit(cache=True, nogil=True)
+def _agree(before: Any, after: Any) -> bool:
     """Whether the passes after are of several machines, where several drove before."""
-    return len(np.unique(after)) > 1 or len(np.unique(before)) == 1
+    return bool((after != after[0]).any() or (before == before[0]).all())
+
+
+def ages(segments: Segments, changes: Iterable[Repair], cell_m: float) -> dict[Block, Ints]:
+    """Since when (256,) [ns] the ground of cells is as it is, 0 for ever, in the blocks of segments that changed.
+
+    Of those cells whose centres are nearest to a changed segment, and within HALF_WIDTH_M of its line.
+    """
+    newest: dict[int, int] = {}
+    for change in changes:
+        newest[change.segment] = max(change.first_ns, newest.get(change.segment, 0))
+    out: dict[Block, Ints] = {}
+    if not newest:
+        return out
+    owner, tree = np.repeat(np.arange(len(segments.ids)), np.diff(segments.ends)), cKDTree(segments.points)
+    for segment, begin_ns in newest.items():
+        line = segments.line(segment)
+        first = np.floor((line.min(axis=0) - HALF_WIDTH_M) / cell_m).astype(np.int64)
+        last = np.floor((line.max(axis=0) + HALF_WIDTH_M) / cell_m).astype(np.int64)
+        x, y = (grid.ravel() for grid in np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True))))
+        off_m, nearest = tree.query((np.stack([x, y], axis=1) + 0.5) * cell_m)
+        own = (off_m <= HALF_WIDTH_M) & (owner[nearest] == segment)
+        for column, row in zip(x[own].tolist(), y[own].tolist(), strict=True):
+            block = out.setdefault((column // BLOCK_CELLS, row // BLOCK_CELLS), np.zeros(BLOCK_CELLS**2, np.int64))
+            block[row % BLOCK_CELLS * BLOCK_CELLS + column % BLOCK_CELLS] = begin_ns
+    return out

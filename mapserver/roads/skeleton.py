@@ -1,25 +1,36 @@
-"""The lines along which machines drove, as single cells, tile by tile: a tile is made again only where it changed."""
+"""The lines along which machines drove, as single cells, tile by tile: a tile is made again only where it changed.
+
+Ridges of a tile depend on the evidence in it and near it, its lines on the ridges of it and of the tiles around. More
+passes on a road seldom move its ridges, so that most tiles into which samples come keep their lines.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
+import numba
 import numpy as np
 
-from mapserver.evidence import cells as ev
-from mapserver.evidence.timeline import Block, TimedPage, TimedPages, packed_votes
-from mapserver.roads.ridges import AXES, Blur, add_axes, ridges
+from mapserver.evidence.cells import CELLS, HEADING
+from mapserver.evidence.timeline import Block, TimedPage, TimedPages, plane_counts
+from mapserver.roads.ridges import AXES, Blur, ridges
 from mapserver.roads.thinning import REACH, thinned
-from protocol.arrays import Ints
+from protocol.arrays import Bools, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-TILE_BLOCKS = 8
+TILE = 128  # cells of the raster to a side
 RASTER_M = 1.0  # smaller cells are joined to about this size: positions are not known any better
 NEAR = 2  # cells to each side of a line whose metres are told beside it
+EDGE = REACH + 1  # cells of ridges around a tile that its lines depend on
+# Of a tile and EDGE cells around: where the tiles before it, itself and those after it lie, and which of their cells.
+_OF_WINDOW = {-1: slice(0, EDGE), 0: slice(EDGE, EDGE + TILE), 1: slice(EDGE + TILE, None)}
+_OF_TILE = {-1: slice(TILE - EDGE, None), 0: slice(None), 1: slice(0, EDGE)}
 
 Pages = Mapping[Block, Sequence[TimedPage]]
-Tile = tuple[int, int]
+Tile = tuple[int, int]  # column and row
 
 
 @dataclass(frozen=True)
@@ -35,94 +46,154 @@ class Skeleton:
     raster_m: float
 
 
-class Skeletons:
-    """Makes skeletons of one map, and keeps the tiles whose pages are still the same objects.
+@dataclass
+class _Lines:
+    """Those of one tile, as in Skeleton."""
 
-    made: how many tiles so far. For one thread at a time.
+    places: Ints
+    metres: Ints
+
+
+class Skeletons:
+    """Makes skeletons of one map, and keeps what the pages that are still the same objects show.
+
+    made: tiles whose ridges were looked for so far. For one thread at a time.
     """
 
     def __init__(self, cell_m: float) -> None:
         self._join = max(1, int(RASTER_M / cell_m + 1e-9))
         self._raster_m = self._join * cell_m
         self._blur = Blur(self._raster_m)
-        reach = (self._blur.reach + self._blur.side + REACH + NEAR + 1) * self._join
-        self._margin = -(-reach // BLOCK_CELLS)  # blocks around a tile that it depends on
-        self._tiles: dict[Tile, tuple[tuple[object, ...], Ints, Ints]] = {}
+        self._margin = self._blur.reach + self._blur.side
+        self._pages: dict[Block, Sequence[TimedPage]] = {}
+        self._ridges: dict[Tile, Bools] = {}  # of tiles that have any
+        self._lines: dict[Tile, _Lines] = {}
         self.made = 0
 
     def skeleton(self, pages: Pages) -> Skeleton:
         """The skeleton of a whole map."""
-        wanted = {(x // TILE_BLOCKS, y // TILE_BLOCKS) for x, y in pages}
-        self._tiles = {tile: kept for tile, kept in self._tiles.items() if tile in wanted}
-        for tile in wanted:
-            self._make(tile, pages)
-        parts = [(places, metres) for _, places, metres in self._tiles.values()]
-        places = np.concatenate([np.zeros((0, 2), np.int64), *(places for places, _ in parts)])
-        metres = np.concatenate([np.zeros((0, AXES), np.int64), *(metres for _, metres in parts)])
-        order = np.lexsort((places[:, 1], places[:, 0]))
+        known, self._pages = self._pages, dict(pages)
+        changed = [block for block, own in pages.items() if known.get(block) is not own]
+        changed += [block for block in known if block not in pages]
+        stale = self._near(changed)
+        others = [tile for tile in stale if self._look(tile)]
+        moved = {(x + dx, y + dy) for x, y in others for dx, dy in product((-1, 0, 1), repeat=2)}
+        for tile in sorted(moved | (stale & self._lines.keys())):
+            self._draw(tile, thin=tile in moved)
+        parts = self._lines.values()
+        places = np.concatenate([np.zeros((0, 2), np.int64), *(part.places for part in parts)])
+        metres = np.concatenate([np.zeros((0, AXES), np.int64), *(part.metres for part in parts)])
+        order = np.argsort((places[:, 0] << 32) + places[:, 1])
         return Skeleton(places[order], metres[order], self._raster_m)
 
-    def _make(self, tile: Tile, pages: Pages) -> None:
-        first_x, first_y = (TILE_BLOCKS * index - self._margin for index in tile)
-        count = TILE_BLOCKS + 2 * self._margin
-        blocks = ((first_x + dx, first_y + dy) for dy in range(count) for dx in range(count))
-        near = {block: pages[block] for block in blocks if block in pages}
-        key: tuple[object, ...] = tuple(item for pair in near.items() for item in pair)
-        kept = self._tiles.get(tile)
-        if kept and len(kept[0]) == len(key) and all(map(_is_same, kept[0], key)):
-            return
+    def _near(self, blocks: Iterable[Block]) -> set[Tile]:
+        """Tiles whose ridges depend on these blocks."""
+        corner = np.array(list(blocks), np.int64).reshape(-1, 2) * BLOCK_CELLS
+        first = (corner // self._join - self._margin) // TILE
+        last = ((corner + BLOCK_CELLS - 1) // self._join + self._margin) // TILE
+        spans = np.unique(np.concatenate([first, last], axis=1), axis=0).tolist()
+        return {
+            tile
+            for left, bottom, right, top in spans
+            for tile in product(range(left, right + 1), range(bottom, top + 1))
+        }
+
+    def _look(self, tile: Tile) -> bool:
+        """Look for the ridges of a tile again; returns whether they are others."""
         self.made += 1
-        n = count * BLOCK_CELLS
-        cells = np.zeros((n, n, AXES), np.int64)
-        for (x, y), block_pages in near.items():
-            row, column = (y - first_y) * BLOCK_CELLS, (x - first_x) * BLOCK_CELLS
-            at, metres = axis_metres(block_pages)
-            cells[row + at[:, 0], column + at[:, 1], at[:, 2]] = metres
-        axes, row, column = cells, first_y * BLOCK_CELLS, first_x * BLOCK_CELLS
-        if self._join > 1:
-            axes, row, column = _joined(axes, row, column, self._join)
-        rows, columns = np.nonzero(thinned(ridges(axes, self._blur)))
-        places = np.stack([rows + row, columns + column], axis=1)
-        begin = np.array([tile[1], tile[0]]) * TILE_BLOCKS * BLOCK_CELLS
-        own = ((places * self._join >= begin) & (places * self._join < begin + TILE_BLOCKS * BLOCK_CELLS)).all(axis=1)
-        metres = _around(axes, rows[own], columns[own])
-        self._tiles[tile] = key, places[own], metres
+        now, known = ridges(self._axes(tile, self._margin), self._blur), self._ridges.get(tile)
+        if not now.any():
+            return self._ridges.pop(tile, None) is not None
+        if known is not None and np.array_equal(known, now):
+            return False
+        self._ridges[tile] = now
+        return True
+
+    def _draw(self, tile: Tile, *, thin: bool) -> None:
+        """Make the lines of a tile again, or only what is told beside them."""
+        places = self._thinned(tile) if thin else self._lines[tile].places
+        if not len(places):
+            self._lines.pop(tile, None)
+            return
+        own = places - np.array(tile[::-1]) * TILE
+        self._lines[tile] = _Lines(places, _around(self._axes(tile, NEAR), own))
+
+    def _thinned(self, tile: Tile) -> Ints:
+        """Cells (n, 2) of a tile's lines."""
+        if tile not in self._ridges:
+            return np.zeros((0, 2), np.int64)
+        mask = np.zeros((TILE + 2 * EDGE, TILE + 2 * EDGE), np.bool_)
+        for dx, dy in product((-1, 0, 1), repeat=2):
+            if (near := self._ridges.get((tile[0] + dx, tile[1] + dy))) is not None:
+                mask[_OF_WINDOW[dy], _OF_WINDOW[dx]] = near[_OF_TILE[dy], _OF_TILE[dx]]
+        lines = thinned(mask)[EDGE:-EDGE, EDGE:-EDGE]
+        return np.asarray(np.argwhere(lines) + np.array(tile[::-1]) * TILE, np.int64)
+
+    def _axes(self, tile: Tile, margin: int) -> Ints:
+        """Metres (rows, columns, AXES) driven along each axis in a tile and so many cells around it."""
+        column, row = (TILE * index - margin for index in tile)
+        size = TILE + 2 * margin
+        spans = (
+            range(at * self._join // BLOCK_CELLS, ((at + size) * self._join - 1) // BLOCK_CELLS + 1)
+            for at in (column, row)
+        )
+        blocks = [block for block in product(*spans) if block in self._pages]
+        out = np.zeros((size, size, AXES), np.int64)
+        if blocks:
+            parts = [axis_metres(self._pages[block]) for block in blocks]
+            codes, metres = (np.concatenate(part) for part in zip(*parts, strict=True))
+            ends = np.cumsum([len(part[0]) for part in parts])
+            _fill(codes, metres, ends, np.array(blocks) * BLOCK_CELLS, self._join, row, column, out)
+        return out
 
 
 def axis_metres(pages: Sequence[TimedPage]) -> tuple[Ints, Ints]:
-    """Where in a block machines drove: (n, 3) row, column and axis, and metres (n,) in 1/4096 m, of all pages."""
+    """Where in a block machines drove: cell * AXES + axis (n,), and metres (n,) in 1/4096 m, of all pages."""
     if isinstance(pages, TimedPages) and axis_metres in pages.derived:
         known: tuple[Ints, Ints] = pages.derived[axis_metres]
         return known
-    counts = np.zeros((ev.CELLS, AXES), np.int64)
-    add_axes(packed_votes(pages)[0], ev.HEADING.start, ev.CELLS, counts)
-    cells = counts.reshape(BLOCK_CELLS, BLOCK_CELLS, AXES)
-    at = np.argwhere(cells)
-    metres = at.astype(np.int16), cells[tuple(at.T)]
+    metres = _driven(plane_counts(pages, HEADING))
     if isinstance(pages, TimedPages):
         pages.derived[axis_metres] = metres  # few cells of a block are on a road
-    return metres  # type: ignore[return-value]
+    return metres
 
 
-def _is_same(one: object, other: object) -> bool:
-    return one is other or (isinstance(one, tuple) and one == other)
+@numba.njit(cache=True, nogil=True)
+def _driven(sectors: Any) -> tuple[Any, Any]:
+    """Codes and metres, as of `axis_metres`, of counts (sectors, cells)."""
+    codes, metres, used = np.empty(CELLS * AXES, np.int64), np.empty(CELLS * AXES, np.int64), 0
+    for cell in range(CELLS):
+        for axis in range(AXES):
+            count = sectors[axis, cell] + sectors[axis + AXES, cell]
+            if count:
+                codes[used], metres[used] = cell * AXES + axis, count
+                used += 1
+    return codes[:used].copy(), metres[:used].copy()
 
 
-def _joined(cells: Ints, row: int, column: int, join: int) -> tuple[Ints, int, int]:
-    """Sum squares of cells whose numbers have the same quotient; also the first row and column of what comes out."""
-    out, firsts = cells, []
-    for axis, first in ((0, row), (1, column)):
-        number = (first + np.arange(cells.shape[axis])) // join
-        out = np.add.reduceat(out, np.flatnonzero(np.diff(number, prepend=number[0] - 1)), axis=axis)
-        firsts.append(int(number[0]))
-    return out, firsts[0], firsts[1]
+@numba.njit(cache=True, nogil=True)
+def _fill(codes: Any, metres: Any, ends: Any, corners: Any, join: int, row: int, column: int, out: Any) -> None:
+    """Add the metres of blocks, whose first cells are at corners (x, y), to a raster that begins at row, column."""
+    rows, columns = out.shape[:2]
+    first = 0
+    for b in range(len(ends)):
+        for i in range(first, ends[b]):
+            cell, axis = codes[i] // AXES, codes[i] % AXES
+            y = (corners[b, 1] + cell // BLOCK_CELLS) // join - row
+            x = (corners[b, 0] + cell % BLOCK_CELLS) // join - column
+            if 0 <= y < rows and 0 <= x < columns:
+                out[y, x, axis] += metres[i]
+        first = ends[b]
 
 
-def _around(axes: Ints, rows: Ints, columns: Ints) -> Ints:
-    """Metres in the 5 x 5 cells around some cells, (n, AXES); these lie well inside."""
-    steps = range(-NEAR, NEAR + 1)
-    total = np.zeros((len(rows), AXES), np.int64)
-    for dy in steps:
-        for dx in steps:
-            total += axes[rows + dy, columns + dx]
-    return total
+@numba.njit(cache=True, nogil=True)
+def _around(axes: Any, places: Any) -> Any:
+    """Metres (n, AXES) in the 5 x 5 cells around cells (n, 2) of a tile; axes: of it and of NEAR cells around."""
+    out = np.zeros((len(places), AXES), np.int64)
+    for i in range(len(places)):
+        y, x = places[i]
+        for row in range(y, y + 2 * NEAR + 1):
+            for column in range(x, x + 2 * NEAR + 1):
+                for axis in range(AXES):
+                    out[i, axis] += axes[row, column, axis]
+    return out

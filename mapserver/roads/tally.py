@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.roads.segments import LATTICE_M
+from mapserver.roads.cutting import LATTICE_M
 from protocol.arrays import Floats, Ints, Table
 
 CELL_M = LATTICE_M / 10  # so that cells end where segments do

@@ -23,10 +23,14 @@ MAX_RESOLUTION_M = 1000.0
 
 @dataclass(frozen=True)
 class When:
-    """as_of_ns: the map from samples stamped so or earlier; None: as it is. minus_ns: less the map as of that time."""
+    """as_of_ns: the map from samples stamped so or earlier; None: as it is. minus_ns: less the map as of that time.
+
+    repairs: cells of a road whose ground changed, as `worklist` shows it, are read from the samples since.
+    """
 
     as_of_ns: int | None = None
     minus_ns: int | None = None
+    repairs: bool = False
 
     @property
     def times(self) -> tuple[int | None, ...]:
@@ -207,13 +211,15 @@ class SegmentsQuery:
     """Roads of the map, segment by segment, and what drove on them.
 
     from_ns, to_ns: traffic of the hours that begin in from_ns <= time < to_ns, None for all that is remembered.
-    as_of_ns: from samples stamped so or earlier. bounds: segments whose middle lies there.
+    as_of_ns: from samples stamped so or earlier. bounds: segments whose middle lies there. machine: traffic of this one
+    alone, and what it measured; "" for all.
     """
 
     from_ns: int | None = None
     to_ns: int | None = None
     as_of_ns: int | None = None
     bounds: Bounds | None = None
+    machine: str = ""
     fresh: Freshness = ANY_ROW
 
     name = "segments"
@@ -233,6 +239,7 @@ class WorklistQuery:
     to_ns: int | None = None
     as_of_ns: int | None = None
     bounds: Bounds | None = None
+    machine: str = ""
     fresh: Freshness = ANY_ROW
 
     name = "worklist"
@@ -327,7 +334,8 @@ def _of_map(query: PointQuery | PointsQuery | RegionQuery | HistoryQuery) -> dic
     if isinstance(query, HistoryQuery):
         parameters |= _stamps({"from": query.from_ns, "to": query.to_ns})
         return parameters | ({"span": ps.text_of(query.span_s)} if query.span_s is not None else {})
-    return parameters | _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
+    parameters |= _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
+    return parameters | ({"repairs": "1"} if query.when.repairs else {})
 
 
 def _of_region(query: RegionQuery) -> dict[str, str]:
@@ -341,6 +349,8 @@ def _of_roads(query: RoadQuery) -> dict[str, str]:
     parameters = _stamps({"from": query.from_ns, "to": query.to_ns, "as_of": query.as_of_ns})
     if query.bounds:
         parameters["bounds"] = _text_of_bounds(query.bounds)
+    if query.machine:
+        parameters["machine"] = ps.quoted(query.machine)
     if isinstance(query, WorklistQuery):
         numbers = {"target": ps.text_of(query.target), "efficiency": ps.text_of(query.efficiency)}
         parameters |= {**numbers, "limit": str(query.limit)}
@@ -422,7 +432,8 @@ def _parse_why(parameters: ps.Parameters) -> WhyQuery:
 
 def _parse_segments(parameters: ps.Parameters) -> SegmentsQuery:
     bounds = _bounds(parameters) if "bounds" in parameters else None
-    return SegmentsQuery(*_times(parameters), ps.stamp(parameters, "as_of"), bounds, ps.freshness(parameters))
+    machine = ps.free_text(parameters, "machine")
+    return SegmentsQuery(*_times(parameters), ps.stamp(parameters, "as_of"), bounds, machine, ps.freshness(parameters))
 
 
 def _parse_worklist(parameters: ps.Parameters) -> WorklistQuery:
@@ -431,15 +442,15 @@ def _parse_worklist(parameters: ps.Parameters) -> WorklistQuery:
         ps.number({name: ps.text_of(getattr(default, name)), **parameters}, name) for name in ("target", "efficiency")
     )
     limit = ps.count({"limit": str(default.limit), **parameters}, "limit")
-    return WorklistQuery(target, efficiency, limit, same.from_ns, same.to_ns, same.as_of_ns, same.bounds, same.fresh)
+    return WorklistQuery(target, efficiency, limit, **vars(same))
 
 
-_ROADS = ("from", "to", "as_of", "bounds")
+_ROADS = ("from", "to", "as_of", "bounds", "machine")
 _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
-    "point": (("x", "y", "layers", "as_of", "minus", *_FRESH), _parse_point),
-    "points": (("places", "layers", "as_of", "minus", *_FRESH), _parse_points),
-    "region": (("bounds", "polygon", "resolution", "layers", "as_of", "minus", *_FRESH), _parse_region),
+    "point": (("x", "y", "layers", "as_of", "minus", "repairs", *_FRESH), _parse_point),
+    "points": (("places", "layers", "as_of", "minus", "repairs", *_FRESH), _parse_points),
+    "region": (("bounds", "polygon", "resolution", "layers", "as_of", "minus", "repairs", *_FRESH), _parse_region),
     "piece": (("cursor", "number"), _parse_piece),
     "history": (("x", "y", "layers", "from", "to", "span", *_FRESH), _parse_history),
     "machines": (_FRESH, lambda parameters: MachinesQuery(ps.freshness(parameters))),
@@ -472,7 +483,10 @@ def _layers(parameters: ps.Parameters) -> tuple[str, ...]:
 
 
 def _when(parameters: ps.Parameters) -> When:
-    return When(ps.stamp(parameters, "as_of"), ps.stamp(parameters, "minus"))
+    repairs = parameters.get("repairs", "0")
+    if repairs not in ("0", "1"):
+        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `repairs`: {repairs[:40]!r} is neither 0 nor 1")
+    return When(ps.stamp(parameters, "as_of"), ps.stamp(parameters, "minus"), repairs == "1")
 
 
 def _bounds(parameters: ps.Parameters) -> Bounds:

@@ -53,7 +53,10 @@ class Segments:
 class WorklistRow:
     """What a stretch costs an hour, over ground of the target's resistance: value, low and high of 90 %.
 
-    rank: from 1; stretches that differ by less than the noise have the same.
+    rank: from 1; stretches that differ by less than the noise have the same. since_ns: since when the ground is so: the
+    first pass after its last change, or the first hour of which its resistance is remembered. before, saved_kwh_ph:
+    resistance before that change, and what it saves an hour (below 0: it became worse); None for no change.
+    day_ns, day_resistance: begins of days with measurements, the oldest first, and the mean resistance of each.
     """
 
     rank: int
@@ -61,6 +64,11 @@ class WorklistRow:
     kwh_ph: tuple[float, ...]
     litres_ph: tuple[float, ...]
     seconds_ph: tuple[float, ...]
+    since_ns: int
+    before: float | None
+    saved_kwh_ph: float | None
+    day_ns: tuple[int, ...]
+    day_resistance: tuple[float, ...]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""`sitegrid eval`: the experiments behind the project's figures."""
+"""`sitegrid eval`: the experiments behind the project's figures.
+
+It is one module because experiments share options, and each of them adds only a few lines.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from protocol.errors import ConfigError
 from sitegrid.options.groups import add_action
-from sitegrid.options.outputs import FOLDER
+from sitegrid.options.outputs import FOLDER, OutputFile
 from sitegrid.options.values import count, count_or_names, names, positive, seed, setting, shares, withhold
 from sitegrid.process.lifetime import note, plain, raise_interrupts, say, tell
 from sitegrid.process.progress import Display
@@ -21,6 +25,7 @@ if TYPE_CHECKING:
 HELP = "run the accuracy experiments"
 EXTRA = "eval"
 Report = dict[str, Any]  # plain values by name; lists of rows are tables
+DEFAULT_SEEDS, DEFAULT_S = 12, 1200.0  # of experiments on positions
 MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side
 SCENARIOS = ("paper_site", "paper_site_driven", "haul_road_driven")  # of the paper's table; one machine drives alone
 SHOWN = (list, dict)  # values of a row that a table for people has no room for
@@ -35,6 +40,9 @@ def add_options(parser: ArgumentParser) -> None:
         "--data", type=Path, required=True, help="folder with the folders rl_test1_husky, rl_test2_jackal"
     )
     table = add_action(what, "localisation", "repeat the paper's table on simulated recordings")
+    paper = add_action(
+        what, "paper", "repeat the paper's tables and maps, and what this project makes of the same drives"
+    )
     blackout = add_action(what, "blackout", "measure positions without GPS: blackouts, jumps afterwards, starts alone")
     budget = add_action(what, "budget", "show what each kind of error costs, by the truth in its place")
     ground = add_action(what, "ground", "measure the accuracy of rolling resistance and gradient of loaders at work")
@@ -46,17 +54,18 @@ def add_options(parser: ArgumentParser) -> None:
     )
     roads = add_action(what, "roads", "measure roads, traffic, losses and repairs on random patches of soil")
     routes = add_action(what, "routes", "compare routes with what machines spent, and ways with a finer search")
-    for action in (table, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
-        action.add_argument("--seeds", type=count, default=12, help="number of seeds (default %(default)s)")
+    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
+        action.add_argument("--seeds", type=count, default=DEFAULT_SEEDS, help="number of seeds (default %(default)s)")
     physics.add_argument("--seeds", type=count, default=3, help="number of seeds (default %(default)s)")
-    for action in (physics, table, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
+    for action in (physics, table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
-    for action in (table, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
+    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
         (table, "errors over time, tracks and the table"),
+        (paper, "the maps, their wrong cells, tracks and errors of the first seed, and how sure maps are"),
         (blackout, "errors over the time without GPS"),
         (ground, "estimates along the track, errors by place"),
         (merge, "the maps of the first seed and the table"),
@@ -64,11 +73,12 @@ def add_options(parser: ArgumentParser) -> None:
     ):
         action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
     for action, seconds in (
-        (table, 1200.0),
-        (blackout, 1200.0),
-        (budget, 1200.0),
+        (table, DEFAULT_S),
+        (paper, DEFAULT_S),
+        (blackout, DEFAULT_S),
+        (budget, DEFAULT_S),
         (ground, 600.0),
-        (base, 1200.0),
+        (base, DEFAULT_S),
         (lag, 900.0),
         (fleet, 900.0),
         (roads, 900.0),
@@ -84,7 +94,13 @@ def add_options(parser: ArgumentParser) -> None:
     table.add_argument("--shares", type=shares, default=(None,), help=shared)
     judged = "compare the EKF of the profile default with the batch optimum of the same runs, by GTSAM (extra oracle)"
     table.add_argument("--oracle", action="store_true", help=judged)
-    for action in (merge, routes):
+    tensor = (
+        "file to write the map to that the paper plots, with the first seed: 2 x m x n x 3, x, y and value of each cell"
+    )
+    paper.add_argument("--tensor", type=OutputFile((".npy",)), metavar="FILE", help=tensor)
+    quick = "short drives of its own without PyBullet, and few rows: to see that all works"
+    paper.add_argument("--quick", action="store_true", help=quick)
+    for action in (merge, roads, routes):
         action.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
 
@@ -113,6 +129,7 @@ def run(arguments: Namespace) -> int:
     evaluations = {
         "physics": _physics,
         "localisation": _localisation,
+        "paper": _paper,
         "blackout": _blackout,
         "budget": _budget,
         "ground": _ground,
@@ -150,6 +167,27 @@ def _localisation(arguments: Namespace) -> Report:
     )
     judged = _with_oracle(work) if arguments.oracle else work
     return _experiment(arguments, "machines drive, filters follow", judged, "evaluation.positions.plots")
+
+
+def _paper(arguments: Namespace) -> Report:
+    from evaluation.paper import experiment
+    from evaluation.paper.drives import QUICK, Plan
+    from evaluation.paper.report import readable
+
+    plan = Plan(_seeds(arguments), arguments.seconds)
+    if arguments.quick:
+        if plan != Plan(range(DEFAULT_SEEDS), DEFAULT_S):
+            raise ConfigError("--quick", "has a drive of its own: leave out --seeds, --first-seed and --seconds")
+        plan = QUICK
+
+    def work(runner: Runner) -> tuple[Report, Any]:
+        report, outcomes = experiment.run(runner, plan)
+        if arguments.tensor:
+            experiment.write_map(outcomes, runner, arguments.tensor)
+        return report, outcomes
+
+    report = _experiment(arguments, "machines drive, and plot what they drive on", work, "evaluation.paper.plots")
+    return report if arguments.json else readable(report)
 
 
 def _with_oracle(table: Callable[[Runner], tuple[Report, Any]]) -> Callable[[Runner], tuple[Report, Any]]:
@@ -223,7 +261,8 @@ def _fleet(arguments: Namespace) -> Report:
 def _roads(arguments: Namespace) -> Report:
     from evaluation.roads import experiment
 
-    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds)
+    cases = experiment.select([name for name in arguments.cases.split(",") if name])
+    work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds, cases=cases)
     return _experiment(arguments, "machines drive on patches of soil, their samples show roads", work)
 
 

@@ -75,6 +75,8 @@ def add_options(parser: ArgumentParser) -> None:
         roads = _add_query(queries, ask, summary)
         hours = ("from", "traffic of the hours from this time on"), ("to", "traffic of the hours before this time")
         _add_times(roads, *hours, ("as-of", "the map as of this time"))
+        alone = "traffic of this machine alone, and what it measured"
+        roads.add_argument("--machine", default="", metavar="NAME", help=alone)
     roads.add_argument("--target", type=positive, default=0.02, help="rolling resistance of good ground (default 0.02)")
     route = _add_query(queries, _route, "what a drive along a line costs a machine: energy and time")
     route.add_argument("line", type=float, nargs="+", metavar="X_M Y_M", help="places of the line, in metres")
@@ -114,6 +116,8 @@ def _add_drive(query: ArgumentParser) -> None:
 
 def _add_when(query: ArgumentParser) -> None:
     _add_times(query, ("as-of", "the map as of this time"), ("minus", "subtract the map as of this time"))
+    since = "read roads whose ground changed, as the worklist shows it, from the samples since"
+    query.add_argument("--repairs", action="store_true", help=since)
 
 
 def _add_times(query: ArgumentParser, *options: tuple[str, str]) -> None:
@@ -137,7 +141,8 @@ def run(arguments: Namespace) -> int:
 
 def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
-    point = client.point(arguments.x_m, arguments.y_m, layers, **when, after=arguments.after)
+    rest = {"repairs": arguments.repairs, "after": arguments.after}
+    point = client.point(arguments.x_m, arguments.y_m, layers, **when, **rest)
     table = {"x_m": point.x_m, "y_m": point.y_m, **point.values, **_version(point)}
     head = f"cell at {point.x_m:g}, {point.y_m:g} m{_as_of(when, point.stamp_ns)}"
     return table, [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
@@ -145,7 +150,8 @@ def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Ans
 
 def _points(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
-    answer = client.points(_places_of(arguments.places), layers, **when, after=arguments.after)
+    rest = {"repairs": arguments.repairs, "after": arguments.after}
+    answer = client.points(_places_of(arguments.places), layers, **when, **rest)
     places = {"x_m": answer.x_m.tolist(), "y_m": answer.y_m.tolist()}
     table = {**places, **{name: values.tolist() for name, values in answer.layers.items()}, **_version(answer)}
     rows = (
@@ -165,8 +171,8 @@ def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     area = arguments.area if len(arguments.area) == 4 else _places_of(arguments.area)
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
     try:
-        same = {**when, "after": arguments.after, "resolution_m": arguments.resolution}
-        region = client.region(area, layers, **same, progress=_pieces_shown())
+        rest = {"repairs": arguments.repairs, "after": arguments.after, "resolution_m": arguments.resolution}
+        region = client.region(area, layers, **when, **rest, progress=_pieces_shown())
     except ValueError as error:
         raise ConfigError("sitegrid query region", str(error)) from None
     if arguments.out:
@@ -219,7 +225,7 @@ def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> A
 
 def _road_times(client: Client, arguments: Namespace) -> dict[str, Any]:
     times = {"from": arguments.from_time, "to": arguments.to_time, "as_of": arguments.as_of_time}
-    return {**_stamps(client, **times), "after": arguments.after}
+    return {**_stamps(client, **times), "machine": arguments.machine, "after": arguments.after}
 
 
 def _segments(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
@@ -245,6 +251,7 @@ def _worklist(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answe
     if not answer.rows and not answer.changes:
         return answer, [f"{total}: no stretch is worse for sure"]
     head = ["", "stretch", "around", "kWh/h", "low..high", "l/h", "s/h", "resistance", "+-", "a day", "machines"]
+    head += ["since", "before"]
     rows = (
         [
             str(row.rank),
@@ -256,6 +263,8 @@ def _worklist(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answe
             *map(_value, (row.segment.resistance, row.segment.resistance_std)),
             "-" if row.segment.trend is None else f"{row.segment.trend:+.4f}",
             str(row.segment.machines),
+            utc_text(row.since_ns),
+            "-" if row.before is None else _value(row.before),
         ]
         for row in answer.rows
     )

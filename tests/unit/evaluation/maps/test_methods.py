@@ -80,7 +80,7 @@ def test_samples_fall_into_the_cell_of_their_stated_position():
 
 def test_samples_of_all_machines_count_in_the_order_of_their_stamps():
     early, late = samples([10, 40], [3.5, 3.5], [2.5, 2.5], [0.02, 0.25]), samples([20], [3.5], [2.5], [0.06])
-    rows = methods.in_order([Delivery("b", early, 50), Delivery("a", late, 60)])
+    rows = methods.in_order([early, late])
     assert rows["stamp_ns"].tolist() == [10, 20, 40]
     layers = methods.merge_hard(last_write, rows, ("resistance", "grade_north"), WINDOW)
     assert layers["resistance"].shape == (18, 20)

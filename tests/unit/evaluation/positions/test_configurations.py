@@ -4,6 +4,7 @@ import pytest
 
 from evaluation.campaign.recordings import PlannedDrive
 from evaluation.positions import configurations as table
+from evaluation.positions import published
 from evaluation.positions.configurations import Configuration, select
 
 
@@ -14,8 +15,8 @@ def used(machine):
 def test_the_table_has_every_configuration_of_the_paper_in_both_profiles_and_one_more():
     rows = table.configurations()
     assert len(rows) == len(set(rows)) == len(table.SENSORS) * len(table.FILTERS) * len(table.PROFILES) == 36
-    assert {(r.filter, r.gps, r.imu) for r in rows} == set(table.PAPER_NET_M) | {("ekf", 3, 1), ("ukf", 3, 1)}
-    assert len(table.PAPER_NET_M) == 16
+    assert {(r.filter, r.gps, r.imu) for r in rows} == set(published.POSITIONS) | {("ekf", 3, 1), ("ukf", 3, 1)}
+    assert len(published.POSITIONS) == 16
     assert {(r.gps, r.imu) for r in table.configurations(table.HEADLINE)} == {(1, 1), (2, 1), (3, 1)}
     assert Configuration("ukf", 3, 1, "paper").published_net_m is None
 

@@ -7,8 +7,10 @@ from scipy.stats import kendalltau
 from evaluation.campaign.figures import judge
 from evaluation.roads import experiment
 from evaluation.roads.drives import BAD, planned
-from evaluation.roads.score import kendall
+from evaluation.roads.score import MINUTE_NS, Recorded, _needed, kendall, kept_after, roads
+from protocol.errors import ConfigError
 from sim.scenario.file import load_scenario
+from tests.unit.mapserver.roads.drives import along, passes
 
 
 def test_tau_without_ties_is_that_of_the_library():
@@ -47,6 +49,9 @@ def test_rows_sum_repairs_and_take_medians_of_the_rest():
         "seen_2": 3,
         "seen_3": 4,
         "looks": 100,
+        "cells": 40.0,
+        "cells_changed": 10.0,
+        "cells_since": 30.0,
         "false_alarms": 0,
         "saved_j": 9.0,
         "true_saved_j": 10.0,
@@ -54,7 +59,73 @@ def test_rows_sum_repairs_and_take_medians_of_the_rest():
     row = experiment.summarise(experiment.CASES[3], [seed, {**seed, "seen_2": 1, "false_alarms": 1}])
     assert (row["repairs"], row["seen_2_pct"], row["seen_3_pct"]) == (8, 50.0, 100.0)
     assert (row["false_per_1000"], row["saved_pct"]) == (5.0, -10.0)
+    assert (row["cells_changed_pct"], row["cells_since_pct"]) == (25.0, 75.0)
     plain = experiment.summarise(experiment.CASES[0], [{"c_pct": 3.0}, {"c_pct": 9.0}, {"c_pct": 4.0}])
     assert plain["c_pct"] == 4.0
     assert len(plain["by_seed"]) == 3
     assert judge(experiment.GOALS[:1], [plain])[0]["met"]
+
+
+def test_cases_are_chosen_by_name_and_others_refused():
+    assert [case.name for case in experiment.select(["repairs", "haul_road"])] == ["haul_road", "repairs"]
+    assert experiment.select([]) == experiment.CASES
+    with pytest.raises(ConfigError, match="`haul` is not known; known: haul_road"):
+        experiment.select(["haul"])
+
+
+def test_names_are_those_of_the_day_before_where_the_same_roads_are_driven():
+    line, elsewhere = along([(10, 10), (210, 60)]), along([(10, 300), (210, 330)])
+
+    def recorded(place, seed):
+        return Recorded({"a": passes(place, 4, seed=seed)}, {}, 0, 1)
+
+    first = recorded(line, 1)
+    whole = roads(first.rows)
+    assert kept_after(first, recorded(line, 2), whole) > 95
+    assert kept_after(first, recorded(elsewhere, 2), whole) == 100.0
+    assert first.rows["a"]["stamp_ns"].max() < 1_770_000_000 * 10**9  # nothing was moved in place
+
+
+def test_a_day_after_is_judged_with_the_next_seed_and_what_is_judged_is_kept(tmp_path, monkeypatch):
+    """Which tasks there are; recordings and agents are not made here."""
+    asked = []
+
+    class Runner:
+        cache = tmp_path
+
+        def run(self, what, tasks):
+            asked.extend((what.name, task.variant.name, task.seed, getattr(task.variant, "other", 0)) for task in tasks)
+            return [experiment.Judged({"c_pct": 1.0}) for _ in tasks]
+
+    monkeypatch.setattr(experiment, "GOALS", experiment.GOALS[:1])
+    report, _ = experiment.run(Runner(), [4, 5, 6], 90.0, experiment.CASES[:1])
+    assert [each for each in asked if each[0] == "roads"] == [
+        ("roads", "haul_road", 4, 5),
+        ("roads", "haul_road", 5, 6),
+        ("roads", "haul_road", 6, 4),
+    ]
+    assert report["rows"][0]["c_pct"] == 1.0
+    tasks = [
+        experiment.replay_task(experiment.Judging(experiment.CASES[0], 90.0, other), planned("haul_road", 4, 90.0))
+        for other in (5, None)
+    ]
+    names = {experiment.EXPERIMENT.file(task, tmp_path).name for task in tasks}
+    assert len(names) == 2
+
+
+def test_seeds_far_beyond_a_goal_are_named():
+    goals = [goal for goal in experiment.GOALS if goal.figure in ("c_pct", "tau", "top_pct", "total_pct")]
+    good = {"c_pct": 11.9, "tau": 0.78, "top_pct": 95.6, "total_pct": -11.0}
+    bad = {"c_pct": 12.1, "tau": 0.77, "top_pct": 95.4, "total_pct": -12.5}
+    table = [{"case": "haul_road", "by_seed": [good, bad]}]
+    named = experiment.beyond(goals, table, [7, 8])
+    assert {(row["name"], row["seed"], row["value"]) for row in named} == {(name, 8, bad[name]) for name in bad}
+
+
+def test_a_change_needs_the_passes_until_the_one_that_showed_it():
+    later = {"a": np.array([10, 40]) * MINUTE_NS, "b": np.array([11, 20]) * MINUTE_NS + 7, "c": np.array([], np.int64)}
+    assert _needed(later, ["b"], 11) == 2  # and not what drove in the rest of that minute
+    assert _needed(later, ["b"], 19) == 3  # it began in that minute, and ended later
+    assert _needed(later, ["a"], 40) == 4
+    assert _needed(later, ["c"], 11) == 2  # it was over half of the segment in no true pass
+    assert _needed(later, [], None) == np.inf

@@ -220,3 +220,41 @@ def test_pages_are_cut_once_as_long_as_nothing_is_folded_into_them(monkeypatch):
 def test_blocks_near_each_other_are_in_one_cluster():
     parts = clusters([(0, 0), (40, 0), (2, 2), (4, 4), (40, 3)], 1)
     assert sorted(map(sorted, parts)) == [[(0, 0), (2, 2), (4, 4)], [(40, 0)], [(40, 3)]]
+
+
+def ages_of(begin_ns: int, cells: slice) -> dict[tuple[int, int], np.ndarray]:
+    """An age of some cells of block (0, 0)."""
+    begins = np.zeros(ev.CELLS, np.int64)
+    begins[cells] = begin_ns
+    return {(0, 0): begins, (90, 90): begins}  # the last one has no evidence
+
+
+def firsts(grid: Grid, begin_ns: int, config: ChangeConfig = CONFIG) -> tuple[np.ndarray, list]:
+    pages = {(0, 0): grid.pages([(0, 0)])[0]}
+    valid = valid_pages(pages, grid.cell_m, config, ages_of(begin_ns, slice(0, 128)))
+    assert set(valid) == {(0, 0)}
+    return valid[0, 0], list(pages[0, 0])
+
+
+def test_an_age_takes_the_pages_that_begin_in_it_in_its_cells_alone():
+    grid = repaved(-30, -30, 4)  # nothing changed in this block
+    first, pages = firsts(grid, NOW_NS + HOUR_NS + 1)
+    assert {pages[i].first_ns for i in first[:128].tolist()} == {NOW_NS + 2 * HOUR_NS}
+    assert (first[128:] == 0).all()
+
+
+def test_where_nothing_was_driven_since_the_page_of_the_change_counts():
+    grid = repaved(-30, -30, 4)
+    last_ns = NOW_NS + (PASSES - 1) * HOUR_NS
+    first, pages = firsts(grid, last_ns + 60 * 10**9)
+    assert {pages[i].first_ns for i in first[:128].tolist()} == {last_ns}
+    first, _ = firsts(grid, last_ns + 100 * HOUR_NS)
+    assert (first == 0).all()  # after all that is known: better old than nothing
+
+
+def test_an_age_before_a_change_of_the_cells_takes_nothing_back():
+    grid = repaved(0, 0, 16)
+    plain = valid_pages({b: grid.pages([b])[0] for b in [(0, 0)]}, 1.0, CONFIG)[0, 0]
+    first, _ = firsts(grid, NOW_NS + 1)
+    np.testing.assert_array_equal(np.maximum(first, plain), first)
+    assert (first[128:] == plain[128:]).all()

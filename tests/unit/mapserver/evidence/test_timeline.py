@@ -9,7 +9,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.pages import CELL, PackedPages
 from mapserver.evidence.settling import DAY_S, HOUR_S, Space, Tiers
-from mapserver.evidence.timeline import Timeline, settle_all
+from mapserver.evidence.timeline import Timeline, plane_counts, settle_all
 from tests.unit.mapserver.data import same_page
 
 S = 10**9
@@ -172,3 +172,19 @@ def test_buckets_of_an_hour_are_not_cut_by_it():
     for bucket in range(500_000, 500_005):
         line.add(page(bucket))
     assert places(line) == [(0, 500_004), (1, 500_003), (2, 500_002 // 24)]
+
+
+@pytest.mark.parametrize("weight", [3, 2**16 + 5])
+def test_planes_are_summed_as_all_pages_are(weight):
+    line = empty_timeline(FoldConfig(keep_buckets=2))
+    for i, bucket_ in enumerate(range(START, START + 40)):
+        line.add(page(bucket_, weight + i, cells=(5, 9, 255)))
+    pages = line.timed()
+    whole = np.zeros((ev.COUNTS, ev.CELLS), np.int64)
+    for timed in pages:
+        np.add.at(whole.reshape(-1), timed.page.votes["place"], timed.page.votes["count"].astype(np.int64))
+    assert whole.any(axis=1).sum() == 40
+    for part in (ev.HEADING, slice(0, 1), slice(0, ev.COUNTS)):
+        np.testing.assert_array_equal(plane_counts(pages, part), whole[part])
+        np.testing.assert_array_equal(plane_counts(list(pages), part), whole[part])
+    assert not plane_counts((), ev.HEADING).any()

@@ -8,7 +8,16 @@ import pytest
 from mapserver.fleet.correction import Correction, Corrections
 from mapserver.journal.facts import Facts
 from protocol.errors import QueryError, Refusal
-from protocol.queries.requests import MAX_LIMIT, SegmentsQuery, WorklistQuery, encode_query, parse_query
+from protocol.queries.requests import (
+    MAX_LIMIT,
+    PointQuery,
+    RegionQuery,
+    SegmentsQuery,
+    When,
+    WorklistQuery,
+    encode_query,
+    parse_query,
+)
 from protocol.queries.roads import decode_segments, decode_worklist
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import incoming, open_writer, send
@@ -153,8 +162,9 @@ def test_samples_are_corrected(tmp_path):
         ("worklist", {"efficiency": "1.5"}, "`efficiency`"),
         ("worklist", {"limit": "0"}, "`limit`"),
         ("worklist", {"limit": str(MAX_LIMIT + 1)}, "`limit`"),
-        ("worklist", {"machine": "a"}, "`machine` is not known"),
+        ("worklist", {"machine": "a%0Ab"}, "`machine` must be one line"),
         ("segments", {"from": "20", "to": "10"}, "`from` .20. is after `to` .10."),
+        ("point", {"x": "1", "y": "2", "repairs": "yes"}, "`repairs`: 'yes' is neither 0 nor 1"),
         ("segments", {"bounds": "1,2,3"}, "`bounds` must be"),
         ("segments", {"target": "0.02"}, "`target` is not known"),
     ],
@@ -174,9 +184,10 @@ def test_bounds_off_the_site_are_refused(writer):
     "query",
     [
         SegmentsQuery(),
-        SegmentsQuery(5, 7, 9, Bounds(-1, -2, 3, 4)),
+        SegmentsQuery(5, 7, 9, Bounds(-1, -2, 3, 4), "a"),
         WorklistQuery(),
-        WorklistQuery(0.03, 0.4, 7, 5, 7, 9, Bounds(-1, -2, 3, 4)),
+        PointQuery(1.0, 2.0, when=When(5, 6, repairs=True)),
+        WorklistQuery(0.03, 0.4, 7, 5, 7, 9, Bounds(-1, -2, 3, 4), "a b"),
     ],
 )
 def test_queries_survive_the_wire(query):
@@ -214,6 +225,142 @@ def test_a_repair_is_told_and_counts(tmp_path):
         assert change.saved_kwh_ph > 0
     assert then.changes == ()
     assert [row.segment.id for row in then.rows] == [row.segment.id for row in before.rows]
+
+
+BOX = Bounds(36.0, 8.0, 44.0, 13.0)
+
+
+@pytest.fixture
+def repaired(tmp_path):
+    """Ground of 0.06 until 600 s, 0.02 since, driven by two machines; and the stamp at which it was still bad."""
+    parts = [(0.06, 4, 0.0), (0.02, 3, 900.0)]
+    with closing(open_writer(tmp_path)) as opened:
+        sent = {"a": 1, "b": 1}
+        for c_rr, count, after_s in parts:
+            for i, name in enumerate(sent):
+                rows = passes(LINE, count, c_rr, seed=7 * count + i, after_s=after_s + 30.0 * i)
+                send(opened, [incoming(rows, sent[name], machine=name)])
+                sent[name] += len(rows)
+        yield opened, START_NS + 800 * 10**9
+
+
+def resistance(answers, *, repairs, as_of_ns=None):
+    return answers.region(RegionQuery(BOX, ("resistance",), when=When(as_of_ns, None, repairs))).layers["resistance"]
+
+
+def test_a_found_change_begins_a_new_age_of_its_cells(repaired):
+    opened, then_ns = repaired
+    answers = answers_of(opened)
+    plain, since = (resistance(answers, repairs=repairs) for repairs in (False, True))
+    driven, again = np.isfinite(plain), np.isfinite(since)  # some only touched since: not known
+    assert again.sum() > driven.sum() / 2
+    assert not (again & ~driven).any()
+    assert plain[driven].max() > 0.03  # of old and new samples together: the strip is too narrow for a change of cells
+    assert since[again] == pytest.approx(0.02, rel=0.2)
+    np.testing.assert_array_equal(resistance(answers, repairs=True), since)
+    np.testing.assert_array_equal(resistance(answers_of(opened), repairs=True), since)  # as after a restart
+    before = resistance(answers, repairs=True, as_of_ns=then_ns)
+    assert before[again] == pytest.approx(0.06, rel=0.2)
+    np.testing.assert_array_equal(before, resistance(answers, repairs=False, as_of_ns=then_ns))
+    newest = max(int(passes(LINE, 3, 0.02, after_s=930.0)["stamp_ns"].max()), 0)
+    np.testing.assert_array_equal(resistance(answers, repairs=True, as_of_ns=newest), since)
+    point = answers.point(PointQuery(40.0, 10.0, ("resistance",), when=When(repairs=True)))
+    assert point.values["resistance"] == pytest.approx(0.02, rel=0.2)
+    assert point.merged == worklist(answers).merged
+
+
+def test_where_nothing_changed_cells_are_as_they_are(writer):
+    answers = answers_of(writer)
+    names = ("resistance", "grade", "weight", "age_s", "resistance_filled")
+    one, other = (answers.region(RegionQuery(BOX, names, when=When(repairs=repairs))) for repairs in (False, True))
+    for name in names:
+        np.testing.assert_array_equal(one.layers[name], other.layers[name])
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        Facts(corrections=Corrections([Correction(name, 0, FOREVER, 0.02, 0.0, 0.0, ()) for name in "ab"]), number=1),
+        Facts(frozenset({"b"}), number=1),
+    ],
+    ids=["calibration", "distrust"],
+)
+def test_a_fact_between_two_passes_is_no_repair(tmp_path, facts):
+    """The machines' samples are off by 0.02, or b's alone; the fact comes while they drive on."""
+    off = {"a": 0.0 if facts.excluded else 0.02, "b": 0.02}
+    sent = {"a": 1, "b": 1}
+
+    def drive(opened, after_s):
+        for i, name in enumerate(sent):
+            rows = passes(LINE, 4, 0.04 + off[name], seed=i, after_s=after_s + 30.0 * i)
+            send(opened, [incoming(rows, sent[name], machine=name)])
+            sent[name] += len(rows)
+
+    with closing(open_writer(tmp_path)) as opened:
+        drive(opened, 0.0)
+        answers = answers_of(opened)
+        assert worklist(answers).changes == ()
+        opened.run(lambda store: setattr(store, "facts", facts))
+        assert worklist(answers).changes == ()
+        drive(opened, 600.0)
+        listed = worklist(answers)
+        known = {one.id: one.resistance for one in segments(answers).segments}
+        plain, since = (resistance(answers, repairs=repairs) for repairs in (False, True))
+    assert listed.changes == ()
+    assert all(row.before is None and row.saved_kwh_ph is None for row in listed.rows)
+    assert known["3_0_e"] == pytest.approx(0.04, rel=0.05)
+    np.testing.assert_array_equal(plain, since)
+
+
+def test_rows_say_since_when_and_what_was_before(repaired):
+    opened, then_ns = repaired
+    answers = answers_of(opened)
+    now, then = worklist(answers, target=0.01), worklist(answers, target=0.01, as_of_ns=then_ns)
+    changed = {change.id: change for change in now.changes}
+    assert {row.segment.id for row in now.rows} <= set(changed)
+    for row in now.rows:
+        assert row.since_ns == changed[row.segment.id].first_ns
+        assert row.before == pytest.approx(0.06, rel=0.1)
+        assert row.saved_kwh_ph == changed[row.segment.id].saved_kwh_ph > 0
+    for row in then.rows:
+        assert row.since_ns == START_NS // HOUR_NS * HOUR_NS
+        assert (row.before, row.saved_kwh_ph) == (None, None)
+
+
+def test_days_of_a_row_are_its_history(tmp_path):
+    day_ns = 24 * HOUR_NS
+    with closing(open_writer(tmp_path)) as opened:
+        first = 1
+        for day in range(4):
+            rows = passes(LINE, 2, 0.04 + 0.002 * day, seed=day, after_s=86_400.0 * day)
+            send(opened, [incoming(rows, first)])
+            first += len(rows)
+        row = worklist(answers_of(opened)).rows[0]
+    assert row.day_ns == tuple((START_NS // day_ns + day) * day_ns for day in range(4))
+    assert row.day_resistance == pytest.approx([0.04, 0.042, 0.044, 0.046], abs=5e-4)
+    assert row.segment.trend == pytest.approx(0.002, rel=0.15)
+
+
+def test_traffic_of_one_machine_on_the_roads_of_all(writer):
+    answers = answers_of(writer)
+    everything, alone = segments(answers), segments(answers, machine="a")
+    assert [one.id for one in alone.segments] == [one.id for one in everything.segments]
+    by_id = {one.id: one for one in everything.segments}
+    driven = [one for one in alone.segments if sum(one.passes_ph)]
+    assert {one.id.split("_")[1] for one in driven} == {"0"}
+    assert all(one.resistance == by_id[one.id].resistance for one in driven)
+    rows = worklist(answers, machine="b").rows
+    assert rows
+    assert not {row.segment.id for row in rows} & {one.id for one in driven}
+    then_ns = int(rows_of()["a"]["stamp_ns"].max())
+    assert worklist(answers, machine="b", as_of_ns=then_ns).rows == ()
+
+
+@pytest.mark.parametrize("ask", [segments, worklist])
+def test_an_unknown_machine_is_refused_by_name(writer, ask):
+    with pytest.raises(QueryError, match="machine `truck-9` has sent nothing") as refused:
+        ask(answers_of(writer), machine="truck-9")
+    assert refused.value.reason == Refusal.UNKNOWN_MACHINE
 
 
 def test_more_segments_than_an_answer_holds_are_refused_with_what_to_do(writer, monkeypatch):

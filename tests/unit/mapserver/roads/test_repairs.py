@@ -7,7 +7,7 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.fleet.correction import Correction, corrected
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.passes import PassTally
-from mapserver.roads.repairs import AGREE, BEFORE, repairs
+from mapserver.roads.repairs import AGREE, BEFORE, KNOWN_BY, Repair, ages, repairs
 from tests.unit.mapserver.roads.drives import START_NS, along, passes, roads
 
 LINE = along([(10, 10), (110, 10)])
@@ -125,3 +125,44 @@ def test_order_and_batches_do_not_matter():
 
 def test_nothing_driven_is_nothing_repaired():
     assert repairs(PassTally().passes(Ledgers(roads()))) == ([], 0)
+
+
+def test_ground_that_wears_is_compared_with_the_newest_passes():
+    """Half a percent more from pass to pass is no change; over all passes it would hide the repair in the end."""
+    worn = [0.02 * 1.005**i for i in range(2 * KNOWN_BY)]
+    repaired, looks = shown(fleet([*worn, 0.014, 0.014], noise=0.0))
+    assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
+    assert all(each.minute > START_NS // MINUTE_NS + 150 * len(worn) // 60 - 3 for each in repaired)
+    assert looks == 5 * (len(worn) + 2 - BEFORE - AGREE + 1)
+
+
+def cells_of(blocks):
+    """Columns and rows of all cells with an age, and the ages."""
+    places, begins = [], []
+    for (x, y), own in blocks.items():
+        at = np.flatnonzero(own)
+        places.append(np.stack([16 * x + at % 16, 16 * y + at // 16], axis=1))
+        begins.append(own[at])
+    return np.concatenate(places), np.concatenate(begins)
+
+
+@pytest.mark.parametrize("cell_m", [0.5, 1.0, 2.0])
+def test_a_change_begins_an_age_of_the_cells_of_its_segment_alone(cell_m):
+    beside = along([(10, 16), (110, 16)])
+    segments = roads(passes(LINE), passes(beside, seed=1))
+    at = segments.ids.index("2_0_e") if "2_0_e" in segments.ids else segments.ids.index("2_0_e.1")
+    line = segments.line(at)
+    places, begins = cells_of(ages(segments, [Repair(at, 10, 11, 0.04, 0.02)], cell_m))
+    middles = (places + 0.5) * cell_m
+    assert set(begins.tolist()) == {10 * MINUTE_NS}
+    assert np.abs(middles[:, 1] - line[:, 1].mean()).max() <= 3.5
+    assert middles[:, 0].min() == pytest.approx(line[:, 0].min(), abs=1.0)
+    assert middles[:, 0].max() == pytest.approx(line[:, 0].max(), abs=1.0)
+    assert len(places) * cell_m**2 == pytest.approx(25 * 6, rel=0.25)
+
+
+def test_the_newest_change_of_a_segment_counts_and_none_is_no_age():
+    segments = roads(passes(LINE))
+    changes = [Repair(1, minute, minute + 1, 0.04, 0.02) for minute in (30, 10)]
+    assert set(cells_of(ages(segments, changes, 1.0))[1].tolist()) == {30 * MINUTE_NS}
+    assert ages(segments, [], 1.0) == {}

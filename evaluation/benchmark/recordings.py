@@ -1,0 +1,154 @@
+"""The recordings of the benchmark: made from seeds, with the samples of this project's agents and published hashes."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from evaluation.campaign.experiment import Runner, replay_task
+from evaluation.campaign.figures import Row
+from evaluation.campaign.recordings import Setup
+from evaluation.fleet import drives
+from evaluation.fleet.drives import Agent, FleetDrive
+from protocol.arrays import Table
+from protocol.errors import ConfigError
+from protocol.files import write_whole
+from protocol.machine.samples import COLUMNS
+from sim.scenario.file import load_scenario
+
+HASHES = Path(__file__).parent / "hashes.json"  # of the recordings and of the samples, by name, as they were published
+SAMPLES_FILE = "samples.csv"
+MACHINE = "machine"  # column of a samples file before those of a sample
+NAMES = ("paper_site", "loading", "haul_road_driven")
+FIRST_SEED, SEEDS = 2000, 8  # nothing is developed or judged on these
+SECONDS = 600.0
+LOADERS = 4  # on the paper's site
+
+
+@dataclass(frozen=True)
+class BenchDrive(FleetDrive):
+    """One recording. It lies in a folder of its plain name: what it has to be, its hash says."""
+
+    @property
+    def name(self) -> str:
+        """For people, and of its folder."""
+        return f"{self.setup.scenario}-{self.seed}"
+
+    def folder(self, cache_dir: Path) -> Path:
+        """Where it lies."""
+        return cache_dir / self.name
+
+
+@dataclass(frozen=True)
+class Edition:
+    """What is recorded: so many seeds of each scenario, for so many seconds; world: over the scenarios'."""
+
+    names: Sequence[str] = NAMES
+    seeds: int = SEEDS
+    seconds: float = SECONDS
+    world: str | None = None
+
+    @property
+    def drives(self) -> list[BenchDrive]:
+        """All recordings."""
+        seeds = range(FIRST_SEED, FIRST_SEED + self.seeds)
+        return [self._drive(name, seed) for name in self.names for seed in seeds]
+
+    def _drive(self, name: str, seed: int) -> BenchDrive:
+        preset = load_scenario(name).fleet[0].preset
+        count = LOADERS if name == "paper_site" else 0
+        return BenchDrive(seed, self.seconds, preset, Setup(name, (), (), (), world=self.world), count)
+
+
+FULL = Edition()
+QUICK = Edition(("paper_site", "loading"), seeds=1, seconds=60.0, world="fast")
+
+
+def make(runner: Runner, edition: Edition) -> list[Row]:
+    """Record what is not recorded, and write the samples; a row per recording, with hashes and whether they are right.
+
+    is_published: whether both are those that were published; None where none were, as of a shorter edition.
+    """
+    planned = edition.drives
+    tasks = [(drive, replay_task(agent, drive)) for drive in planned for agent in _agents(drive)]
+    made = runner.run(drives.EXPERIMENT, [task for _, task in tasks])
+    rows = []
+    for drive in planned:
+        folder = drive.folder(runner.cache)
+        own = [each.samples for (other, _), each in zip(tasks, made, strict=True) if other == drive]
+        write_samples(folder / SAMPLES_FILE, dict(zip(machine_names(folder), own, strict=True)))
+        rows.append(_row(drive, folder, edition))
+    return rows
+
+
+def _agents(drive: FleetDrive) -> list[Agent]:
+    return [Agent(index, closed_tours=True) for index in range(drive.machines)]
+
+
+def machine_names(folder: Path) -> list[str]:
+    """The machines of a recording."""
+    return sorted(path.name for path in (folder / "logs").iterdir() if path.is_dir())
+
+
+def _row(drive: BenchDrive, folder: Path, edition: Edition) -> Row:
+    hashes = {"recording": recording_hash(folder), "samples": file_hash([folder / SAMPLES_FILE], folder)}
+    published = published_hashes().get(_edition_key(edition), {}).get(drive.name)
+    is_published = None if published is None else published == hashes
+    return {
+        "name": drive.name,
+        "machines": drive.machines,
+        "seconds": drive.seconds,
+        **hashes,
+        "published": is_published,
+    }
+
+
+def _edition_key(edition: Edition) -> str:
+    return f"{edition.seconds:g} s {edition.world or 'as scenarios have it'}"
+
+
+def published_hashes() -> dict[str, dict[str, dict[str, str]]]:
+    """Hashes of recording and samples, by edition and name."""
+    hashes: dict[str, dict[str, dict[str, str]]] = json.loads(HASHES.read_text(encoding="utf-8"))
+    return hashes
+
+
+def recording_hash(folder: Path) -> str:
+    """Of all readings and of the truth; a truth map by its numbers, since an archive has the time in it."""
+    parts = ("logs", "truth")
+    return file_hash((path for part in parts for path in (folder / part).rglob("*") if path.suffix != ".npz"), folder)
+
+
+def file_hash(files: Iterable[Path], folder: Path) -> str:
+    """SHA-256 of names and contents of files, the same in whatever order they come."""
+    total = hashlib.sha256()
+    for path in sorted(path for path in files if path.is_file()):
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        total.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
+    return total.hexdigest()
+
+
+# --- samples files ---------------------------------------------------------------------------------------------------
+
+
+def write_samples(path: Path, rows: Mapping[str, Table]) -> None:
+    """Write the samples of all machines as CSV, machine by machine, each number as short as it is exact."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([MACHINE, *COLUMNS])
+    for name, table in rows.items():
+        columns = [[str(value) for value in table[column]] for column in COLUMNS]
+        writer.writerows([name, *values] for values in zip(*columns, strict=True))
+    write_whole(path, text.getvalue().encode())
+
+
+def require_made(drive: BenchDrive, cache: Path) -> None:
+    """ConfigError where a recording is not there."""
+    folder = drive.folder(cache)
+    if not (folder / SAMPLES_FILE).is_file():
+        raise ConfigError(folder, "there is no such recording; make it with `sitegrid bench make`")

@@ -1,0 +1,1 @@
+"""The paper repeated: its tables and maps, and what this project makes of the same drives."""

@@ -1,0 +1,210 @@
+"""Road maps: roads, the tally of what drove on them, and the changes of their ground; now, and as of any time.
+
+The tally follows the journal; roads and changes are made as somebody asks, from the same version of the map.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapserver.evidence.fold_config import is_foldable, name_hash
+from mapserver.evidence.grid import Grid
+from mapserver.journal.facts import NO_FACTS, Facts
+from mapserver.journal.rows import Selection
+from mapserver.query.source import MapSource, MapState
+from mapserver.query.views import View, surroundings
+from mapserver.roads.ledger import Ledger, Ledgers
+from mapserver.roads.network import network
+from mapserver.roads.passes import PassTally
+from mapserver.roads.repairs import Repair, ages, repairs
+from mapserver.roads.segments import Segments, segments
+from mapserver.roads.skeleton import Pages, Skeletons
+from mapserver.roads.tally import HOUR_NS, Tally, slot
+from protocol.arrays import Ints, Table
+from protocol.errors import QueryError, Refusal, StoreError
+from protocol.machine.readings import MAX_STAMP_NS
+from protocol.queries.answers import MapVersion
+from protocol.site.geometry import BLOCK_CELLS, CellWindow
+
+LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older journals are not read for it
+
+
+@dataclass(frozen=True)
+class RoadMap:
+    """Roads of one version of the map, and the tally that goes with it.
+
+    pages: the evidence that the roads are of. changes: of the ground of segments, the newest first.
+    """
+
+    segments: Segments
+    ledgers: Ledgers
+    tally: Table
+    changes: tuple[Repair, ...]
+    pages: Pages
+    facts: Facts
+    version: MapVersion
+    stamp_ns: int
+
+    @cached_property
+    def ledger(self) -> Ledger:
+        """Of all hours that are remembered."""
+        return self.ledgers.ledger(self.tally, HOUR_NS)
+
+    def hours_with_driving(self, from_ns: int, to_ns: int) -> tuple[Ledger, float]:
+        """The ledger of hours that begin in from_ns <= time < to_ns, and how many: of the running one a part."""
+        whole = from_ns <= 0 and to_ns > self.stamp_ns
+        traffic = self.ledger if whole else self.ledgers.ledger(self.tally, HOUR_NS, from_ns, to_ns)
+        slots = np.unique(traffic.rows["slot"])
+        ends = np.minimum((slots + 1) * HOUR_NS, max(self.stamp_ns, 1))
+        return traffic, float(np.maximum(ends - slots * HOUR_NS, 0).sum() / HOUR_NS)
+
+    def since_ns(self) -> Ints:
+        """Since when (k,) the ground of segments is as it is: the last change, or the first hour with a measurement."""
+        rows = self.ledger.rows[self.ledger.rows["measured"] > 0]
+        out = np.zeros(len(self.segments.ids), np.int64)
+        known, first = np.unique(rows["segment"], return_index=True)  # by segment, then slot
+        out[known] = rows["slot"][first] * HOUR_NS
+        for segment, change in self.last_changes.items():
+            out[segment] = change.first_ns
+        return out
+
+    @cached_property
+    def last_changes(self) -> dict[int, Repair]:
+        """The last change of each segment that changed."""
+        return {change.segment: change for change in reversed(self.changes)}
+
+
+class Traffic:
+    """What drove, in sums by hour and by pass."""
+
+    def __init__(self) -> None:
+        self.tally, self.passes = Tally(), PassTally()
+
+    def add(self, rows: Table, names: NDArray[np.uint64]) -> None:
+        """As `Tally.add`."""
+        self.tally.add(rows, names)
+        self.passes.add(rows, names)
+
+
+class RoadMaps:
+    """Makes road maps of one source. For any thread; one at a time works."""
+
+    def __init__(self, source: MapSource) -> None:
+        self._source, self._cell_m, self._config = source, source.site.cell_m, source.config
+        self._lock = threading.Lock()
+        self._skeletons = Skeletons(self._cell_m)
+        self._made: RoadMap | None = None
+        self._begin("", NO_FACTS)
+
+    def _begin(self, store: str, facts: Facts) -> None:
+        """Follow the journal anew."""
+        self._traffic, self._followed, self._with = Traffic(), 0, (store, facts)
+
+    def read(self, as_of_ns: int | None = None, machine: str = "") -> RoadMap:
+        """The roads now or as of a time; machine: with its traffic alone. Raises QueryError."""
+        if machine and not self._source.run(lambda state: machine in state.machines()):
+            raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing")
+        try:
+            if as_of_ns is not None:
+                return self._as_of(as_of_ns, machine)
+            with self._lock:
+                roads = self._now()
+            return self._alone(roads, machine) if machine else roads
+        except StoreError as error:
+            raise QueryError(Refusal.STORE, str(error)) from None
+
+    def view(self, window: CellWindow, reach: int, as_of_ns: int | None) -> View:
+        """Evidence of a window and of `reach` blocks around, with the age of roads whose ground changed."""
+        roads, (left, bottom, right, top) = self.read(as_of_ns), _blocks_of(surroundings(window, reach))
+        near = {
+            block: pages
+            for block, pages in roads.pages.items()
+            if left <= block[0] <= right and bottom <= block[1] <= top
+        }
+        return View(near, roads.version, roads.stamp_ns, ages(roads.segments, roads.changes, self._cell_m))
+
+    def _now(self) -> RoadMap:
+        pages, version, facts, newest_ns = self._source.run(_all)
+        if self._made and self._made.version == version:
+            return self._made
+        if self._with != (version.store, facts):
+            self._begin(version.store, facts)
+        self._follow(self._traffic, facts, newest_ns, self._followed, version.row)
+        self._followed = version.row
+        ledgers = Ledgers(segments(network(self._skeletons.skeleton(pages))))
+        self._made = self._map(ledgers, self._traffic, pages, facts, version, newest_ns)
+        return self._made
+
+    def _as_of(self, as_of_ns: int, machine: str) -> RoadMap:
+        version, facts = self._source.run(lambda state: (state.version, state.facts))
+        traffic = Traffic()
+        with self._source.location.reader() as reader:
+            grid = self._source.past.grid_as_of(reader, as_of_ns, None, facts)
+        self._follow(traffic, facts, as_of_ns, 0, version.row, as_of_ns, machine)
+        pages = _pages(grid)
+        ledgers = Ledgers(segments(network(Skeletons(self._cell_m).skeleton(pages))))
+        return self._map(ledgers, traffic, pages, facts, version, as_of_ns)
+
+    def _alone(self, roads: RoadMap, machine: str) -> RoadMap:
+        """The same roads with the traffic of one machine; read from the journal, as nothing of it is kept apart."""
+        traffic = Traffic()
+        self._follow(traffic, roads.facts, roads.stamp_ns, 0, roads.version.row, machine=machine)
+        return self._map(roads.ledgers, traffic, roads.pages, roads.facts, roads.version, roads.stamp_ns)
+
+    def _follow(
+        self,
+        traffic: Traffic,
+        facts: Facts,
+        newest_ns: int,
+        after: int,
+        until: int,
+        to_ns: int = MAX_STAMP_NS,
+        machine: str = "",
+    ) -> None:
+        """Take journal rows after < row <= until into the traffic, of samples up to `to_ns`, of one machine or all."""
+        if after >= until:
+            return
+        begin_ns = max(0, newest_ns - LOOK_BACK_NS) // HOUR_NS * HOUR_NS
+        with self._source.location.reader() as reader:
+            selection = Selection.by(facts, begin_ns, to_ns)
+            for samples, names in self._source.past.samples(reader, selection, after, until):
+                wanted = is_foldable(samples, self._config.fold)
+                if machine:
+                    wanted &= names == np.uint64(name_hash(machine))
+                traffic.add(samples[wanted], names[wanted])
+
+    def _map(
+        self, ledgers: Ledgers, traffic: Traffic, pages: Pages, facts: Facts, version: MapVersion, stamp_ns: int
+    ) -> RoadMap:
+        """Put together; the look back is cut here, where it does not depend on when the journal was followed."""
+        table = traffic.tally.table()
+        first = max(0, stamp_ns - LOOK_BACK_NS) // HOUR_NS
+        table = table[slot(table["key"]) >= first]
+        changes, _ = repairs(traffic.passes.passes(ledgers, first * HOUR_NS))
+        newest_first = tuple(sorted(changes, key=lambda change: (-change.seen, change.segment)))
+        return RoadMap(ledgers.segments, ledgers, table, newest_first, pages, facts, version, stamp_ns)
+
+
+def _all(state: MapState) -> tuple[Pages, MapVersion, Facts, int]:
+    return _pages(state.grid), state.version, state.facts, state.newest_ns
+
+
+def _pages(grid: Grid) -> Pages:
+    bounds = grid.bounds()
+    if bounds is None:
+        return {}
+    west, south, east, north = bounds
+    blocks = grid.blocks_in(CellWindow(west, south, east - west, north - south))
+    return dict(zip(blocks, grid.pages(blocks), strict=True))
+
+
+def _blocks_of(window: CellWindow) -> tuple[int, int, int, int]:
+    """First and last column and row of the blocks of a window that begins and ends with blocks."""
+    n = BLOCK_CELLS
+    left, bottom = window.column // n, window.row // n
+    return left, bottom, left + window.columns // n - 1, bottom + window.rows // n - 1

@@ -1,0 +1,72 @@
+"""Lines cut at the lattice: pieces hang together, none is a sliver where it has a neighbour, nothing is lost."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mapserver.roads.cutting import LATTICE_M, LEAST_M, SLIVER_M, cut, gathered
+
+
+def edges(*lines):
+    points = np.concatenate([np.array(line, float) for line in lines])
+    return points, np.cumsum([0, *map(len, lines)])
+
+
+def walk(seed, count=120):
+    """A line of cells' middles that turns slowly."""
+    draw = np.random.default_rng(seed)
+    heading = np.cumsum(draw.normal(0, 0.1, count)) + draw.uniform(0, 6)
+    return 0.5 + np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pieces_share_their_ends_and_cover_the_line(seed):
+    points, ends = edges(walk(seed), walk(seed + 100, 40))
+    line, pieces = cut(points, ends, np.array([[1, 2], [2, 3]]))
+    for edge, (first, end) in enumerate(pairwise(ends)):
+        own = pieces[(pieces[:, 0] >= first) & (pieces[:, 0] < end)]
+        assert (own[0, 0], own[-1, 1]) == (first, end - 1)
+        np.testing.assert_array_equal(own[1:, 0], own[:-1, 1])
+        np.testing.assert_array_equal(line[[first, end - 1]], points[[first, end - 1]])  # ends stay
+        assert own[0, 2] == edge + 1
+        assert own[-1, 3] == edge + 2
+        assert (own[1:, 2] == -1).all()
+        assert (own[:-1, 3] == -1).all()
+        lengths = [np.hypot(*np.diff(line[a : b + 1], axis=0).T).sum() for a, b in own[:, :2]]
+        assert len(own) == 1 or min(lengths) >= SLIVER_M
+
+
+def test_a_cut_is_where_the_line_enters_another_cell():
+    line, pieces = cut(*edges([(x + 0.5, 10.5) for x in range(100)]), np.array([[0, 1]]))
+    np.testing.assert_array_equal(line[pieces[1:, 0], 0], [25.5, 50.5, 75.5])
+
+
+def test_a_ring_begins_at_a_cut_and_touches_no_node():
+    turns = np.linspace(0, 2 * np.pi, 251)
+    ring = 100 + 40 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    ring[-1] = ring[0]
+    line, pieces = cut(*edges(ring), np.array([[5, 5]]))
+    assert (pieces[:, 2:] == -1).all()
+    np.testing.assert_array_equal(line[pieces[0, 0]], line[pieces[-1, 1]])
+    start = np.floor(line[pieces[0, 0]] / LATTICE_M)
+    assert (start != np.floor(line[pieces[-1, 1] - 1] / LATTICE_M)).any()
+    assert np.hypot(*(line - 100).T) == pytest.approx(40, abs=0.5)
+
+
+def test_what_is_shorter_than_a_machine_is_nothing():
+    _, pieces = cut(*edges([(0.5, 0.5), (0.5 + LEAST_M - 1, 0.5)], [(50, 0), (90, 0)]), np.zeros((2, 2), np.int64))
+    assert pieces[:, :2].tolist() == [[2, 3]]
+
+
+def test_no_edges_are_no_pieces():
+    line, pieces = cut(np.zeros((0, 2)), np.zeros(1, np.int64), np.zeros((0, 2), np.int64))
+    assert (line.shape, pieces.shape) == ((0, 2), (0, 4))
+
+
+def test_lines_are_turned_round_and_measured():
+    points = np.array([(0.0, 0.0), (3.0, 4.0), (3.0, 5.0)])
+    lines, ends, length_m = gathered(points, np.array([0, 1]), np.array([2, 2]), np.array([True, False]))
+    assert lines.tolist() == [[3, 5], [3, 4], [0, 0], [3, 4], [3, 5]]
+    assert ends.tolist() == [0, 3, 5]
+    assert length_m.tolist() == [6.0, 1.0]
