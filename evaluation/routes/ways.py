@@ -20,7 +20,7 @@ from protocol.queries.routing import RouteMachine
 from sim.truth import TruthMap
 
 SIZE = 150  # cells to a side
-HILLS_M, HILL_CELLS, PATCH_CELLS = 6.0, 20.0, 8.0  # of drawn maps: standard deviation of heights, sizes
+HILLS_M, HILL_CELLS, PATCH_CELLS = 2.0, 20.0, 8.0  # of drawn maps: heights' deviation (slopes of 10 %), sizes
 SAND, WET, GRAVEL, PAVED = 0.25, 0.06, 0.03, 0.012
 MARGIN = 15  # cells between ends and the edge of a map
 UNKNOWN = 0.38  # share of a map

@@ -153,9 +153,8 @@ class Answers:
         """Layers of the cells that positions lie in."""
         names, places = _names(query), np.array(query.places)
         cells = self._site.geometry.cell_of(places)
-        newer, *others = (
-            self._look_at_cells(cells, names, as_of_ns, repairs=query.when.repairs) for as_of_ns in query.when.times
-        )
+        times, repairs = query.when.times, query.when.repairs
+        newer, *others = (self._look_at_cells(cells, names, as_of_ns, repairs=repairs) for as_of_ns in times)
         layers, look = {name: newer[0][name] for name in names}, newer[1]
         version = look.version
         for older, its_look in others:
@@ -235,7 +234,7 @@ class Answers:
         return Reading(window, names, tuple(looks))
 
     def _look_at_cells(
-        self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool = False
+        self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
     ) -> tuple[dict[str, Floats32], Look]:
         """Layers (n,) of cells (n, 2), columns and rows, and what they were read from."""
         if as_of_ns is None and not repairs:

@@ -137,7 +137,8 @@ class Routes:
         known = measured | (driven & measured.any())
         if (unmeasured := known & ~measured).any():
             resistance = np.where(unmeasured, _nearest(resistance, measured), resistance)
-        cost = query.unknown if isinstance(query.unknown, float) else dearest(resistance)
+        # whoever chooses a way must not choose what nobody knows: it may be as steep as it may be soft
+        cost = query.unknown if isinstance(query.unknown, float) else dearest(resistance + np.hypot(east, north))
         if not known.any() and isinstance(query.unknown, str):
             raise _refusal("nobody has driven near these places yet: give `unknown` a resistance")
         crawl = machine.power_w / (machine.mass_kg * GRAVITY_MPS2 * machine.speed_mps)

@@ -150,9 +150,8 @@ def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Ans
 
 def _points(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
     when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
-    answer = client.points(
-        _places_of(arguments.places), layers, **when, repairs=arguments.repairs, after=arguments.after
-    )
+    rest = {"repairs": arguments.repairs, "after": arguments.after}
+    answer = client.points(_places_of(arguments.places), layers, **when, **rest)
     places = {"x_m": answer.x_m.tolist(), "y_m": answer.y_m.tolist()}
     table = {**places, **{name: values.tolist() for name, values in answer.layers.items()}, **_version(answer)}
     rows = (
