@@ -91,7 +91,7 @@ def ask(link: zenoh.Session, selector: str, payload: bytes | None = None) -> lis
     """All replies to a query."""
     replies = list(link.get(selector, payload=payload, timeout=ANSWER_S))
     if not replies or any(reply.ok is None for reply in replies):
-        problems = [reply.err.payload.to_string() for reply in replies if reply.err is not None]
+        problems = [reply.err.payload.to_bytes() for reply in replies if reply.err is not None]
         raise RuntimeError(f"{selector}: {problems or 'no answer'}")
     return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 

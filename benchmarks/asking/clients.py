@@ -109,7 +109,7 @@ def main() -> None:
     turns = max(1, round(seconds / EVERY_S))
     chosen = draw.choice(list(MIX), (CLIENTS, turns), p=shares).tolist()
     plans = [[pool[name][int(draw.integers(CLIENTS))] for name in names] for names in chosen]
-    took_ms: list[float] = []
+    took_ms, refused = list[float](), list[str]()
     with ExitStack() as opened:
         links = [opened.enter_context(session(endpoint)) for _ in range(CLIENTS)]
         print(json.dumps({"ready": CLIENTS}), flush=True)
@@ -120,8 +120,12 @@ def main() -> None:
                 due_s = start_s + EVERY_S * (turn + number / CLIENTS)
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 began_s = time.monotonic()
-                _ask(links[number], query)
-                took_ms.append(1e3 * (time.monotonic() - began_s))
+                try:
+                    _ask(links[number], query)
+                except RuntimeError:  # refused: too many wait
+                    refused.append(query.name)
+                else:
+                    took_ms.append(1e3 * (time.monotonic() - began_s))
 
         threads = [threading.Thread(target=client, args=(number,)) for number in range(CLIENTS)]
         for thread in threads:
@@ -129,7 +133,7 @@ def main() -> None:
         for thread in threads:
             thread.join()
     p50, p99 = np.percentile(took_ms, (50, 99)).tolist()
-    print(json.dumps({"answers": len(took_ms), "ms_p50": p50, "ms_p99": p99}))
+    print(json.dumps({"answers": len(took_ms), "refused": len(refused), "ms_p50": p50, "ms_p99": p99}))
 
 
 def _ask(link: zenoh.Session, query: MapQuery) -> None:
