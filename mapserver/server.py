@@ -22,6 +22,7 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal import records
 from mapserver.journal.location import JournalLocation
 from mapserver.past.past import Past
+from mapserver.query import road_maps, routes
 from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.answering import Answers
 from mapserver.query.journal_queryable import JournalQueryable
@@ -167,7 +168,9 @@ class Server:
 
 
 def warm_up(config: ServerConfig) -> None:
-    """Have all kernels that ingest needs, before the first batch."""
+    """Have all kernels, before the first batch and the first question."""
     grid.warm_up(config.fold)
     batches.warm_up()
     records.warm_up()
+    road_maps.warm_up(config.fold)
+    routes.warm_up()

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.evidence.fold_config import is_foldable, name_hash
+from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.rows import Selection
@@ -28,6 +28,7 @@ from mapserver.roads.tally import HOUR_NS, Tally, slot
 from protocol.arrays import Ints, Table
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.machine.readings import MAX_STAMP_NS
+from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
@@ -208,3 +209,18 @@ def _blocks_of(window: CellWindow) -> tuple[int, int, int, int]:
     n = BLOCK_CELLS
     left, bottom = window.column // n, window.row // n
     return left, bottom, left + window.columns // n - 1, bottom + window.rows // n - 1
+
+
+def warm_up(config: FoldConfig) -> None:
+    """Compile the kernels of roads, or read them from their cache, before somebody who asks waits for them."""
+    rows = np.zeros(3 * 160, SAMPLE_DTYPE)  # three passes along 80 m, which are a road
+    rows["x_m"], rows["distance_m"], rows["speed_mps"] = np.tile(np.arange(160) / 2, 3), 0.5, 5.0
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.25
+    rows["c_rr"], rows["c_rr_var"], rows["mass_kg"] = 0.02, 1e-6, 1e4
+    rows["stamp_ns"] = HOUR_NS + np.repeat(np.arange(3), 160) * 10**11 + np.tile(np.arange(160), 3) * 10**8
+    grid, traffic = Grid(1.0, config), Traffic()
+    grid.fold(rows, "")
+    traffic.add(rows, np.full(len(rows), name_hash(""), np.uint64))
+    ledgers = Ledgers(segments(network(Skeletons(1.0).skeleton(_pages(grid)))))
+    ledgers.ledger(traffic.tally.table(), HOUR_NS)
+    repairs(traffic.passes.passes(ledgers, 0))

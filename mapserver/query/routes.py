@@ -224,3 +224,12 @@ def _steepness(terrain: Terrain) -> Floats:
 
 def _refusal(problem: str) -> QueryError:
     return QueryError(Refusal.OUT_OF_RANGE, problem)
+
+
+def warm_up() -> None:
+    """Compile the kernels of routes, or read them from their cache, before somebody who asks waits for them."""
+    resistance, level = np.full((8, 8), 0.02), np.zeros((8, 8))
+    terrain = Terrain(resistance, level, level, resistance > 0, 1.0)
+    least_cost_line(terrain, (0, 0), (7, 5))
+    ground = {name: resistance.astype(np.float32) for name in LAYERS}
+    route(np.array([[1.0, 1.0], [7.0, 7.0]]), Squares.stacked(1.0, 8, {(0, 0): ground}), RouteMachine())
