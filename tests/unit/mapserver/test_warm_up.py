@@ -31,10 +31,8 @@ with tempfile.TemporaryDirectory() as folder, closing(open_writer(Path(folder)))
     send(writer, [incoming(passes(along([(110, 10), (110, 90)]), 6, 0.05), machine="b")])
     answers = answers_of(writer)
     line = ((12.0, 10.0), (150.0, 10.0))
-    for name, query in (
-        ("segments", SegmentsQuery()), ("worklist", WorklistQuery()), ("route", RouteQuery(line)), ("way", WayQuery(*line))
-    ):
-        answered(answers, name, encode_query(query))
+    for query in (SegmentsQuery(), WorklistQuery(), RouteQuery(line), WayQuery(*line)):
+        answered(answers, query.name, encode_query(query))
 print(json.dumps([before, sorted(set(ready()))]))
 """
 
