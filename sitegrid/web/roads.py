@@ -42,6 +42,7 @@ DRIVE = {
     "stops": "begin, end, begin,end or none",
     "step": "length of the steps that are answered [m]",
     "unknown": "ground that nobody knows: dearest, refuse or a resistance",
+    "repairs": "1: roads whose ground changed, from the samples since (default); 0: from all samples",
     **AS_OF,
 }
 ROUTE = {"line": "x,y;x,y;... [m], two places or more", **DRIVE}
