@@ -286,7 +286,7 @@ def test_a_route_is_of_the_road_as_it_is_since_its_repair(repaired):
     since, plain, then = drive(answers), drive(answers, repairs=False), drive(answers, as_of_ns=then_ns)
     assert since.steps.resistance == pytest.approx(0.02, rel=0.1)
     assert then.steps.resistance == pytest.approx(0.06, rel=0.1)
-    assert since.totals.energy_j < 0.8 * plain.totals.energy_j < 0.8 * then.totals.energy_j
+    assert since.totals.energy_j < 0.8 * plain.totals.energy_j
     assert since.version.row == worklist(answers).merged
     way = WayQuery((15.0, 10.0), (205.0, 10.0))
     cheapest = decode_answer(answered(answers, "way", encode_query(way)))
