@@ -31,7 +31,7 @@ from mapserver.evidence.timeline import Block, evidence
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.source import MapState
-from mapserver.query.views import StillGrid, StillMap, View, place
+from mapserver.query.views import StillMap, View, place
 from protocol.arrays import AnyArray, Floats, Floats32, Ints
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -120,7 +120,7 @@ class BlockLayers:
     ) -> Look:
         """Layers of cells in a rectangle of blocks, or in some of it only, and of areas in squares that touch it."""
         grid, margin = state.grid, self._margin(area_names)
-        ages, owner = (state.ages, grid.grid) if isinstance(grid, StillGrid) else ({}, ref(grid))
+        ages, owner = (state.ages, state.grid.grid) if isinstance(state, StillMap) else ({}, ref(state.grid))
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
         own = dict(zip(blocks := grid.blocks_in(_cells_of(wide)), grid.last_turns(blocks), strict=True))
