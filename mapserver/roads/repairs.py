@@ -71,7 +71,7 @@ def repairs(passes: Passes) -> tuple[list[Repair], int]:
 
 @numba.njit(cache=True, nogil=True)
 def _cuts(c_rr: Any, machine: Any, bounds: Any) -> tuple[Any, int]:
-    """Of each change (n, 4): the first pass before it, the first after it, the one that showed it, the end of all after.
+    """Of each change (n, 4): first pass before it, first after it, the one that showed it, end of all after.
 
     bounds: where the passes of each segment begin, and the end of all. Also how many passes were looked at.
     """

@@ -299,16 +299,16 @@ def test_repaired_routes_are_equal_to_the_bit_wherever_they_are_made(tmp_path):
     bad = {name: passes(LINE, 4, 0.06, seed=i, after_s=30.0 * i) for i, name in enumerate("ab")}
     asked = encode_query(RouteQuery(((15.0, 10.0), (205.0, 10.0))))
     with closing(open_writer(tmp_path)) as opened:
-        answers, told = answers_of(opened), set()
+        answers, made = answers_of(opened), set()
         for part in (bad, good):
             for name, rows in part.items():
                 first = 1 if part is bad else 1 + len(bad[name])
                 for at in range(0, len(rows), 100):
                     send(opened, [incoming(rows[at : at + 100], first + at, machine=name)])
-                told.add(answered(answers, "route", asked))
+                made.add(answered(answers, "route", asked))
         now = answered(answers, "route", asked)
         assert now == answered(answers_of(opened), "route", asked)
-    assert len(told) == 4
+    assert len(made) == 4
     with closing(open_writer(tmp_path)) as again:
         assert answered(answers_of(again), "route", asked) == now
 
