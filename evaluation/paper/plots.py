@@ -267,7 +267,7 @@ def draw_reliability(forecasts: Sequence[Row]) -> Figure:
         head(column[0], " ".join(site), 9)
         column[0].set(xlim=(0, 1), ylim=(0, 1.02), ylabel="share that is right")
         column[1].set(xlim=(0, 1), yscale="log", ylabel="cells", xlabel="confidence")
-        column[0].legend(loc="upper left")
+        column[0].legend(loc="lower right")  # who is sure and wrong is rare
     head(
         figure, "Reliability over driven cells, all seeds; on the dotted line confidence is what is right", 9, "normal"
     )

@@ -13,7 +13,7 @@ from mapserver.journal.facts import NO_FACTS
 from mapserver.query.block_layers import BlockLayers
 from mapserver.query.routes import Routes
 from mapserver.routes.ground import Squares
-from mapserver.routes.route import LAYERS, SURE_VISITS
+from mapserver.routes.route import LAYERS
 from protocol.arrays import Floats32, Table
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
@@ -62,7 +62,7 @@ def true_squares(truth: TruthMap) -> Squares:
         "resistance_filled": square(truth.c_rr),
         "grade_east_filled": square(truth.grade_east),
         "grade_north_filled": square(truth.grade_north),
-        "visits": square(SURE_VISITS),
+        "visits": square(1.0),
         "confidence": square(1.0),
     }
     if (truth.west_m, truth.south_m) != (0.0, 0.0):

@@ -28,6 +28,14 @@ LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # betw
 GRADE_STEP = float(ev.GRADE_CENTRES[1] - ev.GRADE_CENTRES[0])
 MAX_REACH_M = 50.0  # every window is widened by it, and its kernel has its square of cells
 SURE_AXIS = 0.2  # least length of the mean axis, 0 to 1, that is a preferred one
+# What all votes of a cell err in alike, so that more of them do not take it off (docs/layers.md): of c_rr, what is left
+# of zeros after calibration [-], and what the balance of forces leaves out, as a share; of the gradient, unevenness that
+# a machine bridges and sensors that lag [m/m], and how machines sit on slopes, as a share of the slope.
+ZERO_STD, MODEL_SHARE = 0.0025, 0.05
+UNEVEN_STD, SLOPE_SHARE = 0.0055, 0.05
+# Votes of one drive repeat each other, but those for two kinds of ground are mostly a place error of the fewer: shares to
+# this power are as often right as they say.
+SHARPNESS = 1.5
 
 
 @dataclass(frozen=True)
@@ -99,8 +107,11 @@ def resistance(cells: CellEvidence) -> Floats:
 
 
 def resistance_std(cells: CellEvidence) -> Floats:
-    """Standard deviation of the votes for c_rr [-], without the spread that binning adds."""
-    return resistance(cells) * LOG_STEP * robust_spread(cells.votes(ev.RESISTANCE))
+    """Standard deviation of `resistance` [-]: what votes differ by, and what they err in alike."""
+    c_rr = resistance(cells)
+    spread = c_rr * LOG_STEP * robust_spread(cells.votes(ev.RESISTANCE))
+    deviation: Floats = np.sqrt(spread**2 + ZERO_STD**2 + (MODEL_SHARE * c_rr) ** 2)
+    return deviation
 
 
 def resistance_class(cells: CellEvidence) -> Floats:
@@ -110,9 +121,10 @@ def resistance_class(cells: CellEvidence) -> Floats:
 
 
 def confidence(cells: CellEvidence) -> Floats:
-    """Share of the votes that the leading ground class has."""
+    """How likely the leading ground class is right: its share of all classes' votes, each to the power SHARPNESS."""
     votes = _class_votes(cells)
-    return ratio(votes.max(axis=-1), votes.sum(axis=-1))
+    sharp = (votes / np.maximum(votes.sum(axis=-1, keepdims=True), 1.0)) ** SHARPNESS
+    return ratio(sharp.max(axis=-1), sharp.sum(axis=-1))
 
 
 def grade_east(cells: CellEvidence) -> Floats:
@@ -131,9 +143,11 @@ def grade(cells: CellEvidence) -> Floats:
 
 
 def grade_std(cells: CellEvidence) -> Floats:
-    """Standard deviation of the votes for one component of the gradient [m/m]: root mean square of the two."""
+    """Standard deviation of one component of the gradient [m/m], root mean square of the two, as `resistance_std`."""
     east, north = (robust_spread(cells.votes(part)) for part in (ev.GRADE_EAST, ev.GRADE_NORTH))
-    return GRADE_STEP * np.hypot(east, north) / math.sqrt(2)
+    spread = GRADE_STEP * np.hypot(east, north) / math.sqrt(2)
+    deviation: Floats = np.sqrt(spread**2 + UNEVEN_STD**2 + (SLOPE_SHARE * grade(cells)) ** 2)
+    return deviation
 
 
 def slope_class(cells: CellEvidence) -> Floats:

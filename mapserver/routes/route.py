@@ -25,7 +25,6 @@ LAYERS = (
     "confidence",
 )
 STEP_M = 1.0  # of the drive; what is answered is of longer ones
-SURE_VISITS = 10.0  # more passes over a cell do not make its value surer: what they err in is the same
 ALIKE_M = 25.0  # over so much way errors of the map are alike: positions, and what a machine's estimator lags behind
 COMMON_STD = 0.001  # what calibration leaves in the zeros of machines, the same everywhere [-]
 UNKNOWN_STD = 0.5  # of the resistance of unknown ground, as a share of it
@@ -41,14 +40,16 @@ NINETY = 1.645  # standard deviations to each side that hold 90 %
 class Ground:
     """The ground along n steps.
 
-    resistance, slope (n,): along, with what they are taken for where they are not known; their deviations; confidence:
-    NaN where unknown; unknown: nobody was there; unmeasured: machines were, and none could tell the resistance.
+    resistance, slope (n,): along, with what they are taken for where they are not known; their deviations, and that of
+    their sum; confidence: NaN where unknown; unknown: nobody was there; unmeasured: machines were, and none could tell
+    the resistance.
     """
 
     resistance: Floats
     slope: Floats
     resistance_std: Floats
     slope_std: Floats
+    sum_std: Floats
     confidence: Floats
     unknown: Bools
     unmeasured: Bools
@@ -75,12 +76,16 @@ def ground_along(squares: Squares, cut: Steps, unknown_resistance: float | None)
         unknown_resistance = dearest(squares.layers["resistance_filled"])
         if unknown.all() or not np.isfinite(unknown_resistance):
             raise QueryError(Refusal.OUT_OF_RANGE, "nobody has driven near this line yet: say what `unknown` ground is")
-    passes = np.sqrt(np.clip(np.nan_to_num(along["visits"], nan=1.0), 1.0, SURE_VISITS))
+    std = np.where(unknown, UNKNOWN_STD * unknown_resistance, std)
+    slope_std = np.where(flat, UNKNOWN_SLOPE_STD, along["grade_filled_std"])
+    # machines measure the force that both together take: a resistance is wrong by as much as a slope, the other way
+    alone = unknown | unmeasured | flat | ~np.isfinite(along["visits"])
     return Ground(
         resistance=np.where(unknown, unknown_resistance, resistance),
         slope=np.where(flat, 0.0, slope),
-        resistance_std=np.where(unknown, UNKNOWN_STD * unknown_resistance, np.where(unmeasured, std, std / passes)),
-        slope_std=np.where(flat, UNKNOWN_SLOPE_STD, along["grade_filled_std"] / passes),
+        resistance_std=std,
+        slope_std=slope_std,
+        sum_std=np.where(alone, np.hypot(std, slope_std), std),
         confidence=np.where(unknown, np.nan, along["confidence"]),
         unknown=unknown,
         unmeasured=unmeasured,
@@ -143,7 +148,7 @@ def route(
             f"the machine cannot climb at {x:.0f}, {y:.0f} m: resistance and slope make {climbs:.1f} % of its weight"
         )
         raise QueryError(Refusal.OUT_OF_RANGE, f"{problem}; more `power`, less `mass` or another line")
-    off = NINETY * mean_std(np.hypot(ground.resistance_std, ground.slope_std), cut.length_m)
+    off = NINETY * mean_std(ground.sum_std, cut.length_m)
     low, high = (drive(cut.length_m, resistance + by, slope, limit, machine) for by in (-off, off))
     return _by_step(cut, ground, done, step_m), _totals(cut, ground, machine, done, (low, high))
 

@@ -70,7 +70,7 @@ export const LAYERS = [
     colour: (v) => ink(1 - Math.log(1 + v / 10) / Math.log(8641)), at: (v) => Math.log(1 + v / 10) / Math.log(8641), text: ago,
     ticks: [[0, "now"], [0.215, "1 min"], [0.65, "1 h"], [1, "1 d"]],
     change: [(now, then) => Math.sign(now - then) * Math.log(1 + Math.abs(now - then) / 10) / Math.log(361), "1 h fresher", "1 h older"] },
-  { id: "confidence", name: "Confidence", unit: "agreeing votes", key: "5", fades: null,
+  { id: "confidence", name: "Confidence", unit: "likely right", key: "5", fades: null,
     colour: (v) => ink((v - 0.3) / 0.7), at: (v) => (v - 0.3) / 0.7, text: (v) => percent(v, 0), ticks: [[0, "30 %"], [0.43, "60 %"], [1, "100 %"]],
     change: [(now, then) => (now - then) / 0.5, "−50 %", "+50 %"] },
 ];

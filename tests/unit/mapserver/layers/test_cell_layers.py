@@ -6,7 +6,19 @@ import pytest
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.layers.cell_layers import LAYERS, ReadConfig, derive_area, margin_cells, read, required, select
+from mapserver.layers.cell_layers import (
+    LAYERS,
+    MODEL_SHARE,
+    SLOPE_SHARE,
+    UNEVEN_STD,
+    ZERO_STD,
+    ReadConfig,
+    derive_area,
+    margin_cells,
+    read,
+    required,
+    select,
+)
 from mapserver.layers.gap_filling import AREA_LAYERS
 from protocol.config import from_table
 from protocol.errors import ConfigError, QueryError, Refusal
@@ -16,6 +28,7 @@ from tests.unit.mapserver.data import NOW_NS, folded, samples
 CELL = 8 * 16 + 8  # of the usual sample in its block
 RESISTANCE_LAYERS = ("resistance", "resistance_std", "resistance_class", "confidence")
 LOG_STEP = np.log(100) / 23  # between resistance bins
+THIRD = 1 / 3 / (32 * np.sqrt(2))  # of a bin of the gradient, root mean square of two components of which one is zero
 EXACT = {"cov_xx_m2": 0.0, "cov_yy_m2": 0.0}
 
 
@@ -61,9 +74,21 @@ def test_class_is_that_of_the_zone_and_sure(index, zone):
     assert value(grid, "confidence") > 0.85
 
 
-def test_confidence_is_the_share_of_the_leading_class():
-    grid = folded(samples(100, c_rr=[0.25] * 70 + [0.008] * 30, distance_m=10.0))
-    assert value(grid, "confidence") == pytest.approx(0.7, abs=0.001)
+def deviation(c_rr: float, spread: float) -> float:
+    """Of c_rr, whose votes spread so much in their logarithm."""
+    return float(np.sqrt((spread * c_rr) ** 2 + ZERO_STD**2 + (MODEL_SHARE * c_rr) ** 2))
+
+
+def grade_deviation(grade: float, spread: float) -> float:
+    return float(np.sqrt(spread**2 + UNEVEN_STD**2 + (SLOPE_SHARE * grade) ** 2))
+
+
+@pytest.mark.parametrize(("share", "likely"), [(0.7, 0.781), (0.9, 0.964), (1.0, 1.0)])
+def test_confidence_is_the_sharpened_share_of_the_leading_class(share, likely):
+    """0.7^1.5 / (0.7^1.5 + 0.3^1.5) is 0.781."""
+    leading = round(100 * share)
+    grid = folded(samples(100, c_rr=[0.25] * leading + [0.008] * (100 - leading), distance_m=10.0))
+    assert value(grid, "confidence") == pytest.approx(likely, abs=0.001)
     assert value(grid, "resistance_class") == 4
 
 
@@ -79,7 +104,7 @@ def test_boundaries_of_the_read_options_make_the_classes():
     assert value(grid, "resistance_class", ReadConfig(boundaries=(0.1,))) == 0
     assert value(grid, "resistance_class", ReadConfig(boundaries=(0.005, 0.006, 0.007, 0.01, 0.02, 0.03))) == 6
     assert value(grid, "confidence", ReadConfig(boundaries=(0.1,))) == pytest.approx(1.0, abs=1e-6)
-    assert value(grid, "confidence", ReadConfig(boundaries=(0.02,))) == pytest.approx(0.6, abs=1e-3)
+    assert value(grid, "confidence", ReadConfig(boundaries=(0.02,))) == pytest.approx(0.6475, abs=1e-3)
 
 
 @pytest.mark.parametrize("boundaries", [(), (0.03, 0.03), (0.05, 0.03), (0.0, 0.03), (-0.1, 0.03), (float("nan"),)])
@@ -112,11 +137,17 @@ def test_noise_does_not_bias_the_gradient(start, noise):
 
 
 @pytest.mark.parametrize("start", np.linspace(0, 1, 7))
-def test_votes_that_agree_have_no_spread(start):
+@pytest.mark.parametrize("count", [30, 600])
+def test_votes_that_agree_err_in_what_they_have_in_common_however_many_they_are(start, count):
     c_rr = 0.03 * np.exp(start * LOG_STEP)
-    grid = folded(samples(30, c_rr=c_rr, grade_e=start / 32, grade_n=-start / 32, distance_m=10.0))
-    assert value(grid, "resistance_std") < 0.05 * LOG_STEP * c_rr
-    assert value(grid, "grade_std") < 0.05 / 32
+    grid = folded(samples(count, c_rr=c_rr, grade_e=start / 32, grade_n=-start / 32, distance_m=10.0))
+    assert value(grid, "resistance_std") == pytest.approx(deviation(c_rr, 0.0), rel=0.01)
+    assert value(grid, "grade_std") == pytest.approx(grade_deviation(start / 32 * np.sqrt(2), 0.0), rel=0.03)
+
+
+def test_a_zero_of_the_machines_is_a_larger_share_of_firm_ground():
+    stds = [value(folded(samples(30, c_rr=c_rr)), "resistance_std") / c_rr for c_rr in (0.008, 0.04, 0.25)]
+    assert stds == pytest.approx([0.316, 0.080, 0.051], abs=0.003)
 
 
 @pytest.mark.parametrize("start", [0.0, 0.25, 0.5, 0.75])
@@ -131,15 +162,16 @@ def test_noise_of_the_votes_is_their_spread(start, noise_bins):
     }
     grid = folded(samples(3000, **columns))
     c_rr = 0.03 * np.exp(LOG_STEP * start)
-    assert value(grid, "resistance_std") == pytest.approx(noise_bins * LOG_STEP * c_rr, rel=0.07)
-    assert value(grid, "grade_std") == pytest.approx(noise_bins / 32, rel=0.05)
+    assert value(grid, "resistance_std") == pytest.approx(deviation(c_rr, noise_bins * LOG_STEP), rel=0.07)
+    slope = np.hypot(start, 2 + start) / 32
+    assert value(grid, "grade_std") == pytest.approx(grade_deviation(slope, noise_bins / 32), rel=0.05)
 
 
 @pytest.mark.parametrize("start", [0.0, 0.25, 0.5])
 def test_noise_below_a_third_of_a_bin_reads_as_no_more_than_that(start):
     z = np.random.default_rng(8).normal(size=2000)
     grid = folded(samples(2000, grade_e=(start + 0.15 * z) / 32, grade_n=0.0))
-    assert value(grid, "grade_std") * np.sqrt(2) * 32 < 1 / 3
+    assert value(grid, "grade_std") < grade_deviation(start / 32, THIRD)
 
 
 def test_a_minority_does_not_widen_the_spread():

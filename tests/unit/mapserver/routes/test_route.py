@@ -79,6 +79,19 @@ def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
     assert unsure.energy_high_j - unsure.energy_low_j > 2 * (sure.energy_high_j - sure.energy_low_j)
 
 
+def test_a_slope_that_is_wrong_is_a_resistance_that_is_wrong_the_other_way() -> None:
+    """Where both were measured; a slope of neighbours has nothing to do with the resistance of neighbours."""
+    ahead, width = line((10, 10), (170, 130)), {}
+    for name, visits, slope_std in (("sure", 4.0, 0.0), ("measured", 4.0, 0.02), ("filled", np.nan, 0.02)):
+        ground = fields(0.03)
+        ground.layers["visits"][:] = visits
+        ground.layers["grade_filled_std"][:] = slope_std
+        totals = route(ahead, ground, SLOW)[1]
+        width[name] = totals.energy_high_j - totals.energy_low_j
+    assert width["sure"] == width["measured"]
+    assert width["filled"] > 1.5 * width["measured"]
+
+
 def test_errors_along_a_line_average_out_but_not_over_short_stretches() -> None:
     std, step = np.full(2000, 0.01), np.full(2000, 1.0)
     assert mean_std(std[:5], step[:5]) == pytest.approx(0.01, rel=0.1)
