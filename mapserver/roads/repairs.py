@@ -95,9 +95,22 @@ def _cuts(c_rr: Any, machine: Any, bounds: Any) -> tuple[Any, int]:
 def _differs(before: Any, after: Any) -> bool:
     """Whether all passes after differ alike from the median of those before, beyond noise and by enough."""
     median = np.median(before)
-    spread = max(1.4826 * np.median(np.abs(before - median)), FLOOR_SHARE * median, FLOOR)
+    spread = max(FLOOR_SHARE * median, FLOOR)
     least = max(SIGMAS * spread, SHARE * max(median, FLOOR))
-    return bool((after - median > least).all() or (median - after > least).all())
+    if not _is_beyond(after, median, least):  # as of nearly all, whatever the noise
+        return False
+    spread = max(1.4826 * np.median(np.abs(before - median)), spread)
+    return _is_beyond(after, median, max(SIGMAS * spread, least))
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_beyond(after: Any, median: float, least: float) -> bool:
+    """Whether all values are higher by more than `least`, or all are lower."""
+    higher = lower = True
+    for value in after:
+        higher = higher and value - median > least
+        lower = lower and median - value > least
+    return higher or lower
 
 
 @numba.njit(cache=True, nogil=True)
