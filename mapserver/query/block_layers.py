@@ -2,8 +2,10 @@
 
 A layer of a cell depends on the pages of its block, and, since a change of the ground is seen with its surroundings, on
 those of the blocks around; a layer of an area on the cells around it besides. The grid numbers its turns and knows the
-last one of each block, so a block is derived again only where something was folded into it or near to it. Layers of
-areas are derived square by square, of some blocks each: the same bits for whoever asks, for whatever window.
+last one of each block, so what nothing was folded into or near to is read as it is kept. Near to it, it is looked
+whether that changed which pages count, which it seldom does: a block is derived again only where its own pages are
+others, or other ones of them count, and a square only where a block was. Layers of areas are derived square by square,
+of some blocks each: the same bits for whoever asks, for whatever window.
 
 It is one module because what is looked up on the map's thread and what is derived beside it have to agree.
 """
@@ -13,8 +15,8 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
-from itertools import product
+from dataclasses import dataclass, field, replace
+from itertools import count, product
 from weakref import ReferenceType, ref
 
 import cv2
@@ -44,19 +46,26 @@ Layers = Mapping[str, AnyArray]  # (256,) each, or of a square
 
 @dataclass(frozen=True)
 class Kept:
-    """Layers of one block or square, as of a turn of the grid: the last one of all that they depend on."""
+    """Layers of one block or square, as of a turn of the grid: the last one of all that they depend on.
+
+    state: what they were derived from, the same for the same: of a block, its own last turn, and where its pages begin
+    to count (256,) as bytes, empty for all of them; of a square, the numbers of the blocks around. number: of this
+    state of a block among all that there were.
+    """
 
     turn: int
     layers: Layers
+    state: tuple[object, ...]
+    number: int = NEVER
 
 
 @dataclass(frozen=True)
 class Look:
     """What a window's layers are read from, of one version of the map: layers that are kept, and pages of the others.
 
-    cells, areas: what is kept of blocks and of squares, as of these turns; cell_turns: of all blocks with evidence,
-    area_turns: of all squares that have or are near any. pages: of the blocks whose layers of cells are to be derived,
-    and of those around them. ages: as in View.
+    cells, areas: what is kept of blocks and of squares, as of these turns or older ones; cell_turns: of all blocks with
+    evidence, area_turns: of all squares that have or are near any; own_turns: of blocks, whatever is around. pages: of
+    the blocks whose layers of cells are not kept as of their turn, and of those around them. ages: as in View.
     """
 
     version: MapVersion
@@ -65,6 +74,7 @@ class Look:
     areas: Mapping[Block, Kept]
     cell_turns: Mapping[Block, int]
     area_turns: Mapping[Block, int]
+    own_turns: Mapping[Block, int]
     pages: Pages
     grid: ReferenceType[Grid] | None = None
     ages: Ages = field(default_factory=dict)
@@ -82,6 +92,7 @@ class BlockLayers:
         self._areas: OrderedDict[Block, Kept] = OrderedDict()
         self._count = 0  # layers of blocks in both
         self._grid: ReferenceType[Grid] | None = None
+        self._numbers = count()
         self.used, self.derived = 0, 0  # blocks and squares whose layers were kept, and had to be derived
 
     def look(self, state: MapState, window: CellWindow, names: Sequence[str]) -> Look:
@@ -129,22 +140,25 @@ class BlockLayers:
                 self._grid, self._count = ref(grid), 0
             areas = _valid(self._areas, area_turns, area_names)
             needed = self._around(area_turns.keys() - areas.keys(), area_names)
+            areas |= _some(self._areas, area_turns.keys() - areas.keys())
             needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
             asked = own.keys() & only if only is not None else {b for b in own if _is_in(b, inner)}
             wanted = {b: cell_turns[b] for b in own if b in needed or (cell_names and b in asked)}
             cells = _valid(self._cells, wanted, needed_names)
-        missing = wanted.keys() - cells.keys()
+            missing = wanted.keys() - cells.keys()
+            cells |= _some(self._cells, missing)
         near = sorted({one for block in missing for one in around(block, self._reach) if one in own})
         pages = dict(zip(near, grid.pages(near), strict=True))
         turns = {block: cell_turns[block] for block in own}
-        return Look(state.version, state.newest_ns, cells, areas, turns, area_turns, pages, self._grid)
+        return Look(state.version, state.newest_ns, cells, areas, turns, area_turns, own, pages, self._grid)
 
     def look_at(self, view: View) -> Look:
         """The same of a view, of which nothing is kept: a map of the past."""
         turns = {block: 0 for block, pages in view.pages.items() if pages}
         near = {one for block in turns for one in around(block, self._margin(tuple(AREA_LAYERS)))}
         squares = {(x // SQUARE, y // SQUARE) for x, y in near}
-        return Look(view.version, view.stamp_ns, {}, {}, turns, dict.fromkeys(squares, 0), view.pages, ages=view.ages)
+        area_turns = dict.fromkeys(squares, 0)
+        return Look(view.version, view.stamp_ns, {}, {}, turns, area_turns, turns, view.pages, ages=view.ages)
 
     def read(self, look: Look, window: CellWindow, names: Sequence[str]) -> dict[str, Floats32]:
         """Layers (rows, columns) of a window within that of the look."""
@@ -190,10 +204,21 @@ class BlockLayers:
         needed = self._around(stale, names)
         blocks = {block: turn for block, turn in look.cell_turns.items() if block in needed}
         cells = self._cells_of(look, blocks, cell_layers.required(names))
-        made = {square: Kept(wanted[square], self._derive(square, cells, names)) for square in sorted(stale)}
+        made, derived = dict[Block, Kept](), 0
+        for square in sorted(stale):
+            old, state = look.areas.get(square), self._state_of(square, cells, names)
+            before = old.layers if old and old.state == state else {}
+            if any(name not in before for name in names):
+                before, derived = {**before, **self._derive(square, cells, names)}, derived + 1
+            made[square] = Kept(wanted[square], before, state)
         self._keep(self._areas, look, made)
-        self._note(len(areas), len(made))
+        self._note(len(wanted) - derived, derived)
         return {square: kept.layers for square, kept in (areas | made).items()}
+
+    def _state_of(self, square: Block, cells: Mapping[Block, Kept], names: Sequence[str]) -> tuple[int, ...]:
+        """Numbers of the blocks that a square depends on."""
+        near = self._around([square], names)
+        return tuple(cells[block].number if block in cells else NEVER for block in sorted(near))
 
     def _margin(self, names: Sequence[str]) -> int:
         """How many blocks around one the layers of areas depend on."""
@@ -207,18 +232,23 @@ class BlockLayers:
         pages = {block: look.pages[block] for block in sorted(near)}
         first = valid_pages(pages, self._cell_m, self._config.change, look.ages)
         made: dict[Block, Kept] = {}
-        for some in chunks(missing):
+        for block in missing:
+            state = look.own_turns[block], first[block].tobytes() if first[block].any() else b""
+            old = look.cells.get(block)
+            same = old if old and old.state == state else Kept(NEVER, {}, state, next(self._numbers))
+            made[block] = replace(same, turn=blocks[block])
+        lacking = [block for block in missing if any(name not in made[block].layers for name in names)]
+        for some in chunks(lacking):
             sums = evidence([look.pages[block] for block in some], [first[block] for block in some])
             plain = [name for name in dict.fromkeys((*names, "weight")) if name not in TIMED.values()]
             values: dict[str, AnyArray] = {**cell_layers.read(sums, plain, self._config.read)}
             for name in set(names).intersection(TIMED.values()):
                 values[name] = np.where(np.isnan(values["weight"]), 0, getattr(sums, name))
             for i, block in enumerate(some):
-                old = look.cells.get(block)
-                before = old.layers if old and old.turn == blocks[block] else {}
-                made[block] = Kept(blocks[block], {**before, **{name: layer[i] for name, layer in values.items()}})
+                more = {name: layer[i].copy() for name, layer in values.items()}  # a view would keep all of them
+                made[block] = replace(made[block], layers={**made[block].layers, **more})
         self._keep(self._cells, look, made)
-        self._note(len(cells), len(made))
+        self._note(len(blocks) - len(lacking), len(lacking))
         return cells | made
 
     def _around(self, squares: Iterable[Block], names: Sequence[str]) -> set[Block]:
@@ -256,7 +286,7 @@ class BlockLayers:
                     continue
                 layers = {**old.layers, **kept.layers} if old and old.turn == kept.turn else kept.layers
                 self._count += _size(layers) - (_size(old.layers) if old else 0)
-                store[block] = Kept(kept.turn, layers)
+                store[block] = replace(kept, layers=layers)
                 store.move_to_end(block)
             while self._count > self._most:
                 fuller = self._areas if SQUARE**2 * len(self._areas) > len(self._cells) else self._cells
@@ -294,6 +324,11 @@ def _valid(kept: Mapping[Block, Kept], turns: Mapping[Block, int], names: Sequen
             if isinstance(kept, OrderedDict):
                 kept.move_to_end(block)
     return out
+
+
+def _some(kept: Mapping[Block, Kept], blocks: Iterable[Block]) -> dict[Block, Kept]:
+    """What is kept of these blocks, as of whatever turn."""
+    return {block: kept[block] for block in blocks if block in kept}
 
 
 # --- rectangles of blocks or squares: first column, first row, number of columns, of rows ----------------------------
