@@ -23,6 +23,7 @@ from protocol.queries.answer_codec import decode_alive, decode_error
 from protocol.queries.answers import FollowerState, ServerAlive
 from protocol.queries.origin import SERVER, Origin, decode_origin
 from protocol.queries.parameters import selector_of, text_of
+from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.wire import keys
 
@@ -42,8 +43,8 @@ READ = (
     *PLACES,
     requests.RegionQuery,
     requests.TilesQuery,
-    requests.SegmentsQuery,
-    requests.WorklistQuery,
+    SegmentsQuery,
+    WorklistQuery,
     RouteQuery,
     WayQuery,
 )
@@ -125,7 +126,7 @@ class Asker:
     def ask(self, query: requests.MapQuery, *, at: Origin | None = None) -> Answered:
         """Ask the map. at: of whoever gave an earlier answer, which has what this one goes on with."""
         wait_s = query.fresh.wait_s if query.fresh.after else 0.0
-        wait_s += PAST_S if requests.reads_past(query) else 0.0
+        wait_s += PAST_S if requests.may_read_journal(query) else 0.0
         if at and at.follower:
             return self._of_follower(query, at.follower)
         return self._get(query, wait_s)

@@ -35,6 +35,7 @@ from protocol.queries.parameters import Freshness
 from protocol.queries.pieces import Progress, joined
 from protocol.queries.places import Place
 from protocol.queries.reasons import CellReasons, decode_why
+from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
 from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import LOADER, NamedMachine, RouteAnswer, RouteMachine, decode_answer, machine_of
@@ -185,7 +186,7 @@ class Client:
         machine: traffic of this one alone, and what it measured.
         """
         fresh = Freshness(after, wait_s)
-        return decode_segments(self._ask(requests.SegmentsQuery(from_ns, to_ns, as_of_ns, bounds, machine, fresh)))
+        return decode_segments(self._ask(SegmentsQuery(from_ns, to_ns, as_of_ns, bounds, machine, fresh)))
 
     def worklist(
         self,
@@ -205,7 +206,7 @@ class Client:
 
         efficiency: of engine and drive train, for litres of diesel. machine: what this one alone loses.
         """
-        query = requests.WorklistQuery(
+        query = WorklistQuery(
             target, efficiency, limit, from_ns, to_ns, as_of_ns, bounds, machine, Freshness(after, wait_s)
         )
         return decode_worklist(self._ask(query))
@@ -219,6 +220,7 @@ class Client:
         step_m: float = 25.0,
         unknown: str | float = "dearest",
         as_of_ns: int | None = None,
+        repairs: bool = True,
         after: int = 0,
         wait_s: float = 10.0,
     ) -> RouteAnswer:
@@ -231,7 +233,7 @@ class Client:
         """
         fresh = Freshness(after, wait_s)
         places = tuple((float(x), float(y)) for x, y in line)
-        return self.drive(RouteQuery(places, _machine(machine), stops, step_m, unknown, as_of_ns, fresh))
+        return self.drive(RouteQuery(places, _machine(machine), stops, step_m, unknown, as_of_ns, fresh, repairs))
 
     def way(
         self,
@@ -247,6 +249,7 @@ class Client:
         step_m: float = 25.0,
         unknown: str | float = "dearest",
         as_of_ns: int | None = None,
+        repairs: bool = True,
         after: int = 0,
         wait_s: float = 10.0,
     ) -> RouteAnswer:
@@ -269,6 +272,7 @@ class Client:
             unknown,
             as_of_ns,
             Freshness(after, wait_s),
+            repairs,
         )
         return self.drive(query)
 

@@ -7,7 +7,7 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.fleet.correction import Correction, corrected
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.passes import PassTally
-from mapserver.roads.repairs import AGREE, BEFORE, KNOWN_BY, Repair, ages, repairs
+from mapserver.roads.repairs import BEFORE, KNOWN_BY, LEAST_AFTER, Repair, ages, repairs
 from tests.unit.mapserver.roads.drives import START_NS, along, passes, roads
 
 LINE = along([(10, 10), (110, 10)])
@@ -57,6 +57,14 @@ def test_a_repair_is_seen_after_two_passes():
         assert each.minute == pytest.approx(START_NS // MINUTE_NS + 15, abs=2)
 
 
+def test_where_passes_are_noisy_three_show_what_two_do_not():
+    before = [0.036, 0.040, 0.044, 0.038, 0.042, 0.037, 0.043, 0.040]  # median 0.04, robust deviation 0.0037
+    repaired, _ = shown(fleet([*before, 0.0275, 0.0275, 0.0275, 0.0275]))  # 3.4 deviations off
+    assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
+    assert all(4 <= each.seen - each.minute <= 6 for each in repaired), "the second pass after the first one shows it"
+    assert not shown(fleet([*before, 0.0275, 0.0275, 0.040, 0.040]))[0], "two do not"
+
+
 def test_one_odd_pass_is_nothing():
     assert shown(fleet([0.04] * 6 + [0.02] + [0.04] * 4, noise=0.001))[0] == []
 
@@ -78,7 +86,7 @@ def test_less_than_a_quarter_is_no_change():
 
 
 def test_a_segment_has_to_be_known_first():
-    repaired, looks = shown(fleet([0.04] * (BEFORE - 1) + [0.02] * AGREE))
+    repaired, looks = shown(fleet([0.04] * (BEFORE - 1) + [0.02] * LEAST_AFTER))
     assert repaired == []
     assert looks == 0
 
@@ -133,7 +141,7 @@ def test_ground_that_wears_is_compared_with_the_newest_passes():
     repaired, looks = shown(fleet([*worn, 0.014, 0.014], noise=0.0))
     assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
     assert all(each.minute > START_NS // MINUTE_NS + 150 * len(worn) // 60 - 3 for each in repaired)
-    assert looks == 5 * (len(worn) + 2 - BEFORE - AGREE + 1)
+    assert looks == 5 * (len(worn) + 2 - BEFORE - LEAST_AFTER + 1)
 
 
 def cells_of(blocks):
