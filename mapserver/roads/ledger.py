@@ -127,7 +127,7 @@ def _places(tally: Any) -> tuple[Any, Any, Any]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _slot_of(table: Any, numbers: Any, number: int) -> int:
+def _slot_of(table: Any, numbers: Any, number: int) -> Any:
     """Where a number stands in a hash table of indices into numbers, or would."""
     last = len(table) - 1
     at = np.int64((np.uint64(number) * np.uint64(HASH)) >> np.uint64(32)) & last
