@@ -47,7 +47,7 @@ class Network:
     @property
     def place_m(self) -> Floats:
         """Centres (k, 2)."""
-        return np.stack([self.column, self.row], axis=1) + 0.5
+        return np.stack([self.column, self.row], axis=1).astype(np.float64) + 0.5
 
     def part(self, where: Bools) -> Network:
         """Some of the cells."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from evaluation.maps.score import DrivenScore, region_of, score_driven, true_lay
 from evaluation.paper.maps import with_true_values
 from mapserver.change.change_log import KIND as CHANGE
 from mapserver.trust.decisions import KIND as TRUST
-from protocol.arrays import Bools, Floats, Ints
+from protocol.arrays import AnyArray, Bools, Floats, Ints
 from protocol.site.ground_classes import UNKNOWN, resistance_class
 from sim.scenario.ground import Point
 from sim.simulator import START_NS
@@ -161,7 +161,7 @@ def driven_figures(layers: Layers, true: Scene, names: Sequence[str]) -> Row:
     return dict(zip(("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct"), figures_of, strict=True))
 
 
-def driven_score(layers: Layers, true: Scene, names: Sequence[str]) -> DrivenScore:
+def driven_score(layers: Mapping[str, AnyArray], true: Scene, names: Sequence[str]) -> DrivenScore:
     """A map against the truth, where these machines truly passed."""
     tracks = [true.tracks[name].place_m for name in names]
     return score_driven(region_of(true.truth, layers), true_layers(true.truth), tracks)

@@ -12,6 +12,8 @@ from evaluation.campaign.experiment import Runner
 from evaluation.campaign.figures import Report
 from evaluation.cooperation import experiment, live, plots
 from evaluation.cooperation.experiment import QUICK, Outcome
+from evaluation.cooperation.processes import Processes
+from protocol.errors import SitegridError
 from sitegrid.process.lifetime import plain
 
 STORED = Path(__file__).parent / "cooperation_quick.json"
@@ -76,6 +78,20 @@ def test_it_goes_on_where_it_was(result, runner: Runner, monkeypatch: pytest.Mon
     monkeypatch.setattr(live, "run", lambda *_: pytest.fail("runs an arm again"))
     report, _ = experiment.run(runner, QUICK)
     assert plain(report) == result[0]
+
+
+def test_a_process_that_does_not_start_says_why_in_one_line(tmp_path: Path):
+    with Processes(tmp_path) as processes:
+        server = processes.start(
+            "server", "server", "--site-file", tmp_path / "none.toml", "--store", tmp_path / "store"
+        )
+        with pytest.raises(
+            SitegridError, match=r"^server: ended with \d+ .* `ready`; its last word: .*none.toml"
+        ) as error:
+            server.expect("ready", 60.0)
+    assert "\n" not in str(error.value)
+    with pytest.raises(ProcessLookupError):
+        os.kill(server.pid, 0)
 
 
 def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):

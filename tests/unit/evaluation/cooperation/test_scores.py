@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation.cooperation.drives import FOUR, REPAVED, TOURS, length_m, planned
+from evaluation.cooperation.drives import FOUR, REPAVED, TOURS, length_m, lines, planned
 from evaluation.cooperation.live import LiveRun
 from evaluation.cooperation.maps import Timeline
 from evaluation.cooperation.scores import (
@@ -76,33 +76,33 @@ def test_a_round_is_over_once_the_last_machine_has_driven_it():
 
 
 def test_repaved_ground_is_shown_once_enough_of_its_cells_have_the_new_class():
-    """One machine goes over the west's ground twice after the change, and measures it right the second time."""
-    x_m, low_m, high_m = 24.5, 20.5, 70.5
-    up = np.stack([np.full(51, x_m), np.linspace(low_m, high_m, 51)], axis=1)
-    lap = np.concatenate([up, np.full((149, 2), 5.0)])  # 100 s, of which 25 on this line
-    own = track(np.concatenate([lap] * 5))
-    ground = true_ground(DRIVE.ground, 3)
-    terrain = ground.terrain
+    """One machine goes over the west's ground every 100 s; it measures the change, after 200 s, in its second pass."""
+    line_m = np.roll(lines()["west"].points, 100, axis=0)  # it begins on this ground
+    there_m = line_m[inside(REPAVED["west"], line_m, 1.0)]
+    n = len(there_m)
+    lap_m = np.concatenate([there_m, np.full((200 - n, 2), 5.0)])  # half a second from point to point
+    own = track(np.concatenate([lap_m] * 5))
+    terrain = true_ground(DRIVE.ground, 3).terrain
     for change in DRIVE.changes.values():
         terrain = with_zone(terrain, change.zone)
     true = Scene(truth_map(terrain, 200.0, 150.0), {"loader-1": own})
     parts = []
-    for number, c_rr in ((0, 0.008), (1, 0.008), (2, 0.008), (3, 0.02)):
-        rows = driving(0, 51, c_rr=c_rr)
-        rows["stamp_ns"] = own.stamp_ns[200 * number : 200 * number + 51]
-        rows["x_m"], rows["y_m"] = up.T
-        parts.append(np.repeat(rows, 1 if c_rr == 0.008 else 8))  # the newest weigh most
+    for number, c_rr in enumerate((0.008, 0.008, 0.008, 0.02, 0.02)):
+        rows = driving(0, n, c_rr=c_rr)
+        rows["stamp_ns"] = own.stamp_ns[200 * number : 200 * number + n]
+        rows["x_m"], rows["y_m"] = there_m.T
+        parts.append(np.repeat(rows, 1 if c_rr == 0.008 else 8))  # the newer ones weigh most
     samples = np.concatenate(parts)
-    line = Timeline(samples, np.zeros(len(samples), int), ("loader-1",), samples["stamp_ns"], ((0, NO_FACTS),))
-    late = replace(line, time_ns=line.time_ns + 60 * 10**9)
-    rows = {row["ground"]: row for row in repaved_rows(DRIVE, line, late, true, ["loader-1"])}
-    west = rows["west"]
-    assert west["cells"] > 20
-    assert west["by_pass_pct"][0] < 20.0  # the change was after 200 s, the pass at 200 s had begun before
-    shown = west["passes"]
-    assert shown == 2 or west["by_pass_pct"][1] > west["by_pass_pct"][0] + 20.0
-    assert rows["shared"]["passes"] is None
-    assert rows["shared"]["by_pass_pct"] == []
+    known = Timeline(samples, np.zeros(len(samples), int), ("loader-1",), samples["stamp_ns"], ((0, NO_FACTS),))
+    late = replace(known, time_ns=known.time_ns + 60 * 10**9)
+    shared, west = repaved_rows(DRIVE, known, late, true, ["loader-1"])
+    assert (west["ground"], west["passes"]) == ("west", 2)
+    assert west["by_pass_pct"][0] == 0.0
+    assert west["by_pass_pct"][1] > 95.0
+    left_s = (inside(REPAVED["west"], there_m).sum() - 1) / 2  # of its line
+    assert west["minutes"] * 60 == pytest.approx(100.0 + left_s, abs=1.0)
+    assert west["arrived_min"] == pytest.approx(west["minutes"] + 1.0, abs=0.05)
+    assert (shared["ground"], shared["passes"], shared["by_pass_pct"]) == ("shared", None, [])
 
 
 def test_changes_that_are_listed_elsewhere_are_false_alarms():
