@@ -21,7 +21,7 @@ from agents.pipeline import Pipeline, PipelineConfig
 from agents.sampling import LAG_S
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Goal, Report, Row, half_width, judge, rounded
-from evaluation.campaign.recordings import PlannedDrive, Setup, track_file
+from evaluation.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, track_file
 from evaluation.ground.comparison import Comparison, compare, pool
 from evaluation.ground.figures import by_border, c_rr_bias, figures, soils
 from evaluation.ground.truth import LoadTrack, TrueGround, read_load_track, true_ground
@@ -35,7 +35,7 @@ PRESETS = {"nominal": ("dgps", False), "calibrated": ("dgps", True), "harsh": ("
 # ground both ways, which is what calibration needs. Runs that are shorter than 600 s settle for the same share of them.
 SETTLE_S, SETTLE_SHARE = 240.0, 0.4
 CHUNK = 5000  # readings that the pipeline gets at a time
-SOURCES = ("agents", "protocol", "evaluation/ground/experiment.py")
+SOURCES = ("agents", *MACHINES_PROTOCOL, "evaluation/ground/experiment.py")
 DIGITS = 3
 
 

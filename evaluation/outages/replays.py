@@ -17,7 +17,7 @@ import numpy as np
 
 from agents.pipeline import Positioning
 from evaluation.campaign.experiment import Experiment, Task
-from evaluation.campaign.recordings import RecordedDrive
+from evaluation.campaign.recordings import MACHINES_PROTOCOL, RecordedDrive
 from evaluation.positions.configurations import Configuration, select
 from evaluation.positions.consistency import ellipse_limit, normalised_square
 from evaluation.positions.replay import Trace, continued, errors, replay
@@ -38,7 +38,7 @@ CASES = (BLACKOUT, *JUMPS, START)
 SENSORS = ("reference", "gyro")  # with the attitude reference, and with one gyro and wheels alone
 SOURCES = (
     "agents",
-    "protocol",
+    *MACHINES_PROTOCOL,
     *(f"evaluation/{part}.py" for part in ("outages/replays", "positions/configurations", "positions/replay")),
 )
 

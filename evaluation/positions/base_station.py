@@ -23,7 +23,7 @@ from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import PipelineConfig, Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Goal, Report, Row, judge, rounded
-from evaluation.campaign.recordings import PlannedDrive
+from evaluation.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive
 from evaluation.campaign.truth import Truth
 from evaluation.positions.configurations import select
 from evaluation.positions.replay import STEP_NS, Score, Trace, continued, replay, score
@@ -44,7 +44,7 @@ NUMBER = 1000  # of the base among the machines of its site: another one's error
 JUMP_M = 5.0
 SOURCES = (
     "agents",
-    "protocol",
+    *MACHINES_PROTOCOL,
     "sim/sensors",
     *(f"evaluation/positions/{part}.py" for part in ("base_station", "configurations", "replay", "substitution")),
 )

@@ -20,7 +20,7 @@ from agents.localisation.filters import motion as motion_model
 from agents.pipeline import PipelineConfig, Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Report, Row, half_width, rounded
-from evaluation.campaign.recordings import PAPER, PlannedDrive, RecordedDrive, Setup
+from evaluation.campaign.recordings import MACHINES_PROTOCOL, PAPER, PlannedDrive, RecordedDrive, Setup
 from evaluation.positions.configurations import Configuration, select
 from evaluation.positions.replay import Score, replay, score
 from evaluation.positions.substitution import (
@@ -39,7 +39,7 @@ from protocol.machine.machine_config import MachineConfig
 RECEIVERS = (1, 2)
 SOURCES = (
     "agents",
-    "protocol",
+    *MACHINES_PROTOCOL,
     *(f"evaluation/positions/{part}.py" for part in ("budget", "configurations", "replay", "consistency")),
     "evaluation/positions/substitution.py",
 )

@@ -17,7 +17,7 @@ import numpy as np
 from agents.pipeline import PipelineConfig, Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Report, Row, half_width, rounded
-from evaluation.campaign.recordings import PAPER, PlannedDrive, RecordedDrive, Setup
+from evaluation.campaign.recordings import MACHINES_PROTOCOL, PAPER, PlannedDrive, RecordedDrive, Setup
 from evaluation.positions.configurations import Configuration, UnsupportedError, select
 from evaluation.positions.replay import Score, errors, replay, score
 from evaluation.positions.substitution import gps_errors, true_motion, with_gps_errors
@@ -29,7 +29,7 @@ from sim.sensors.presets import GpsNoise
 TRACE_S = 1.0  # between two points of the curves that plots draw
 SOURCES = (
     "agents",
-    "protocol",
+    *MACHINES_PROTOCOL,
     *(
         f"evaluation/positions/{part}.py"
         for part in ("table", "configurations", "replay", "consistency", "substitution")

@@ -1,6 +1,7 @@
 """The runner of experiments: results are kept, an interrupted run goes on, and nothing meets results of other code."""
 
 import json
+import re
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from evaluation.campaign import experiment as module
 from evaluation.campaign.experiment import Experiment, Runner, Task, read_result, replay_task, write_result
-from evaluation.campaign.recordings import PlannedDrive, code_version
+from evaluation.campaign.recordings import MACHINES_PROTOCOL, ROOT, PlannedDrive, code_version
 from evaluation.ground import experiment as ground
 from evaluation.maps import experiment as maps
 from evaluation.positions import table
@@ -140,5 +141,17 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path):
 def test_results_depend_on_sources_that_exist_and_on_the_code_that_makes_them(experiment: Experiment):
     assert code_version(*experiment.sources)  # raises where one of them does not exist
     own = f"{experiment.solve.__module__.replace('.', '/')}.py"
-    assert {own, "protocol"} <= set(experiment.sources)
-    assert {"agents", "mapserver"} & set(experiment.sources)
+    assert own in experiment.sources
+    assert {"agents", *MACHINES_PROTOCOL} <= set(experiment.sources) or {
+        "mapserver",
+        "protocol",
+    } <= set(experiment.sources)
+
+
+def test_machines_know_no_more_of_the_protocol_than_their_results_depend_on():
+    known = tuple(part.removesuffix(".py").replace("/", ".") for part in MACHINES_PROTOCOL)
+    kept = "protocol.disk"  # where an agent keeps what it has not delivered; replays deliver nothing
+    for package in ("agents", "sim"):
+        for source in (ROOT / package).rglob("*.py"):
+            for name in re.findall(r"^\s*from (protocol[\w.]*) import", source.read_text(encoding="utf-8"), re.M):
+                assert name.startswith((*known, kept)), f"{source}: {name}"
