@@ -33,8 +33,7 @@ SURE_AXIS = 0.2  # least length of the mean axis, 0 to 1, that is a preferred on
 # a machine bridges and sensors that lag [m/m], and how machines sit on slopes, as a share of the slope.
 ZERO_STD, MODEL_SHARE = 0.0025, 0.05
 UNEVEN_STD, SLOPE_SHARE = 0.0055, 0.05
-# Votes of one drive repeat each other, but those for two kinds of ground are mostly a place error of the fewer: shares to
-# this power are as often right as they say.
+# Votes for the class that leads less are mostly errors of places: shares to this power are right as often as they say.
 SHARPNESS = 1.5
 
 
