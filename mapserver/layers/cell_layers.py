@@ -28,8 +28,8 @@ LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # betw
 GRADE_STEP = float(ev.GRADE_CENTRES[1] - ev.GRADE_CENTRES[0])
 MAX_REACH_M = 50.0  # every window is widened by it, and its kernel has its square of cells
 SURE_AXIS = 0.2  # least length of the mean axis, 0 to 1, that is a preferred one
-# What all votes of a cell err in alike, so that more of them do not take it off (docs/layers.md): of c_rr, what is left
-# of zeros after calibration [-], and what the balance of forces leaves out, as a share; of the gradient, unevenness that
+# What all votes of a cell err in alike, so that more of them do not take it off (docs/layers.md): of c_rr, what is
+# left of zeros after calibration [-], and a share that the balance of forces misses; of the gradient, unevenness that
 # a machine bridges and sensors that lag [m/m], and how machines sit on slopes, as a share of the slope.
 ZERO_STD, MODEL_SHARE = 0.0025, 0.05
 UNEVEN_STD, SLOPE_SHARE = 0.0055, 0.05
