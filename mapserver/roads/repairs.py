@@ -22,7 +22,8 @@ from mapserver.roads.segments import Segments
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-BEFORE = 4  # passes, at least, that a segment is known by
+BEFORE = 2  # passes, at least, that a segment is known by
+FEW = 4  # passes before: fewer do not show how much passes differ by
 KNOWN_BY = 32  # passes, at most: the newest ones, as ground wears
 # Passes in a row that must differ alike, and by how many robust standard deviations of those before. Three with less
 # show what two do not where passes are noisy; on drawn repairs they raise what is seen within three from 87 to 92 %.
@@ -31,6 +32,7 @@ LEAST_AFTER = 2
 SHARE = 0.25  # of the median before
 HALF_WIDTH_M = 3.0  # of the strip that is driven, with the errors of positions; half the distance of two lanes
 FLOOR_SHARE, FLOOR = 0.05, 0.001  # of the median, and least standard deviation of passes
+FEW_SHARE, FEW_FLOOR = 0.1, 0.003  # the same where few were before: of nearly all segments on development seeds
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,8 @@ def _sure(c_rr: Any, machine: Any, begin: int, at: int, end: int) -> int:
 def _differs(before: Any, after: Any, sigmas: float) -> bool:
     """Whether all passes after differ alike from the median of those before, beyond noise and by enough."""
     median = np.median(before)
-    spread = max(1.4826 * np.median(np.abs(before - median)), FLOOR_SHARE * median, FLOOR)
+    share, floor = (FEW_SHARE, FEW_FLOOR) if len(before) < FEW else (FLOOR_SHARE, FLOOR)
+    spread = max(1.4826 * np.median(np.abs(before - median)), share * median, floor)
     least = max(sigmas * spread, SHARE * max(median, FLOOR))
     return bool((after - median > least).all() or (median - after > least).all())
 

@@ -7,7 +7,7 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.fleet.correction import Correction, corrected
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.passes import PassTally
-from mapserver.roads.repairs import BEFORE, KNOWN_BY, LEAST_AFTER, Repair, ages, repairs
+from mapserver.roads.repairs import BEFORE, FEW, KNOWN_BY, LEAST_AFTER, Repair, ages, repairs
 from tests.unit.mapserver.roads.drives import START_NS, along, passes, roads
 
 LINE = along([(10, 10), (110, 10)])
@@ -89,6 +89,13 @@ def test_a_segment_has_to_be_known_first():
     repaired, looks = shown(fleet([0.04] * (BEFORE - 1) + [0.02] * LEAST_AFTER))
     assert repaired == []
     assert looks == 0
+
+
+def test_a_segment_that_is_known_by_few_passes_changes_by_more():
+    few = [0.03] * BEFORE
+    assert len(shown(fleet([*few, 0.05, 0.05]))[0]) == 5, "by 6 times what passes differ by as a rule"
+    assert shown(fleet([*few, 0.04, 0.04]))[0] == [], "by 3 times"
+    assert len(shown(fleet([0.03] * FEW + [0.04, 0.04]))[0]) == 5, "that passes agree is known then"
 
 
 def test_one_machine_of_several_is_no_witness():
