@@ -1,9 +1,9 @@
 """Repairs, and ground that became worse: where the passes over a segment differ from those before.
 
 On a haul road the driven strip is narrower than what a change of cells must be, to be none of position errors. A
-segment has all of a pass, so two or three passes tell. What machines have in common is taken from all of them: a new
-calibration of one machine is no repair, since passes are of samples that are corrected as is known now, and since two
-machines must agree wherever more than one drives.
+segment has all of a pass, so two or three passes tell. Each is compared with what this machine found in this direction
+before. A new calibration of one machine is no repair, since passes are of samples that are corrected as is known now,
+and since two machines must agree wherever more than one drives.
 """
 
 from __future__ import annotations
@@ -22,17 +22,16 @@ from mapserver.roads.segments import Segments
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-BEFORE = 2  # passes, at least, that a segment is known by
-FEW = 4  # passes before: fewer do not show how much passes differ by
+BEFORE = 6  # passes, at least, that a segment is known by: of fewer, most machines have but one
 KNOWN_BY = 32  # passes, at most: the newest ones, as ground wears
-# Passes in a row that must differ alike, and by how many robust standard deviations of those before. Three with less
-# show what two do not where passes are noisy; on drawn repairs they raise what is seen within three from 87 to 92 %.
-RULES = ((2, 4.0), (3, 3.0))
-LEAST_AFTER = 2
-SHARE = 0.25  # of the median before
+AGREE = (2, 3)  # passes in a row that show a change, at least and at most
+SIGMAS, SIGMAS_EACH = 5.0, 2.0  # of all of them together, and of each, they are from what is expected
+SHARE = 0.25  # of what is expected, on average
+# Standard deviation of passes before any were seen: what calibration leaves of a zero, and a share of c_rr; how many
+# passes this counts as beside those that were.
+ZERO, OWN_SHARE, PRIOR = 0.002, 0.05, 8
 HALF_WIDTH_M = 3.0  # of the strip that is driven, with the errors of positions; half the distance of two lanes
-FLOOR_SHARE, FLOOR = 0.05, 0.001  # of the median, and least standard deviation of passes
-FEW_SHARE, FEW_FLOOR = 0.1, 0.003  # the same where few were before: of nearly all segments on development seeds
+LEAST_C = 0.001  # that shares are of
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ def repairs(passes: Passes) -> tuple[list[Repair], int]:
     """All changes, and how many passes were looked at. After one, a segment is known by later passes alone."""
     out: list[Repair] = []
     bounds = np.flatnonzero(np.diff(passes.segment, prepend=-1, append=-1))
-    cuts, looks = _cuts(passes.c_rr, passes.machine, bounds)
+    cuts, looks = _cuts(passes.c_rr, passes.machine, 2 * passes.machine + passes.direction, bounds)
     for first, at, sure, end in cuts.tolist():
         before, after = (float(np.median(passes.c_rr[part])) for part in (slice(first, at), slice(at, end)))
         minute, seen = passes.minute[[at, sure]].tolist()
@@ -72,50 +71,82 @@ def repairs(passes: Passes) -> tuple[list[Repair], int]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _cuts(c_rr: Any, machine: Any, bounds: Any) -> tuple[Any, int]:
+def _cuts(c_rr: Any, machine: Any, group: Any, bounds: Any) -> tuple[Any, int]:
     """Of each change (n, 4): first pass before it, first after it, the one that showed it, end of all after.
 
-    bounds: where the passes of each segment begin, and the end of all. Also how many passes were looked at.
+    group: of passes that err alike, a machine in one direction. bounds: where the passes of each segment begin, and the
+    end of all. Also how many passes were looked at.
     """
     cuts, count, looks = np.empty((len(c_rr), 4), np.int64), 0, 0
+    groups, means = np.empty((2, KNOWN_BY), np.int64), np.empty(KNOWN_BY)
     for k in range(len(bounds) - 1):
         begin, first_cut = bounds[k], count
-        for at in range(bounds[k] + BEFORE, bounds[k + 1] - LEAST_AFTER + 1):
+        for at in range(bounds[k] + BEFORE, bounds[k + 1] - AGREE[0] + 1):
             if at - begin < BEFORE:
                 continue
             looks += 1
-            end = _sure(c_rr, machine, max(begin, at - KNOWN_BY), at, bounds[k + 1])
-            if end:
-                cuts[count, 0], cuts[count, 1], cuts[count, 2] = begin, at, end - 1
-                count += 1
-                begin = at
+            first = max(begin, at - KNOWN_BY)
+            expected = _expected(c_rr[first:at], group[first:at], groups, means)
+            later = slice(at, min(at + AGREE[1], bounds[k + 1]))
+            for end in _differing(c_rr[later], group[later], expected, groups, means) + at:
+                if _agree(machine[first:at], machine[at:end]):
+                    cuts[count, 0], cuts[count, 1], cuts[count, 2] = begin, at, end - 1
+                    count += 1
+                    begin = at
+                    break
         for i in range(first_cut, count):
             cuts[i, 3] = cuts[i + 1, 1] if i + 1 < count else bounds[k + 1]
     return cuts[:count], looks
 
 
 @numba.njit(cache=True, nogil=True)
-def _sure(c_rr: Any, machine: Any, begin: int, at: int, end: int) -> int:
-    """The end of the passes from `at` on that show a change from those since `begin`; 0 where there is none."""
-    for count, sigmas in RULES:
-        before, after = slice(begin, at), slice(at, at + count)
-        if (
-            at + count <= end
-            and _differs(c_rr[before], c_rr[after], sigmas)
-            and _agree(machine[before], machine[after])
-        ):
-            return at + count
-    return 0
+def _expected(c_rr: Any, group: Any, groups: Any, means: Any) -> tuple[int, float, float, float]:
+    """What passes (n,) say of later ones: number of groups, level, and variances within groups and between them.
+
+    Errors repeat: a machine has a zero of its own, and its estimate settles from the same side wherever ground changes
+    within a segment. So passes are compared with those of the same machine in the same direction first. A model with
+    random effects: pass = level + what its group is off + noise. groups, means: filled with numbers of groups, how many
+    passes each has, and their means.
+    """
+    count, level, within, between = 0, c_rr.mean(), 0.0, 0.0
+    for i in range(len(c_rr)):
+        k = 0
+        while k < count and groups[0, k] != group[i]:
+            k += 1
+        if k == count:
+            groups[0, k], groups[1, k], means[k] = group[i], 0, 0.0
+            count += 1
+        groups[1, k] += 1
+        step = c_rr[i] - means[k]
+        means[k] += step / groups[1, k]
+        within += step * (c_rr[i] - means[k])
+    for k in range(count):
+        between += (means[k] - level) ** 2
+    known = PRIOR * (ZERO**2 + (OWN_SHARE * level) ** 2)
+    return count, level, (known + within) / (PRIOR + len(c_rr) - count), (known + between) / (PRIOR + count - 1)
 
 
 @numba.njit(cache=True, nogil=True)
-def _differs(before: Any, after: Any, sigmas: float) -> bool:
-    """Whether all passes after differ alike from the median of those before, beyond noise and by enough."""
-    median = np.median(before)
-    share, floor = (FEW_SHARE, FEW_FLOOR) if len(before) < FEW else (FLOOR_SHARE, FLOOR)
-    spread = max(1.4826 * np.median(np.abs(before - median)), share * median, floor)
-    least = max(sigmas * spread, SHARE * max(median, FLOOR))
-    return bool((after - median > least).all() or (median - after > least).all())
+def _differing(c_rr: Any, group: Any, expected: tuple[int, float, float, float], groups: Any, means: Any) -> Any:
+    """How many of these passes, from the first on, differ alike from what is expected, beyond noise and by enough."""
+    count, level, within, between = expected
+    out, side, sigmas, share = np.zeros(len(c_rr), np.bool_), 0.0, 0.0, 0.0
+    for i in range(len(c_rr)):
+        weight, total = 1.0 / between, level / between
+        for k in range(count):
+            if groups[0, k] == group[i]:
+                weight += groups[1, k] / within
+                total += groups[1, k] * means[k] / within
+        own = total / weight
+        side = side or (1.0 if c_rr[i] > own else -1.0)
+        off = side * (c_rr[i] - own)
+        apart = off / np.sqrt(within + 1.0 / weight)
+        if apart < SIGMAS_EACH:
+            break
+        sigmas, share = sigmas + apart, share + off / max(own, LEAST_C)
+        passes = i + 1
+        out[i] = passes >= AGREE[0] and sigmas > SIGMAS * np.sqrt(passes) and share > SHARE * passes
+    return np.flatnonzero(out) + 1
 
 
 @numba.njit(cache=True, nogil=True)
