@@ -140,15 +140,15 @@ def _strips(cells: Bools, unknown: Bools, edge: int) -> Bools:
     """
     n, last, wide = edge, edge - 1, [(edge, edge), (edge, edge)]
     some, free = np.pad(cells, wide).astype(np.uint8), np.pad(cells | unknown, wide, constant_values=True)
-    crossed = np.zeros(some.shape, np.uint8)
+    crossed: Bools = np.zeros(some.shape, np.bool_)
     for along, across in (((n, 1), (1, n)), ((1, n), (n, 1))):  # a cell in each of its rows, or columns
         touched = cv2.dilate(some, np.ones(across, np.uint8), anchor=(0, 0), borderValue=0)
-        crossed |= cv2.erode(touched, np.ones(along, np.uint8), anchor=(0, 0), borderValue=0)
+        crossed |= cv2.erode(touched, np.ones(along, np.uint8), anchor=(0, 0), borderValue=0) > 0
     square = np.ones((n, n), np.uint8)
     count = cv2.filter2D(some, cv2.CV_32F, square.astype(np.float32), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
-    corners = cv2.erode(free.astype(np.uint8), square, anchor=(0, 0), borderValue=0) & crossed
-    corners &= count >= LEAST_SHARE * n**2
-    opened = cv2.dilate(corners, square, anchor=(last, last), borderValue=0) > 0
+    fits = cv2.erode(free.astype(np.uint8), square, anchor=(0, 0), borderValue=0) > 0
+    corners = fits & crossed & (np.asarray(count) >= LEAST_SHARE * n**2)
+    opened = cv2.dilate(corners.astype(np.uint8), square, anchor=(last, last), borderValue=0) > 0
     return np.asarray(cells & opened[n:-n, n:-n])
 
 
