@@ -29,6 +29,9 @@ STEP_M = 1.0  # of the drive; what is answered is of longer ones
 SURE_VISITS = 10.0  # more passes over a cell do not make its value surer: what they err in is the same
 ALIKE_M = 25.0  # over so much way errors of the map are alike: positions, and what a machine's estimator lags behind
 COMMON_STD = 0.001  # what calibration leaves in the zeros of machines, the same everywhere [-]
+# Of the resistance along a whole line, as a share: scales of machines, and estimators that round off what changes. On
+# 13 drives of three recordings of the simulator, maps were off by 0.1 to 3.5 %, 2 % in the root mean square.
+COMMON_SHARE = 0.02
 UNKNOWN_STD = 0.5  # of the price of unknown ground, as a share of it
 UNMEASURED_STD = 0.25  # of that of ground that was driven on and not measured, beside what its two ends differ by
 UNKNOWN_SLOPE_STD = 0.05  # of its slope, which is taken for as even as the ground around lets it be [m/m]
@@ -149,7 +152,8 @@ def route(
             f"the machine cannot climb at {x:.0f}, {y:.0f} m: resistance and slope make {climbs:.1f} % of its weight"
         )
         raise QueryError(Refusal.OUT_OF_RANGE, f"{problem}; more `power`, less `mass` or another line")
-    off = NINETY * mean_std(np.hypot(ground.resistance_std, ground.slope_std), cut.length_m)
+    of_steps = mean_std(np.hypot(ground.resistance_std, ground.slope_std), cut.length_m)
+    off = NINETY * math.hypot(of_steps, COMMON_SHARE * float(ground.resistance.mean()))
     low, high = (drive(cut.length_m, resistance + by, slope, limit, machine) for by in (-off, off))
     return _by_step(cut, ground, done, step_m), _totals(cut, ground, machine, done, (low, high))
 
