@@ -11,7 +11,7 @@ import json
 import logging
 import pkgutil
 import sys
-from argparse import ArgumentParser
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from importlib import import_module
 
@@ -55,7 +55,7 @@ def run(words: Sequence[str]) -> int:
 def _run(words: Sequence[str]) -> int:
     extra = ""
     try:
-        arguments = build_parser().parse_args(words)
+        arguments = build_parser().parse_args(words, Namespace(words=words))
         extra = arguments.extra
         start_logging(verbose=arguments.verbose)
         return int(arguments.run(arguments))

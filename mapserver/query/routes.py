@@ -13,7 +13,6 @@ from mapserver.evidence.timeline import Block
 from mapserver.query.block_layers import SQUARE_CELLS, BlockLayers, Look, place_square, squares_of
 from mapserver.query.named_machines import NamedMachines
 from mapserver.query.source import MapSource
-from mapserver.query.views import PastMaps
 from mapserver.routes.ground import Squares, squares_at
 from mapserver.routes.least_cost import Cell, Terrain, cost_of, least_cost_line, reaches
 from mapserver.routes.line import steps
@@ -37,10 +36,10 @@ GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled", "visit
 
 
 class Routes:
-    """Answers of one map; for any thread. past: maps as of any time."""
+    """Answers of one map; for any thread. look: at squares, now or as of a time, with the ages of roads or without."""
 
-    def __init__(self, source: MapSource, layers: BlockLayers, past: Callable[[], PastMaps]) -> None:
-        self._source, self._layers, self._past = source, layers, past
+    def __init__(self, source: MapSource, layers: BlockLayers, look: Callable[..., Look]) -> None:
+        self._source, self._layers, self._look = source, layers, look
         self._site, self._machines = source.site, NamedMachines(source)
 
     def route(self, query: RouteQuery) -> RouteAnswer:
@@ -55,7 +54,7 @@ class Routes:
             nobody = ~np.isfinite(read.at(places)["visits"])
             return squares_at(places[nobody], self._site.cell_m, SQUARE_CELLS) if nobody.any() else set()
 
-        look, read = self._read(touched, query.as_of_ns, unpriced)
+        look, read = self._read(touched, query, unpriced)
         return self._answer(query, machine, line, look, read)
 
     def way(self, query: WayQuery) -> RouteAnswer:
@@ -64,7 +63,7 @@ class Routes:
             self._require_on_site(name, ends)
         machine, window = self._machines.resolve(query.machine, query.as_of_ns), self._window(query)
         touched = squares_of(window)
-        look, read = self._read(touched, query.as_of_ns, lambda read: bare(read, touched))
+        look, read = self._read(touched, query, lambda read: bare(read, touched))
         terrain, known = self._terrain(query, machine, window, read)
         ends = start, end = self._cell(query.start, window), self._cell(query.end, window)
         terrain = replace(terrain, is_open=_open(terrain, known, query, window, self._site.cell_m))
@@ -140,7 +139,7 @@ class Routes:
         return RouteAnswer(look.version, look.stamp_ns, line, totals, steps, machine)
 
     def _read(
-        self, squares: Set[Block], as_of_ns: int | None, unpriced: Callable[[Squares], Set[Block]]
+        self, squares: Set[Block], query: RouteQuery | WayQuery, unpriced: Callable[[Squares], Set[Block]]
     ) -> tuple[Look, Squares]:
         """Layers of squares, and of those around the ones with ground to price, which are known once they are read.
 
@@ -148,18 +147,14 @@ class Routes:
         """
         wanted = set(squares)
         while True:
-            look, read = self._read_once(wanted, as_of_ns)
+            look, read = self._read_once(wanted, query)
             more = around(unpriced(read)) - wanted
             if not more:
                 return look, read
             wanted |= more
 
-    def _read_once(self, squares: Set[Block], as_of_ns: int | None) -> tuple[Look, Squares]:
-        if as_of_ns is None:
-            look = self._source.run(lambda state: self._layers.look_squares(state, squares, LAYERS))
-        else:
-            facts = self._source.run(lambda state: state.facts)
-            look = self._layers.look_at(self._past().view(self._cells_of(squares), as_of_ns, facts))
+    def _read_once(self, squares: Set[Block], query: RouteQuery | WayQuery) -> tuple[Look, Squares]:
+        look = self._look(squares, LAYERS, query.as_of_ns, repairs=query.repairs)
         layers = self._layers.squares(look, squares, LAYERS)
         nothing = {min(squares): {name: np.full((SQUARE_CELLS, SQUARE_CELLS), np.nan, np.float32) for name in LAYERS}}
         return look, Squares.stacked(self._site.cell_m, SQUARE_CELLS, layers or nothing)
@@ -203,14 +198,6 @@ class Routes:
     def _cell(self, place: Place, window: CellWindow) -> Cell:
         column, row = (math.floor(value / self._site.cell_m) for value in place)
         return row - window.row, column - window.column
-
-    def _cells_of(self, squares: Set[Block]) -> CellWindow:
-        """The window of squares, and of what layers in them depend on."""
-        (left, bottom), (right, top) = (
-            (side(x for x, _ in squares), side(y for _, y in squares)) for side in (min, max)
-        )
-        n = SQUARE_CELLS
-        return CellWindow((left - 1) * n, (bottom - 1) * n, (right - left + 3) * n, (top - bottom + 3) * n)
 
     def _require_on_site(self, name: str, places: Sequence[Place]) -> None:
         for x, y in places:

@@ -34,6 +34,7 @@ def run(arguments: Namespace) -> int:
     from benchmarks.measure import table
     from evaluation.benchmark import recordings, scores
     from evaluation.campaign.experiment import Runner
+    from evaluation.campaign.provenance import made_by
     from evaluation.campaign.workers import cores
 
     raise_interrupts()  # the bar hides the cursor of the terminal
@@ -45,7 +46,7 @@ def run(arguments: Namespace) -> int:
         else:
             report = scores.run(arguments.data, edition, arguments.entries, processes, display.show)
     if arguments.json:
-        say(plain(report))
+        say(plain({"made": made_by(arguments.words), **report}))
     else:
         rows = [{name: value for name, value in row.items() if name != "by_recording"} for row in plain(report)["rows"]]
         tell(table(rows))

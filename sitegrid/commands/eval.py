@@ -126,6 +126,8 @@ def _add_log(log: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> int:
     """Run one evaluation and print its report."""
+    from evaluation.campaign.provenance import made_by
+
     evaluations = {
         "physics": _physics,
         "localisation": _localisation,
@@ -144,7 +146,7 @@ def run(arguments: Namespace) -> int:
     }
     report = evaluations[arguments.what](arguments)
     if arguments.json:
-        say(plain(report))
+        say(plain({"made": made_by(arguments.words), **report}))
     else:
         tell("\n\n".join(_lines(plain(report))))
     return 0
