@@ -13,16 +13,14 @@ from mapserver.query.map_tiles import Tiles
 from protocol.errors import QueryError, Refusal
 from protocol.queries.map_tiles import PLANES
 from protocol.queries.requests import (
-    MAX_LIMIT,
     PointQuery,
     RegionQuery,
-    SegmentsQuery,
     TilesQuery,
     When,
-    WorklistQuery,
     encode_query,
     parse_query,
 )
+from protocol.queries.road_requests import MAX_LIMIT, SegmentsQuery, WorklistQuery
 from protocol.queries.roads import decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import decode_answer

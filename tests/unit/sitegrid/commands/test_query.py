@@ -25,11 +25,10 @@ from protocol.queries.requests import (
     PointQuery,
     PointsQuery,
     RegionQuery,
-    SegmentsQuery,
     When,
-    WorklistQuery,
     parse_query,
 )
+from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
 from protocol.queries.roads import Segments, Worklist, encode_segments, encode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES, NamedMachine
