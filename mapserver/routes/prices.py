@@ -35,7 +35,7 @@ def around(squares: Iterable[Square]) -> set[Square]:
 def bare(squares: Squares, among: Iterable[Square]) -> set[Square]:
     """Those that have cells where nobody was."""
     driven = np.isfinite(squares.layers["visits"]).all(axis=(1, 2))
-    return set(among) - {place for place, whole in zip(squares.by_place(), driven, strict=True) if whole}
+    return set(among) - {place for place, at in squares.by_place().items() if driven[at]}
 
 
 def priced(squares: Squares, wanted: Set[Square], given: float | None) -> Squares:
@@ -58,7 +58,11 @@ def priced(squares: Squares, wanted: Set[Square], given: float | None) -> Square
         if (at := near[1][1]) is not None:
             own, is_driven, is_sloped = resistance[at].astype(np.float64), driven[at], sloped[at]
             doubt = np.clip(std[at] / own / RESISTANCE_PRIOR_STD, 0.0, 1.0)
-        dear = given if given is not None else _dearest(sum(counts[at] for row in near for at in row if at is not None))
+        dear = (
+            given
+            if given is not None
+            else _dearest(counts[[at for row in near for at in row if at is not None]].sum(axis=0))
+        )
         price = np.where(np.isfinite(own), own + doubt * np.maximum(dear - own, 0.0), dear)
         if (unmeasured := is_driven & ~np.isfinite(own)).any():
             price = np.where(unmeasured, _nearest(_joined(resistance, near), _joined(known, near) > 0, dear), price)
@@ -81,7 +85,7 @@ def _counts(values: AnyArray, known: Bools) -> Ints:
     return np.bincount(bins, minlength=len(known) * (len(BINS) - 1)).reshape(len(known), -1)
 
 
-def _dearest(counts: Ints | int) -> float:
+def _dearest(counts: Ints) -> float:
     """DEAREST of values that were counted in BINS, even in the logarithm within each; LOOSE of none."""
     total = np.cumsum(counts)
     if not total[-1]:
