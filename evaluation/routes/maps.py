@@ -47,10 +47,10 @@ class KnownMap:
         """What answers queries for routes of the map as it is, without roads."""
         layers = BlockLayers(self.site.cell_m, self.config)
 
-        def look(squares: Set[tuple[int, int]], names: Sequence[str], as_of_ns: int | None, *, repairs: bool) -> Look:
+        def look(squares: Set[tuple[int, int]], names: Sequence[str], as_of_ns: int | None, **_: bool) -> Look:
             if as_of_ns is not None:
                 raise NotImplementedError("nobody asks for the past here")
-            return layers.look_squares(self, squares, names)  # type: ignore[arg-type]
+            return layers.look_squares(self, squares, names)
 
         return Routes(self, layers, look)  # type: ignore[arg-type]
 
