@@ -34,7 +34,7 @@ def around(squares: Iterable[Square]) -> set[Square]:
 
 def bare(squares: Squares, among: Iterable[Square]) -> set[Square]:
     """Those that have cells where nobody was."""
-    driven: Bools = np.isfinite(squares.layers["visits"]).all(axis=(1, 2))
+    driven = np.asarray(np.isfinite(squares.layers["visits"]).all(axis=(1, 2)))
     return set(among) - {place for place, at in squares.by_place().items() if driven[at]}
 
 
