@@ -133,8 +133,10 @@ class BlockLayers:
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
         own = dict(zip(blocks := grid.blocks_in(_cells_of(wide)), grid.last_turns(blocks), strict=True))
-        cell_turns = _spread(own, wide, self._reach)
-        area_turns = _by_square(_spread(cell_turns, wide, margin), squares) if squares else {}
+        at, turns = _image(own, wide)
+        turns = _spread(turns, self._reach)
+        cell_turns: dict[Block, int] = dict(zip(blocks, turns[at].astype(int).tolist(), strict=True))
+        area_turns = _by_square(_spread(turns, margin), wide, squares) if squares else {}
         cell_states = _states(cell_turns, ages, lambda block: [block])
         area_states = _states(area_turns, ages, lambda square: self._around([square], area_names))
         with self._lock:
@@ -147,15 +149,14 @@ class BlockLayers:
             areas |= _some(self._areas, stale)
             needed = self._around(stale, area_names)
             needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
-            asked = own.keys() & only if only is not None else {b for b in own if _is_in(b, inner)}
-            wanted = {b: cell_states[b] for b in own if b in needed or (cell_names and b in asked)}
+            asked = only if only is not None else _within(own, inner).keys() if cell_names else set[Block]()
+            wanted = {block: state for block, state in cell_states.items() if block in needed or block in asked}
             cells = _valid(self._cells, wanted, needed_names)
             missing = wanted.keys() - cells.keys()
             cells |= _some(self._cells, missing)
         near = sorted({one for block in missing for one in around(block, self._reach) if one in own})
         pages = dict(zip(near, grid.pages(near), strict=True))
-        states = {block: cell_states[block] for block in own}
-        return Look(state.version, state.newest_ns, cells, areas, states, area_states, own, pages, owner, ages)
+        return Look(state.version, state.newest_ns, cells, areas, cell_states, area_states, own, pages, owner, ages)
 
     def look_at(self, view: View) -> Look:
         """The same of a view, of which nothing is kept: a map of the past."""
@@ -426,25 +427,29 @@ def _within(states: Mapping[Block, State], rect: Rect) -> dict[Block, State]:
     return {block: state for block, state in states.items() if _is_in(block, rect)}
 
 
-def _by_square(turns: Mapping[Block, int], squares: Set[Block]) -> dict[Block, int]:
-    """The newest turn in each of these squares, where there is one."""
-    newest: dict[Block, int] = {}
-    for (x, y), turn in turns.items():
-        square = x // SQUARE, y // SQUARE
-        if square in squares:
-            newest[square] = max(turn, newest.get(square, NEVER))
-    return newest
+def _image(turns: Mapping[Block, int], rect: Rect) -> tuple[tuple[Ints, Ints], Floats]:
+    """Turns of blocks in a rectangle as an image (rows, columns), NEVER elsewhere; and where in it they are."""
+    places = np.array(list(turns), np.int64).reshape(-1, 2) - rect[:2]
+    at, image = (places[:, 1], places[:, 0]), np.full((rect[3], rect[2]), float(NEVER))
+    image[at] = list(turns.values())
+    return at, image
 
 
-def _spread(turns: Mapping[Block, int], rect: Rect, reach: int) -> dict[Block, int]:
-    """The newest turn of each block of a rectangle and of those around it, where there is one."""
-    image = np.full((rect[3], rect[2]), NEVER, np.float64)
-    for (x, y), turn in turns.items():
-        image[y - rect[1], x - rect[0]] = turn
-    newest = cv2.dilate(image, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8), borderValue=NEVER)
-    rows, columns = np.nonzero(newest > NEVER)
-    places = zip((columns + rect[0]).tolist(), (rows + rect[1]).tolist(), strict=True)
-    return dict(zip(places, newest[rows, columns].astype(int).tolist(), strict=True))
+def _spread(image: Floats, reach: int) -> Floats:
+    """The newest turn of each block and of those around it."""
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return np.asarray(cv2.dilate(image, square, borderValue=NEVER), np.float64)
+
+
+def _by_square(image: Floats, rect: Rect, squares: Set[Block]) -> dict[Block, int]:
+    """The newest turn in each of these squares, where there is one; all of them lie in the rectangle."""
+    first_x, first_y = -rect[0] % SQUARE, -rect[1] % SQUARE
+    rows, columns = (image.shape[0] - first_y) // SQUARE, (image.shape[1] - first_x) // SQUARE
+    whole = image[first_y : first_y + rows * SQUARE, first_x : first_x + columns * SQUARE]
+    newest = whole.reshape(rows, SQUARE, columns, SQUARE).max(axis=(1, 3))
+    left, bottom = (rect[0] + first_x) // SQUARE, (rect[1] + first_y) // SQUARE
+    turns = {(x, y): int(newest[y - bottom, x - left]) for x, y in squares}
+    return {square: turn for square, turn in turns.items() if turn > NEVER}
 
 
 def place_square(out: Floats32, window: CellWindow, square: Block, values: AnyArray) -> None:
