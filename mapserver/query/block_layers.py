@@ -149,7 +149,7 @@ class BlockLayers:
             areas |= _some(self._areas, stale)
             needed = self._around(stale, area_names)
             needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
-            asked = only if only is not None else _within(own, inner).keys() if cell_names else set[Block]()
+            asked = only if only is not None else _within(cell_states, inner).keys() if cell_names else set[Block]()
             wanted = {block: state for block, state in cell_states.items() if block in needed or block in asked}
             cells = _valid(self._cells, wanted, needed_names)
             missing = wanted.keys() - cells.keys()
@@ -195,12 +195,16 @@ class BlockLayers:
         near = {(x // SQUARE, y // SQUARE) for x, y in asked}
         squares = self.squares(look, near, area_names) if area_names else {}
         out: dict[str, Floats32] = {name: np.full(len(cells), np.nan, np.float32) for name in names}
-        for name, values in out.items():
-            edge, kept = (SQUARE_CELLS, squares) if name in area_names else (BLOCK_CELLS, of_blocks)
-            for part, at in _by_part(cells, edge):
+        for edge, kept, some in (
+            (BLOCK_CELLS, of_blocks, set(names) - set(area_names)),
+            (SQUARE_CELLS, squares, area_names),
+        ):
+            for part, at in _by_part(cells, edge) if some else ():
                 if part in kept:
                     column, row = (cells[at] % edge).T
-                    values[at] = kept[part][name].reshape(edge, edge)[row, column]
+                    inside = row * edge + column
+                    for name in some:
+                        out[name][at] = kept[part][name].reshape(-1)[inside]
         return out
 
     def squares(self, look: Look, squares: Set[Block], names: Sequence[str]) -> dict[Block, Layers]:
@@ -370,10 +374,10 @@ def _blocks_with(cells: Ints) -> set[Block]:
 
 def _by_part(cells: Ints, edge: int) -> list[tuple[Block, Ints]]:
     """Squares of cells, edge to a side, and which of these cells (n, 2) lie in each."""
-    parts, of_cell = np.unique(cells // edge, axis=0, return_inverse=True)
-    order = np.argsort(of_cell, kind="stable")
-    ends = np.cumsum(np.bincount(of_cell.reshape(-1)))
-    return list(zip(map(tuple, parts.tolist()), np.split(order, ends[:-1]), strict=True))
+    parts = cells // edge
+    order = np.lexsort(parts.T)
+    first = np.flatnonzero(np.append(True, (np.diff(parts[order], axis=0) != 0).any(axis=1)))
+    return list(zip(map(tuple, parts[order[first]].tolist()), np.split(order, first[1:]), strict=True))
 
 
 def _parts_of(rect: Rect, edge: int) -> Rect:
