@@ -104,6 +104,20 @@ class BlockLayers:
         area_names, inner = _areas_of(names), _blocks_of(window)
         return self._look(state, inner, _stored(names), squares_of(window) if area_names else set(), area_names)
 
+    def kept_cell(self, state: MapState, cell: Block, names: Sequence[str]) -> dict[str, float] | None:
+        """Layers of a cell, column and row, of the map as it is, where all of them are kept: a look for most points."""
+        (column, row), n = cell, BLOCK_CELLS
+        block = column // n, row // n
+        turn = max(state.grid.last_turns(around(block, self._reach)))
+        with self._lock:
+            kept = self._cells.get(block) if self._grid and self._grid() is state.grid else None
+            if kept is None or kept.state != (turn, NO_AGES) or any(name not in kept.layers for name in names):
+                return None
+            self._cells.move_to_end(block)
+            self.used += 1
+        at = row % n * n + column % n
+        return {name: float(kept.layers[name][at]) for name in names}
+
     def look_squares(self, state: MapState | StillMap, squares: Set[Block], names: Sequence[str]) -> Look:
         """What layers of areas are read from in these squares."""
         return self._look(state, _blocks_of(around_squares(squares)), (), squares, tuple(names))
