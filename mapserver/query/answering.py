@@ -37,6 +37,7 @@ from protocol.queries.map_tiles import TilesAnswer, encode_tiles
 from protocol.queries.reasons import CellReasons, encode_why
 from protocol.queries.requests import (
     MAX_SPANS,
+    NOW,
     HistoryQuery,
     MapQuery,
     PointQuery,
@@ -147,10 +148,20 @@ class Answers:
 
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
-        cell = self._cell(query.x_m, query.y_m)
-        region = self._read(self._reading(cell, _names(query), query.when), cell)
+        cell, names = self._cell(query.x_m, query.y_m), _names(query)
+        if query.when == NOW and (kept := self._source.run(lambda state: self._kept_point(state, cell, names))):
+            return kept
+        region = self._read(self._reading(cell, names, query.when), cell)
         values = {name: float(layer[0, 0]) for name, layer in region.layers.items()}
         return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.version, region.stamp_ns)
+
+    def _kept_point(self, state: MapState, cell: CellWindow, names: tuple[str, ...]) -> PointAnswer | None:
+        """Layers of a cell of the map as it is, where they are kept."""
+        values = self._layers.kept_cell(state, (cell.column, cell.row), names)
+        if values is None:
+            return None
+        x_m, y_m = (float(self._site.geometry.centres(index, 1)[0]) for index in (cell.column, cell.row))
+        return PointAnswer(x_m, y_m, values, state.version, state.newest_ns)
 
     def points(self, query: PointsQuery) -> PointsAnswer:
         """Layers of the cells that positions lie in."""

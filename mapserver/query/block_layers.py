@@ -104,6 +104,20 @@ class BlockLayers:
         area_names, inner = _areas_of(names), _blocks_of(window)
         return self._look(state, inner, _stored(names), squares_of(window) if area_names else set(), area_names)
 
+    def kept_cell(self, state: MapState, cell: Block, names: Sequence[str]) -> dict[str, float] | None:
+        """Layers of a cell, column and row, of the map as it is, where all of them are kept: a look for most points."""
+        (column, row), n = cell, BLOCK_CELLS
+        block = column // n, row // n
+        turn = max(state.grid.last_turns(around(block, self._reach)))
+        with self._lock:
+            kept = self._cells.get(block) if self._grid and self._grid() is state.grid else None
+            if kept is None or kept.state != (turn, NO_AGES) or any(name not in kept.layers for name in names):
+                return None
+            self._cells.move_to_end(block)
+            self.used += 1
+        at = row % n * n + column % n
+        return {name: float(kept.layers[name][at]) for name in names}
+
     def look_squares(self, state: MapState | StillMap, squares: Set[Block], names: Sequence[str]) -> Look:
         """What layers of areas are read from in these squares."""
         return self._look(state, _blocks_of(around_squares(squares)), (), squares, tuple(names))
@@ -133,8 +147,10 @@ class BlockLayers:
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
         own = dict(zip(blocks := grid.blocks_in(_cells_of(wide)), grid.last_turns(blocks), strict=True))
-        cell_turns = _spread(own, wide, self._reach)
-        area_turns = _by_square(_spread(cell_turns, wide, margin), squares) if squares else {}
+        at, turns = _image(own, wide)
+        turns = _spread(turns, self._reach)
+        cell_turns: dict[Block, int] = dict(zip(blocks, turns[at].astype(int).tolist(), strict=True))
+        area_turns = _by_square(_spread(turns, margin), wide, squares) if squares else {}
         cell_states = _states(cell_turns, ages, lambda block: [block])
         area_states = _states(area_turns, ages, lambda square: self._around([square], area_names))
         with self._lock:
@@ -147,15 +163,14 @@ class BlockLayers:
             areas |= _some(self._areas, stale)
             needed = self._around(stale, area_names)
             needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
-            asked = own.keys() & only if only is not None else {b for b in own if _is_in(b, inner)}
-            wanted = {b: cell_states[b] for b in own if b in needed or (cell_names and b in asked)}
+            asked = only if only is not None else _within(cell_states, inner).keys() if cell_names else set[Block]()
+            wanted = {block: state for block, state in cell_states.items() if block in needed or block in asked}
             cells = _valid(self._cells, wanted, needed_names)
             missing = wanted.keys() - cells.keys()
             cells |= _some(self._cells, missing)
         near = sorted({one for block in missing for one in around(block, self._reach) if one in own})
         pages = dict(zip(near, grid.pages(near), strict=True))
-        states = {block: cell_states[block] for block in own}
-        return Look(state.version, state.newest_ns, cells, areas, states, area_states, own, pages, owner, ages)
+        return Look(state.version, state.newest_ns, cells, areas, cell_states, area_states, own, pages, owner, ages)
 
     def look_at(self, view: View) -> Look:
         """The same of a view, of which nothing is kept: a map of the past."""
@@ -194,12 +209,16 @@ class BlockLayers:
         near = {(x // SQUARE, y // SQUARE) for x, y in asked}
         squares = self.squares(look, near, area_names) if area_names else {}
         out: dict[str, Floats32] = {name: np.full(len(cells), np.nan, np.float32) for name in names}
-        for name, values in out.items():
-            edge, kept = (SQUARE_CELLS, squares) if name in area_names else (BLOCK_CELLS, of_blocks)
-            for part, at in _by_part(cells, edge):
+        for edge, kept, some in (
+            (BLOCK_CELLS, of_blocks, set(names) - set(area_names)),
+            (SQUARE_CELLS, squares, area_names),
+        ):
+            for part, at in _by_part(cells, edge) if some else ():
                 if part in kept:
                     column, row = (cells[at] % edge).T
-                    values[at] = kept[part][name].reshape(edge, edge)[row, column]
+                    inside = row * edge + column
+                    for name in some:
+                        out[name][at] = kept[part][name].reshape(-1)[inside]
         return out
 
     def squares(self, look: Look, squares: Set[Block], names: Sequence[str]) -> dict[Block, Layers]:
@@ -369,10 +388,10 @@ def _blocks_with(cells: Ints) -> set[Block]:
 
 def _by_part(cells: Ints, edge: int) -> list[tuple[Block, Ints]]:
     """Squares of cells, edge to a side, and which of these cells (n, 2) lie in each."""
-    parts, of_cell = np.unique(cells // edge, axis=0, return_inverse=True)
-    order = np.argsort(of_cell, kind="stable")
-    ends = np.cumsum(np.bincount(of_cell.reshape(-1)))
-    return list(zip(map(tuple, parts.tolist()), np.split(order, ends[:-1]), strict=True))
+    parts = cells // edge
+    order = np.lexsort(parts.T)
+    first = np.flatnonzero(np.append(True, (np.diff(parts[order], axis=0) != 0).any(axis=1)))
+    return list(zip(map(tuple, parts[order[first]].tolist()), np.split(order, first[1:]), strict=True))
 
 
 def _parts_of(rect: Rect, edge: int) -> Rect:
@@ -426,25 +445,29 @@ def _within(states: Mapping[Block, State], rect: Rect) -> dict[Block, State]:
     return {block: state for block, state in states.items() if _is_in(block, rect)}
 
 
-def _by_square(turns: Mapping[Block, int], squares: Set[Block]) -> dict[Block, int]:
-    """The newest turn in each of these squares, where there is one."""
-    newest: dict[Block, int] = {}
-    for (x, y), turn in turns.items():
-        square = x // SQUARE, y // SQUARE
-        if square in squares:
-            newest[square] = max(turn, newest.get(square, NEVER))
-    return newest
+def _image(turns: Mapping[Block, int], rect: Rect) -> tuple[tuple[Ints, Ints], Floats]:
+    """Turns of blocks in a rectangle as an image (rows, columns), NEVER elsewhere; and where in it they are."""
+    places = np.array(list(turns), np.int64).reshape(-1, 2) - rect[:2]
+    at, image = (places[:, 1], places[:, 0]), np.full((rect[3], rect[2]), float(NEVER))
+    image[at] = list(turns.values())
+    return at, image
 
 
-def _spread(turns: Mapping[Block, int], rect: Rect, reach: int) -> dict[Block, int]:
-    """The newest turn of each block of a rectangle and of those around it, where there is one."""
-    image = np.full((rect[3], rect[2]), NEVER, np.float64)
-    for (x, y), turn in turns.items():
-        image[y - rect[1], x - rect[0]] = turn
-    newest = cv2.dilate(image, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8), borderValue=NEVER)
-    rows, columns = np.nonzero(newest > NEVER)
-    places = zip((columns + rect[0]).tolist(), (rows + rect[1]).tolist(), strict=True)
-    return dict(zip(places, newest[rows, columns].astype(int).tolist(), strict=True))
+def _spread(image: Floats, reach: int) -> Floats:
+    """The newest turn of each block and of those around it."""
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return np.asarray(cv2.dilate(image, square, borderValue=NEVER), np.float64)
+
+
+def _by_square(image: Floats, rect: Rect, squares: Set[Block]) -> dict[Block, int]:
+    """The newest turn in each of these squares, where there is one; all of them lie in the rectangle."""
+    first_x, first_y = -rect[0] % SQUARE, -rect[1] % SQUARE
+    rows, columns = (image.shape[0] - first_y) // SQUARE, (image.shape[1] - first_x) // SQUARE
+    whole = image[first_y : first_y + rows * SQUARE, first_x : first_x + columns * SQUARE]
+    newest = whole.reshape(rows, SQUARE, columns, SQUARE).max(axis=(1, 3))
+    left, bottom = (rect[0] + first_x) // SQUARE, (rect[1] + first_y) // SQUARE
+    turns = {(x, y): int(newest[y - bottom, x - left]) for x, y in squares}
+    return {square: turn for square, turn in turns.items() if turn > NEVER}
 
 
 def place_square(out: Floats32, window: CellWindow, square: Block, values: AnyArray) -> None:

@@ -13,8 +13,10 @@ from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.block_layers import BlockLayers
 from mapserver.query.views import read_cells, view_now
+from protocol.queries.answer_codec import decode_point
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 from tests.unit.mapserver.data import CONFIG, SITE, incoming, open_writer, random_samples, samples, send
+from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
 
 ALL = (*LAYERS, *AREA_LAYERS)
 WINDOW = CellWindow(-70, -45, 130, 100)
@@ -174,3 +176,27 @@ def test_a_block_is_derived_again_where_what_came_in_beside_it_shows_that_its_gr
         wide = drive(writer, range(16, 19), 0.2, 7200.0)
         assert wide == pytest.approx(0.2, rel=0.1)
         assert narrow < wide / 2
+
+
+def test_a_point_that_is_kept_is_what_its_region_says_until_something_comes_in_beside_it(tmp_path):
+    names = ("resistance", "grade", "changed_s")
+    with closing(open_writer(tmp_path)) as writer:
+        answers, asked = answers_of(writer), {"x": "0.5", "y": "0.5", "layers": "resistance,grade"}
+        send(writer, [incoming(samples(600, x_m=np.arange(-300, 300) + 0.5, y_m=0.5, distance_m=4.0))])
+
+        def kept_cell(cell: tuple[int, int], names: tuple[str, ...]) -> dict[str, float] | None:
+            return writer.run(lambda state: answers._layers.kept_cell(state, cell, names))
+
+        assert kept_cell((0, 0), names[:2]) is None, "nobody has asked yet"
+        first = answered(answers, "point", asked)
+        assert answered(answers, "point", asked) == first
+        assert kept_cell((0, 0), names[:2]) == decode_point(first).values
+        assert kept_cell((0, 0), names) is None, "ages follow from the site's now"
+        assert kept_cell((5000, 5000), names[:2]) is None
+        more = samples(5, x_m=np.arange(5) + 17.5, y_m=0.5, distance_m=4.0, c_rr=0.2)
+        more["stamp_ns"] += 10**12
+        send(writer, [incoming(more, first_seq=601)])
+        assert kept_cell((0, 0), names[:2]) is None, "whether the ground changed is seen with its surroundings"
+        again = decode_point(answered(answers, "point", asked))
+        assert again.version.row == 2
+        assert again.values == decode_point(first).values
