@@ -10,7 +10,7 @@ import numpy as np
 
 from mapserver.pictures.frame import INK, Axes, Colour, Image, LegendEntry, compose, text, text_size
 from protocol.arrays import Floats, Ints
-from protocol.queries.roads import RoadSegment, Segments, Worklist
+from protocol.queries.roads import RoadChange, RoadSegment, Segments, Worklist
 from protocol.site.geometry import Bounds
 
 TOP = 10
@@ -43,7 +43,8 @@ def draw_worklist(roads: Segments, worklist: Worklist) -> Image:
     thick = max(3, round(5 * px_per_m))
     for one in roads.segments:
         _line(ground, axes, one, _colour(one, worklist.target), thick)
-    for change in worklist.changes:
+    repaired, _ = _changes(worklist)
+    for change in repaired:
         cv2.polylines(ground, [_pixels(axes, np.array(change.line), len(ground))], False, REPAIRED, thick // 2)
     for row in rows:
         _line(ground, axes, row.segment, WORST, thick)
@@ -53,7 +54,7 @@ def draw_worklist(roads: Segments, worklist: Worklist) -> Image:
         _number(ground, axes, row.segment, str(place))
     classes = [LegendEntry(WORST, f"costs most: the first {len(rows)}")] if rows else []
     classes += [LegendEntry(colour, words) for _, colour, words in STEPS] + [LegendEntry(UNKNOWN, "not known")]
-    classes += [LegendEntry(REPAIRED, "changed since")] if worklist.changes else []
+    classes += [LegendEntry(REPAIRED, "repaired")] if repaired else []
     title = f"Where work pays: {worklist.total_kwh_ph:.1f} kWh an hour lost against a resistance of {worklist.target:g}"
     return compose(ground, axes, title, classes, notes=_notes(worklist))
 
@@ -64,14 +65,24 @@ def _notes(worklist: Worklist) -> Sequence[str]:
         value, low, high = row.kwh_ph
         one = row.segment
         known = f"{one.resistance:.3f} +- {one.resistance_std:.3f}" if one.resistance and one.resistance_std else "?"
-        notes.append(f"{place}  {value:.2f} kWh/h ({low:.2f} to {high:.2f}), {row.litres_ph[0]:.1f} l/h")
+        notes.append(f"{place}  {value:.2f} kWh/h ({low:.2f} to {high:.2f}), {row.litres_ph[0]:.2g} l/h")
         notes.append(f"     resistance {known}, {sum(one.passes_ph):.0f} passes/h" + " (mass guessed)" * one.guessed)
         if row.before is not None:
             notes.append(f"     since {_time(row.since_ns)}, {row.before:.3f} before")
-    saved = [change.saved_kwh_ph for change in worklist.changes]
-    if saved:
-        notes.append(f"{len(saved)} stretches changed: {sum(saved):.1f} kWh an hour saved")
+    ranks = [row.rank for row in worklist.rows[:TOP]]
+    if len(set(ranks)) < len(ranks):
+        notes.append("Those that cost nearly the same may stand in either order.")
+    for changes, words, effect in zip(_changes(worklist), ("repaired", "worse"), ("saved", "more lost"), strict=True):
+        if changes:
+            kwh_ph = abs(sum(change.saved_kwh_ph for change in changes))
+            notes.append(f"{len(changes)} {words} since they were known: {kwh_ph:.1f} kWh an hour {effect}")
     return notes
+
+
+def _changes(worklist: Worklist) -> tuple[list[RoadChange], list[RoadChange]]:
+    """Stretches that were repaired, and those that became worse."""
+    better = [change for change in worklist.changes if change.after < change.before]
+    return better, [change for change in worklist.changes if change.after >= change.before]
 
 
 def _time(stamp_ns: int) -> str:

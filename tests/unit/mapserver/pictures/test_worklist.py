@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapserver.pictures.worklist import REPAIRED, UNKNOWN, WORST, draw_worklist
+from mapserver.pictures.worklist import REPAIRED, UNKNOWN, WORST, _notes, draw_worklist
 from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
 from tests.paths import GOLDEN
 
@@ -33,3 +33,20 @@ def test_a_map_without_roads_is_a_picture():
     picture = draw_worklist(Segments(*version, 0.0, 1.0, ()), Worklist(*version, 0.0, 0.02, 0.0, (), ()))
     assert picture.ndim == 3
     assert count(picture, WORST) == 0
+
+
+def test_what_became_worse_is_not_green_and_is_said():
+    change = WORK.changes[0]
+    worse = replace(change, before=change.after, after=change.before, saved_kwh_ph=-change.saved_kwh_ph)
+    assert count(draw_worklist(ROADS, replace(WORK, rows=(), changes=(worse,))), REPAIRED) == 0
+    notes = _notes(replace(WORK, rows=(), changes=(change, worse)))
+    assert notes[-2:] == [
+        f"1 repaired since they were known: {change.saved_kwh_ph:.1f} kWh an hour saved",
+        f"1 worse since they were known: {change.saved_kwh_ph:.1f} kWh an hour more lost",
+    ]
+
+
+def test_stretches_of_one_rank_are_said_to_be_so():
+    row = WORK.rows[0]
+    assert any("either order" in note for note in _notes(replace(WORK, rows=(row, row))))
+    assert not any("either order" in note for note in _notes(replace(WORK, rows=(row,))))
