@@ -33,9 +33,9 @@ def around(squares: Iterable[Square]) -> set[Square]:
 
 
 def bare(squares: Squares, among: Iterable[Square]) -> set[Square]:
-    """Those that have cells where nobody was."""
-    driven = np.asarray(np.isfinite(squares.layers["visits"]).all(axis=(1, 2)))
-    return set(among) - {place for place, at in squares.by_place().items() if driven[at]}
+    """Those that have cells where nobody was, or none could tell the resistance."""
+    whole = np.isfinite(squares.layers["visits"] + squares.layers["resistance_filled"]).reshape(len(squares.places), -1)
+    return set(among) - {place for place, at in squares.by_place().items() if whole[at].all()}
 
 
 def priced(squares: Squares, wanted: Set[Square], given: float | None) -> Squares:

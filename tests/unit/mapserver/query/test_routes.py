@@ -146,6 +146,9 @@ def test_unknown_ground_costs_the_same_whoever_asks_from_wherever(tmp_path):
             again, straight = ask(answers, RouteQuery(line, SLOW)), ask(answers, RouteQuery(ends, SLOW))
             assert again.totals == way.totals
             assert way.totals.energy_j <= straight.totals.energy_j
+        then = ask(answers, WayQuery(*ends, SLOW, as_of_ns=way.stamp_ns))
+        assert then.line_m.tolist() == way.line_m.tolist()
+        assert then.totals == way.totals, "as of a time as now"
         long, short = (ask(answers, RouteQuery(((-x, 3.0), (x, 3.0)), SLOW, step_m=1.0)).steps for x in (58.0, 12.0))
         assert long.resistance[46:70] == pytest.approx(short.resistance)
         alone = ask(answers, RouteQuery(((-2.0, 3.0), (2.0, 3.0)), SLOW)).totals

@@ -73,6 +73,7 @@ def test_far_from_everything_ground_is_as_loose_as_sand_unless_somebody_says_wha
 def test_what_was_driven_and_not_measured_is_as_the_nearest_that_was() -> None:
     one = squares({(0, 0): {"resistance": half(0.04)}})
     assert priced(one, HERE, None).layers[RESISTANCE][0][:, EDGE // 2 :] == pytest.approx(0.04)
+    assert bare(one, HERE) == HERE, "though machines were everywhere"
 
 
 def test_squares_are_bare_where_any_cell_was_never_driven() -> None:
