@@ -23,7 +23,7 @@ from sim.sensors.presets import load_preset
 OUTAGE_S, PERIOD_S = 60.0, 300.0  # one minute in five
 KBIT_PER_S = 300.0
 BAD, STANDALONE = "bad", "standalone"
-SPEED = 8.0  # of the replay of four machines: two cores run their agents 15 times as fast as logs are
+SPEED = 8.0  # of replays: two cores run four agents 15 times as fast as logs are
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ def arms(whole_s: float, world: str | None = None) -> tuple[Arm, ...]:
     """
     four = Arm("four", EIGHT, 4, 0.4 * whole_s, SPEED, world=world)
     return (
-        Arm("one", ONE, 1, whole_s, 2 * SPEED, world=world),
-        Arm("two", TWO, 2, 0.6 * whole_s, 2 * SPEED, world=world),
+        Arm("one", ONE, 1, whole_s, SPEED, world=world),
+        Arm("two", TWO, 2, 0.6 * whole_s, SPEED, world=world),
         four,
         replace(four, name="eight", machines=8, speed=SPEED / 2),
         replace(four, name="lost", link=LOST),

@@ -13,7 +13,7 @@ from evaluation.campaign.figures import Goal, Report, Row, half_width, judge, ro
 from evaluation.cooperation import live, scores
 from evaluation.cooperation.arms import Arm, arms
 from evaluation.cooperation.central import central_tasks
-from evaluation.cooperation.drives import TWO
+from evaluation.cooperation.drives import REPAVED, TWO
 from evaluation.cooperation.live import LiveRun
 from evaluation.cooperation.network import FIGURES
 from evaluation.cooperation.scores import SHARE_PCT, Judging, Scored, minutes_until
@@ -31,7 +31,7 @@ GRADES = tuple(Goal({"arm": FOUR, "rounds": n}, "grade_pct", "<=", limit) for n,
 COSTS = tuple(
     Goal({"arm": arm}, "cost_pct", "<=", limit) for arm, limit in (("bad_machine", 0.05), ("standalone", 0.1))
 )
-PASSES = (Goal({}, "passes", "<=", 2),)
+PASSES = tuple(Goal({"ground": name}, "passes", "<=", 2) for name in REPAVED)
 
 
 @dataclass(frozen=True)
