@@ -76,9 +76,9 @@ class Arm:
 def arms(whole_s: float, world: str | None = None) -> tuple[Arm, ...]:
     """All arms. whole_s: of a lone machine's recording, which has three rounds of all tours or more.
 
-    Two machines have drive for 3/5 of that time, more machines for 2/5: six rounds and more of one tour each.
+    Two machines drive for 3/5 of that time, more machines for 9/20: six rounds and more of one tour each.
     """
-    four = Arm("four", EIGHT, 4, 0.4 * whole_s, SPEED, world=world)
+    four = Arm("four", EIGHT, 4, 0.45 * whole_s, SPEED, world=world)
     return (
         Arm("one", ONE, 1, whole_s, SPEED, world=world),
         Arm("two", TWO, 2, 0.6 * whole_s, SPEED, world=world),
