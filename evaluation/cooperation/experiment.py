@@ -177,15 +177,13 @@ def speedup_rows(rows: Sequence[Row]) -> list[Row]:
 
 def round_rows(outcome: Outcome) -> list[Row]:
     """After each of ROUNDS: means over the seeds, and with what was decided in the end; NaN where one drove fewer."""
-    nothing = dict.fromkeys(("minutes", *FIGURES), math.nan)
+    names = ("minutes", *FIGURES)
+    nothing: Row = {**dict.fromkeys(names, math.nan), "decided": dict.fromkeys(names, math.nan)}
     out = []
     for number, rounds in enumerate(ROUNDS):
-        of_seeds = [
-            each.rounds[number] if number < len(each.rounds) else {**nothing, "decided": nothing}
-            for each in outcome.scored
-        ]
+        of_seeds = [each.rounds[number] if number < len(each.rounds) else nothing for each in outcome.scored]
         row: Row = {"arm": outcome.judging.name, "rounds": rounds}
-        row |= {name: _mean([each[name] for each in of_seeds]) for name in nothing}
+        row |= {name: _mean([each[name] for each in of_seeds]) for name in names}
         row |= {f"decided_{name}": _mean([each["decided"][name] for each in of_seeds]) for name in DECIDED}
         out.append(rounded({**row, "by_seed": {"grade_pct": [each["grade_pct"] for each in of_seeds]}}, DIGITS))
     return out
