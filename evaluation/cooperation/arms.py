@@ -23,7 +23,7 @@ from sim.sensors.presets import load_preset
 OUTAGE_S, PERIOD_S = 60.0, 300.0  # one minute in five
 KBIT_PER_S = 300.0
 BAD, STANDALONE = "bad", "standalone"
-SPEED = 8.0  # of the replay of four machines: two cores run their agents 15 times as fast as logs are
+SPEED = 8.0  # of replays: two cores run four agents 15 times as fast as logs are
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ class Arm:
 def arms(whole_s: float, world: str | None = None) -> tuple[Arm, ...]:
     """All arms. whole_s: of a lone machine's recording, which has three rounds of all tours or more.
 
-    Two machines have drive for 3/5 of that time, more machines for 2/5: six rounds and more of one tour each.
+    Two machines drive for 3/5 of that time, more machines for 9/20: six rounds and more of one tour each.
     """
-    four = Arm("four", EIGHT, 4, 0.4 * whole_s, SPEED, world=world)
+    four = Arm("four", EIGHT, 4, 0.45 * whole_s, SPEED, world=world)
     return (
-        Arm("one", ONE, 1, whole_s, 2 * SPEED, world=world),
-        Arm("two", TWO, 2, 0.6 * whole_s, 2 * SPEED, world=world),
+        Arm("one", ONE, 1, whole_s, SPEED, world=world),
+        Arm("two", TWO, 2, 0.6 * whole_s, SPEED, world=world),
         four,
         replace(four, name="eight", machines=8, speed=SPEED / 2),
         replace(four, name="lost", link=LOST),

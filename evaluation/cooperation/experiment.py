@@ -13,16 +13,17 @@ from evaluation.campaign.figures import Goal, Report, Row, half_width, judge, ro
 from evaluation.cooperation import live, scores
 from evaluation.cooperation.arms import Arm, arms
 from evaluation.cooperation.central import central_tasks
-from evaluation.cooperation.drives import TWO
+from evaluation.cooperation.drives import REPAVED, TWO
 from evaluation.cooperation.live import LiveRun
 from evaluation.cooperation.network import FIGURES
-from evaluation.cooperation.scores import SHARE_PCT, Judging, Scored, minutes_until
+from evaluation.cooperation.scores import ROUNDS, SHARE_PCT, Judging, Scored, minutes_until
 from evaluation.fleet import drives as fleet_drives
 from protocol.errors import SitegridError
 
 WHOLE_S, LEAST_S = 1200.0, 300.0  # of a lone machine's recording
 ALONE, FOUR = "one", "four"
 DIGITS = 4
+DECIDED = ("c_rr_pct", "grade_pct")  # that are shown with what was decided in the end, too
 DRIVEN = ("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct")
 SPEEDUPS = (Goal({"arm": FOUR}, "speedup", ">=", 3.0),)
 ENDS = (Goal({"arm": FOUR}, "c_rr_pct", "<=", 6.0),)
@@ -31,7 +32,7 @@ GRADES = tuple(Goal({"arm": FOUR, "rounds": n}, "grade_pct", "<=", limit) for n,
 COSTS = tuple(
     Goal({"arm": arm}, "cost_pct", "<=", limit) for arm, limit in (("bad_machine", 0.05), ("standalone", 0.1))
 )
-PASSES = (Goal({}, "passes", "<=", 2),)
+PASSES = tuple(Goal({"ground": name}, "passes", "<=", 2) for name in REPAVED)
 
 
 @dataclass(frozen=True)
@@ -175,18 +176,16 @@ def speedup_rows(rows: Sequence[Row]) -> list[Row]:
 
 
 def round_rows(outcome: Outcome) -> list[Row]:
-    """After each round that all machines have driven with all seeds: means, and with what was decided in the end."""
+    """After each of ROUNDS: means over the seeds, and with what was decided in the end; NaN where one drove fewer."""
+    names = ("minutes", *FIGURES)
+    nothing: Row = {**dict.fromkeys(names, math.nan), "decided": dict.fromkeys(names, math.nan)}
     out = []
-    for number in range(min(len(each.rounds) for each in outcome.scored)):
-        of_seeds = [each.rounds[number] for each in outcome.scored]
-        row: Row = {
-            "arm": outcome.judging.name,
-            "rounds": number + 1,
-            "minutes": _mean([r["minutes"] for r in of_seeds]),
-        }
-        row |= {name: _mean([r[name] for r in of_seeds]) for name in FIGURES}
-        row |= {f"decided_{name}": _mean([r["decided"][name] for r in of_seeds]) for name in ("c_rr_pct", "grade_pct")}
-        out.append(rounded({**row, "by_seed": {"grade_pct": [r["grade_pct"] for r in of_seeds]}}, DIGITS))
+    for number, rounds in enumerate(ROUNDS):
+        of_seeds = [each.rounds[number] if number < len(each.rounds) else nothing for each in outcome.scored]
+        row: Row = {"arm": outcome.judging.name, "rounds": rounds}
+        row |= {name: _mean([each[name] for each in of_seeds]) for name in names}
+        row |= {f"decided_{name}": _mean([each["decided"][name] for each in of_seeds]) for name in DECIDED}
+        out.append(rounded({**row, "by_seed": {"grade_pct": [each["grade_pct"] for each in of_seeds]}}, DIGITS))
     return out
 
 

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ class Process:
         self._log = log
         self._lines: dict[str, Any] = {}
         self._new = threading.Condition()
+        self._is_silent = False  # whether it will print no more
         with log.open("ab") as errors:
             self._process = subprocess.Popen(  # noqa: S603 - our own command, no shell
                 [sys.executable, "-m", "sitegrid.cli", *words],
@@ -45,9 +46,12 @@ class Process:
     def expect(self, key: str, timeout_s: float) -> Any:
         """What it printed under a key; SitegridError where it ends, or the time is up, before."""
         with self._new:
-            self._new.wait_for(lambda: key in self._lines or not self._reader.is_alive(), timeout_s)
+            self._new.wait_for(lambda: key in self._lines or self._is_silent, timeout_s)
             if key in self._lines:
                 return self._lines[key]
+        if self._is_silent:  # it has closed its end of the pipe, and is about to be gone
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(END_S)
         ended = self._process.poll()
         last = self._log.read_text(errors="replace").strip().rpartition("\n")[2]
         what = f"ended with {ended}" if ended is not None else f"still runs after {timeout_s:g} s"
@@ -78,6 +82,7 @@ class Process:
                     self._lines.update(table)
                     self._new.notify_all()
         with self._new:
+            self._is_silent = True
             self._new.notify_all()
 
 

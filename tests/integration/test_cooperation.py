@@ -21,7 +21,7 @@ STORED = Path(__file__).parent / "cooperation_quick.json"
 WITHIN = {"covered_pct": 15.0, "wrong_pct": 15.0, "c_rr_pct": 15.0, "driven_wrong_pct": 15.0, "grade_pct": 0.2}
 EXACT = ("arm", "machines", "link", "recorded_s", "known_pct", "driven_known_pct")
 
-pytestmark = [pytest.mark.processes, pytest.mark.slow]
+pytestmark = [pytest.mark.processes, pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """The report of cooperation: rows of made-up figures, goals, refusals."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -96,10 +97,23 @@ def test_every_goal_has_one_row_or_one_for_each_ground():
     ]
 
 
+def test_a_round_that_one_seed_did_not_drive_has_a_row_without_figures():
+    made = outcomes(PLAN, {"one": 5.0})
+    four = next(each for each in made if each.judging.name == "four")
+    short = replace(four.scored[0], rounds=four.scored[0].rounds[:5])
+    made[made.index(four)] = replace(four, scored=[short, four.scored[1]])
+    result = report(PLAN, made)
+    rows = {row["rounds"]: row for row in result["rounds"] if row["arm"] == "four"}
+    assert list(rows) == [1, 2, 3, 4, 5, 6]
+    assert rows[5]["grade_pct"] == pytest.approx(0.08)
+    assert np.isnan(rows[6]["grade_pct"])
+    assert [goal["met"] for goal in result["goals"] if goal["row"] == "four 6"] == [False]
+
+
 def test_bytes_are_those_of_one_machine_in_one_hour_of_its_work():
     rows = {row["arm"]: row for row in report(PLAN, outcomes(PLAN, {}))["rows"]}
     four = next(arm for arm in PLAN.arms if arm.name == "four")
-    assert rows["four"]["sent_mb_per_h"] == pytest.approx(2.0 * 3600 / four.seconds)
+    assert rows["four"]["sent_mb_per_h"] == pytest.approx(2.0 * 3600 / four.seconds, abs=1e-4)
     assert rows["four"]["received_mb_per_h"] == pytest.approx(0.001 * 3600 / four.seconds, abs=1e-4)
     assert rows["central"]["sent_mb_per_h"] is None
     assert (rows["central"]["link"], rows["central"]["same_pct"]) == ("perfect", 100.0)
@@ -132,4 +146,4 @@ def test_the_quick_version_takes_no_other_drives(capsys: pytest.CaptureFixture, 
 
 def test_an_arm_is_judged_with_the_length_of_its_recording():
     lengths = {arm.name: arm.seconds for arm in arms(1000.0)}
-    assert (lengths["one"], lengths["two"], lengths["four"], lengths["eight"]) == (1000.0, 600.0, 400.0, 400.0)
+    assert (lengths["one"], lengths["two"], lengths["four"], lengths["eight"]) == (1000.0, 600.0, 450.0, 450.0)
