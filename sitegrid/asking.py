@@ -125,7 +125,7 @@ class Asker:
     def ask(self, query: requests.MapQuery, *, at: Origin | None = None) -> Answered:
         """Ask the map. at: of whoever gave an earlier answer, which has what this one goes on with."""
         wait_s = query.fresh.wait_s if query.fresh.after else 0.0
-        wait_s += PAST_S if requests.reads_past(query) else 0.0
+        wait_s += PAST_S if requests.may_read_journal(query) else 0.0
         if at and at.follower:
             return self._of_follower(query, at.follower)
         return self._get(query, wait_s)

@@ -219,6 +219,7 @@ class Client:
         step_m: float = 25.0,
         unknown: str | float = "dearest",
         as_of_ns: int | None = None,
+        repairs: bool = True,
         after: int = 0,
         wait_s: float = 10.0,
     ) -> RouteAnswer:
@@ -231,7 +232,7 @@ class Client:
         """
         fresh = Freshness(after, wait_s)
         places = tuple((float(x), float(y)) for x, y in line)
-        return self.drive(RouteQuery(places, _machine(machine), stops, step_m, unknown, as_of_ns, fresh))
+        return self.drive(RouteQuery(places, _machine(machine), stops, step_m, unknown, as_of_ns, fresh, repairs))
 
     def way(
         self,
@@ -247,6 +248,7 @@ class Client:
         step_m: float = 25.0,
         unknown: str | float = "dearest",
         as_of_ns: int | None = None,
+        repairs: bool = True,
         after: int = 0,
         wait_s: float = 10.0,
     ) -> RouteAnswer:
@@ -269,6 +271,7 @@ class Client:
             unknown,
             as_of_ns,
             Freshness(after, wait_s),
+            repairs,
         )
         return self.drive(query)
 

@@ -6,24 +6,26 @@ It is one module because all queries about cells read them in the same few steps
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Set
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
+from mapserver.evidence.timeline import Block
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.past.cell_history import CellHistory
 from mapserver.query import roads
 from mapserver.query.areas import cells_to_a_side, finer, inside, means
-from mapserver.query.block_layers import BlockLayers, Look
+from mapserver.query.block_layers import BlockLayers, Look, around_squares
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
 from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
-from mapserver.query.source import MapSource
-from mapserver.query.views import PastMaps, View, view_now, widened
+from mapserver.query.source import MapSource, MapState
+from mapserver.query.views import PastMaps, StillMap, View, view_now, widened
 from mapserver.query.why import reasons
 from protocol.arrays import Floats32, Ints
 from protocol.errors import QueryError, Refusal
@@ -64,10 +66,10 @@ class Answers:
         self._source = source
         self._site, self._config = source.site, source.config
         self._layers = BlockLayers(self._site.cell_m, self._config)
-        self._routes = Routes(source, self._layers, lambda: self._past)
+        self._routes = Routes(source, self._layers, self._look_at_squares)
         self._open = OpenRegions()
-        self._tiles = Tiles(source)
         self._roads = RoadMaps(source)
+        self._tiles = Tiles(source, self._roads.lately)
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
 
     @property
@@ -237,22 +239,34 @@ class Answers:
         self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
     ) -> tuple[dict[str, Floats32], Look]:
         """Layers (n,) of cells (n, 2), columns and rows, and what they were read from."""
-        if as_of_ns is None and not repairs:
-            look = self._source.run(lambda state: self._layers.look_cells(state, cells, names))
+        if as_of_ns is None:
+            look = self._now(lambda state: self._layers.look_cells(state, cells, names), repairs=repairs)
         else:
             first, last = cells.min(axis=0), cells.max(axis=0)
             window = CellWindow(*first.tolist(), *(last - first + 1).tolist())
             look = self._look(window, names, as_of_ns, repairs=repairs)
         return self._layers.at_cells(look, cells, names), look
 
+    def _look_at_squares(
+        self, squares: Set[Block], names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
+    ) -> Look:
+        """What layers of areas are read from in these squares."""
+        if as_of_ns is None:
+            return self._now(lambda state: self._layers.look_squares(state, squares, names), repairs=repairs)
+        return self._look(around_squares(squares), names, as_of_ns, repairs=repairs)
+
     def _look(self, window: CellWindow, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool) -> Look:
-        if as_of_ns is None and not repairs:
-            return self._source.run(lambda state: self._layers.look(state, window, names))
+        if as_of_ns is None:
+            return self._now(lambda state: self._layers.look(state, window, names), repairs=repairs)
         wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
         if repairs:
             reach = reach_blocks(self._site.cell_m, self._config.change)
             return self._layers.look_at(self._roads.view(wide, reach, as_of_ns))
         return self._layers.look_at(self._view(wide, as_of_ns))
+
+    def _now(self, look: Callable[[MapState | StillMap], Look], *, repairs: bool) -> Look:
+        """Look at the map as it is; repairs: with the ages of roads, at the version that these are of."""
+        return look(self._roads.read().still) if repairs else self._source.run(look)
 
     def _piece(self, reading: Reading, pieces: PieceGrid, number: int, cursor: int) -> Region:
         return replace(self._read(reading, pieces.piece(number)), piece=pieces.place(number, cursor))

@@ -3,16 +3,19 @@
 A layer of a cell depends on the pages of its block, and, since a change of the ground is seen with its surroundings, on
 those of the blocks around; a layer of an area on the cells around it besides. The grid numbers its turns and knows the
 last one of each block, so a block is derived again only where something was folded into it or near to it. Layers of
-areas are derived square by square, of some blocks each: the same bits for whoever asks, for whatever window.
+areas are derived square by square, of some blocks each: the same bits for whoever asks, for whatever window. Where the
+ground of a road changed, they depend on its age besides: what is read with ages and without has all other blocks in
+common.
 
 It is one module because what is looked up on the map's thread and what is derived beside it have to agree.
 """
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import product
 from weakref import ReferenceType, ref
@@ -28,7 +31,7 @@ from mapserver.evidence.timeline import Block, evidence
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.source import MapState
-from mapserver.query.views import View, place
+from mapserver.query.views import StillMap, View, place
 from protocol.arrays import AnyArray, Floats, Floats32, Ints
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -40,13 +43,16 @@ NEVER = -1  # turn of a block without evidence
 # These follow from stamps and the site's now; the stamps are kept.
 TIMED = {"age_s": "newest_ns", "changed_s": "changed_ns"}
 Layers = Mapping[str, AnyArray]  # (256,) each, or of a square
+# What layers depend on: the last turn of the grid of all blocks that they do, and the ages there.
+State = tuple[int, bytes]
+NO_AGES = b""
 
 
 @dataclass(frozen=True)
 class Kept:
-    """Layers of one block or square, as of a turn of the grid: the last one of all that they depend on."""
+    """Layers of one block or square, and what they were derived from."""
 
-    turn: int
+    state: State
     layers: Layers
 
 
@@ -54,8 +60,8 @@ class Kept:
 class Look:
     """What a window's layers are read from, of one version of the map: layers that are kept, and pages of the others.
 
-    cells, areas: what is kept of blocks and of squares, as of these turns; cell_turns: of all blocks with evidence,
-    area_turns: of all squares that have or are near any. pages: of the blocks whose layers of cells are to be derived,
+    cells, areas: what is kept of blocks and of squares, of these states; cell_states: of all blocks with evidence,
+    area_states: of all squares that have or are near any. pages: of the blocks whose layers of cells are to be derived,
     and of those around them. ages: as in View.
     """
 
@@ -63,8 +69,8 @@ class Look:
     stamp_ns: int
     cells: Mapping[Block, Kept]
     areas: Mapping[Block, Kept]
-    cell_turns: Mapping[Block, int]
-    area_turns: Mapping[Block, int]
+    cell_states: Mapping[Block, State]
+    area_states: Mapping[Block, State]
     pages: Pages
     grid: ReferenceType[Grid] | None = None
     ages: Ages = field(default_factory=dict)
@@ -84,19 +90,16 @@ class BlockLayers:
         self._grid: ReferenceType[Grid] | None = None
         self.used, self.derived = 0, 0  # blocks and squares whose layers were kept, and had to be derived
 
-    def look(self, state: MapState, window: CellWindow, names: Sequence[str]) -> Look:
+    def look(self, state: MapState | StillMap, window: CellWindow, names: Sequence[str]) -> Look:
         """What these layers of a window are read from."""
         area_names, inner = _areas_of(names), _blocks_of(window)
         return self._look(state, inner, _stored(names), squares_of(window) if area_names else set(), area_names)
 
-    def look_squares(self, state: MapState, squares: Set[Block], names: Sequence[str]) -> Look:
-        """What layers of cells or areas are read from in these squares; not of ages, which are not kept so."""
-        left, bottom = (min(square[axis] for square in squares) for axis in (0, 1))
-        right, top = (max(square[axis] for square in squares) for axis in (0, 1))
-        rect = _of_squares((left, bottom, right - left + 1, top - bottom + 1))
-        return self._look(state, rect, (), squares, tuple(names))
+    def look_squares(self, state: MapState | StillMap, squares: Set[Block], names: Sequence[str]) -> Look:
+        """What layers of areas are read from in these squares."""
+        return self._look(state, _blocks_of(around_squares(squares)), (), squares, tuple(names))
 
-    def look_cells(self, state: MapState, cells: Ints, names: Sequence[str]) -> Look:
+    def look_cells(self, state: MapState | StillMap, cells: Ints, names: Sequence[str]) -> Look:
         """What these layers of cells (n, 2), columns and rows, are read from."""
         area_names, blocks = _areas_of(names), _blocks_with(cells)
         squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} if area_names else set[Block]()
@@ -108,7 +111,7 @@ class BlockLayers:
 
     def _look(
         self,
-        state: MapState,
+        state: MapState | StillMap,
         inner: Rect,
         cell_names: tuple[str, ...],
         squares: Set[Block],
@@ -117,40 +120,44 @@ class BlockLayers:
     ) -> Look:
         """Layers of cells in a rectangle of blocks, or in some of it only, and of areas in squares that touch it."""
         grid, margin = state.grid, self._margin(area_names)
+        ages, owner = (state.ages, state.grid.grid) if isinstance(state, StillMap) else ({}, ref(state.grid))
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
         own = dict(zip(blocks := grid.blocks_in(_cells_of(wide)), grid.last_turns(blocks), strict=True))
         cell_turns = _spread(own, wide, self._reach)
         area_turns = _by_square(_spread(cell_turns, wide, margin), squares) if squares else {}
+        cell_states = _states(cell_turns, ages, lambda block: [block])
+        area_states = _states(area_turns, ages, lambda square: self._around([square], area_names))
         with self._lock:
-            if self._grid is None or self._grid() is not grid:  # a fact, or rows that are gone, bring another one
+            if self._grid is None or self._grid() is not owner():  # a fact, or rows that are gone, bring another one
                 self._cells.clear()
                 self._areas.clear()
-                self._grid, self._count = ref(grid), 0
-            areas = _valid(self._areas, area_turns, area_names)
-            needed = self._around(area_turns.keys() - areas.keys(), area_names)
+                self._grid, self._count = owner, 0
+            areas = _valid(self._areas, area_states, area_names)
+            needed = self._around(area_states.keys() - areas.keys(), area_names)
             needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
             asked = own.keys() & only if only is not None else {b for b in own if _is_in(b, inner)}
-            wanted = {b: cell_turns[b] for b in own if b in needed or (cell_names and b in asked)}
+            wanted = {b: cell_states[b] for b in own if b in needed or (cell_names and b in asked)}
             cells = _valid(self._cells, wanted, needed_names)
         missing = wanted.keys() - cells.keys()
         near = sorted({one for block in missing for one in around(block, self._reach) if one in own})
         pages = dict(zip(near, grid.pages(near), strict=True))
-        turns = {block: cell_turns[block] for block in own}
-        return Look(state.version, state.newest_ns, cells, areas, turns, area_turns, pages, self._grid)
+        states = {block: cell_states[block] for block in own}
+        return Look(state.version, state.newest_ns, cells, areas, states, area_states, pages, owner, ages)
 
     def look_at(self, view: View) -> Look:
         """The same of a view, of which nothing is kept: a map of the past."""
-        turns = {block: 0 for block, pages in view.pages.items() if pages}
-        near = {one for block in turns for one in around(block, self._margin(tuple(AREA_LAYERS)))}
-        squares = {(x // SQUARE, y // SQUARE) for x, y in near}
-        return Look(view.version, view.stamp_ns, {}, {}, turns, dict.fromkeys(squares, 0), view.pages, ages=view.ages)
+        state: State = 0, NO_AGES
+        states = {block: state for block, pages in view.pages.items() if pages}
+        near = {one for block in states for one in around(block, self._margin(tuple(AREA_LAYERS)))}
+        squares = dict.fromkeys({(x // SQUARE, y // SQUARE) for x, y in near}, state)
+        return Look(view.version, view.stamp_ns, {}, {}, states, squares, view.pages, ages=view.ages)
 
     def read(self, look: Look, window: CellWindow, names: Sequence[str]) -> dict[str, Floats32]:
         """Layers (rows, columns) of a window within that of the look."""
         cell_names, area_names, inner = _stored(names), _areas_of(names), _blocks_of(window)
         areas = self.squares(look, squares_of(window), area_names) if area_names else {}
-        blocks = _within(look.cell_turns, inner) if cell_names else {}
+        blocks = _within(look.cell_states, inner) if cell_names else {}
         cells = self._cells_of(look, blocks, cell_names)
         out: dict[str, Floats32] = {name: np.full((window.rows, window.columns), np.nan, np.float32) for name in names}
         for name, layer in out.items():
@@ -165,8 +172,8 @@ class BlockLayers:
     def at_cells(self, look: Look, cells: Ints, names: Sequence[str]) -> dict[str, Floats32]:
         """Layers (n,) of cells (n, 2), columns and rows, among those of the look."""
         cell_names, area_names, asked = _stored(names), _areas_of(names), _blocks_with(cells)
-        turns = {block: look.cell_turns[block] for block in asked if block in look.cell_turns}
-        blocks = self._cells_of(look, turns, cell_names) if cell_names else {}
+        states = {block: look.cell_states[block] for block in asked if block in look.cell_states}
+        blocks = self._cells_of(look, states, cell_names) if cell_names else {}
         of_blocks = {
             block: {name: _at(kept.layers, name, look.stamp_ns) for name in names if name not in area_names}
             for block, kept in blocks.items()
@@ -184,11 +191,11 @@ class BlockLayers:
 
     def squares(self, look: Look, squares: Set[Block], names: Sequence[str]) -> dict[Block, Layers]:
         """Layers (SQUARE_CELLS, SQUARE_CELLS) of those of these squares that have or are near any evidence."""
-        wanted = {square: turn for square, turn in look.area_turns.items() if square in squares}
+        wanted = {square: state for square, state in look.area_states.items() if square in squares}
         areas = _valid(look.areas, wanted, names)
         stale = wanted.keys() - areas.keys()
         needed = self._around(stale, names)
-        blocks = {block: turn for block, turn in look.cell_turns.items() if block in needed}
+        blocks = {block: state for block, state in look.cell_states.items() if block in needed}
         cells = self._cells_of(look, blocks, cell_layers.required(names))
         made = {square: Kept(wanted[square], self._derive(square, cells, names)) for square in sorted(stale)}
         self._keep(self._areas, look, made)
@@ -199,7 +206,7 @@ class BlockLayers:
         """How many blocks around one the layers of areas depend on."""
         return -(-cell_layers.margin_cells(names, self._cell_m, self._config.read) // BLOCK_CELLS)
 
-    def _cells_of(self, look: Look, blocks: Mapping[Block, int], names: Sequence[str]) -> dict[Block, Kept]:
+    def _cells_of(self, look: Look, blocks: Mapping[Block, State], names: Sequence[str]) -> dict[Block, Kept]:
         """Layers of the cells of these blocks, kept or derived."""
         cells = _valid(look.cells, blocks, names)
         missing = [block for block in blocks if block not in cells]
@@ -215,7 +222,7 @@ class BlockLayers:
                 values[name] = np.where(np.isnan(values["weight"]), 0, getattr(sums, name))
             for i, block in enumerate(some):
                 old = look.cells.get(block)
-                before = old.layers if old and old.turn == blocks[block] else {}
+                before = old.layers if old and old.state == blocks[block] else {}
                 made[block] = Kept(blocks[block], {**before, **{name: layer[i] for name, layer in values.items()}})
         self._keep(self._cells, look, made)
         self._note(len(cells), len(made))
@@ -252,11 +259,11 @@ class BlockLayers:
                 return
             for block, kept in made.items():
                 old = store.get(block)
-                if old and old.turn > kept.turn:
+                if old and old.state[0] > kept.state[0]:
                     continue
-                layers = {**old.layers, **kept.layers} if old and old.turn == kept.turn else kept.layers
+                layers = {**old.layers, **kept.layers} if old and old.state == kept.state else kept.layers
                 self._count += _size(layers) - (_size(old.layers) if old else 0)
-                store[block] = Kept(kept.turn, layers)
+                store[block] = Kept(kept.state, layers)
                 store.move_to_end(block)
             while self._count > self._most:
                 fuller = self._areas if SQUARE**2 * len(self._areas) > len(self._cells) else self._cells
@@ -284,12 +291,27 @@ def _at(layers: Layers, name: str, now_ns: int) -> Floats | Floats32:
     return layers[name]
 
 
-def _valid(kept: Mapping[Block, Kept], turns: Mapping[Block, int], names: Sequence[str]) -> dict[Block, Kept]:
-    """What is kept of these blocks as of these turns, with all of these layers; and marked as used."""
+def _states(turns: Mapping[Block, int], ages: Ages, near: Callable[[Block], Iterable[Block]]) -> dict[Block, State]:
+    """States of blocks or squares. near: the blocks whose ages they depend on."""
+    if not ages:
+        return {one: (turn, NO_AGES) for one, turn in turns.items()}
+    return {one: (turn, _digest(sorted(ages.keys() & near(one)), ages)) for one, turn in turns.items()}
+
+
+def _digest(blocks: Sequence[Block], ages: Ages) -> bytes:
+    """Stands for the ages in these blocks."""
+    if not blocks:
+        return NO_AGES
+    parts = (part for block in blocks for part in (repr(block).encode(), ages[block].tobytes()))
+    return hashlib.blake2b(b"".join(parts), digest_size=16).digest()
+
+
+def _valid(kept: Mapping[Block, Kept], states: Mapping[Block, State], names: Sequence[str]) -> dict[Block, Kept]:
+    """What is kept of these blocks in these states, with all of these layers; and marked as used."""
     out = {}
-    for block, turn in turns.items():
+    for block, state in states.items():
         one = kept.get(block)
-        if one and one.turn == turn and all(name in one.layers for name in names):
+        if one and one.state == state and all(name in one.layers for name in names):
             out[block] = one
             if isinstance(kept, OrderedDict):
                 kept.move_to_end(block)
@@ -330,6 +352,13 @@ def squares_of(window: CellWindow) -> set[Block]:
     return set(_all_of(_squares_of(_blocks_of(window))))
 
 
+def around_squares(squares: Set[Block]) -> CellWindow:
+    """The window of squares."""
+    left, bottom = (min(square[axis] for square in squares) for axis in (0, 1))
+    right, top = (max(square[axis] for square in squares) for axis in (0, 1))
+    return _cells_of(_of_squares((left, bottom, right - left + 1, top - bottom + 1)))
+
+
 def _squares_of(blocks: Rect) -> Rect:
     return _parts_of(blocks, SQUARE)
 
@@ -355,8 +384,8 @@ def _all_of(rect: Rect) -> Iterable[Block]:
     return product(range(rect[0], rect[0] + rect[2]), range(rect[1], rect[1] + rect[3]))
 
 
-def _within(turns: Mapping[Block, int], rect: Rect) -> dict[Block, int]:
-    return {block: turn for block, turn in turns.items() if _is_in(block, rect)}
+def _within(states: Mapping[Block, State], rect: Rect) -> dict[Block, State]:
+    return {block: state for block, state in states.items() if _is_in(block, rect)}
 
 
 def _by_square(turns: Mapping[Block, int], squares: Set[Block]) -> dict[Block, int]:

@@ -1,21 +1,22 @@
 """Tiles of the map as it is, kept and brought up to date where evidence came in; and of the map as of any time.
 
-A tile is a function of the evidence alone: the age of a cell is counted from the tile's newest sample, so that time
-alone changes no tile.
+A tile is a function of the evidence and of the ages of roads: the age of a cell is counted from the tile's newest
+sample, so that time alone changes no tile. Ages of roads are those of some seconds ago, as a page asks ten times a
+second; they enter together with new rows, which readers ask for.
 """
 
 from __future__ import annotations
 
 import threading
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from weakref import ReferenceType, ref
 
 import numpy as np
 
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import Pages, around, valid_pages
+from mapserver.change.validity import Ages, Pages, around, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
 from mapserver.evidence.timeline import Block, evidence
@@ -58,8 +59,9 @@ class _Square:
 class Tiles:
     """Tiles of the map as it is; for any thread. What it costs is for what changed since somebody last asked."""
 
-    def __init__(self, source: MapSource) -> None:
-        self._source, self._config = source, source.config
+    def __init__(self, source: MapSource, ages: Callable[[], Ages]) -> None:
+        """ages: since when cells of roads are as they are, lately."""
+        self._source, self._config, self._lately = source, source.config, ages
         self._cell_m = source.site.cell_m
         self._reach = reach_blocks(self._cell_m, self._config.change)
         self._lock = threading.Lock()
@@ -67,6 +69,7 @@ class Tiles:
         self._tiles: dict[Place, MapTile] = {}
         self._holding: dict[Block, bytes] = {}  # the pages of blocks that hold, where not all do
         self._turn, self._fact, self._row = -1, -1, 0
+        self._ages: Ages = {}
         self._grid: ReferenceType[Grid] | None = None  # the last one; a fact may bring another one
 
     def answer(self, query: TilesQuery) -> TilesAnswer:
@@ -82,11 +85,12 @@ class Tiles:
 
     def _update(self) -> tuple[MapVersion, int]:
         """Make anew what evidence came into, and what lies so near that a change of the ground there counts for it."""
-        blocks, folded, pages, whole, version, stamp_ns = self._source.run(self._folded)
+        ages = self._lately()
+        blocks, folded, pages, whole, version, stamp_ns = self._source.run(lambda state: self._folded(state, ages))
         if version.row < self._row:  # rows are gone: what was said of them differs from no version
             self._tiles = {}
         squares: dict[Place, _Square] = {} if whole else self._squares
-        first = valid_pages(pages, self._cell_m, self._config.change)
+        first = valid_pages(pages, self._cell_m, self._config.change, self._ages)
         holding = {block: first[block].tobytes() if first[block].any() else b"" for block in blocks}
         others = [
             block for block in blocks if block in folded or holding[block] != self._holding.get(block, b"") or whole
@@ -101,17 +105,25 @@ class Tiles:
         self._squares, self._fact, self._row = squares, version.fact, version.row
         return version, stamp_ns
 
-    def _folded(self, state: MapState) -> tuple[list[Block], set[Block], Pages, bool, MapVersion, int]:
+    def _folded(self, state: MapState, ages: Ages) -> tuple[list[Block], set[Block], Pages, bool, MapVersion, int]:
         """Blocks that may be others, those of them that evidence came into, and pages of all that lies around them."""
         grid, known_grid = state.grid, self._grid and self._grid()
         whole = state.version.fact != self._fact or grid is not known_grid
+        aged: list[Block] = []
+        if whole or state.version.row != self._row:
+            aged = [block for block in ages.keys() | self._ages.keys() if not _is_same(ages, self._ages, block)]
+            self._ages = ages
         folded, self._turn = grid.folded_since(-1 if whole else self._turn)
         self._grid = ref(grid)
-        blocks = folded if whole else sorted({near for one in folded for near in around(one, self._reach)})
+        blocks = folded if whole else sorted({*aged, *(near for one in folded for near in around(one, self._reach))})
         wide = sorted({near for block in blocks for near in around(block, self._reach)})
         pages = {block: pages for block, pages in zip(wide, grid.pages(wide), strict=True) if pages}
         known = [block for block in blocks if block in pages]
         return known, set(folded), pages, whole, state.version, state.newest_ns
+
+
+def _is_same(some: Ages, others: Ages, block: Block) -> bool:
+    return block in some and block in others and bool((some[block] == others[block]).all())
 
 
 def _is_newer(tile: MapTile, since: MapVersion | None) -> bool:

@@ -5,19 +5,23 @@ The tally follows the journal; roads and changes are made as somebody asks, from
 
 from __future__ import annotations
 
+import logging
 import threading
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapserver.change.validity import Ages
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.rows import Selection
 from mapserver.query.source import MapSource, MapState
-from mapserver.query.views import View, surroundings
+from mapserver.query.views import StillGrid, StillMap, View, surroundings
 from mapserver.roads.ledger import Ledger, Ledgers
 from mapserver.roads.network import network
 from mapserver.roads.passes import PassTally
@@ -32,6 +36,8 @@ from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
+log = logging.getLogger("mapserver.query.road_maps")
+LATELY_S, PATIENCE_S = 10.0, 2.0  # how old ages may be for a picture, and how long it waits for them
 LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older journals are not read for it
 
 
@@ -39,7 +45,8 @@ LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older jou
 class RoadMap:
     """Roads of one version of the map, and the tally that goes with it.
 
-    pages: the evidence that the roads are of. changes: of the ground of segments, the newest first.
+    pages: the evidence that the roads are of; grid: the same, of the map as it is. changes: of the ground of segments,
+    the newest first.
     """
 
     segments: Segments
@@ -50,6 +57,19 @@ class RoadMap:
     facts: Facts
     version: MapVersion
     stamp_ns: int
+    cell_m: float = 1.0
+    grid: StillGrid | None = None
+
+    @cached_property
+    def ages(self) -> Ages:
+        """Since when cells of roads are as they are, where their ground changed."""
+        return ages(self.segments, self.changes, self.cell_m)
+
+    @cached_property
+    def still(self) -> StillMap:
+        """The map that the roads are of, of one that is not of the past."""
+        assert self.grid
+        return StillMap(self.grid, self.version, self.stamp_ns, self.ages)
 
     @cached_property
     def ledger(self) -> Ledger:
@@ -100,6 +120,8 @@ class RoadMaps:
         self._lock = threading.Lock()
         self._skeletons = Skeletons(self._cell_m)
         self._made: RoadMap | None = None
+        self._making: threading.Thread | None = None
+        self._made_s = -LATELY_S
         self._begin("", NO_FACTS)
 
     def _begin(self, store: str, facts: Facts) -> None:
@@ -119,26 +141,43 @@ class RoadMaps:
         except StoreError as error:
             raise QueryError(Refusal.STORE, str(error)) from None
 
-    def view(self, window: CellWindow, reach: int, as_of_ns: int | None) -> View:
-        """Evidence of a window and of `reach` blocks around, with the age of roads whose ground changed."""
+    def lately(self) -> Ages:
+        """Ages of cells as of some seconds ago, for pictures; none while the journal is read for the first time."""
+        now_s = time.monotonic()
+        if now_s - self._made_s >= LATELY_S and not (self._making and self._making.is_alive()):
+            self._made_s = now_s
+            self._making = threading.Thread(target=self._make, name="roads", daemon=True)
+            self._making.start()
+            self._making.join(PATIENCE_S)
+        return self._made.ages if self._made else {}
+
+    def _make(self) -> None:
+        try:
+            self.read()
+        except QueryError as error:  # asked again after LATELY_S
+            log.warning("no road map reason=%s problem=%r", error.reason, str(error))
+
+    def view(self, window: CellWindow, reach: int, as_of_ns: int) -> View:
+        """Evidence of a window and of `reach` blocks around as of a time, with the ages that changes of roads give."""
         roads, (left, bottom, right, top) = self.read(as_of_ns), _blocks_of(surroundings(window, reach))
         near = {
             block: pages
             for block, pages in roads.pages.items()
             if left <= block[0] <= right and bottom <= block[1] <= top
         }
-        return View(near, roads.version, roads.stamp_ns, ages(roads.segments, roads.changes, self._cell_m))
+        return View(near, roads.version, roads.stamp_ns, roads.ages)
 
     def _now(self) -> RoadMap:
-        pages, version, facts, newest_ns = self._source.run(_all)
+        grid, version, facts, newest_ns = self._source.run(_all)
         if self._made and self._made.version == version:
             return self._made
         if self._with != (version.store, facts):
             self._begin(version.store, facts)
         self._follow(self._traffic, facts, newest_ns, self._followed, version.row)
         self._followed = version.row
-        ledgers = Ledgers(segments(network(self._skeletons.skeleton(pages))))
-        self._made = self._map(ledgers, self._traffic, pages, facts, version, newest_ns)
+        ledgers = Ledgers(segments(network(self._skeletons.skeleton(grid.all_pages))))
+        made = self._map(ledgers, self._traffic, grid.all_pages, facts, version, newest_ns)
+        self._made = replace(made, grid=grid)
         return self._made
 
     def _as_of(self, as_of_ns: int, machine: str) -> RoadMap:
@@ -188,11 +227,13 @@ class RoadMaps:
         table = table[slot(table["key"]) >= first]
         changes, _ = repairs(traffic.passes.passes(ledgers, first * HOUR_NS))
         newest_first = tuple(sorted(changes, key=lambda change: (-change.seen, change.segment)))
-        return RoadMap(ledgers.segments, ledgers, table, newest_first, pages, facts, version, stamp_ns)
+        return RoadMap(ledgers.segments, ledgers, table, newest_first, pages, facts, version, stamp_ns, self._cell_m)
 
 
-def _all(state: MapState) -> tuple[Pages, MapVersion, Facts, int]:
-    return _pages(state.grid), state.version, state.facts, state.newest_ns
+def _all(state: MapState) -> tuple[StillGrid, MapVersion, Facts, int]:
+    pages = _pages(state.grid)
+    turns = dict(zip(pages, state.grid.last_turns(pages), strict=True))
+    return StillGrid(pages, turns, ref(state.grid)), state.version, state.facts, state.newest_ns
 
 
 def _pages(grid: Grid) -> Pages:

@@ -12,7 +12,6 @@ import numpy as np
 from mapserver.query.block_layers import SQUARE_CELLS, BlockLayers, Look, place_square, squares_of
 from mapserver.query.named_machines import NamedMachines
 from mapserver.query.source import MapSource
-from mapserver.query.views import PastMaps
 from mapserver.routes.ground import Squares, dearest
 from mapserver.routes.least_cost import Cell, Terrain, least_cost_line, reaches
 from mapserver.routes.route import LAYERS, route
@@ -34,10 +33,10 @@ GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled", "visit
 
 
 class Routes:
-    """Answers of one map; for any thread. past: maps as of any time."""
+    """Answers of one map; for any thread. look: at squares, now or as of a time, with the ages of roads or without."""
 
-    def __init__(self, source: MapSource, layers: BlockLayers, past: Callable[[], PastMaps]) -> None:
-        self._source, self._layers, self._past = source, layers, past
+    def __init__(self, source: MapSource, layers: BlockLayers, look: Callable[..., Look]) -> None:
+        self._source, self._layers, self._look = source, layers, look
         self._site, self._machines = source.site, NamedMachines(source)
 
     def route(self, query: RouteQuery) -> RouteAnswer:
@@ -46,7 +45,7 @@ class Routes:
         machine = self._machines.resolve(query.machine, query.as_of_ns)
         line = np.array(query.line)
         squares = _squares_along(line, self._site.cell_m)
-        look, read = self._read(squares, query.as_of_ns)
+        look, read = self._read(squares, query)
         return self._answer(query, machine, line, look, read)
 
     def way(self, query: WayQuery) -> RouteAnswer:
@@ -54,7 +53,7 @@ class Routes:
         for name, ends in (("from", [query.start]), ("to", [query.end]), ("avoid", query.avoid)):
             self._require_on_site(name, ends)
         machine, window = self._machines.resolve(query.machine, query.as_of_ns), self._window(query)
-        look, read = self._read(squares_of(window), query.as_of_ns)
+        look, read = self._read(squares_of(window), query)
         terrain, known = self._terrain(query, machine, window, read)
         start, end = (self._cell(place, window) for place in (query.start, query.end))
         is_open = _open(terrain, known, query, window, self._site.cell_m)
@@ -113,12 +112,8 @@ class Routes:
         )
         return RouteAnswer(look.version, look.stamp_ns, line, totals, steps, machine)
 
-    def _read(self, squares: Set[tuple[int, int]], as_of_ns: int | None) -> tuple[Look, Squares | None]:
-        if as_of_ns is None:
-            look = self._source.run(lambda state: self._layers.look_squares(state, squares, LAYERS))
-        else:
-            facts = self._source.run(lambda state: state.facts)
-            look = self._layers.look_at(self._past().view(self._cells_of(squares), as_of_ns, facts))
+    def _read(self, squares: Set[tuple[int, int]], query: RouteQuery | WayQuery) -> tuple[Look, Squares | None]:
+        look = self._look(squares, LAYERS, query.as_of_ns, repairs=query.repairs)
         layers = self._layers.squares(look, squares, LAYERS)
         return look, Squares.stacked(self._site.cell_m, SQUARE_CELLS, layers) if layers else None
 
@@ -166,14 +161,6 @@ class Routes:
     def _cell(self, place: Place, window: CellWindow) -> Cell:
         column, row = (math.floor(value / self._site.cell_m) for value in place)
         return row - window.row, column - window.column
-
-    def _cells_of(self, squares: Set[tuple[int, int]]) -> CellWindow:
-        """The window of squares, and of what layers in them depend on."""
-        (left, bottom), (right, top) = (
-            (side(x for x, _ in squares), side(y for _, y in squares)) for side in (min, max)
-        )
-        n = SQUARE_CELLS
-        return CellWindow((left - 1) * n, (bottom - 1) * n, (right - left + 3) * n, (top - bottom + 3) * n)
 
     def _require_on_site(self, name: str, places: Sequence[Place]) -> None:
         for x, y in places:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import product
+from weakref import ReferenceType
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import Ages, Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
-from mapserver.evidence.timeline import Block, evidence
+from mapserver.evidence.timeline import Block, TimedPage, evidence
 from mapserver.journal.facts import Facts
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.location import JournalLocation
@@ -40,6 +42,42 @@ class View:
     version: MapVersion
     stamp_ns: int
     ages: Ages = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class StillGrid:
+    """What a grid had in one of its turns, read as the grid itself. turns: of all blocks; grid: whose they are."""
+
+    all_pages: Pages
+    turns: Mapping[Block, int]
+    grid: ReferenceType[Grid]
+
+    def blocks_in(self, window: CellWindow) -> list[Block]:
+        """As `Grid.blocks_in`."""
+        n = BLOCK_CELLS
+        columns = range(window.column // n, (window.column + window.columns - 1) // n + 1)
+        rows = range(window.row // n, (window.row + window.rows - 1) // n + 1)
+        if len(columns) * len(rows) > len(self.all_pages):
+            return sorted((x, y) for x, y in self.all_pages if x in columns and y in rows)
+        return [block for block in product(columns, rows) if block in self.all_pages]
+
+    def last_turns(self, blocks: Iterable[Block]) -> list[int]:
+        """As `Grid.last_turns`."""
+        return [self.turns.get(block, -1) for block in blocks]
+
+    def pages(self, blocks: Iterable[Block]) -> list[Sequence[TimedPage]]:
+        """As `Grid.pages`."""
+        return [self.all_pages.get(block, ()) for block in blocks]
+
+
+@dataclass(frozen=True)
+class StillMap:
+    """A version of the map as it was, with the ages that changes of roads give. newest_ns: as in MapState."""
+
+    grid: StillGrid
+    version: MapVersion
+    newest_ns: int
+    ages: Ages
 
 
 @dataclass(frozen=True)

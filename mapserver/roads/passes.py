@@ -20,7 +20,7 @@ from protocol.arrays import Floats, Ints, Table
 MINUTE_NS, CELL_M = VISIT_NS, LATTICE_M / 2
 MINUTES = 3 * 24 * 60  # with driving, of each machine, that are remembered
 ONE_PASS = 1.3  # of a segment's length: more in two minutes are two passes
-LEAST_M = 8.0  # measured on a segment, for a pass to say what its c_rr is
+LEAST_M = 5.0  # measured on a segment, for a pass to say what its c_rr is: half of the shortest segments
 
 
 class Passes(NamedTuple):

@@ -1,9 +1,9 @@
 """Repairs, and ground that became worse: where the passes over a segment differ from those before.
 
 On a haul road the driven strip is narrower than what a change of cells must be, to be none of position errors. A
-segment has all of a pass, so two passes tell. What machines have in common is taken from all of them: a new
-calibration of one machine is no repair, since passes are of samples that are corrected as is known now, and since two
-machines must agree wherever more than one drives.
+segment has all of a pass, so two or three passes tell. Each is compared with what this machine found in this direction
+before. A new calibration of one machine is no repair, since passes are of samples that are corrected as is known now,
+and since two machines must agree wherever more than one drives.
 """
 
 from __future__ import annotations
@@ -24,11 +24,14 @@ from protocol.site.geometry import BLOCK_CELLS
 
 BEFORE = 4  # passes, at least, that a segment is known by
 KNOWN_BY = 32  # passes, at most: the newest ones, as ground wears
-AGREE = 2  # passes in a row that must differ alike
-SIGMAS = 4.0  # robust, of the passes before
-SHARE = 0.25  # of the median before
+AGREE = (2, 3)  # passes in a row that show a change, at least and at most
+SIGMAS, SIGMAS_EACH = 5.0, 2.0  # of all of them together, and of each, they are from what is expected
+SHARE = 0.25  # of what is expected, on average
+# Standard deviation of passes before any were seen: what calibration leaves of a zero, and a share of c_rr; how many
+# passes this counts as beside those that were.
+ZERO, OWN_SHARE, PRIOR = 0.002, 0.05, 8
 HALF_WIDTH_M = 3.0  # of the strip that is driven, with the errors of positions; half the distance of two lanes
-FLOOR_SHARE, FLOOR = 0.05, 0.001  # of the median, and least standard deviation of passes
+LEAST_C = 0.001  # that shares are of
 
 
 @dataclass(frozen=True)
@@ -59,45 +62,91 @@ def repairs(passes: Passes) -> tuple[list[Repair], int]:
     """All changes, and how many passes were looked at. After one, a segment is known by later passes alone."""
     out: list[Repair] = []
     bounds = np.flatnonzero(np.diff(passes.segment, prepend=-1, append=-1))
-    cuts, looks = _cuts(passes.c_rr, passes.machine, bounds)
-    for first, at, end in cuts.tolist():
+    cuts, looks = _cuts(passes.c_rr, passes.machine, 2 * passes.machine + passes.direction, bounds)
+    for first, at, sure, end in cuts.tolist():
         before, after = (float(np.median(passes.c_rr[part])) for part in (slice(first, at), slice(at, end)))
-        minute, seen = passes.minute[[at, at + AGREE - 1]].tolist()
+        minute, seen = passes.minute[[at, sure]].tolist()
         out.append(Repair(int(passes.segment[at]), minute, seen, before, after))
     return out, looks
 
 
 @numba.njit(cache=True, nogil=True)
-def _cuts(c_rr: Any, machine: Any, bounds: Any) -> tuple[Any, int]:
-    """Of each change, the first pass before it, the first after it, and the end of those that are like this (n, 3).
+def _cuts(c_rr: Any, machine: Any, group: Any, bounds: Any) -> tuple[Any, int]:
+    """Of each change (n, 4): first pass before it, first after it, the one that showed it, end of all after.
 
-    bounds: where the passes of each segment begin, and the end of all.
+    group: of passes that err alike, a machine in one direction. bounds: where the passes of each segment begin, and the
+    end of all. Also how many passes were looked at.
     """
-    cuts, count, looks = np.empty((len(c_rr), 3), np.int64), 0, 0
+    cuts, count, looks = np.empty((len(c_rr), 4), np.int64), 0, 0
+    groups, means = np.empty((2, KNOWN_BY), np.int64), np.empty(KNOWN_BY)
     for k in range(len(bounds) - 1):
         begin, first_cut = bounds[k], count
-        for at in range(bounds[k] + BEFORE, bounds[k + 1] - AGREE + 1):
+        for at in range(bounds[k] + BEFORE, bounds[k + 1] - AGREE[0] + 1):
             if at - begin < BEFORE:
                 continue
             looks += 1
-            before = slice(max(begin, at - KNOWN_BY), at)
-            after = slice(at, at + AGREE)
-            if _differs(c_rr[before], c_rr[after]) and _agree(machine[before], machine[after]):
-                cuts[count, 0], cuts[count, 1] = begin, at
-                count += 1
-                begin = at
+            first = max(begin, at - KNOWN_BY)
+            expected = _expected(c_rr[first:at], group[first:at], groups, means)
+            later = slice(at, min(at + AGREE[1], bounds[k + 1]))
+            for end in _differing(c_rr[later], group[later], expected, groups, means) + at:
+                if _agree(machine[first:at], machine[at:end]):
+                    cuts[count, 0], cuts[count, 1], cuts[count, 2] = begin, at, end - 1
+                    count += 1
+                    begin = at
+                    break
         for i in range(first_cut, count):
-            cuts[i, 2] = cuts[i + 1, 1] if i + 1 < count else bounds[k + 1]
+            cuts[i, 3] = cuts[i + 1, 1] if i + 1 < count else bounds[k + 1]
     return cuts[:count], looks
 
 
 @numba.njit(cache=True, nogil=True)
-def _differs(before: Any, after: Any) -> bool:
-    """Whether all passes after differ alike from the median of those before, beyond noise and by enough."""
-    median = np.median(before)
-    spread = max(1.4826 * np.median(np.abs(before - median)), FLOOR_SHARE * median, FLOOR)
-    least = max(SIGMAS * spread, SHARE * max(median, FLOOR))
-    return bool((after - median > least).all() or (median - after > least).all())
+def _expected(c_rr: Any, group: Any, groups: Any, means: Any) -> tuple[int, float, float, float]:
+    """What passes (n,) say of later ones: number of groups, level, and variances within groups and between them.
+
+    Errors repeat: a machine has a zero of its own, and its estimate settles from the same side wherever ground changes
+    within a segment. So passes are compared with those of the same machine in the same direction first. A model with
+    random effects: pass = level + what its group is off + noise. groups, means: filled with numbers of groups, how many
+    passes each has, and their means.
+    """
+    count, level, within, between = 0, c_rr.mean(), 0.0, 0.0
+    for i in range(len(c_rr)):
+        k = 0
+        while k < count and groups[0, k] != group[i]:
+            k += 1
+        if k == count:
+            groups[0, k], groups[1, k], means[k] = group[i], 0, 0.0
+            count += 1
+        groups[1, k] += 1
+        step = c_rr[i] - means[k]
+        means[k] += step / groups[1, k]
+        within += step * (c_rr[i] - means[k])
+    for k in range(count):
+        between += (means[k] - level) ** 2
+    known = PRIOR * (ZERO**2 + (OWN_SHARE * level) ** 2)
+    return count, level, (known + within) / (PRIOR + len(c_rr) - count), (known + between) / (PRIOR + count - 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _differing(c_rr: Any, group: Any, expected: tuple[int, float, float, float], groups: Any, means: Any) -> Any:
+    """How many of these passes, from the first on, differ alike from what is expected, beyond noise and by enough."""
+    count, level, within, between = expected
+    out, side, sigmas, share = np.zeros(len(c_rr), np.bool_), 0.0, 0.0, 0.0
+    for i in range(len(c_rr)):
+        weight, total = 1.0 / between, level / between
+        for k in range(count):
+            if groups[0, k] == group[i]:
+                weight += groups[1, k] / within
+                total += groups[1, k] * means[k] / within
+        own = total / weight
+        side = side or (1.0 if c_rr[i] > own else -1.0)
+        off = side * (c_rr[i] - own)
+        apart = off / np.sqrt(within + 1.0 / weight)
+        if apart < SIGMAS_EACH:
+            break
+        sigmas, share = sigmas + apart, share + off / max(own, LEAST_C)
+        passes = i + 1
+        out[i] = passes >= AGREE[0] and sigmas > SIGMAS * np.sqrt(passes) and share > SHARE * passes
+    return np.flatnonzero(out) + 1
 
 
 @numba.njit(cache=True, nogil=True)

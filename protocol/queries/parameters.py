@@ -72,6 +72,14 @@ def number(parameters: Parameters, name: str) -> float:
     return value
 
 
+def flag(parameters: Parameters, name: str, *, default: bool) -> bool:
+    """Yes or no, as 1 or 0."""
+    text = parameters.get(name, str(int(default)))
+    if text not in ("0", "1"):
+        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {text[:40]!r} is neither 0 nor 1")
+    return text == "1"
+
+
 def count(parameters: Parameters, name: str) -> int:
     """A whole number from 0 on; 0 where it is missing."""
     value = number({name: "0", **parameters}, name)

@@ -316,6 +316,11 @@ def reads_past(query: MapQuery) -> bool:
     return isinstance(query, HistoryQuery)
 
 
+def may_read_journal(query: MapQuery) -> bool:
+    """Whether the server may have to read its journal, if only as the first one since its start."""
+    return reads_past(query) or (isinstance(query, RouteQuery | WayQuery) and query.repairs)
+
+
 def _of_tiles(query: TilesQuery) -> dict[str, str]:
     parameters = _stamps({"as_of": query.as_of_ns})
     if query.since:
@@ -483,10 +488,8 @@ def _layers(parameters: ps.Parameters) -> tuple[str, ...]:
 
 
 def _when(parameters: ps.Parameters) -> When:
-    repairs = parameters.get("repairs", "0")
-    if repairs not in ("0", "1"):
-        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `repairs`: {repairs[:40]!r} is neither 0 nor 1")
-    return When(ps.stamp(parameters, "as_of"), ps.stamp(parameters, "minus"), repairs == "1")
+    repairs = ps.flag(parameters, "repairs", default=False)
+    return When(ps.stamp(parameters, "as_of"), ps.stamp(parameters, "minus"), repairs)
 
 
 def _bounds(parameters: ps.Parameters) -> Bounds:

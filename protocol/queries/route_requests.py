@@ -35,7 +35,7 @@ _MACHINE = {
     "lateral": "lateral_mps2",
     "rotating": "rotating",
 }
-_SAME = ("machine", *_MACHINE, "stops", "step", "unknown", "as_of")
+_SAME = ("machine", *_MACHINE, "stops", "step", "unknown", "as_of", "repairs")
 ROUTE = ("line", *_SAME)
 WAY = ("from", "to", "cost", "max_grade", "margin", "avoid", *_SAME)
 
@@ -46,6 +46,7 @@ class RouteQuery:
 
     stops: whether it stands at the begin and at the end. step_m: of the steps that are answered. unknown: what ground
     that nobody knows is taken for: DEAREST, REFUSE or a rolling resistance coefficient. machine: also one of the site.
+    repairs: roads whose ground changed are read from the samples since.
     """
 
     line: tuple[Place, ...]
@@ -55,6 +56,7 @@ class RouteQuery:
     unknown: str | float = DEAREST
     as_of_ns: int | None = None
     fresh: Freshness = ANY_ROW
+    repairs: bool = True
 
     name = "route"
 
@@ -92,6 +94,7 @@ class WayQuery:
     unknown: str | float = DEAREST
     as_of_ns: int | None = None
     fresh: Freshness = ANY_ROW
+    repairs: bool = True
 
     name = "way"
 
@@ -121,6 +124,7 @@ def encode_route(query: RouteQuery | WayQuery) -> dict[str, str]:
     stops = ",".join(name for name, is_one in zip(("begin", "end"), query.stops, strict=True) if is_one)
     unknown = query.unknown if isinstance(query.unknown, str) else ps.text_of(query.unknown)
     out |= {"stops": stops or "none", "step": ps.text_of(query.step_m), "unknown": unknown}
+    out |= {} if query.repairs else {"repairs": "0"}
     return out | ({"as_of": str(query.as_of_ns)} if query.as_of_ns is not None else {})
 
 
@@ -142,7 +146,7 @@ def parse_way(parameters: ps.Parameters) -> WayQuery:
 
 def _same(
     parameters: ps.Parameters,
-) -> tuple[RouteMachine | NamedMachine, tuple[bool, bool], float, str | float, int | None, Freshness]:
+) -> tuple[RouteMachine | NamedMachine, tuple[bool, bool], float, str | float, int | None, Freshness, bool]:
     step_m = ps.number({"step": "25", **parameters}, "step")
     unknown: str | float = parameters.get("unknown", DEAREST)
     if unknown not in (DEAREST, REFUSE):
@@ -154,6 +158,7 @@ def _same(
         unknown,
         ps.stamp(parameters, "as_of"),
         ps.freshness(parameters),
+        ps.flag(parameters, "repairs", default=True),
     )
 
 

@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from protocol.arrays import AnyArray, Bools, Floats
+from protocol.arrays import AnyArray, Floats
 from protocol.queries.answers import GroundChange
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, TilesAnswer
-from protocol.queries.roads import RoadSegment, WorklistRow
+from protocol.queries.roads import Line, RoadChange, RoadSegment, WorklistRow
 from protocol.site.ground_classes import ZONES
 from protocol.site.site_config import Projection
 from protocol.wire.messages import Pose
@@ -95,16 +95,20 @@ def worklist(rows: Iterable[WorklistRow], projection: Projection) -> dict[str, A
     return _collection(out)
 
 
-def inside(outline: Sequence[Corner], x_m: Floats, y_m: Floats) -> Bools:
-    """Which cell centres (rows, columns) lie in a polygon."""
-    x, y = np.meshgrid(x_m, y_m)
-    within = np.zeros(x.shape, np.bool_)
-    corners = np.array(outline)
-    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if y0 != y1:
-            crosses = (y0 > y) != (y1 > y)
-            within ^= crosses & (x < (x1 - x0) * (y - y0) / (y1 - y0) + x0)
-    return within
+def repairs(road_changes: Iterable[RoadChange], projection: Projection) -> dict[str, Any]:
+    """Lines of the stretches that were repaired or became worse, the newest first."""
+    out = []
+    for change in road_changes:
+        properties = {
+            "id": change.id,
+            "first_time": iso(change.first_ns),
+            "seen_time": iso(change.seen_ns),
+            "resistance_before": change.before,
+            "resistance_after": change.after,
+            "saved_kwh_ph": change.saved_kwh_ph,
+        }
+        out.append(_feature("LineString", _line(change.line, projection), properties))
+    return _collection(out)
 
 
 def _resistance(answer: TilesAnswer) -> tuple[Floats, int, int]:
@@ -147,8 +151,11 @@ def _road(road: RoadSegment, more: dict[str, Any], projection: Projection) -> di
     properties = {name: value for name, value in asdict(road).items() if name not in ("line", "passes_ph", "tonnes_ph")}
     for name, (there, back) in (("passes_ph", road.passes_ph), ("tonnes_ph", road.tonnes_ph)):
         properties |= {name: there, f"{name}_back": back}
-    line = [_corner(x, y, 1.0, projection) for x, y in road.line]
-    return _feature("LineString", line, {**more, **properties})
+    return _feature("LineString", _line(road.line, projection), {**more, **properties})
+
+
+def _line(line: Line, projection: Projection) -> list[list[float]]:
+    return [_corner(x, y, 1.0, projection) for x, y in line]
 
 
 def _corner(x: float, y: float, scale: float, projection: Projection) -> list[float]:

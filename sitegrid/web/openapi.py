@@ -11,7 +11,7 @@ from sitegrid.web.resources import RESOURCES
 PREFIX = "/api/v1"
 NUMBERS = (
     *("x", "y", "lat", "lon", "span", "after", "row", "fact", "target", "efficiency", "limit", "mass", "speed"),
-    *("power", "accelerate", "brake", "lateral", "rotating", "step", "max_grade", "margin"),
+    *("power", "accelerate", "brake", "lateral", "rotating", "step", "max_grade", "margin", "resolution"),
 )
 PROBLEM = {
     "description": "Refused, or not possible now",

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from starlette.responses import Response
 
+from protocol.queries import requests
 from protocol.queries.answers import MapVersion
 from sitegrid.web import values
 from sitegrid.web.site import SiteFeed
@@ -21,6 +22,11 @@ PLACE |= {"lat": "latitude [deg], with lon in place of x and y", "lon": "longitu
 AS_OF = {"as_of": "the map as of this time, ISO 8601 or nanoseconds since 1970 (UTC)"}
 LAYERS = {"layers": "names, comma-separated; without it all"}
 BOUNDS = {"bounds": "west,south,east,north [m]"}
+WHEN = {
+    **AS_OF,
+    "minus": "less the map as of this time, value by value",
+    "repairs": "1: cells of roads whose ground changed, from the samples since (default 0)",
+}
 GEOJSON = ("application/geo+json",)
 
 
@@ -48,3 +54,12 @@ def as_geojson(value: Any) -> Response:
 def version_of(version: MapVersion) -> dict[str, Any]:
     """The map that an answer is of, as all answers name it."""
     return {"store": version.store, "merged": version.row, "fact": version.fact}
+
+
+def parsed(
+    name: str, parameters: Parameters, times: Sequence[str] = ("as_of",), places: Sequence[str] = ()
+) -> requests.MapQuery:
+    """The map server's query of this name, checked as there. times may be ISO 8601, places x,y;x,y;... too."""
+    stamps = {key: str(values.stamp(parameters, key)) for key in times if key in parameters}
+    lines = {key: parameters[key].replace(";", ",") for key in places if key in parameters}
+    return requests.parse_query(name, {**parameters, **stamps, **lines})

@@ -9,7 +9,8 @@ from starlette.responses import Response
 
 from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion
-from protocol.site.geometry import Bounds
+from protocol.queries.parameters import text_of
+from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery
 from sitegrid.web import features, roads, values
 from sitegrid.web.problems import bad
 from sitegrid.web.resource import (
@@ -18,9 +19,11 @@ from sitegrid.web.resource import (
     GEOJSON,
     LAYERS,
     PLACE,
+    WHEN,
     Resource,
     as_geojson,
     as_json,
+    parsed,
     version_of,
 )
 from sitegrid.web.site import SiteFeed, frame
@@ -28,17 +31,29 @@ from sitegrid.web.values import Parameters
 
 MAX_CELLS_JSON = 250_000  # of a region as text: 2 MB a layer
 MAX_CELLS_NPZ = 4_000_000
+TIMES = ("as_of", "minus")
 AGES = ("age_s", "changed_s")  # layers that change with the site's now
 
 
 async def point(feed: SiteFeed, parameters: Parameters) -> Response:
     """Layers of the cell at a position."""
     x_m, y_m = values.place(parameters, await feed.projection())
-    as_of_ns = values.stamp(parameters, "as_of")
-    answer = await feed.ask(feed.client.point, x_m, y_m, values.layers(parameters), as_of_ns=as_of_ns)
+    rest = {name: text for name, text in parameters.items() if name not in PLACE}
+    query = parsed("point", {**rest, "x": text_of(x_m), "y": text_of(y_m)}, TIMES)
+    assert isinstance(query, PointQuery)
+    answer = await feed.ask(feed.client.point, query.x_m, query.y_m, query.layers, **vars(query.when))
     lat_deg, lon_deg, _ = (await feed.projection()).to_geodetic(answer.x_m, answer.y_m)
     place = {"x_m": answer.x_m, "y_m": answer.y_m, "lat_deg": lat_deg, "lon_deg": lon_deg}
     return as_json({**place, "values": answer.values, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
+
+
+async def points(feed: SiteFeed, parameters: Parameters) -> Response:
+    """Layers of the cells at many positions, in their order."""
+    query = parsed("points", parameters, TIMES, ("places",))
+    assert isinstance(query, PointsQuery)
+    answer = await feed.ask(feed.client.points, query.places, query.layers, **vars(query.when))
+    columns = {"x_m": answer.x_m, "y_m": answer.y_m, "layers": answer.layers}
+    return as_json({**columns, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
 
 
 async def why(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -48,23 +63,22 @@ async def why(feed: SiteFeed, parameters: Parameters) -> Response:
 
 
 async def region(feed: SiteFeed, parameters: Parameters) -> Response:
-    """Layers of the cells that a rectangle touches, or that lie in a polygon."""
-    outline = _outline(parameters)
-    bounds = _bounds(parameters) if outline is None else _around(outline)
+    """Layers of the cells that a rectangle touches, or that lie in a polygon; or of larger cells."""
     as_npz = parameters.get("format", "json") == "npz"
     if parameters.get("format", "json") not in ("json", "npz"):
         raise bad(Refusal.OUT_OF_RANGE, "parameter `format`: json or npz")
-    cell_m = (await feed.info()).site.cell_m
+    rest = {name: text for name, text in parameters.items() if name != "format"}
+    query = parsed("region", rest, TIMES, ("polygon",))
+    assert isinstance(query, RegionQuery)
+    cell_m = query.resolution_m or (await feed.info()).site.cell_m
+    bounds = query.bounds
     cells = (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) / cell_m**2
     if cells > (most := MAX_CELLS_NPZ if as_npz else MAX_CELLS_JSON):
         problem = f"a region of about {cells:.0f} cells; at most {most} as {'npz' if as_npz else 'json'}"
-        raise bad(Refusal.TOO_LARGE, problem)
-    as_of_ns = values.stamp(parameters, "as_of")
-    answer = await feed.ask(feed.client.region, bounds, values.layers(parameters), as_of_ns=as_of_ns)
+        raise bad(Refusal.TOO_LARGE, f"{problem}: ask for less, or for larger cells with `resolution`")
+    asked = {"resolution_m": query.resolution_m, **vars(query.when)}
+    answer = await feed.ask(feed.client.region, query.area, query.layers, **asked)
     layers = dict(answer.layers)
-    if outline is not None:
-        inside = features.inside(outline, answer.x_m, answer.y_m)
-        layers = {name: np.where(inside, layer, np.float32(np.nan)) for name, layer in layers.items()}
     if as_npz:
         file = io.BytesIO()
         version = np.array([answer.version.row, answer.version.fact])
@@ -148,7 +162,10 @@ async def track_features(feed: SiteFeed, _: Parameters) -> Response:
 
 RESOURCES: dict[str, Resource] = {
     "info": Resource(info, "State of the map and of its server", {}, follows_now=True),
-    "point": Resource(point, "Layers of the cell at a position", {**PLACE, **LAYERS, **AS_OF}),
+    "point": Resource(point, "Layers of the cell at a position", {**PLACE, **LAYERS, **WHEN}),
+    "points": Resource(
+        points, "Layers of the cells at many positions", {"places": "x,y;x,y;... [m]", **LAYERS, **WHEN}
+    ),
     "why": Resource(why, "Why the cell at a position has its value", {**PLACE, **AS_OF}),
     "region": Resource(
         region,
@@ -156,8 +173,9 @@ RESOURCES: dict[str, Resource] = {
         {
             **BOUNDS,
             "polygon": "in place of bounds: x,y;x,y;... [m]",
+            "resolution": "edge of larger cells [m], each the mean of what is known in it",
             **LAYERS,
-            **AS_OF,
+            **WHEN,
             "format": "json or npz",
         },
         ("application/json", "application/x-npz"),
@@ -191,30 +209,3 @@ def follows_now(resource: Resource, parameters: Parameters) -> bool:
     names = values.layers(parameters)
     ages = "layers" in resource.parameters and (not names or any(name in AGES for name in names))
     return "as_of" not in parameters and (resource.follows_now or ages)
-
-
-def _bounds(parameters: Parameters) -> Bounds:
-    parts = parameters.get("bounds", "").split(",")
-    if len(parts) != 4:
-        raise bad(Refusal.MISSING_FIELD, "parameter `bounds` must be west,south,east,north in metres")
-    try:
-        return Bounds(*(values.number({"bounds": part}, "bounds") for part in parts))
-    except ValueError as error:
-        raise bad(Refusal.OUT_OF_RANGE, f"parameter `bounds`: {error}") from None
-
-
-def _outline(parameters: Parameters) -> list[tuple[float, float]] | None:
-    if "polygon" not in parameters:
-        return None
-    corners = [part.split(",") for part in parameters["polygon"].split(";")]
-    if not 3 <= len(corners) <= 1000 or any(len(corner) != 2 for corner in corners):
-        raise bad(Refusal.OUT_OF_RANGE, "parameter `polygon` must be x,y;x,y;... with 3 to 1000 corners, in metres")
-    return [(values.number({"polygon": x}, "polygon"), values.number({"polygon": y}, "polygon")) for x, y in corners]
-
-
-def _around(outline: list[tuple[float, float]]) -> Bounds:
-    xs, ys = zip(*outline, strict=True)
-    try:
-        return Bounds(min(xs), min(ys), max(xs), max(ys))
-    except ValueError as error:
-        raise bad(Refusal.OUT_OF_RANGE, f"parameter `polygon`: {error}") from None

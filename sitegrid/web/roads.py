@@ -11,16 +11,16 @@ from typing import Any
 
 from starlette.responses import Response
 
-from protocol.queries import requests
 from protocol.queries.requests import SegmentsQuery, WorklistQuery
 from protocol.queries.roads import Segments, Worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
-from sitegrid.web import features, values
-from sitegrid.web.resource import AS_OF, BOUNDS, GEOJSON, Resource, as_geojson, as_json, version_of
+from sitegrid.web import features
+from sitegrid.web.resource import AS_OF, BOUNDS, GEOJSON, Resource, as_geojson, as_json, parsed, version_of
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters
 
+TIMES = ("from", "to", "as_of")
 ROADS = {"from": "traffic of the hours that begin from then on", "to": "and before then", **AS_OF, **BOUNDS}
 ROADS |= {"machine": "traffic of this one alone, and what it measured"}
 WORK = {
@@ -42,6 +42,7 @@ DRIVE = {
     "stops": "begin, end, begin,end or none",
     "step": "length of the steps that are answered [m]",
     "unknown": "ground that nobody knows: dearest, refuse or a resistance",
+    "repairs": "1: roads whose ground changed, from the samples since (default); 0: from all samples",
     **AS_OF,
 }
 ROUTE = {"line": "x,y;x,y;... [m], two places or more", **DRIVE}
@@ -78,6 +79,12 @@ async def worklist_features(feed: SiteFeed, parameters: Parameters) -> Response:
     return as_geojson(features.worklist(answer.rows, await feed.projection()))
 
 
+async def repair_features(feed: SiteFeed, parameters: Parameters) -> Response:
+    """Stretches whose ground changed, as lines."""
+    answer = await _worklist(feed, parameters)
+    return as_geojson(features.repairs(answer.changes, await feed.projection()))
+
+
 async def route(feed: SiteFeed, parameters: Parameters) -> Response:
     """What a drive along a line costs a machine."""
     return await _drive(feed, "route", parameters, places=("line",))
@@ -93,37 +100,37 @@ RESOURCES: dict[str, Resource] = {
     "worklist": Resource(worklist, "Stretches of road where work pays", WORK, follows_now=True),
     "features/segments": Resource(segment_features, "Roads as lines", ROADS, GEOJSON, follows_now=True),
     "features/worklist": Resource(worklist_features, "The worklist as lines", WORK, GEOJSON, follows_now=True),
+    "features/repairs": Resource(
+        repair_features,
+        "Stretches that were repaired or became worse, as lines",
+        {name: text for name, text in WORK.items() if name not in ("limit", "efficiency")},
+        GEOJSON,
+        follows_now=True,
+    ),
     "route": Resource(route, "What a drive along a line costs a machine", ROUTE),
     "way": Resource(cheapest, "The line between two places that costs a machine least", CHEAPEST),
 }
 
 
 async def _segments(feed: SiteFeed, parameters: Parameters) -> Segments:
-    query = _parsed("segments", parameters, times=("from", "to", "as_of"))
+    query = parsed("segments", parameters, TIMES)
     assert isinstance(query, SegmentsQuery)
     return await feed.ask(feed.client.segments, **_named(query))
 
 
 async def _worklist(feed: SiteFeed, parameters: Parameters) -> Worklist:
-    query = _parsed("worklist", parameters, times=("from", "to", "as_of"))
+    query = parsed("worklist", parameters, TIMES)
     assert isinstance(query, WorklistQuery)
     return await feed.ask(feed.client.worklist, **_named(query))
 
 
 async def _drive(feed: SiteFeed, name: str, parameters: Parameters, places: Sequence[str]) -> Response:
-    lines = {key: parameters[key].replace(";", ",") for key in places if key in parameters}
-    query = _parsed(name, {**parameters, **lines}, times=("as_of",))
+    query = parsed(name, parameters, places=places)
     assert isinstance(query, RouteQuery | WayQuery)
     answer = await feed.ask(feed.client.drive, query)
     totals = {**asdict(answer.totals), "litres": answer.totals.litres}
     ground = {"line": answer.line_m, "totals": totals, "steps": vars(answer.steps)}
     return as_json({**ground, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
-
-
-def _parsed(name: str, parameters: Parameters, times: Sequence[str]) -> requests.MapQuery:
-    """The map server's query of this name."""
-    stamps = {key: str(values.stamp(parameters, key)) for key in times if key in parameters}
-    return requests.parse_query(name, {**parameters, **stamps})
 
 
 def _named(query: SegmentsQuery | WorklistQuery) -> dict[str, Any]:

@@ -79,6 +79,33 @@ def test_a_region_is_the_clients_as_text_and_as_arrays(web: WebSite):
     assert np.array_equal(kept[0, :50], region["visits"][0, :50], equal_nan=True)
 
 
+def test_larger_cells_and_outlines_are_the_clients(web: WebSite):
+    outline = ((100.0, 100.0), (160.0, 100.0), (130.0, 150.0))
+    region = web.client.region(outline, ["resistance"], resolution_m=5.0)
+    asked = {"polygon": "100,100;160,100;130,150", "resolution": 5, "layers": "resistance"}
+    answer = web.get("region", asked).json
+    assert (answer["cell_m"], answer["x_m"]) == (5.0, region.x_m.tolist())
+    assert np.array_equal(np.array(answer["layers"]["resistance"], np.float32), region["resistance"], equal_nan=True)
+    # what is too much as text in cells of the map is little in larger ones
+    wide = {"bounds": "0,0,900,900", "layers": "visits"}
+    refused = web.get("region", wide)
+    assert (refused.status, refused.json["reason"]) == (413, "too_large")
+    assert "resolution" in refused.json["detail"]
+    assert len(web.get("region", {**wide, "resolution": 10}).json["x_m"]) == 90
+
+
+def test_many_places_are_one_question(web: WebSite):
+    places = [driven_place(web), (0.5, 0.5), (-3000.0, 40.0)]
+    ours = web.client.points(places, ["resistance", "visits"])
+    text = ";".join(f"{x},{y}" for x, y in places)
+    answer = web.get("points", {"places": text, "layers": "resistance,visits"}).json
+    assert (answer["x_m"], answer["y_m"]) == (ours.x_m.tolist(), ours.y_m.tolist())
+    for name in ("resistance", "visits"):
+        assert np.array_equal(np.array(answer["layers"][name], np.float32), ours.layers[name], equal_nan=True)
+    assert np.isfinite(ours.layers["visits"][0])
+    assert web.get("points", {"places": text.replace(";", ","), "layers": "visits"}).status == 200
+
+
 def test_why_history_machines_changes_are_the_clients(web: WebSite):
     x_m, y_m = driven_place(web)
     why, answer = web.client.why(x_m, y_m), web.get("why", {"x": x_m, "y": y_m}).json
@@ -136,7 +163,18 @@ def tile_planes(tile) -> bytes:
         ("region", {"bounds": "5,0,1,9"}, 400, "out_of_range"),
         ("region", {"bounds": "0,0,9000,9000"}, 413, "too_large"),
         ("region", {"polygon": "0,0;1,1"}, 400, "out_of_range"),
-        ("region", {"polygon": ";".join(["1,1"] * 1001)}, 400, "out_of_range"),
+        ("region", {"polygon": ";".join(["1,1"] * 1001)}, 413, "too_large"),
+        ("region", {"polygon": "0,0;9,9;9,0;0,9"}, 400, "out_of_range"),
+        ("region", {"polygon": "0,0;9,0;0,9", "bounds": "0,0,9,9"}, 400, "out_of_range"),
+        ("region", {}, 400, "missing_field"),
+        ("region", {"bounds": "0,0,9,9", "resolution": 1.5}, 400, "out_of_range"),
+        ("region", {"bounds": "0,0,9,9", "resolution": 5, "layers": "heading"}, 400, "out_of_range"),
+        ("region", {"bounds": "0,0,9,9", "repairs": "yes"}, 400, "out_of_range"),
+        ("points", {}, 400, "missing_field"),
+        ("points", {"places": "1,1;2"}, 400, "out_of_range"),
+        ("points", {"places": "1,1;nan,2"}, 400, "not_finite"),
+        ("points", {"places": "1,1", "layers": "colour"}, 400, "unknown_layer"),
+        ("point", {"x": 1, "y": 1, "minus": "yesterday"}, 400, "wrong_type"),
         ("region", {"bounds": "0,0,9,9", "format": "xml"}, 400, "out_of_range"),
         ("history", {"x": 0, "y": 0, "span": 0}, 400, "out_of_range"),
         ("tiles", {"store": "x", "row": -1, "fact": 0}, 400, "out_of_range"),

@@ -93,6 +93,27 @@ def test_lines_of_roads_are_where_gis_look_for_them(web: WebSite):
     assert web.get("features/segments").headers["content-type"] == "application/geo+json"
 
 
+def test_a_repaired_road_is_read_as_it_is_since(web: WebSite):
+    change = web.client.worklist().changes[0]
+    (feature, *_) = web.get("features/repairs").json["features"]
+    assert feature["properties"]["id"] == change.id
+    assert feature["properties"]["resistance_after"] == change.after
+    assert len(feature["geometry"]["coordinates"]) == len(change.line)
+    x_m, y_m = change.line[len(change.line) // 2]
+    asked = {"x": x_m, "y": y_m, "layers": "resistance"}
+    plain, since = (web.get("point", {**asked, "repairs": given}).json["values"]["resistance"] for given in (0, 1))
+    assert since == web.client.point(x_m, y_m, ["resistance"], repairs=True).values["resistance"]
+    assert abs(since - change.after) < abs(plain - change.after)
+    bounds = {"bounds": f"{x_m - 2},{y_m - 2},{x_m + 2},{y_m + 2}", "layers": "resistance", "repairs": 1}
+    ours = web.client.region((x_m - 2, y_m - 2, x_m + 2, y_m + 2), ["resistance"], repairs=True)
+    answer = web.get("region", bounds).json["layers"]["resistance"]
+    assert np.array_equal(np.array(answer, np.float32), ours["resistance"], equal_nan=True)
+    many = web.get("points", {"places": f"{x_m},{y_m}", "layers": "resistance", "repairs": 1}).json
+    assert many["layers"]["resistance"] == [pytest.approx(since)]
+    then = web.get("point", {**asked, "repairs": 1, "as_of": change.first_ns - 1}).json["values"]["resistance"]
+    assert then == pytest.approx(change.before, rel=0.1), "as of a time, with the changes of then"
+
+
 def test_a_route_and_the_cheapest_line_are_the_clients(web: WebSite):
     asked = {"line": text_of(LINE), "machine": "truck", "mass": 30_000, "step": 10, "stops": "begin"}
     answer = web.get("route", asked).json
@@ -190,7 +211,14 @@ def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
 
 def test_everything_is_in_the_description(web: WebSite):
     paths = web.get("/api/v1/openapi.json").json["paths"]
-    for name in ("segments", "worklist", "route", "way", "features/segments", "features/worklist"):
+    for name in (
+        "segments",
+        "worklist",
+        "route",
+        "way",
+        "points",
+        *(f"features/{name}" for name in ("segments", "worklist", "repairs")),
+    ):
         assert f"/api/v1/sites/{{site}}/{name}" in paths
     route = paths["/api/v1/sites/{site}/route"]["get"]
     kinds = {one["name"]: one["schema"]["type"] for one in route["parameters"]}

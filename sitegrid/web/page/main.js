@@ -326,7 +326,7 @@ async function showValue(left, top) {
   const layers = [name, "resistance_class", ...(std ? [std] : [])];
   try {
     const at = { x: (column + 0.5) * shown.cell_m, y: (row + 0.5) * shown.cell_m, layers: layers.join() };
-    const ask = async (as_of) => (await getJson(page.path("point"), { ...at, as_of })).values;
+    const ask = async (as_of) => (await getJson(page.path("point"), { ...at, as_of, repairs: as_of ? undefined : 1 })).values; // as tiles are
     const [values, then] = await Promise.all([ask(timeAt(left)), subtracts() ? ask(page.time.other) : null]);
     const was = then && `${then[name] === null ? "not measured" : page.layer.text(then[name])} → `;
     const value = values[name], kind = KINDS[values.resistance_class];

@@ -7,18 +7,25 @@ import pytest
 
 from mapserver.fleet.correction import Correction, Corrections
 from mapserver.journal.facts import Facts
+from mapserver.query import road_maps
+from mapserver.query.answering import LAYERS_DERIVED
+from mapserver.query.map_tiles import Tiles
 from protocol.errors import QueryError, Refusal
+from protocol.queries.map_tiles import PLANES
 from protocol.queries.requests import (
     MAX_LIMIT,
     PointQuery,
     RegionQuery,
     SegmentsQuery,
+    TilesQuery,
     When,
     WorklistQuery,
     encode_query,
     parse_query,
 )
 from protocol.queries.roads import decode_segments, decode_worklist
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.routing import decode_answer
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import incoming, open_writer, send
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
@@ -267,6 +274,91 @@ def test_a_found_change_begins_a_new_age_of_its_cells(repaired):
     point = answers.point(PointQuery(40.0, 10.0, ("resistance",), when=When(repairs=True)))
     assert point.values["resistance"] == pytest.approx(0.02, rel=0.2)
     assert point.merged == worklist(answers).merged
+
+
+def drive(answers, line=((15.0, 10.0), (205.0, 10.0)), **more):
+    return decode_answer(answered(answers, "route", encode_query(RouteQuery(line, **more))))
+
+
+def test_a_route_is_of_the_road_as_it_is_since_its_repair(repaired):
+    opened, then_ns = repaired
+    answers = answers_of(opened)
+    since, plain, then = drive(answers), drive(answers, repairs=False), drive(answers, as_of_ns=then_ns)
+    assert since.steps.resistance == pytest.approx(0.02, rel=0.1)
+    assert then.steps.resistance == pytest.approx(0.06, rel=0.1)
+    assert since.totals.energy_j < 0.8 * plain.totals.energy_j
+    assert since.version.row == worklist(answers).merged
+    way = WayQuery((15.0, 10.0), (205.0, 10.0))
+    cheapest = decode_answer(answered(answers, "way", encode_query(way)))
+    assert cheapest.totals.energy_j == pytest.approx(since.totals.energy_j, rel=0.05)
+
+
+def test_repaired_routes_are_equal_to_the_bit_wherever_they_are_made(tmp_path):
+    """In a server that was asked all the while, in one that begins now, and in one that got all rows at once."""
+    good = {name: passes(LINE, 3, 0.02, seed=7 + i, after_s=900.0 + 30.0 * i) for i, name in enumerate("ab")}
+    bad = {name: passes(LINE, 4, 0.06, seed=i, after_s=30.0 * i) for i, name in enumerate("ab")}
+    asked = encode_query(RouteQuery(((15.0, 10.0), (205.0, 10.0))))
+    with closing(open_writer(tmp_path)) as opened:
+        answers, made = answers_of(opened), set()
+        for part in (bad, good):
+            for name, rows in part.items():
+                first = 1 if part is bad else 1 + len(bad[name])
+                for at in range(0, len(rows), 100):
+                    send(opened, [incoming(rows[at : at + 100], first + at, machine=name)])
+                made.add(answered(answers, "route", asked))
+        now = answered(answers, "route", asked)
+        assert now == answered(answers_of(opened), "route", asked)
+    assert len(made) == 4
+    with closing(open_writer(tmp_path)) as again:
+        assert answered(answers_of(again), "route", asked) == now
+
+
+def test_layers_that_repairs_leave_as_they_are_are_kept_for_all(repaired):
+    opened, _ = repaired
+    answers, far = answers_of(opened), Bounds(-60.0, -60.0, 260.0, 60.0)
+    names = ("resistance", "resistance_filled")
+    for query in (RegionQuery(far, names), RegionQuery(far, names, when=When(repairs=True))):
+        answers.region(query)
+        derived = answers.info()["counters"][LAYERS_DERIVED]
+        answers.region(query)
+        assert answers.info()["counters"][LAYERS_DERIVED] == derived, "asked again, all is kept"
+    plain, since = (answers.region(RegionQuery(far, names, when=When(repairs=one))) for one in (False, True))
+    fresh = answers_of(opened)
+    for one, repairs in ((plain, False), (since, True)):
+        other = fresh.region(RegionQuery(far, names, when=When(repairs=repairs)))
+        for name in names:
+            np.testing.assert_array_equal(one.layers[name], other.layers[name])
+    assert not np.array_equal(plain.layers["resistance"], since.layers["resistance"], equal_nan=True)
+
+
+def test_tiles_show_a_repair_with_the_next_row(repaired):
+    opened, _ = repaired
+    answers, ages = answers_of(opened), {}
+    tiles = Tiles(answers._source, lambda: dict(ages))
+    first = tiles.answer(TilesQuery())
+    ages |= answers._roads.read().ages
+    assert tiles.answer(TilesQuery(first.version)).tiles == (), "who has this row would not ask for it"
+    send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine="c")])
+    later = {(tile.x, tile.y): tile for tile in tiles.answer(TilesQuery(first.version)).tiles}
+    before = {(tile.x, tile.y): tile for tile in first.tiles}
+    row = 10, slice(36, 44)
+    resistance = PLANES["resistance"].values()
+    assert resistance[before[0, 0].unpacked()["resistance"]][row].max() > 0.03
+    assert resistance[later[0, 0].unpacked()["resistance"]][row] == pytest.approx(0.02, rel=0.2)
+    fresh = Tiles(answers._source, lambda: dict(ages)).answer(TilesQuery())
+    assert {(tile.x, tile.y): tile.planes for tile in fresh.tiles}[0, 0] == later[0, 0].planes
+
+
+def test_pictures_have_the_ages_of_some_seconds_ago(repaired, monkeypatch):
+    opened, _ = repaired
+    monkeypatch.setattr(road_maps, "PATIENCE_S", 60.0)
+    roads = answers_of(opened)._roads
+    known = roads.lately()
+    assert known.keys() == roads.read().ages.keys() != set()
+    send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine="c")])
+    assert roads.lately() is known, "asked again at once: as it was"
+    monkeypatch.setattr(road_maps, "LATELY_S", 0.0)
+    assert roads.lately() is not known
 
 
 def test_where_nothing_changed_cells_are_as_they_are(writer):

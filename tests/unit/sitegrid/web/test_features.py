@@ -5,7 +5,7 @@ import pytest
 
 from protocol.queries.answers import GroundChange, MapVersion
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer
-from protocol.queries.roads import RoadSegment, WorklistRow
+from protocol.queries.roads import RoadChange, RoadSegment, WorklistRow
 from protocol.site.ground_classes import BOUNDARIES
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire.messages import Pose
@@ -58,14 +58,6 @@ def test_a_change_is_a_rectangle_with_its_times():
     assert feature["properties"]["resistance_after"] is None
 
 
-def test_cells_in_a_polygon_are_those_with_their_centre_inside():
-    centres = np.arange(4) + 0.5
-    inside = features.inside([(0, 0), (4.2, 0), (0, 4.2)], centres, centres)
-    assert inside.astype(int).tolist() == [[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 0]]
-    ring = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 3), (3, 3), (3, 1), (0, 1)]  # a C, open to the west
-    assert features.inside(ring, centres, centres).sum() == 10
-
-
 def test_a_track_is_a_line_in_the_order_of_time():
     poses = [Pose("loader-1", 10**9 * i, 10.0 * i, 0.0, 0.0, 3.0, 1.0, 0.0, 1.0) for i in range(1, 4)]
     (feature,) = features.tracks({"loader-1": poses, "loader-2": poses[:1]}, PROJECTION)["features"]
@@ -103,3 +95,14 @@ def test_a_stretch_of_the_worklist_has_its_loss_and_how_sure_it_is():
     assert [properties[f"kwh_ph{end}"] for end in ("_low", "", "_high")] == [2.0, 3.0, 4.0]
     assert properties["seconds_ph"] == 40.0
     assert (properties["since_time"], properties["resistance_before"]) == ("1970-01-01T00:00:01.000000000Z", 0.03)
+
+
+def test_a_repair_is_a_line_with_what_was_before():
+    change = RoadChange("0_0_e", LINE, 10**9, 3 * 10**9, 0.05, 0.02, 1.5)
+    (feature,) = features.repairs([change], PROJECTION)["features"]
+    line = [PROJECTION.to_map(lat, lon, 0)[:2] for lon, lat in feature["geometry"]["coordinates"]]
+    assert np.array(line) == pytest.approx(np.array(LINE), abs=1e-3)
+    properties = feature["properties"]
+    assert (properties["resistance_before"], properties["resistance_after"]) == (0.05, 0.02)
+    assert properties["seen_time"] == "1970-01-01T00:00:03.000000000Z"
+    assert features.repairs([], PROJECTION)["features"] == []
