@@ -1,12 +1,13 @@
 """Two days on one site: positions of the second day, and the map once its samples lie on those of the first.
 
-The drives of two seeds on the same ground are one day after the other. Agents start anew on the second.
+The same machines: halves of one recording, with a night between them. Others: the fleet of the next seed comes in the
+morning, under names of its own, since each seed draws other errors of sensors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,12 @@ from evaluation.campaign.recordings import PlannedDrive
 from evaluation.fleet.cases import Rows
 from evaluation.fleet.drives import Scene, scene
 from evaluation.fleet.solving import served
+from evaluation.ground.truth import LoadTrack
 from evaluation.maps.methods import folded
 from evaluation.maps.score import region_of, score_driven, true_layers, window_of
 from evaluation.paper import maps
 from evaluation.paper.maps import Fleet, rmse_m, samples_of
-from protocol.arrays import Floats, Table
+from protocol.arrays import Bools, Floats
 
 DAY_NS = 86_400 * 10**9
 FIGURES = ("wrong_resistance_pct", "wrong_grade_pct", "known_pct")
@@ -36,15 +38,23 @@ GOALS = tuple(Goal({"samples": BOTH}, figure, "<=", 0.1) for figure in WORSE.val
 
 @dataclass(frozen=True)
 class SecondDay:
-    """A fleet on the day after another drive of it, which is the first day."""
+    """A fleet on its second day. first: what others drove on the first; None: the day before is half of the drive."""
 
     fleet: Fleet
-    first: PlannedDrive
+    first: PlannedDrive | None = None
 
     @property
     def name(self) -> str:
         """Short and unique."""
-        return f"day-after-{self.first.seed}"
+        return f"day-after-{self.first.seed}" if self.first else "second-half"
+
+
+@dataclass(frozen=True)
+class Day:
+    """Samples by machine, and what is true of their time."""
+
+    rows: Rows
+    true: Scene
 
 
 @dataclass(frozen=True)
@@ -58,16 +68,41 @@ class Days:
     figures: dict[str, dict[str, float]]
 
 
-def second_day(first: tuple[Rows, Scene], second: tuple[Rows, Scene]) -> Days:
-    """Judge two days on the same ground: samples and truth of each."""
-    (rows, true), (later, later_true) = first, second
-    both = {name: np.concatenate([rows[name], _moved(later[name], rows[name])]) for name in later}
-    figures = {
-        FIRST: judged(rows, true),
-        ALONE: judged(later, later_true),
-        BOTH: judged(both, later_true),
-    }
-    return Days([float(np.hypot(*rmse_m(*each))) for each in (first, second)], figures)
+def halves(day: Day) -> tuple[Day, Day]:
+    """A recording as two days of the same machines."""
+    stamps = np.concatenate([rows["stamp_ns"] for rows in day.rows.values()])
+    middle_ns = (stamps.min() + stamps.max()) // 2
+
+    def part(*, later: bool) -> Day:
+        rows = {name: table[(table["stamp_ns"] >= middle_ns) == later] for name, table in day.rows.items()}
+        tracks = {
+            name: _of_track(track, (track.stamp_ns >= middle_ns) == later) for name, track in day.true.tracks.items()
+        }
+        return Day(rows, replace(day.true, tracks=tracks))
+
+    return part(later=False), part(later=True)
+
+
+def as_others(day: Day) -> Day:
+    """The same day of machines with other names."""
+    rows, tracks = ({f"{name}-other": value for name, value in each.items()} for each in (day.rows, day.true.tracks))
+    return Day(rows, replace(day.true, tracks=tracks))
+
+
+def judged_days(first: Day, second: Day) -> Days:
+    """Judge two days on the same ground; the second begins at the hour of the first."""
+    begins = [min(rows["stamp_ns"][0] for rows in day.rows.values() if len(rows)) for day in (first, second)]
+    night_ns = DAY_NS + begins[0] - begins[1]
+    both = dict(first.rows)
+    for name, rows in second.rows.items():
+        later = rows.copy()
+        later["stamp_ns"] += night_ns
+        both[name] = np.concatenate([both[name], later]) if name in both else later
+    maps_of = {FIRST: (first.rows, first.true), ALONE: (second.rows, second.true), BOTH: (both, second.true)}
+    return Days(
+        [float(np.hypot(*rmse_m(day.rows, day.true))) for day in (first, second)],
+        {name: judged(*each) for name, each in maps_of.items()},
+    )
 
 
 def judged(rows: Rows, true: Scene) -> dict[str, float]:
@@ -77,11 +112,8 @@ def judged(rows: Rows, true: Scene) -> dict[str, float]:
     return {name: float(getattr(score, name)) for name in FIGURES}
 
 
-def _moved(rows: Table, after: Table) -> Table:
-    """Samples as if they were of the day after others, from the same hour on."""
-    rows = rows.copy()
-    rows["stamp_ns"] += DAY_NS + after["stamp_ns"][0] - rows["stamp_ns"][0]
-    return rows
+def _of_track(track: LoadTrack, where: Bools) -> LoadTrack:
+    return LoadTrack(*(getattr(track, field.name)[where] for field in fields(track)))
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
@@ -116,15 +148,18 @@ def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Floats]:
 
 
 def _solve(task: Task[SecondDay], cache: Path) -> Days:
-    """Judge a pair of drives whose agents have run before."""
+    """Judge two days whose agents have run before."""
     assert task.drive
-    days = []
-    for drive in (task.variant.first, task.drive):
-        true = scene(drive, cache)
-        names = sorted(true.tracks)
-        agents = task.variant.fleet.agents
-        days.append(({names[each.index]: samples_of(each, drive, cache).samples for each in agents}, true))
-    return second_day(*days)
+    second, first = _day(task.drive, task.variant.fleet, cache), task.variant.first
+    if first is None:
+        return judged_days(*halves(second))
+    return judged_days(_day(first, task.variant.fleet, cache), as_others(second))
+
+
+def _day(drive: PlannedDrive, fleet: Fleet, cache: Path) -> Day:
+    true = scene(drive, cache)
+    names = sorted(true.tracks)
+    return Day({names[agent.index]: samples_of(agent, drive, cache).samples for agent in fleet.agents}, true)
 
 
 EXPERIMENT = Experiment("days", Days, (*maps.SOURCES, "evaluation/paper/days.py", "evaluation/maps/score.py"), _solve)

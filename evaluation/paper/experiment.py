@@ -139,10 +139,17 @@ def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
 
 
 def _days(runner: Runner, plan: Plan, source: MapSource) -> list[Row]:
-    """Rows of two days: each seed on the day after the one before it; none of one seed alone."""
-    pairs = [(source.drive(seed, plan), source.drive(later, plan)) for seed, later in pairwise(plan.seeds)]
-    tasks = [replay_task(SecondDay(Fleet(source.agents), first), second) for first, second in pairs]
-    return day_rows(_of(source), runner.run(days.EXPERIMENT, tasks)) if tasks else []
+    """Rows of two days, of the same machines and of others; none of one seed alone, after which nobody comes."""
+    drives_of = [source.drive(seed, plan) for seed in plan.seeds]
+    kinds = {
+        "the same": [(None, drive) for drive in drives_of[1:]],
+        "others": list(pairwise(drives_of)),
+    }
+    rows = []
+    for who, pairs in kinds.items():
+        tasks = [replay_task(SecondDay(Fleet(source.agents), first), second) for first, second in pairs]
+        rows += day_rows({**_of(source), "second_day": who}, runner.run(days.EXPERIMENT, tasks)) if tasks else []
+    return rows
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------

@@ -4,7 +4,20 @@ import numpy as np
 import pytest
 
 from evaluation.campaign.figures import judge
-from evaluation.paper.days import ALONE, BOTH, DAY_NS, FIRST, GOALS, Days, _moved, day_rows, second_day
+from evaluation.paper import days as days_module
+from evaluation.paper.days import (
+    ALONE,
+    BOTH,
+    DAY_NS,
+    FIRST,
+    GOALS,
+    Day,
+    Days,
+    as_others,
+    day_rows,
+    halves,
+    judged_days,
+)
 from tests.unit.evaluation.fleet.scenes import made_scene
 
 
@@ -38,21 +51,48 @@ def test_goals_judge_what_is_worse_and_not_what_is_better():
     assert [row["value"] for row in judge(GOALS, day_rows({}, better))] == [0.0, 0.0, 0.0]
 
 
-def test_the_second_day_is_a_day_later():
-    rows, _ = made_scene()
-    later = rows["b"].copy()
-    later["stamp_ns"] += 5
-    moved = _moved(later, rows["a"])
-    assert moved["stamp_ns"][0] == rows["a"]["stamp_ns"][0] + DAY_NS
-    np.testing.assert_array_equal(np.diff(moved["stamp_ns"]), np.diff(later["stamp_ns"]))
-    assert later["stamp_ns"][0] == rows["b"]["stamp_ns"][0] + 5
+@pytest.fixture(scope="module")
+def day() -> Day:
+    return Day(*made_scene())
+
+
+def test_halves_are_two_days_of_the_same_machines(day: Day):
+    first, second = halves(day)
+    for name, rows in day.rows.items():
+        assert len(first.rows[name]) + len(second.rows[name]) == len(rows)
+        assert (first.true.tracks[name].stamp_ns[-1:] < second.true.tracks[name].stamp_ns[:1]).all()
+        assert set(second.rows[name]["stamp_ns"]) <= set(second.true.tracks[name].stamp_ns)
+    assert all(len(rows) for half in (first, second) for rows in half.rows.values())
+
+
+def test_others_have_other_names_and_the_same_truth(day: Day):
+    others = as_others(day)
+    assert others.rows.keys() == others.true.tracks.keys()
+    assert not others.rows.keys() & day.rows.keys()
+    assert others.true.truth is day.true.truth
 
 
 @pytest.mark.slow
-def test_the_same_drive_again_makes_no_map_worse():
-    rows, true = made_scene()
-    made = second_day((rows, true), (rows, true))
+def test_the_second_day_is_a_day_later_and_makes_no_map_worse(day: Day, monkeypatch: pytest.MonkeyPatch):
+    asked: list[dict] = []
+    judge_map = days_module.judged
+    monkeypatch.setattr(days_module, "judged", lambda rows, true: (asked.append(rows), judge_map(rows, true))[1])
+    made = judged_days(day, as_others(day))
     assert made.net_m == [pytest.approx(0.0)] * 2
-    assert made.figures[FIRST] == made.figures[ALONE]
     assert made.figures[BOTH]["wrong_resistance_pct"] <= made.figures[ALONE]["wrong_resistance_pct"] + 0.5
     assert made.figures[BOTH]["known_pct"] >= made.figures[ALONE]["known_pct"]
+    both = asked[2]
+    assert both["b-other"]["stamp_ns"][0] - both["b"]["stamp_ns"][0] == DAY_NS
+    assert len(asked[0]["b"]) == len(asked[1]["b-other"]) == len(both["b"])
+
+
+@pytest.mark.slow
+def test_a_night_between_halves_of_a_drive_moves_the_later_samples_alone(day: Day, monkeypatch: pytest.MonkeyPatch):
+    asked: list[dict] = []
+    monkeypatch.setattr(days_module, "judged", lambda rows, _: (asked.append(rows), PAIRS[0].figures[FIRST])[1])
+    first, second = halves(day)
+    judged_days(first, second)
+    both = asked[2]["a"]["stamp_ns"]
+    assert (np.diff(both) > 0).all()
+    assert np.diff(both).max() > DAY_NS / 2
+    assert len(both) == len(day.rows["a"])
