@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -101,6 +101,32 @@ def send(link: zenoh.Session, site: SiteConfig, batch: SampleBatch) -> None:
     (reply,) = ask(link, keys.ingest(site.name, batch.machine), encode_batch(batch))
     if not isinstance(answer := decode_reply(reply), Ack):
         raise RuntimeError(f"the server refused a batch: {answer}")
+
+
+@contextmanager
+def at_work(drive: Callable[[threading.Event], None]) -> Iterator[threading.Event]:
+    """Machines that send meanwhile, on a thread of their own, until left.
+
+    drive is handed an event, which is set once it is to end, and once it has failed; then a RuntimeError says so.
+    """
+    ended, problems = threading.Event(), list[Exception]()
+
+    def run() -> None:
+        try:
+            drive(ended)
+        except Exception as error:  # handed on below
+            problems.append(error)
+            ended.set()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield ended
+    finally:
+        ended.set()
+        thread.join()
+    if problems:
+        raise RuntimeError("the machines stopped sending: nothing was measured") from problems[0]
 
 
 def settle(server: int) -> None:

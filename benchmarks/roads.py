@@ -7,8 +7,9 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import zenoh
 
 from benchmarks.measure import START_NS, Report, machine, medians, timed
 from benchmarks.merge_work import batches
-from benchmarks.processes import ask, processor_s, send, served, session
+from benchmarks.processes import ask, at_work, processor_s, send, served, session
 from mapserver.evidence.fold_config import FoldConfig, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS
@@ -32,7 +33,7 @@ from mapserver.roads.tally import HOUR_NS
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from protocol.queries.answers import MapVersion
-from protocol.queries.requests import WorklistQuery
+from protocol.queries.road_requests import WorklistQuery
 from protocol.queries.roads import encode_worklist
 from protocol.site.geometry import CellWindow
 from protocol.site.site_config import SiteConfig
@@ -94,12 +95,12 @@ def run(hours: float, runs: int, seconds: float) -> Report:
 
 def _ingest(seconds: float) -> Report:
     """What a server takes from machines that send as fast as they are answered, and what asking costs of it."""
-    counts, ended = [0], threading.Event()
+    counts = [0]
     with ExitStack() as opened:
         folder = opened.enter_context(tempfile.TemporaryDirectory())
         endpoint, server = opened.enter_context(served(Path(folder), INGEST_SITE))
         link, asker = (opened.enter_context(session(endpoint)) for _ in range(2))
-        opened.enter_context(_sending(link, counts, ended))
+        ended = opened.enter_context(at_work(partial(_send, link, counts)))
         rates: dict[bool, list[float]] = {False: [], True: []}
         cpu_us: dict[bool, list[float]] = {False: [], True: []}
         answer_s: list[float] = []
@@ -123,33 +124,15 @@ def _ingest(seconds: float) -> Report:
     }
 
 
-@contextmanager
-def _sending(link: zenoh.Session, counts: list[int], ended: threading.Event) -> Iterator[None]:
-    """Ten machines at work, whose batches are sent one after the other until left; counts[0]: samples taken."""
-    problems: list[Exception] = []
-
-    def drive() -> None:
-        sent: Counter[str] = Counter()
-        try:
-            for name, rows in batches():
-                if ended.is_set():
-                    return
-                send(link, INGEST_SITE, SampleBatch(name, 1, sent[name] + 1, rows, INGEST_SITE.frame))
-                sent[name] += len(rows)
-                counts[0] += len(rows)
-        except Exception as error:  # handed on below
-            problems.append(error)
-            ended.set()
-
-    driver = threading.Thread(target=drive)
-    driver.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        driver.join()
-    if problems:
-        raise RuntimeError("the machines stopped sending") from problems[0]
+def _send(link: zenoh.Session, counts: list[int], ended: threading.Event) -> None:
+    """Send the batches of ten machines one after the other; counts[0]: samples taken."""
+    sent: Counter[str] = Counter()
+    for name, rows in batches():
+        if ended.is_set():
+            return
+        send(link, INGEST_SITE, SampleBatch(name, 1, sent[name] + 1, rows, INGEST_SITE.frame))
+        sent[name] += len(rows)
+        counts[0] += len(rows)
 
 
 def _pass(road: int, hour: int, turn: int = 0) -> Table:

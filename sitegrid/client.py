@@ -35,6 +35,7 @@ from protocol.queries.parameters import Freshness
 from protocol.queries.pieces import Progress, joined
 from protocol.queries.places import Place
 from protocol.queries.reasons import CellReasons, decode_why
+from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
 from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import LOADER, NamedMachine, RouteAnswer, RouteMachine, decode_answer, machine_of
@@ -185,7 +186,7 @@ class Client:
         machine: traffic of this one alone, and what it measured.
         """
         fresh = Freshness(after, wait_s)
-        return decode_segments(self._ask(requests.SegmentsQuery(from_ns, to_ns, as_of_ns, bounds, machine, fresh)))
+        return decode_segments(self._ask(SegmentsQuery(from_ns, to_ns, as_of_ns, bounds, machine, fresh)))
 
     def worklist(
         self,
@@ -205,7 +206,7 @@ class Client:
 
         efficiency: of engine and drive train, for litres of diesel. machine: what this one alone loses.
         """
-        query = requests.WorklistQuery(
+        query = WorklistQuery(
             target, efficiency, limit, from_ns, to_ns, as_of_ns, bounds, machine, Freshness(after, wait_s)
         )
         return decode_worklist(self._ask(query))

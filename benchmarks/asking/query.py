@@ -11,6 +11,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from benchmarks.asking.questions import kinds
 from benchmarks.measure import Report, machine, timed
 from benchmarks.merge_restart import SITE, build
 from benchmarks.merge_work import BATCH, Batches, batches, samples_of, seconds_of
-from benchmarks.processes import EMPTY_KEY, ask, process, routed, send, serving, session, settle
+from benchmarks.processes import EMPTY_KEY, ask, at_work, process, routed, send, serving, session, settle
 from protocol.queries.parameters import selector_of
 from protocol.queries.requests import MapQuery, encode_query
 from protocol.wire import keys
@@ -60,9 +61,9 @@ def run(hours: float, queries: int, seconds: float, runs: int) -> Report:
         asked = {name: list(islice(some, _count(name, queries))) for name, some in kinds(before).items()}
         with session(endpoint) as link:
             for name, questions in asked.items():
-                with _at_work(endpoint, Path(path), after, sent):
+                with _serving(endpoint, Path(path), after, sent):
                     rows.append({"state": "cold", "query": name, **_answered(link, questions[:COLD])})
-            with _at_work(endpoint, Path(path), after, sent):
+            with _serving(endpoint, Path(path), after, sent):
                 for name, questions in asked.items():
                     for question in questions:
                         _bytes_of(link, question)
@@ -109,37 +110,20 @@ def _bytes_of(link: zenoh.Session, query: MapQuery) -> int:
 
 
 @contextmanager
-def _at_work(endpoint: str, folder: Path, seconds: Iterator[Batches], sent: Counter[str]) -> Iterator[None]:
+def _serving(endpoint: str, folder: Path, seconds: Iterator[Batches], sent: Counter[str]) -> Iterator[None]:
     """A server that has just come and is done with that, to which machines send."""
     with serving(endpoint, folder, SITE) as pid:
         settle(pid)
-        with _sending(endpoint, seconds, sent):
+        with at_work(partial(_send, endpoint, seconds, sent)):
             yield
 
 
-@contextmanager
-def _sending(endpoint: str, seconds: Iterator[Batches], sent: Counter[str]) -> Iterator[None]:
-    """Machines that send their samples every second, from a session of their own. sent: samples of each so far."""
-    ended, problems = threading.Event(), list[Exception]()
-
-    def drive() -> None:
-        try:
-            with session(endpoint) as link:
-                for second in seconds:
-                    for name, rows in second:
-                        send(link, SITE, SampleBatch(name, 2, sent[name] + 1, rows, SITE.frame))
-                        sent[name] += len(rows)
-                    if ended.wait(1.0):
-                        return
-        except Exception as error:  # handed on below
-            problems.append(error)
-
-    driver = threading.Thread(target=drive)
-    driver.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        driver.join()
-    if problems:
-        raise RuntimeError("the machines stopped sending") from problems[0]
+def _send(endpoint: str, seconds: Iterator[Batches], sent: Counter[str], ended: threading.Event) -> None:
+    """Send every second what machines sample, from a session of its own. sent: samples of each so far."""
+    with session(endpoint) as link:
+        for second in seconds:
+            for name, rows in second:
+                send(link, SITE, SampleBatch(name, 2, sent[name] + 1, rows, SITE.frame))
+                sent[name] += len(rows)
+            if ended.wait(1.0):
+                return

@@ -34,7 +34,7 @@ from websockets.sync.client import connect as open_socket
 from benchmarks.measure import Report, machine, memory_mb, timed
 from benchmarks.merge_restart import SITE, build
 from benchmarks.merge_work import BATCH, MACHINES, SPEED_MPS, Batches, batches, samples_of, seconds_of
-from benchmarks.processes import process, processor_s, send, served, session, settle
+from benchmarks.processes import at_work, process, processor_s, send, served, session, settle
 from protocol.site.site_config import Projection
 from protocol.wire import keys
 from protocol.wire.codec import encode_pose
@@ -87,7 +87,7 @@ def run(hours: float, seconds: float) -> Report:
         site = _Site(port, server, opened.enter_context(process(*words)), samples_of(hours) // MACHINES)
         settle(server)
         figures = {**dict(_asked(site)), **dict(_browsed(site, _first_paint))}
-        with _working(endpoint, site, seconds_of(work)):
+        with at_work(partial(_work, endpoint, site, seconds_of(work))):
             site.cost(seconds)  # a server that gets to work again
             figures |= dict(_five(site, seconds))
             figures |= dict(_many(site, seconds))
@@ -177,36 +177,24 @@ def _pages(port: int, count: int, sleepers: int = 0) -> Iterator[list[_Page]]:
             page.close()
 
 
-@contextmanager
-def _working(endpoint: str, site: _Site, seconds: Iterator[Batches]) -> Iterator[None]:
-    """Ten machines at work meanwhile: a batch each second, a pose four times a second."""
-    stop = threading.Event()
-
-    def work() -> None:
-        sent = {f"loader-{i}": site.sent for i in range(1, MACHINES + 1)}
-        with session(endpoint) as link:
-            began_s = time.monotonic()
-            for number, second in enumerate(seconds):
-                for quarter in range(POSES):
+def _work(endpoint: str, site: _Site, seconds: Iterator[Batches], ended: threading.Event) -> None:
+    """Ten machines at work: a batch each second, a pose four times a second."""
+    sent = {f"loader-{i}": site.sent for i in range(1, MACHINES + 1)}
+    with session(endpoint) as link:
+        began_s = time.monotonic()
+        for number, second in enumerate(seconds):
+            for quarter in range(POSES):
+                for name, rows in second:
+                    _say(link, name, rows[-1], quarter / POSES)
+                if quarter == 0:
                     for name, rows in second:
-                        _say(link, name, rows[-1], quarter / POSES)
-                    if quarter == 0:
-                        for name, rows in second:
-                            send(link, SITE, SampleBatch(name, 1, sent[name] + 1, rows, SITE.frame))
-                            sent[name] += len(rows)
-                        row = site.info()["journalled"]
-                        site.acknowledged.append((1e3 * time.time(), row))
-                    left_s = began_s + number + (quarter + 1) / POSES - time.monotonic()
-                    if stop.wait(max(0.0, left_s)):
-                        return
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+                        send(link, SITE, SampleBatch(name, 1, sent[name] + 1, rows, SITE.frame))
+                        sent[name] += len(rows)
+                    row = site.info()["journalled"]
+                    site.acknowledged.append((1e3 * time.time(), row))
+                left_s = began_s + number + (quarter + 1) / POSES - time.monotonic()
+                if ended.wait(max(0.0, left_s)):
+                    return
 
 
 def _say(link: zenoh.Session, name: str, row: Any, later_s: float) -> None:

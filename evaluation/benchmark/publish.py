@@ -14,12 +14,12 @@ from evaluation.benchmark.recordings import HASHES, published_hashes
 from evaluation.campaign.figures import Report
 from protocol.files import write_whole
 
-OF = ("recording", "samples")
+HASHED = ("recording", "samples")
 
 
 def with_hashes(published: Mapping[str, Mapping[str, Mapping[str, str]]], made: Report) -> Report:
     """The published hashes with those of a report of `sitegrid bench make` in place of its edition's."""
-    return {**published, made["edition"]: {row["name"]: {of: row[of] for of in OF} for row in made["rows"]}}
+    return {**published, made["edition"]: {row["name"]: {part: row[part] for part in HASHED} for row in made["rows"]}}
 
 
 def main(paths: Sequence[str]) -> int:

@@ -88,6 +88,11 @@ class Runner:
     processes: int = 1
     on_progress: Progress = lambda *_: None
 
+    def record(self, drives: Sequence[PlannedDrive]) -> None:
+        """Record what is not recorded."""
+        missing = [drive for drive in drives if not drive.folder(self.cache).exists()]
+        self._record(missing, 0.0, sum(drive.seconds for drive in missing))
+
     def run(self, experiment: Experiment[Variant, Result], tasks: Sequence[Task[Variant]]) -> list[Result]:
         """Record what is not recorded, do the tasks whose result is not there; returns all results, task by task."""
         files = [experiment.file(task, self.cache) for task in tasks]
@@ -96,15 +101,19 @@ class Runner:
         missing = [drive for drive in drives if not drive.folder(self.cache).exists()]
         to_do_s = sum(drive.seconds for drive in missing) + sum(task.seconds for task, _ in waiting)
         total_s = sum(drive.seconds for drive in missing) + sum(task.seconds for task in tasks)
-        done_s = total_s - to_do_s
-        for (drive, _), _ in each(_record, [(drive, self.cache) for drive in missing], self.processes):
-            done_s += drive.seconds
-            self.on_progress(done_s, total_s, f"recorded seed {drive.seed} {drive.preset}")
+        done_s = self._record(missing, total_s - to_do_s, total_s)
         jobs = [(experiment, task, self.cache, file) for task, file in waiting]
         for (_, task, _, _), _ in each(_work, jobs, self.processes):
             done_s += task.seconds
             self.on_progress(done_s, total_s, task.name)
         return [read_result(experiment.result, file) for file in files]
+
+    def _record(self, drives: Sequence[PlannedDrive], done_s: float, total_s: float) -> float:
+        """Record these; returns the simulated seconds that are done then."""
+        for (drive, _), _ in each(_record, [(drive, self.cache) for drive in drives], self.processes):
+            done_s += drive.seconds
+            self.on_progress(done_s, total_s, f"recorded seed {drive.seed} {drive.preset}")
+        return done_s
 
 
 def write_result(result: Any, file: BinaryIO) -> None:

@@ -85,8 +85,12 @@ def halves(day: Day) -> tuple[Day, Day]:
 
 def as_others(day: Day) -> Day:
     """The same day of machines with other names."""
-    rows, tracks = ({f"{name}-other": value for name, value in each.items()} for each in (day.rows, day.true.tracks))
-    return Day(rows, replace(day.true, tracks=tracks))
+    tracks = {_other(name): track for name, track in day.true.tracks.items()}
+    return Day({_other(name): rows for name, rows in day.rows.items()}, replace(day.true, tracks=tracks))
+
+
+def _other(name: str) -> str:
+    return f"{name}-other"
 
 
 def judged_days(first: Day, second: Day) -> Days:

@@ -141,9 +141,9 @@ def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
 def _days(runner: Runner, plan: Plan, source: MapSource) -> list[Row]:
     """Rows of two days, of the same machines and of others; none of one seed alone, after which nobody comes."""
     drives_of = [source.drive(seed, plan) for seed in plan.seeds]
-    kinds = {
+    kinds: dict[str, list[tuple[PlannedDrive | None, PlannedDrive]]] = {
         "the same": [(None, drive) for drive in drives_of[1:]],
-        "others": list(pairwise(drives_of)),
+        "others": [*pairwise(drives_of)],
     }
     rows = []
     for who, pairs in kinds.items():

@@ -27,7 +27,7 @@ from mapserver.roads.repairs import Repair, ages, repairs
 from mapserver.roads.segments import Segments, segments
 from mapserver.roads.skeleton import Skeletons
 from mapserver.roads.tally import PER_M, Tally
-from mapserver.roads.worklist import TIE_SHARE
+from mapserver.roads.worklist import TIE_SHARE, ranked
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
@@ -172,12 +172,23 @@ def traffic_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
 
 
 def _list_figures(known: Losses, true: TrueTraffic, judged: Bools) -> dict[str, float]:
-    """Order and sum of losses. tau: with ties in the truth and the list; tau_plain: with ties in the truth alone."""
+    """Order and sum of losses.
+
+    tau: with ties in the truth and the list; tau_ranks: the list's ties are its ranks; tau_plain: with ties in the
+    truth alone; tau_plain_most: that of the true losses themselves, as nothing without ties can be in order with what
+    has.
+    """
     own, right = known.work_j[judged], true.work_j[judged]
     best, listed = np.argsort(-right)[:TOP], np.argsort(-own, kind="stable")[:TOP]
+    own_tie, tie = (TIE_SHARE * work.max(initial=0.0) for work in (own, right))
+    ranks, shown = np.full(len(judged), np.inf), ranked(known)
+    ranks[shown.order] = shown.rank
+    place = -np.minimum(ranks, len(ranks) + 1)[judged]  # those that are not in the list are the last ones, alike
     return {
-        "tau": kendall(own, right, TIE_SHARE * own.max(initial=0.0), TIE_SHARE * right.max(initial=0.0)),
-        "tau_plain": kendall(own, right, 0.0, TIE_SHARE * right.max(initial=0.0)),
+        "tau": kendall(own, right, own_tie, tie),
+        "tau_ranks": kendall(place, right, 0.0, tie),
+        "tau_plain": kendall(own, right, 0.0, tie),
+        "tau_plain_most": kendall(right, right, 0.0, tie),
         "top_pct": 100.0 * float(right[listed].sum() / max(right[best].sum(), 1e-9)),
         "total_pct": 100.0 * float(own.sum() / max(right.sum(), 1e-9) - 1),
     }

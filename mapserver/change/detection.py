@@ -28,6 +28,7 @@ BINS = (
 )
 WEIGHT_M = 0.3  # least evidence on either side of a cut: a sample's vote in a cell beside its own is no pass
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
+LEAST_SHARE = 0.5  # of a square of size_m that changed, where all else in it is not known
 ALIKE_BINS = 1.0  # kinds of ground nearer to each other are the same; cells whose pages are nearer did not change
 _PARTS = (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH)
 
@@ -89,18 +90,19 @@ def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
 
 
 def kinds(pages: Sequence[TimedPage]) -> Floats:
-    """Median (256,) of all c_rr votes of each cell, in bins; NaN where there are none."""
+    """Median (256,) of all c_rr votes of each cell, in bins; NaN where they are too few for both sides of a cut."""
     packed, _ = packed_votes(pages)
-    kinds_of_cells: Floats = medians(sums(packed, ev.RESISTANCE.start, ev.RESISTANCE.stop) / ev.WEIGHT_UNITS_PER_M)
-    return kinds_of_cells
+    votes = sums(packed, ev.RESISTANCE.start, ev.RESISTANCE.stop) / ev.WEIGHT_UNITS_PER_M
+    return np.where(votes.sum(axis=0) >= 2 * WEIGHT_M, medians(votes), np.nan)
 
 
 def credible(changed: Bools, kind: Floats, now: Floats, cell_m: float, config: ChangeConfig) -> Bools:
     """Changed cells (rows, columns) that are no position errors.
 
     A wrong position moves the ground of one side of a border to the other. So a strip of changed cells counts where it
-    is size_m wide and its new kind is not that of the ground around, or twice as wide. kind: after the change, as in
-    Cuts; now: `kinds` of all cells, NaN where they are not known.
+    is size_m wide and its new kind is not that of the ground around, or twice as wide. Trucks that keep to a lane make
+    a narrower strip known: what is not known beside it speaks neither for the change nor against it, as long as the
+    strip changed over size_m of its length. kind: after the change, as in Cuts; now: `kinds` of all cells.
     """
     edge = _edge(cell_m, config)
     ground = np.where(changed, np.nan, now)
@@ -110,7 +112,7 @@ def credible(changed: Bools, kind: Floats, now: Floats, cell_m: float, config: C
         around = cv2.dilate(alike, np.ones((4 * edge + 1, 4 * edge + 1), np.uint8)) > 0
         near |= around & (np.rint(kind) == one)
     new = changed & np.isfinite(kind) & ~near
-    return _opened(changed, 2 * edge) | _opened(new, edge)
+    return _opened(changed, 2 * edge) | _opened(new, edge) | _strips(new, ~changed & np.isnan(now), edge)
 
 
 def reach_blocks(cell_m: float, config: ChangeConfig) -> int:
@@ -129,6 +131,25 @@ def _opened(cells: Bools, edge: int) -> Bools:
     # not MORPH_OPEN, which moves what it opens by a cell where the edge is even
     corners = cv2.erode(cells.astype(np.uint8), square, anchor=(0, 0), borderValue=0)
     return np.asarray(cv2.dilate(corners, square, anchor=(last, last), borderValue=0) > 0, np.bool_)
+
+
+def _strips(cells: Bools, unknown: Bools, edge: int) -> Bools:
+    """Those that lie in a square of `edge` cells which they cross from side to side, and half of which they are.
+
+    All others in it are unknown, as is what lies outside of the image.
+    """
+    n, last, wide = edge, edge - 1, [(edge, edge), (edge, edge)]
+    some, free = np.pad(cells, wide).astype(np.uint8), np.pad(cells | unknown, wide, constant_values=True)
+    crossed: Bools = np.zeros(some.shape, np.bool_)
+    for along, across in (((n, 1), (1, n)), ((1, n), (n, 1))):  # a cell in each of its rows, or columns
+        touched = cv2.dilate(some, np.ones(across, np.uint8), anchor=(0, 0), borderValue=0)
+        crossed |= cv2.erode(touched, np.ones(along, np.uint8), anchor=(0, 0), borderValue=0) > 0
+    square = np.ones((n, n), np.uint8)
+    count = cv2.filter2D(some, cv2.CV_32F, square.astype(np.float32), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
+    fits = cv2.erode(free.astype(np.uint8), square, anchor=(0, 0), borderValue=0) > 0
+    corners = fits & crossed & (np.asarray(count) >= LEAST_SHARE * n**2)
+    opened = cv2.dilate(corners.astype(np.uint8), square, anchor=(last, last), borderValue=0) > 0
+    return np.asarray(cells & opened[n:-n, n:-n])
 
 
 def _histograms(votes: NDArray[np.uint64], ends: Ints, part: slice, cells: Ints) -> Floats:

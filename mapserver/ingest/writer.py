@@ -7,8 +7,9 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -41,8 +42,7 @@ class _Work:
 class Writer:
     """Owns a Store on a thread of its own, from here on; site, config, location, now_ns, store_id: of the store.
 
-    `submit` and `run` may be called from any thread; both return at once or wait for the owner, never touch the store.
-    waits: who waits for a row to be merged.
+    `submit`, `run` and `look` may be called from any thread. waits: who waits for a row to be merged.
     """
 
     def __init__(self, store: Store, clock: Callable[[], float] = time.monotonic) -> None:
@@ -50,6 +50,7 @@ class Writer:
         self.site, self.config, self.location, self.now_ns = store.site, store.config, store.location, store.now_ns
         self.store_id = store.identity.id
         self._store, self._clock = store, clock
+        self._owned = threading.Lock()  # the store: by its thread, but for while that waits for work
         self._turn = threading.Condition()  # of all that waits
         self._backlog: Backlog[_Batch] = Backlog()
         self._group: list[_Batch] = []  # of this turn, as far as nobody has an answer
@@ -101,6 +102,19 @@ class Writer:
             self._turn.notify()
         return result.result(timeout_s)
 
+    def look(self, work: Callable[[Store], T]) -> T:
+        """As `run`, for work that reads the map alone: on the calling thread while the owner waits for work.
+
+        A question then costs no change of threads; where batches wait, it takes its turn behind them.
+        """
+        if not (self._backlog or self._works) and self._owned.acquire(blocking=False):
+            try:
+                if not self._ended:
+                    return work(self._store)
+            finally:
+                self._owned.release()
+        return self.run(work)
+
     def count(self, what: str) -> None:
         """Count something that never comes to the store: what became of a query."""
         with self._turn:
@@ -136,6 +150,10 @@ class Writer:
         self._thread.join()
 
     def _guard(self) -> None:
+        with self._owned:
+            self._own()
+
+    def _own(self) -> None:
         """A bug must end the process visibly: a server that accepts nothing more is worse than none."""
         try:
             self._serve()
@@ -180,7 +198,7 @@ class Writer:
 
     def _next(self) -> bool:
         """Wait until there are batches, work of others, or a snapshot to take; False to end."""
-        with self._turn:
+        with self._lent(), self._turn:
             if not (self._backlog or self._works or self._is_closing):
                 wait_s = self._times.due_s(self._store.samples_behind) - self._clock()
                 self._turn.wait(min(max(0.0, wait_s), threading.TIMEOUT_MAX))
@@ -189,6 +207,15 @@ class Writer:
             if self._is_closing and not (self._group or self._works):
                 self._ended = "the server is ending"
             return not self._ended
+
+    @contextmanager
+    def _lent(self) -> Iterator[None]:
+        """Let others look at the store meanwhile."""
+        self._owned.release()
+        try:
+            yield
+        finally:
+            self._owned.acquire()
 
     def _gather(self) -> bool:
         """Let more batches come for the next commit, where the last one is not long ago; True if work comes first."""

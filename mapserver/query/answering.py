@@ -46,6 +46,7 @@ from protocol.queries.requests import (
     When,
     WhyQuery,
 )
+from protocol.queries.road_requests import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.queries.roads import encode_segments, encode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import encode_answer
@@ -105,17 +106,17 @@ class Answers:
                 return encode_why(self.why(query))
             case HistoryQuery():
                 return codec.encode_history(self.history(query))
-            case requests.SegmentsQuery() | requests.WorklistQuery() | RouteQuery() | WayQuery():
+            case SegmentsQuery() | WorklistQuery() | RouteQuery() | WayQuery():
                 return self._of_roads(query)
             case _:
                 return self._of_process(query)
 
-    def _of_roads(self, query: requests.RoadQuery | requests.LineQuery) -> bytes:
+    def _of_roads(self, query: RoadQuery | requests.LineQuery) -> bytes:
         """Answers about roads and about lines over the map."""
         match query:
-            case requests.SegmentsQuery():
+            case SegmentsQuery():
                 return encode_segments(roads.segments(self._roads.read, query, self._site.extent_m))
-            case requests.WorklistQuery():
+            case WorklistQuery():
                 return encode_worklist(roads.worklist(self._roads.read, query, self._site.extent_m))
             case RouteQuery():
                 return encode_answer(self._routes.route(query))

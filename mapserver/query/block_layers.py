@@ -2,10 +2,11 @@
 
 A layer of a cell depends on the pages of its block, and, since a change of the ground is seen with its surroundings, on
 those of the blocks around; a layer of an area on the cells around it besides. The grid numbers its turns and knows the
-last one of each block, so a block is derived again only where something was folded into it or near to it. Layers of
-areas are derived square by square, of some blocks each: the same bits for whoever asks, for whatever window. Where the
-ground of a road changed, they depend on its age besides: what is read with ages and without has all other blocks in
-common.
+last one of each block, so what nothing was folded into or near to is read as it is kept. Near to it, it is looked
+which pages count now, which are seldom others: a block is derived again only where its own pages are others, or other
+ones of them count, and a square only where a block was. Layers of areas are derived square by square, of some blocks
+each: the same bits for whoever asks, for whatever window. Where the ground of a road changed, they depend on its age
+besides: what is read with ages and without has all other blocks in common.
 
 It is one module because what is looked up on the map's thread and what is derived beside it have to agree.
 """
@@ -16,8 +17,8 @@ import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
-from itertools import product
+from dataclasses import dataclass, field, replace
+from itertools import count, product
 from weakref import ReferenceType, ref
 
 import cv2
@@ -50,19 +51,25 @@ NO_AGES = b""
 
 @dataclass(frozen=True)
 class Kept:
-    """Layers of one block or square, and what they were derived from."""
+    """Layers of one block or square, the state in which they are good, and what they were derived from.
+
+    origin: of a block, its own last turn, and where its pages begin to count (256,), empty for all of them; of a
+    square, the numbers of the blocks around it. number: of what a block was derived from, another one for another.
+    """
 
     state: State
     layers: Layers
+    origin: tuple[object, ...]
+    number: int = NEVER
 
 
 @dataclass(frozen=True)
 class Look:
     """What a window's layers are read from, of one version of the map: layers that are kept, and pages of the others.
 
-    cells, areas: what is kept of blocks and of squares, of these states; cell_states: of all blocks with evidence,
-    area_states: of all squares that have or are near any. pages: of the blocks whose layers of cells are to be derived,
-    and of those around them. ages: as in View.
+    cells, areas: what is kept of blocks and of squares, in these states or older ones; cell_states: of all blocks with
+    evidence, area_states: of all squares that have or are near any. turns: own ones of blocks, whatever is around.
+    pages: of the blocks whose layers of cells are not kept in their state, and of those around. ages: as in View.
     """
 
     version: MapVersion
@@ -71,6 +78,7 @@ class Look:
     areas: Mapping[Block, Kept]
     cell_states: Mapping[Block, State]
     area_states: Mapping[Block, State]
+    turns: Mapping[Block, int]
     pages: Pages
     grid: ReferenceType[Grid] | None = None
     ages: Ages = field(default_factory=dict)
@@ -88,6 +96,7 @@ class BlockLayers:
         self._areas: OrderedDict[Block, Kept] = OrderedDict()
         self._count = 0  # layers of blocks in both
         self._grid: ReferenceType[Grid] | None = None
+        self._numbers = count()
         self.used, self.derived = 0, 0  # blocks and squares whose layers were kept, and had to be derived
 
     def look(self, state: MapState | StillMap, window: CellWindow, names: Sequence[str]) -> Look:
@@ -134,16 +143,19 @@ class BlockLayers:
                 self._areas.clear()
                 self._grid, self._count = owner, 0
             areas = _valid(self._areas, area_states, area_names)
-            needed = self._around(area_states.keys() - areas.keys(), area_names)
+            stale = area_states.keys() - areas.keys()
+            areas |= _some(self._areas, stale)
+            needed = self._around(stale, area_names)
             needed_names = (*cell_names, *(cell_layers.required(area_names) if needed else ()))
             asked = own.keys() & only if only is not None else {b for b in own if _is_in(b, inner)}
             wanted = {b: cell_states[b] for b in own if b in needed or (cell_names and b in asked)}
             cells = _valid(self._cells, wanted, needed_names)
-        missing = wanted.keys() - cells.keys()
+            missing = wanted.keys() - cells.keys()
+            cells |= _some(self._cells, missing)
         near = sorted({one for block in missing for one in around(block, self._reach) if one in own})
         pages = dict(zip(near, grid.pages(near), strict=True))
         states = {block: cell_states[block] for block in own}
-        return Look(state.version, state.newest_ns, cells, areas, states, area_states, pages, owner, ages)
+        return Look(state.version, state.newest_ns, cells, areas, states, area_states, own, pages, owner, ages)
 
     def look_at(self, view: View) -> Look:
         """The same of a view, of which nothing is kept: a map of the past."""
@@ -151,7 +163,8 @@ class BlockLayers:
         states = {block: state for block, pages in view.pages.items() if pages}
         near = {one for block in states for one in around(block, self._margin(tuple(AREA_LAYERS)))}
         squares = dict.fromkeys({(x // SQUARE, y // SQUARE) for x, y in near}, state)
-        return Look(view.version, view.stamp_ns, {}, {}, states, squares, view.pages, ages=view.ages)
+        turns = dict.fromkeys(states, 0)
+        return Look(view.version, view.stamp_ns, {}, {}, states, squares, turns, view.pages, ages=view.ages)
 
     def read(self, look: Look, window: CellWindow, names: Sequence[str]) -> dict[str, Floats32]:
         """Layers (rows, columns) of a window within that of the look."""
@@ -197,10 +210,21 @@ class BlockLayers:
         needed = self._around(stale, names)
         blocks = {block: state for block, state in look.cell_states.items() if block in needed}
         cells = self._cells_of(look, blocks, cell_layers.required(names))
-        made = {square: Kept(wanted[square], self._derive(square, cells, names)) for square in sorted(stale)}
+        made, derived = dict[Block, Kept](), 0
+        for square in sorted(stale):
+            old, origin = look.areas.get(square), self._origin_of(square, cells, names)
+            layers = old.layers if old and old.origin == origin else {}
+            if any(name not in layers for name in names):
+                layers, derived = {**layers, **self._derive(square, cells, names)}, derived + 1
+            made[square] = Kept(wanted[square], layers, origin)
         self._keep(self._areas, look, made)
-        self._note(len(areas), len(made))
+        self._note(len(wanted) - derived, derived)
         return {square: kept.layers for square, kept in (areas | made).items()}
+
+    def _origin_of(self, square: Block, cells: Mapping[Block, Kept], names: Sequence[str]) -> tuple[int, ...]:
+        """What a square is derived from: numbers of the blocks in it and around."""
+        near = sorted(self._around([square], names))
+        return tuple(cells[block].number if block in cells else NEVER for block in near)
 
     def _margin(self, names: Sequence[str]) -> int:
         """How many blocks around one the layers of areas depend on."""
@@ -214,18 +238,22 @@ class BlockLayers:
         pages = {block: look.pages[block] for block in sorted(near)}
         first = valid_pages(pages, self._cell_m, self._config.change, look.ages)
         made: dict[Block, Kept] = {}
-        for some in chunks(missing):
+        for block in missing:
+            old, origin = look.cells.get(block), (look.turns[block], *_beginning(first[block]))
+            same = old if old and old.origin == origin else Kept(blocks[block], {}, origin, next(self._numbers))
+            made[block] = replace(same, state=blocks[block])
+        lacking = [block for block in missing if any(name not in made[block].layers for name in names)]
+        for some in chunks(lacking):
             sums = evidence([look.pages[block] for block in some], [first[block] for block in some])
             plain = [name for name in dict.fromkeys((*names, "weight")) if name not in TIMED.values()]
             values: dict[str, AnyArray] = {**cell_layers.read(sums, plain, self._config.read)}
             for name in set(names).intersection(TIMED.values()):
                 values[name] = np.where(np.isnan(values["weight"]), 0, getattr(sums, name))
             for i, block in enumerate(some):
-                old = look.cells.get(block)
-                before = old.layers if old and old.state == blocks[block] else {}
-                made[block] = Kept(blocks[block], {**before, **{name: layer[i] for name, layer in values.items()}})
+                more = {name: layer[i].copy() for name, layer in values.items()}  # a view would keep all of them
+                made[block] = replace(made[block], layers={**made[block].layers, **more})
         self._keep(self._cells, look, made)
-        self._note(len(cells), len(made))
+        self._note(len(blocks) - len(lacking), len(lacking))
         return cells | made
 
     def _around(self, squares: Iterable[Block], names: Sequence[str]) -> set[Block]:
@@ -263,11 +291,21 @@ class BlockLayers:
                     continue
                 layers = {**old.layers, **kept.layers} if old and old.state == kept.state else kept.layers
                 self._count += _size(layers) - (_size(old.layers) if old else 0)
-                store[block] = Kept(kept.state, layers)
+                store[block] = replace(kept, layers=layers)
                 store.move_to_end(block)
             while self._count > self._most:
                 fuller = self._areas if SQUARE**2 * len(self._areas) > len(self._cells) else self._cells
                 self._count -= _size(fuller.popitem(last=False)[1].layers)
+
+
+def _beginning(first: Ints) -> tuple[bytes, ...]:
+    """Where the pages of a block begin to count (256,), to be compared and kept."""
+    return (first.tobytes(),) if first.any() else ()
+
+
+def _some(kept: Mapping[Block, Kept], blocks: Iterable[Block]) -> dict[Block, Kept]:
+    """What is kept of these blocks, in whatever state."""
+    return {block: kept[block] for block in blocks if block in kept}
 
 
 def _stored(names: Iterable[str]) -> tuple[str, ...]:

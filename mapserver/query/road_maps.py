@@ -28,7 +28,7 @@ from mapserver.roads.passes import PassTally
 from mapserver.roads.repairs import Repair, ages, repairs
 from mapserver.roads.segments import Segments, segments
 from mapserver.roads.skeleton import Pages, Skeletons
-from mapserver.roads.tally import HOUR_NS, Tally, slot
+from mapserver.roads.tally import HOUR_NS, Tally, between
 from protocol.arrays import Ints, Table
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.machine.readings import MAX_STAMP_NS
@@ -222,9 +222,8 @@ class RoadMaps:
         self, ledgers: Ledgers, traffic: Traffic, pages: Pages, facts: Facts, version: MapVersion, stamp_ns: int
     ) -> RoadMap:
         """Put together; the look back is cut here, where it does not depend on when the journal was followed."""
-        table = traffic.tally.table()
         first = max(0, stamp_ns - LOOK_BACK_NS) // HOUR_NS
-        table = table[slot(table["key"]) >= first]
+        table = between(traffic.tally.table(), first, MAX_STAMP_NS // HOUR_NS + 1)
         changes, _ = repairs(traffic.passes.passes(ledgers, first * HOUR_NS))
         newest_first = tuple(sorted(changes, key=lambda change: (-change.seen, change.segment)))
         return RoadMap(ledgers.segments, ledgers, table, newest_first, pages, facts, version, stamp_ns, self._cell_m)

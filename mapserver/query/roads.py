@@ -18,7 +18,7 @@ from mapserver.roads.worklist import litres, ranked, seconds
 from protocol.arrays import Floats, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import roads as answers
-from protocol.queries.requests import RoadQuery, SegmentsQuery, WorklistQuery
+from protocol.queries.road_requests import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.site.geometry import Bounds
 
 MOST_SEGMENTS = 10_000  # of one answer: 250 km of roads, 3 MB

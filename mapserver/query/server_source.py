@@ -27,8 +27,8 @@ class ServerSource:
         self.site, self.config, self.location, self.waits = writer.site, writer.config, writer.location, writer.waits
 
     def run(self, work: Callable[[MapState], T]) -> T:
-        """Have `work` done by the thread that owns the store."""
-        return self._writer.run(work)
+        """See `Writer.look`."""
+        return self._writer.look(work)
 
     def changes(self, after: int) -> list[GroundChange]:
         """See `Upkeep`."""

@@ -31,8 +31,7 @@ class Chains(NamedTuple):
 
 def chains(places: Ints) -> Chains:
     """Chains of cells (n, 2), rows and columns, sorted by these."""
-    links = neighbours(places)
-    degree = (links >= 0).sum(axis=1)
+    links, degree = neighbours(places)
     cells, ends, used, count = np.empty(2 * len(places) + 16, np.int64), np.zeros(len(places) * 4 + 2, np.int64), 0, 0
     while True:
         used, count = _trace(links, degree, cells, ends)
@@ -43,8 +42,8 @@ def chains(places: Ints) -> Chains:
 
 
 @numba.njit(cache=True, nogil=True)
-def neighbours(places: Any) -> Any:
-    """Numbers (n, 8) of the cells beside each cell (n, 2) [row, column], sorted by these; -1 for none."""
+def neighbours(places: Any) -> tuple[Any, Any]:
+    """Numbers (n, 8) of the cells beside each cell (n, 2) [row, column], sorted by these, -1 for none; and how many."""
     count = len(places)
     keys = (places[:, 0] << _ROW_BITS) + places[:, 1]
     links = np.full((count, 8), -1, np.int64)
@@ -61,7 +60,11 @@ def neighbours(places: Any) -> Any:
         for k in range(4):
             if links[i, k] >= 0 or links[i, (k + 1) % 4] >= 0:
                 links[i, 4 + k] = -1
-    return links
+    degree = np.zeros(count, np.int64)
+    for i in range(count):
+        for k in range(8):
+            degree[i] += links[i, k] >= 0
+    return links, degree
 
 
 @numba.njit(cache=True, nogil=True)

@@ -7,12 +7,15 @@ slice: machines measure c_rr on parts of a segment only, and its mean is over pl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import numba
 import numpy as np
 
+from mapserver.evidence.fold_config import HASH
 from mapserver.roads.placing import Placed, Placing
 from mapserver.roads.segments import Segments
-from mapserver.roads.tally import CELL_M, PER_C, PER_M, SUMS, corner_m, heading_rad, place, slot
+from mapserver.roads.tally import CELL_M, PER_C, PER_M, SUMS, between, corner_m, heading_rad, place, slot
 from protocol.arrays import AnyArray, Floats, Ints, Table
 
 DIRECTIONS = 2
@@ -65,48 +68,133 @@ class Ledgers:
     def ledger(
         self, tally: Table, slot_ns: int, from_ns: int = 0, to_ns: int = 2**62, cell_m: float = CELL_M
     ) -> Ledger:
-        """Sum up rows of TALLY, of slots that begin in from_ns <= time < to_ns."""
-        begins = slot(tally["key"]) * slot_ns
-        tally = tally[(begins >= from_ns) & (begins < to_ns)]
-        segment, inner, direction = self.placed(tally, cell_m)
-        own = segment >= 0
-        rows, kept = tally[own], np.stack([segment, slot(tally["key"]), direction], axis=1)[own]
-        slices = np.zeros((len(PLACED), int(self.slices[-1]), DIRECTIONS), np.int64)
-        for sums, name in zip(slices, PLACED, strict=True):
-            np.add.at(sums, (inner[own], direction[own]), rows[name])
-        total = int(tally["metres"].sum())
-        share = int(rows["metres"].sum()) / total if total else 1.0
-        return Ledger(_grouped(kept, rows), slices, self.slices, slot_ns, share)
+        """Sum up rows of TALLY, by their keys, of slots that begin in from_ns <= time < to_ns."""
+        tally = between(tally, -(-from_ns // slot_ns), -(-to_ns // slot_ns))
+        which, placed = self._placed(tally, cell_m)
+        out: Table = np.empty(len(tally), LEDGER)  # of which few are ever touched
+        slices = np.zeros((int(self.slices[-1]), DIRECTIONS, len(PLACED)), np.int64)
+        used, metres = _sum_up(tally, which, *placed, len(self.segments.ids), slices, out)
+        rows = out[np.argsort(out["segment"][:used], kind="stable")]  # they are by slot, segment and direction
+        share = int(rows["metres"].sum()) / metres if metres else 1.0
+        return Ledger(rows, np.ascontiguousarray(np.moveaxis(slices, 2, 0)), self.slices, slot_ns, share)
 
     def placed(self, tally: Table, cell_m: float) -> Placed:
         """Where rows of TALLY lie: what was driven in one cell and sector is at one place, the mean of it."""
-        numbers, which = np.unique(place(tally["key"]), return_inverse=True)
-        places_m = corner_m(numbers, cell_m) + _inside_m(tally, which, len(numbers))
-        return Placed(*(part[which] for part in self.place(places_m, heading_rad(numbers))))
+        which, placed = self._placed(tally, cell_m)
+        return Placed(*(part[which] for part in placed))
+
+    def _placed(self, tally: Table, cell_m: float) -> tuple[Ints, Placed]:
+        """Number (n,) of each row's cell and sector, and where these lie."""
+        which, numbers, sums = _places(tally)
+        inside_m = sums[:, 1:] / (np.maximum(sums[:, :1], 1) * float(PER_M))
+        return which, self.place(corner_m(numbers, cell_m) + inside_m, heading_rad(numbers))
 
 
-def _inside_m(tally: Table, which: Ints, count: int) -> Floats:
-    """Mean place (count, 2) in their cells, over the metres driven."""
-    sums = np.zeros((count, 3), np.int64)
-    for column, name in enumerate(("metres", "x", "y")):
-        np.add.at(sums[:, column], which, tally[name])
-    return np.asarray(sums[:, 1:] / (np.maximum(sums[:, :1], 1) * float(PER_M)), np.float64)
+@numba.njit(cache=True, nogil=True)
+def _places(tally: Any) -> tuple[Any, Any, Any]:
+    """Number (n,) of each row's cell and sector among all, their numbers (u,) sorted, and their sums of metres, x, y.
+
+    By a hash table: rows of a day have few places, and are not in the order of these.
+    """
+    capacity, used = 1 << 12, 0
+    table = np.full(2 * capacity, -1, np.int64)
+    numbers, which = np.empty(capacity, np.int64), np.empty(len(tally), np.int64)
+    for i in range(len(tally)):
+        number = place(tally[i].key)
+        at = _slot_of(table, numbers, number)
+        if table[at] < 0:
+            if used == capacity:
+                capacity *= 2
+                numbers = np.concatenate((numbers, numbers))
+                table = np.full(2 * capacity, -1, np.int64)
+                for old in range(used):
+                    table[_slot_of(table, numbers, numbers[old])] = old
+                at = _slot_of(table, numbers, number)
+            table[at], numbers[used] = used, number
+            used += 1
+        which[i] = table[at]
+    order = np.argsort(numbers[:used])
+    rank = np.empty(used, np.int64)
+    rank[order] = np.arange(used)
+    sums = np.zeros((used, 3), np.int64)
+    for i in range(len(tally)):
+        row, which[i] = tally[i], rank[which[i]]
+        own = sums[which[i]]
+        own[0] += row.metres
+        own[1] += row.x
+        own[2] += row.y
+    return which, numbers[order], sums
 
 
-def _grouped(keys: Ints, rows: Table) -> Table:
-    """Sum what has the same segment, slot and direction."""
-    out, order = np.zeros(0, LEDGER), np.lexsort(keys.T[::-1])
-    if not len(rows):
-        return out
-    keys, rows = keys[order], rows[order]
-    first = np.flatnonzero(np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1)))
-    out = np.zeros(len(first), LEDGER)
-    for index, name in enumerate(KEYS):
-        out[name] = keys[first, index]
-    for name in PLACED:
-        out[name] = np.add.reduceat(rows[name], first)
-    out["machines"] = np.bitwise_or.reduceat(rows["machines"], first)
-    return out
+@numba.njit(cache=True, nogil=True)
+def _slot_of(table: Any, numbers: Any, number: int) -> Any:
+    """Where a number stands in a hash table of indices into numbers, or would."""
+    last = len(table) - 1
+    at = np.int64((np.uint64(number) * np.uint64(HASH)) >> np.uint64(32)) & last
+    while table[at] >= 0 and numbers[table[at]] != number:
+        at = (at + 1) & last
+    return at
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_up(
+    tally: Any, which: Any, segment: Any, inner: Any, direction: Any, segments: int, slices: Any, out: Any
+) -> tuple[int, int]:
+    """Sum rows by slice, and by slot, segment and direction, in the order of these; returns how many, and all metres.
+
+    which (n,): the place of each row; segment, inner, direction (u,): of places. slices (s, 2, PLACED); out: of LEDGER.
+    """
+    used, metres, begin = 0, 0, 0
+    last: Any = np.full(segments * DIRECTIONS, -1, np.int64)  # row of each segment and direction in this slot
+    while begin < len(tally):
+        now, first, end = slot(tally[begin].key), used, begin
+        while end < len(tally) and slot(tally[end].key) == now:
+            own = segment[which[end]]
+            if own >= 0:
+                last[own * DIRECTIONS + direction[which[end]]] = 0
+            end += 1
+        for code in range(len(last)):
+            if last[code] == 0:
+                row, last[code] = out[used], used
+                row.segment, row.slot, row.direction = code // DIRECTIONS, now, code % DIRECTIONS
+                row.metres = row.weighed = row.measured = row.graded = row.kg = row.c = row.c2 = 0
+                row.east = row.north = 0
+                row.machines = np.uint64(0)
+                used += 1
+        for i in range(begin, end):
+            row, at = tally[i], which[i]
+            metres += row.metres
+            if segment[at] < 0:
+                continue
+            _add(row, out[last[segment[at] * DIRECTIONS + direction[at]]], slices[inner[at], direction[at]])
+        for i in range(first, used):
+            last[out[i].segment * DIRECTIONS + out[i].direction] = -1
+        begin = end
+    return used, metres
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(row: Any, total: Any, of_slice: Any) -> None:
+    """Add a row of TALLY to one of LEDGER, and to the sums of a slice in the order of PLACED."""
+    total.metres += row.metres
+    total.weighed += row.weighed
+    total.measured += row.measured
+    total.graded += row.graded
+    total.kg += row.kg
+    total.c += row.c
+    total.c2 += row.c2
+    total.east += row.east
+    total.north += row.north
+    total.machines |= row.machines
+    of_slice[0] += row.metres
+    of_slice[1] += row.weighed
+    of_slice[2] += row.measured
+    of_slice[3] += row.graded
+    of_slice[4] += row.kg
+    of_slice[5] += row.c
+    of_slice[6] += row.c2
+    of_slice[7] += row.east
+    of_slice[8] += row.north
 
 
 def resistance(ledger: Ledger) -> Floats:

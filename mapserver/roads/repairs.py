@@ -22,7 +22,7 @@ from mapserver.roads.segments import Segments
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-BEFORE = 4  # passes, at least, that a segment is known by
+BEFORE = 6  # passes, at least, that a segment is known by: of fewer, most machines have but one
 KNOWN_BY = 32  # passes, at most: the newest ones, as ground wears
 AGREE = (2, 3)  # passes in a row that show a change, at least and at most
 SIGMAS, SIGMAS_EACH = 5.0, 2.0  # of all of them together, and of each, they are from what is expected

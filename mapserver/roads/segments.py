@@ -15,7 +15,7 @@ from mapserver.roads.cutting import LATTICE_M, cut, gathered
 from mapserver.roads.network import Network
 from protocol.arrays import AnyArray, Floats, Ints
 
-AXES = ("e", "ne", "n", "nw")
+AXES = ("e", "n")  # a third or fourth one would rename more roads, as one is always near the border of two
 FIFTHS = 5
 
 
@@ -47,19 +47,19 @@ def segments(graph: Network) -> Segments:
     run, half = points[last] - points[first], (last - first + 1) // 2
     small = ~run.any(axis=1)  # a small ring: from its beginning to its middle
     run[small] = points[first + half][small] - points[first][small]
-    octant = np.rint(np.arctan2(run[:, 1], run[:, 0]) * 4 / np.pi).astype(np.int64) % 8
-    back = octant >= len(AXES)
+    axis = np.rint(np.arctan2(run[:, 1], run[:, 0]) * len(AXES) / np.pi).astype(np.int64) % (2 * len(AXES))
+    back = axis >= len(AXES)
     middle = points[np.where(back, last - half, first + half)]
     run[back] *= -1
-    octant[back] -= len(AXES)
+    axis[back] -= len(AXES)
     cell = np.floor(middle / LATTICE_M).astype(np.int64)
-    turn = np.pi * octant / 4
+    turn = np.pi * axis / len(AXES)
     place = middle - (cell + 0.5) * LATTICE_M
     beside = place[:, 1] * np.cos(turn) - place[:, 0] * np.sin(turn)  # to the left of the cell's middle
-    order = np.lexsort((*run.T, *middle.T[::-1], beside, octant, cell[:, 1], cell[:, 0]))
+    order = np.lexsort((*run.T, *middle.T[::-1], beside, axis, cell[:, 1], cell[:, 0]))
     lines, ends, length_m = gathered(points, first[order], last[order], back[order])
     return Segments(
-        _ids(cell[order], octant[order], beside[order]),
+        _ids(cell[order], axis[order], beside[order]),
         lines,
         ends,
         (run / np.hypot(*run.T)[:, None])[order],
@@ -68,10 +68,10 @@ def segments(graph: Network) -> Segments:
     )
 
 
-def _ids(cell: Ints, octant: Ints, beside: Floats) -> tuple[str, ...]:
+def _ids(cell: Ints, axis: Ints, beside: Floats) -> tuple[str, ...]:
     """Names of segments, sorted. Of several in one cell and axis, the one nearest to its middle has the plain name."""
-    names = [f"{column}_{row}_{AXES[axis]}" for (column, row), axis in zip(cell.tolist(), octant.tolist(), strict=True)]
-    key = np.concatenate([cell, octant[:, None]], axis=1)
+    names = [f"{column}_{row}_{AXES[own]}" for (column, row), own in zip(cell.tolist(), axis.tolist(), strict=True)]
+    key = np.concatenate([cell, axis[:, None]], axis=1)
     bounds = [*np.flatnonzero((np.diff(key, axis=0, prepend=key[:1] - 1) != 0).any(axis=1)).tolist(), len(names)]
     for first, end in pairwise(bounds):
         if end - first > 1:

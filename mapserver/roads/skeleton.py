@@ -79,7 +79,7 @@ class Skeletons:
         others = [tile for tile in stale if self._look(tile)]
         moved = {(x + dx, y + dy) for x, y in others for dx, dy in product((-1, 0, 1), repeat=2)}
         for tile in sorted(moved | (stale & self._lines.keys())):
-            self._draw(tile, thin=tile in moved)
+            self._draw(tile, moved=tile in moved, stale=tile in stale)
         parts = self._lines.values()
         places = np.concatenate([np.zeros((0, 2), np.int64), *(part.places for part in parts)])
         metres = np.concatenate([np.zeros((0, AXES), np.int64), *(part.metres for part in parts)])
@@ -109,14 +109,17 @@ class Skeletons:
         self._ridges[tile] = now
         return True
 
-    def _draw(self, tile: Tile, *, thin: bool) -> None:
-        """Make the lines of a tile again, or only what is told beside them."""
-        places = self._thinned(tile) if thin else self._lines[tile].places
+    def _draw(self, tile: Tile, *, moved: bool, stale: bool) -> None:
+        """Make the lines of a tile again.
+
+        moved: ridges of it or beside it have moved; stale: evidence in it or near it is another.
+        """
+        known = self._lines.get(tile)
+        places = self._thinned(tile) if moved or known is None else known.places
         if not len(places):
             self._lines.pop(tile, None)
-            return
-        own = places - np.array(tile[::-1]) * TILE
-        self._lines[tile] = _Lines(places, _around(self._axes(tile, NEAR), own))
+        elif stale or known is None or not np.array_equal(known.places, places):
+            self._lines[tile] = _Lines(places, self._around(tile, places))
 
     def _thinned(self, tile: Tile) -> Ints:
         """Cells (n, 2) of a tile's lines."""
@@ -131,6 +134,22 @@ class Skeletons:
 
     def _axes(self, tile: Tile, margin: int) -> Ints:
         """Metres (rows, columns, AXES) driven along each axis in a tile and so many cells around it."""
+        size = TILE + 2 * margin
+        out = np.zeros((size, size, AXES), np.int64)
+        _fill(*self._parts(tile, margin), out)
+        return out
+
+    def _around(self, tile: Tile, places: Ints) -> Ints:
+        """Metres (n, AXES) along each axis in the 5 x 5 cells around cells (n, 2) of a tile."""
+        numbers = np.full((TILE + 2 * NEAR, TILE + 2 * NEAR), -1, np.int64)
+        own = places - np.array(tile[::-1]) * TILE + NEAR
+        numbers[own[:, 0], own[:, 1]] = np.arange(len(own))
+        out = np.zeros((len(places), AXES), np.int64)
+        _add_around(*self._parts(tile, NEAR), numbers, out)
+        return out
+
+    def _parts(self, tile: Tile, margin: int) -> tuple[Ints, Ints, Ints, Ints, int, int, int]:
+        """What was driven in a tile and so many cells around it, as `_fill` takes it."""
         column, row = (TILE * index - margin for index in tile)
         size = TILE + 2 * margin
         spans = (
@@ -138,13 +157,11 @@ class Skeletons:
             for at in (column, row)
         )
         blocks = [block for block in product(*spans) if block in self._pages]
-        out = np.zeros((size, size, AXES), np.int64)
-        if blocks:
-            parts = [axis_metres(self._pages[block]) for block in blocks]
-            codes, metres = (np.concatenate(part) for part in zip(*parts, strict=True))
-            ends = np.cumsum([len(part[0]) for part in parts])
-            _fill(codes, metres, ends, np.array(blocks) * BLOCK_CELLS, self._join, row, column, out)
-        return out
+        parts = [axis_metres(self._pages[block]) for block in blocks]
+        nothing = np.zeros(0, np.int64)
+        codes, metres = (np.concatenate([nothing, *part]) for part in (zip(*parts, strict=True) if parts else ((), ())))
+        ends = np.cumsum([len(part[0]) for part in parts], dtype=np.int64)
+        return codes, metres, ends, np.array(blocks, np.int64).reshape(-1, 2) * BLOCK_CELLS, self._join, row, column
 
 
 def axis_metres(pages: Sequence[TimedPage]) -> tuple[Ints, Ints]:
@@ -187,13 +204,20 @@ def _fill(codes: Any, metres: Any, ends: Any, corners: Any, join: int, row: int,
 
 
 @numba.njit(cache=True, nogil=True)
-def _around(axes: Any, places: Any) -> Any:
-    """Metres (n, AXES) in the 5 x 5 cells around cells (n, 2) of a tile; axes: of it and of NEAR cells around."""
-    out = np.zeros((len(places), AXES), np.int64)
-    for i in range(len(places)):
-        y, x = places[i]
-        for row in range(y, y + 2 * NEAR + 1):
-            for column in range(x, x + 2 * NEAR + 1):
-                for axis in range(AXES):
-                    out[i, axis] += axes[row, column, axis]
-    return out
+def _add_around(
+    codes: Any, metres: Any, ends: Any, corners: Any, join: int, row: int, column: int, numbers: Any, out: Any
+) -> None:
+    """Add the metres of blocks, as of `_fill`, to out (n, AXES) of those cells that are near; numbers: -1 for none."""
+    rows, columns = numbers.shape
+    first = 0
+    for b in range(len(ends)):
+        for i in range(first, ends[b]):
+            cell, axis = codes[i] // AXES, codes[i] % AXES
+            y = (corners[b, 1] + cell // BLOCK_CELLS) // join - row
+            x = (corners[b, 0] + cell % BLOCK_CELLS) // join - column
+            for near_y in range(max(y - NEAR, 0), min(y + NEAR + 1, rows)):
+                for near_x in range(max(x - NEAR, 0), min(x + NEAR + 1, columns)):
+                    number = numbers[near_y, near_x]
+                    if number >= 0:
+                        out[number, axis] += metres[i]
+        first = ends[b]

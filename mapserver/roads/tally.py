@@ -6,6 +6,7 @@ up for the segments when it is read. Any order and any batching of the samples g
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from typing import Any
 
 import numba
@@ -86,12 +87,20 @@ def summed(rows: Table) -> Table:
     return out
 
 
-def slot(keys: Ints) -> Ints:
+def between(table: Table, first: int, end: int) -> Table:
+    """Those rows of a table, by their keys, that are of slots first <= slot < end; no copy."""
+    bounds = (bisect_left(table["key"], slots << _SLOT_SHIFT) for slots in (first, end))
+    return table[slice(*bounds)]
+
+
+@numba.njit(cache=True, nogil=True)
+def slot(keys: Any) -> Any:
     """Which span of time, counted since 1970."""
     return keys >> _SLOT_SHIFT
 
 
-def place(keys: Ints) -> Ints:
+@numba.njit(cache=True, nogil=True)
+def place(keys: Any) -> Any:
     """A number of cell and sector."""
     return keys & ((1 << _SLOT_SHIFT) - 1)
 

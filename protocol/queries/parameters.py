@@ -7,6 +7,7 @@ from urllib.parse import quote, unquote
 
 from protocol.errors import QueryError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
+from protocol.site.geometry import Bounds
 
 MAX_WAIT_S = 60.0
 MAX_TEXT = 200  # characters of a text that a person writes
@@ -120,3 +121,33 @@ def free_text(parameters: Parameters, name: str) -> str:
 def freshness(parameters: Parameters) -> Freshness:
     """Which row to wait for, and how long."""
     return Freshness(count(parameters, "after"), seconds(parameters, "wait", 10.0, MAX_WAIT_S))
+
+
+def times(parameters: Parameters) -> tuple[int | None, int | None]:
+    """The stamps `from` and `to`, in this order; None where one is missing."""
+    from_ns, to_ns = stamp(parameters, "from"), stamp(parameters, "to")
+    if from_ns and to_ns and from_ns > to_ns:
+        raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
+    return from_ns, to_ns
+
+
+def text_of_stamps(stamps: Mapping[str, int | None]) -> dict[str, str]:
+    """Stamps by name, those that there are."""
+    return {name: str(stamp_ns) for name, stamp_ns in stamps.items() if stamp_ns is not None}
+
+
+def bounds(parameters: Parameters) -> Bounds:
+    """The rectangle `bounds`."""
+    parts = parameters.get("bounds", "").split(",")
+    if len(parts) != 4:
+        raise QueryError(Refusal.MISSING_FIELD, "parameter `bounds` must be west,south,east,north in metres")
+    numbers = [number({"bounds": part}, "bounds") for part in parts]
+    try:
+        return Bounds(*numbers)
+    except ValueError as error:
+        raise QueryError(Refusal.OUT_OF_RANGE, str(error)) from None
+
+
+def text_of_bounds(b: Bounds) -> str:
+    """Undo `bounds`."""
+    return ",".join(text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))

@@ -12,12 +12,19 @@ from protocol.queries import parameters as ps
 from protocol.queries.answers import MapVersion
 from protocol.queries.parameters import ANY_ROW, Freshness
 from protocol.queries.places import MAX_CORNERS, Place, check_count, check_outline, refusal, take_places, text_of_places
+from protocol.queries.road_requests import (
+    SEGMENTS,
+    WORKLIST,
+    RoadQuery,
+    encode_roads,
+    parse_segments,
+    parse_worklist,
+)
 from protocol.queries.route_requests import ROUTE, WAY, RouteQuery, WayQuery, encode_route, parse_route, parse_way
 from protocol.site.geometry import MAX_CELLS, Bounds
 
 MAX_SPANS = 2000  # of one history
 MAX_SPAN_S = 1e9
-MAX_LIMIT = 1000  # stretches of one worklist
 MAX_RESOLUTION_M = 1000.0
 
 
@@ -206,57 +213,7 @@ class WhyQuery:
     name = "why"
 
 
-@dataclass(frozen=True)
-class SegmentsQuery:
-    """Roads of the map, segment by segment, and what drove on them.
-
-    from_ns, to_ns: traffic of the hours that begin in from_ns <= time < to_ns, None for all that is remembered.
-    as_of_ns: from samples stamped so or earlier. bounds: segments whose middle lies there. machine: traffic of this one
-    alone, and what it measured; "" for all.
-    """
-
-    from_ns: int | None = None
-    to_ns: int | None = None
-    as_of_ns: int | None = None
-    bounds: Bounds | None = None
-    machine: str = ""
-    fresh: Freshness = ANY_ROW
-
-    name = "segments"
-
-
-@dataclass(frozen=True)
-class WorklistQuery:
-    """Where work on roads pays: segments that cost more than ground of a target c_rr would, the dearest first.
-
-    efficiency: of engine and drive train, for litres. limit: at most so many. The others: as in SegmentsQuery.
-    """
-
-    target: float = 0.02
-    efficiency: float = 0.35
-    limit: int = 100
-    from_ns: int | None = None
-    to_ns: int | None = None
-    as_of_ns: int | None = None
-    bounds: Bounds | None = None
-    machine: str = ""
-    fresh: Freshness = ANY_ROW
-
-    name = "worklist"
-
-    def __post_init__(self) -> None:
-        if not 0 < self.target <= 1:
-            raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `target`: {self.target:g} is not above 0 and at most 1")
-        if not 0 < self.efficiency <= 1:
-            problem = f"parameter `efficiency`: {self.efficiency:g} is not above 0 and at most 1"
-            raise QueryError(Refusal.OUT_OF_RANGE, problem)
-        if not 1 <= self.limit <= MAX_LIMIT:
-            problem = f"parameter `limit`: {self.limit} is not between 1 and {MAX_LIMIT}"
-            raise QueryError(Refusal.OUT_OF_RANGE, problem)
-
-
 CellQuery = PointQuery | PointsQuery | RegionQuery | PieceQuery | HistoryQuery | WhyQuery
-RoadQuery = SegmentsQuery | WorklistQuery
 LineQuery = RouteQuery | WayQuery
 MapQuery = (
     CellQuery
@@ -292,12 +249,13 @@ def encode_query(query: MapQuery) -> dict[str, str]:
         case TilesQuery():
             return _of_tiles(query)
         case WhyQuery():
-            return {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m), **_stamps({"as_of": query.as_of_ns})}
+            place = {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
+            return place | ps.text_of_stamps({"as_of": query.as_of_ns})
     parameters = {}
     if isinstance(query, PointQuery | PointsQuery | RegionQuery | HistoryQuery):
         parameters = _of_map(query)
-    elif isinstance(query, SegmentsQuery | WorklistQuery):
-        parameters = _of_roads(query)
+    elif isinstance(query, RoadQuery):
+        parameters = encode_roads(query)
     elif isinstance(query, RouteQuery | WayQuery):
         parameters = encode_route(query)
     if query.fresh.after:
@@ -307,7 +265,7 @@ def encode_query(query: MapQuery) -> dict[str, str]:
 
 def reads_past(query: MapQuery) -> bool:
     """Whether the server has to read its journal for a query, which takes a while."""
-    if isinstance(query, SegmentsQuery | WorklistQuery):
+    if isinstance(query, RoadQuery):
         return True
     if isinstance(query, TilesQuery | WhyQuery | RouteQuery | WayQuery):
         return query.as_of_ns is not None
@@ -322,7 +280,7 @@ def may_read_journal(query: MapQuery) -> bool:
 
 
 def _of_tiles(query: TilesQuery) -> dict[str, str]:
-    parameters = _stamps({"as_of": query.as_of_ns})
+    parameters = ps.text_of_stamps({"as_of": query.as_of_ns})
     if query.since:
         parameters |= {"store": query.since.store, "row": str(query.since.row), "fact": str(query.since.fact)}
     return parameters | ({"place": f"{query.place[0]},{query.place[1]}"} if query.place else {})
@@ -337,37 +295,17 @@ def _of_map(query: PointQuery | PointsQuery | RegionQuery | HistoryQuery) -> dic
     else:
         parameters |= {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
     if isinstance(query, HistoryQuery):
-        parameters |= _stamps({"from": query.from_ns, "to": query.to_ns})
+        parameters |= ps.text_of_stamps({"from": query.from_ns, "to": query.to_ns})
         return parameters | ({"span": ps.text_of(query.span_s)} if query.span_s is not None else {})
-    parameters |= _stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
+    parameters |= ps.text_of_stamps({"as_of": query.when.as_of_ns, "minus": query.when.minus_ns})
     return parameters | ({"repairs": "1"} if query.when.repairs else {})
 
 
 def _of_region(query: RegionQuery) -> dict[str, str]:
     resolution = {"resolution": ps.text_of(query.resolution_m)} if query.resolution_m is not None else {}
     if isinstance(query.area, Bounds):
-        return {"bounds": _text_of_bounds(query.area), **resolution}
+        return {"bounds": ps.text_of_bounds(query.area), **resolution}
     return {"polygon": text_of_places(query.area), **resolution}
-
-
-def _of_roads(query: RoadQuery) -> dict[str, str]:
-    parameters = _stamps({"from": query.from_ns, "to": query.to_ns, "as_of": query.as_of_ns})
-    if query.bounds:
-        parameters["bounds"] = _text_of_bounds(query.bounds)
-    if query.machine:
-        parameters["machine"] = ps.quoted(query.machine)
-    if isinstance(query, WorklistQuery):
-        numbers = {"target": ps.text_of(query.target), "efficiency": ps.text_of(query.efficiency)}
-        parameters |= {**numbers, "limit": str(query.limit)}
-    return parameters
-
-
-def _text_of_bounds(b: Bounds) -> str:
-    return ",".join(ps.text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
-
-
-def _stamps(stamps: Mapping[str, int | None]) -> dict[str, str]:
-    return {name: str(stamp_ns) for name, stamp_ns in stamps.items() if stamp_ns is not None}
 
 
 # --- from parameters -------------------------------------------------------------------------------------------------
@@ -390,7 +328,7 @@ def _parse_region(parameters: ps.Parameters) -> RegionQuery:
     if {"bounds", "polygon"} <= set(parameters):
         raise refusal("polygon", "given with `bounds`: a region is a rectangle or an outline")
     outline = "polygon" in parameters
-    area = take_places(parameters, "polygon", MAX_CORNERS) if outline else _bounds(parameters)
+    area = take_places(parameters, "polygon", MAX_CORNERS) if outline else ps.bounds(parameters)
     resolution_m = ps.number(parameters, "resolution") if "resolution" in parameters else None
     same = _layers(parameters), ps.freshness(parameters), _when(parameters)
     return RegionQuery(area, *same, resolution_m)
@@ -406,7 +344,7 @@ def _parse_piece(parameters: ps.Parameters) -> PieceQuery:
 
 
 def _parse_history(parameters: ps.Parameters) -> HistoryQuery:
-    from_ns, to_ns = _times(parameters)
+    from_ns, to_ns = ps.times(parameters)
     span_s = ps.number(parameters, "span") if "span" in parameters else None
     if span_s is not None and not 1 <= span_s <= MAX_SPAN_S:
         problem = f"parameter `span`: {span_s:g} s is not between 1 and {MAX_SPAN_S:g} s"
@@ -435,22 +373,6 @@ def _parse_why(parameters: ps.Parameters) -> WhyQuery:
     return WhyQuery(*_place(parameters), ps.stamp(parameters, "as_of"))
 
 
-def _parse_segments(parameters: ps.Parameters) -> SegmentsQuery:
-    bounds = _bounds(parameters) if "bounds" in parameters else None
-    machine = ps.free_text(parameters, "machine")
-    return SegmentsQuery(*_times(parameters), ps.stamp(parameters, "as_of"), bounds, machine, ps.freshness(parameters))
-
-
-def _parse_worklist(parameters: ps.Parameters) -> WorklistQuery:
-    same, default = _parse_segments(parameters), WorklistQuery()
-    target, efficiency = (
-        ps.number({name: ps.text_of(getattr(default, name)), **parameters}, name) for name in ("target", "efficiency")
-    )
-    limit = ps.count({"limit": str(default.limit), **parameters}, "limit")
-    return WorklistQuery(target, efficiency, limit, **vars(same))
-
-
-_ROADS = ("from", "to", "as_of", "bounds", "machine")
 _FRESH = ("after", "wait")
 _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]] = {
     "point": (("x", "y", "layers", "as_of", "minus", "repairs", *_FRESH), _parse_point),
@@ -463,8 +385,8 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
     "tiles": (("store", "row", "fact", "as_of", "place"), _parse_tiles),
     "why": (("x", "y", "as_of"), _parse_why),
-    "segments": ((*_ROADS, *_FRESH), _parse_segments),
-    "worklist": (("target", "efficiency", "limit", *_ROADS, *_FRESH), _parse_worklist),
+    "segments": ((*SEGMENTS, *_FRESH), parse_segments),
+    "worklist": ((*WORKLIST, *_FRESH), parse_worklist),
     "route": ((*ROUTE, *_FRESH), parse_route),
     "way": ((*WAY, *_FRESH), parse_way),
     "alive": ((), lambda _: AliveQuery()),
@@ -476,13 +398,6 @@ def _place(parameters: ps.Parameters) -> tuple[float, float]:
     return ps.number(parameters, "x"), ps.number(parameters, "y")
 
 
-def _times(parameters: ps.Parameters) -> tuple[int | None, int | None]:
-    from_ns, to_ns = ps.stamp(parameters, "from"), ps.stamp(parameters, "to")
-    if from_ns and to_ns and from_ns > to_ns:
-        raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
-    return from_ns, to_ns
-
-
 def _layers(parameters: ps.Parameters) -> tuple[str, ...]:
     return tuple(part for part in parameters.get("layers", "").split(",") if part)
 
@@ -490,14 +405,3 @@ def _layers(parameters: ps.Parameters) -> tuple[str, ...]:
 def _when(parameters: ps.Parameters) -> When:
     repairs = ps.flag(parameters, "repairs", default=False)
     return When(ps.stamp(parameters, "as_of"), ps.stamp(parameters, "minus"), repairs)
-
-
-def _bounds(parameters: ps.Parameters) -> Bounds:
-    parts = parameters.get("bounds", "").split(",")
-    if len(parts) != 4:
-        raise QueryError(Refusal.MISSING_FIELD, "parameter `bounds` must be west,south,east,north in metres")
-    numbers = [ps.number({"bounds": part}, "bounds") for part in parts]
-    try:
-        return Bounds(*numbers)
-    except ValueError as error:
-        raise QueryError(Refusal.OUT_OF_RANGE, str(error)) from None

@@ -26,6 +26,7 @@ HELP = "run the accuracy experiments"
 EXTRA = "eval"
 Report = dict[str, Any]  # plain values by name; lists of rows are tables
 DEFAULT_SEEDS, DEFAULT_S = 12, 1200.0  # of experiments on positions
+COOPERATION_S = 1200.0  # of a lone machine, which drives the tours of all
 MOST_COLUMNS = 24  # of a table; one with more is turned, its rows side by side
 SCENARIOS = ("paper_site", "paper_site_driven", "haul_road_driven")  # of the paper's table; one machine drives alone
 SHOWN = (list, dict)  # values of a row that a table for people has no room for
@@ -54,13 +55,28 @@ def add_options(parser: ArgumentParser) -> None:
     )
     roads = add_action(what, "roads", "measure roads, traffic, losses and repairs on random patches of soil")
     routes = add_action(what, "routes", "compare routes with what machines spent, and ways with a finer search")
-    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
+    cooperation = add_action(what, "cooperation", "measure what machines gain that draw one map, over real links")
+    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes, cooperation):
         action.add_argument("--seeds", type=count, default=DEFAULT_SEEDS, help="number of seeds (default %(default)s)")
     physics.add_argument("--seeds", type=count, default=3, help="number of seeds (default %(default)s)")
-    for action in (physics, table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
+    for action in (
+        physics,
+        table,
+        paper,
+        blackout,
+        budget,
+        ground,
+        base,
+        merge,
+        lag,
+        fleet,
+        roads,
+        routes,
+        cooperation,
+    ):
         action.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
-    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes):
+    for action in (table, paper, blackout, budget, ground, base, merge, lag, fleet, roads, routes, cooperation):
         action.add_argument("--out", type=FOLDER, default="eval-output", help=out)
         action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
     for action, drawn in (
@@ -70,6 +86,7 @@ def add_options(parser: ArgumentParser) -> None:
         (ground, "estimates along the track, errors by place"),
         (merge, "the maps of the first seed and the table"),
         (fleet, "the maps of the first seed before and after, and the table"),
+        (cooperation, "what is known over time, by number of machines and by link"),
     ):
         action.add_argument("--plots", type=FOLDER, help=f"folder to draw {drawn} into")
     for action, seconds in (
@@ -83,6 +100,7 @@ def add_options(parser: ArgumentParser) -> None:
         (fleet, 900.0),
         (roads, 900.0),
         (routes, 900.0),
+        (cooperation, COOPERATION_S),
     ):
         length = "length of each recording in seconds (default %(default)g)"
         action.add_argument("--seconds", type=positive, default=seconds, help=length)
@@ -99,7 +117,8 @@ def add_options(parser: ArgumentParser) -> None:
     )
     paper.add_argument("--tensor", type=OutputFile((".npy",)), metavar="FILE", help=tensor)
     quick = "short drives of its own without PyBullet, and few rows: to see that all works"
-    paper.add_argument("--quick", action="store_true", help=quick)
+    for action in (paper, cooperation):
+        action.add_argument("--quick", action="store_true", help=quick)
     for action in (merge, roads, routes):
         action.add_argument("--cases", default="", help="names, comma-separated; default all")
     _add_log(add_action(what, "log", "replay a real log and compare with withheld fixes or with its ground truth"))
@@ -141,6 +160,7 @@ def run(arguments: Namespace) -> int:
         "fleet": _fleet,
         "roads": _roads,
         "routes": _routes,
+        "cooperation": _cooperation,
         "log": _log,
         "parity": _parity,
     }
@@ -177,9 +197,7 @@ def _paper(arguments: Namespace) -> Report:
     from evaluation.paper.report import readable
 
     plan = Plan(_seeds(arguments), arguments.seconds)
-    if arguments.quick:
-        if plan != Plan(range(DEFAULT_SEEDS), DEFAULT_S):
-            raise ConfigError("--quick", "has a drive of its own: leave out --seeds, --first-seed and --seconds")
+    if _is_quick(arguments, DEFAULT_S):
         plan = QUICK
 
     def work(runner: Runner) -> tuple[Report, Any]:
@@ -274,6 +292,23 @@ def _routes(arguments: Namespace) -> Report:
     cases = experiment.select([name for name in arguments.cases.split(",") if name])
     work = partial(experiment.run, seeds=_seeds(arguments), seconds=arguments.seconds, cases=cases)
     return _experiment(arguments, "machines drive on patches of soil, their samples price routes", work)
+
+
+def _cooperation(arguments: Namespace) -> Report:
+    from evaluation.cooperation import experiment
+    from evaluation.cooperation.experiment import QUICK, Plan
+
+    quick = _is_quick(arguments, COOPERATION_S)
+    plan = QUICK if quick else Plan.full(_seeds(arguments), arguments.seconds)
+    work = partial(experiment.run, plan=plan)
+    return _experiment(arguments, "machines drive, and draw one map", work, "evaluation.cooperation.plots")
+
+
+def _is_quick(arguments: Namespace, seconds: float) -> bool:
+    """Whether the quick version is asked for; ConfigError where it is, and drives of another length or other seeds."""
+    if arguments.quick and (_seeds(arguments), arguments.seconds) != (range(DEFAULT_SEEDS), seconds):
+        raise ConfigError("--quick", "has a drive of its own: leave out --seeds, --first-seed and --seconds")
+    return bool(arguments.quick)
 
 
 def _experiment(

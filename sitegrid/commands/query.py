@@ -20,7 +20,6 @@ from protocol.errors import ConfigError
 from protocol.files import whole_file
 from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, PointsAnswer, Region
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
-from protocol.queries.explanations import calibrated, why
 from protocol.queries.parameters import Freshness, text_of
 from protocol.queries.pieces import Progress
 from protocol.queries.requests import parse_query
@@ -28,6 +27,7 @@ from protocol.queries.roads import RoadSegment
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import RouteAnswer
 from sitegrid.client import Client, connect
+from sitegrid.explanations import calibrated, why
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.outputs import OutputFile
 from sitegrid.options.times import HELP as TIME_HELP

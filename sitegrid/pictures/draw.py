@@ -17,7 +17,6 @@ from mapserver.pictures.worklist import draw_worklist
 from protocol.arrays import Floats32
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError
 from protocol.queries.answers import MachineState, Region
-from protocol.queries.explanations import calibrations
 from protocol.queries.parameters import text_of
 from protocol.queries.requests import parse_query
 from protocol.queries.route_requests import RouteQuery, WayQuery
@@ -27,6 +26,7 @@ from protocol.wire.codec import decode_pose
 from protocol.wire.messages import Pose
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
+from sitegrid.explanations import calibrations
 from sitegrid.process.lifetime import note, say, stop_flag
 
 AROUND_M = 30.0  # of the map around a drive

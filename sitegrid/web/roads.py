@@ -11,7 +11,7 @@ from typing import Any
 
 from starlette.responses import Response
 
-from protocol.queries.requests import SegmentsQuery, WorklistQuery
+from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
 from protocol.queries.roads import Segments, Worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES

@@ -40,6 +40,7 @@ from protocol.queries import requests
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
+from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import NamedMachine
 from protocol.site.geometry import Bounds
@@ -147,8 +148,8 @@ def _selectors() -> Iterator[Decoder]:
         requests.TilesQuery(MapVersion("0123456789abcdef", 17, 3)),
         requests.TilesQuery(as_of_ns=T0, place=(-3, 12)),
         requests.WhyQuery(12.0, 40.5, T0),
-        requests.SegmentsQuery(T0, T0 + 10**12, None, Bounds(0.0, 0.0, 200.0, 150.0), "loader-1", fresh),
-        requests.WorklistQuery(0.03, 0.4, 10, None, None, T0, None, "", fresh),
+        SegmentsQuery(T0, T0 + 10**12, None, Bounds(0.0, 0.0, 200.0, 150.0), "loader-1", fresh),
+        WorklistQuery(0.03, 0.4, 10, None, None, T0, None, "", fresh),
         requests.MachinesQuery(fresh),
         requests.ChangesQuery(3),
         requests.InfoQuery(fresh),

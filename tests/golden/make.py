@@ -243,7 +243,7 @@ ERROR = QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 OVERLOADED = QueryError(Refusal.OVERLOADED, "the server has too many queries to answer", 2.5)
 
 STRETCH = RoadSegment(
-    id="3_-2_ne",
+    id="3_-2_e",
     line=((75.5, -49.5), (80.25, -44.0), (93.0, -31.5)),
     length_m=25.5,
     resistance=0.0625,
@@ -280,7 +280,7 @@ WORKLIST = Worklist(
             (0.03125, 0.0625),
         ),
     ),
-    (RoadChange("3_-2_ne", STRETCH.line, T0, T0 + 60 * 10**9, 0.0625, 0.03125, 2.5),),
+    (RoadChange("3_-2_e", STRETCH.line, T0, T0 + 60 * 10**9, 0.0625, 0.03125, 2.5),),
 )
 JOURNAL = JournalPiece(
     STORE,

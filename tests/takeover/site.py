@@ -17,6 +17,7 @@ from typing import Any
 import psycopg
 
 from benchmarks.postgres.server import Cluster, Database
+from evaluation.cooperation.tcp_proxy import FAIR, Proxy, Weather
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Admission
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -24,7 +25,6 @@ from protocol.site.site_config import SiteConfig, site_toml
 from protocol.wire.messages import SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.process.children import Child, Children, wait_until
-from tests.chaos.tcp_proxy import FAIR, Proxy, Weather
 from tests.takeover.senders import BEGIN_NS, Acknowledged, Sender, rows_of
 
 READY_S = 120.0

@@ -27,6 +27,11 @@ def test_tau_with_ties_on_both_sides():
     assert kendall(np.zeros(3), np.arange(3.0), 0.5, 0.5) == 0.0
 
 
+def test_an_order_without_ties_is_never_all_in_order_with_one_that_has_them():
+    right = np.array([10.0, 9.9, 5.0, 5.1, 0.0, 0.1])  # 3 of 15 pairs are ties
+    assert kendall(right, right, 0.0, 0.5) == pytest.approx(np.sqrt(12 / 15))
+
+
 @pytest.mark.parametrize("scenario", ["haul_road", "paper_site"])
 def test_patches_are_drawn_from_the_seed(tmp_path, scenario):
     drives = [planned(scenario, seed, 90.0, repairs=True) for seed in (3, 3, 4)]

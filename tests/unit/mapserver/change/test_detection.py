@@ -207,6 +207,34 @@ def test_an_area_at_the_images_border_is_kept_and_what_is_cut_by_it_is_not_guess
     assert not counts(square(4, 4, min(column, 76), min(row, 76))).any()
 
 
+def lane(changed: Bools, known: Bools | None = None):
+    """What is credible of cells that changed where nothing else is known, but for some ground as it always was."""
+    now: Floats = np.full(changed.shape, np.nan)
+    now[changed] = NEW
+    now[np.zeros_like(changed) if known is None else known & ~changed] = OLD
+    return credible(changed, np.where(changed, NEW, np.nan), now, 1.0, CONFIG)
+
+
+@pytest.mark.parametrize("turn", [False, True])
+def test_a_lane_that_changed_in_all_its_width_is_believed_where_nothing_else_is_known(turn):
+    strip = square(40, 3)
+    strip = strip.T if turn else strip
+    assert np.array_equal(lane(strip), strip)
+    corner = square(40, 3, 0, 0)
+    assert np.array_equal(lane(corner.T if turn else corner), corner.T if turn else corner)
+    diagonal = np.eye(80, dtype=np.bool_)
+    diagonal = diagonal | np.roll(diagonal, 1, 1) | np.roll(diagonal, -1, 1) | np.roll(diagonal, 2, 1)
+    diagonal[:, :2] = diagonal[:, -2:] = False
+    assert lane(diagonal)[10:70].sum() == diagonal[10:70].sum()
+
+
+def test_a_lane_that_moved_beside_ground_as_it_was_is_not_believed():
+    strip, beside = square(40, 3, 20, 32), square(40, 1, 20, 31) | square(40, 1, 20, 35)
+    assert not lane(strip, beside).any(), "known ground to both sides did not change"
+    assert not lane(square(4, 3)).any(), "shorter than the least size"
+    assert not lane(square(40, 2)).any(), "half of the least width"
+
+
 def test_nothing_changed_and_nothing_known_is_nothing():
     nothing, unknown = square(0), np.full((80, 80), np.nan)
     assert not credible(nothing, unknown, unknown, 1.0, CONFIG).any()

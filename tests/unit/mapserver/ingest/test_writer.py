@@ -236,6 +236,57 @@ def test_work_runs_on_the_owners_thread(start):
     assert start().run(lambda _: threading.current_thread().name) == "writer"
 
 
+def test_a_look_is_taken_by_whoever_asks_while_the_owner_waits(start):
+    writer = start()
+    send(writer, [incoming(samples(3))])
+    here = writer.look(lambda store: (threading.get_ident(), store.merged))
+    while here[0] != threading.get_ident():  # until the owner waits again
+        here = writer.look(lambda store: (threading.get_ident(), store.merged))
+    assert here == (threading.get_ident(), 1)
+    with pytest.raises(ZeroDivisionError):
+        writer.look(lambda _: 1 / 0)
+
+
+def test_a_look_takes_its_turn_while_the_owner_works(start):
+    writer, seen = start(), []
+    with held(writer):
+        writer.submit(incoming(samples(3)), lambda _: None)
+        asker = threading.Thread(target=lambda: seen.append(writer.look(lambda s: (threading.get_ident(), s.merged))))
+        asker.start()
+        wait_for(lambda: writer._works)
+        assert not seen
+    asker.join(WAIT_S)
+    assert len(seen) == 1
+    assert seen[0][1] == 1, "it saw the batch that waited before it"
+
+
+def test_nobody_looks_while_the_owner_commits(start, monkeypatch):
+    """Batches and looks of several threads: none ever sees a map in the making."""
+    writer, both, ended = start(), list[tuple[int, int]](), threading.Event()
+
+    def look() -> None:
+        while not ended.is_set():
+            both.append(writer.look(lambda store: (store.merged, store.grid.folded)))
+
+    askers = [threading.Thread(target=look) for _ in range(3)]
+    for asker in askers:
+        asker.start()
+    for number in range(30):
+        send(writer, [incoming(samples(2), first_seq=1 + 2 * number)])
+    ended.set()
+    for asker in askers:
+        asker.join(WAIT_S)
+    assert both
+    assert all(folded == 2 * merged for merged, folded in both)
+
+
+def test_nobody_looks_at_a_store_that_is_closed_or_failed(start, monkeypatch):
+    writer = start()
+    writer.close()
+    with pytest.raises(QueryError):
+        writer.look(lambda store: store.merged)
+
+
 def test_work_between_batches_is_done_and_sees_those_before(start):
     writer, replies, seen = start(), Replies(), []
     with held(writer):

@@ -135,3 +135,42 @@ def test_so_much_is_kept_and_no_more(tmp_path):
                 layer for store in (kept._cells, kept._areas) for one in store.values() for layer in one.layers.values()
             ]
             assert sum(layer.size for layer in held) == kept._count * BLOCK_CELLS**2
+
+
+def test_beside_new_samples_no_block_is_derived_again_whose_pages_count_as_before(tmp_path):
+    names, wide = ("resistance", "changed_s"), CellWindow(-320, -16, 640, 32)
+    kept = fresh()
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(samples(600, x_m=np.arange(-300, 300) + 0.5, y_m=0.5, distance_m=4.0))])
+        read(kept, writer, wide, names)
+        derived, turn = kept.derived, writer.run(lambda state: state.grid.folded_since(-1)[1])
+        more = samples(5, x_m=np.arange(5) + 0.5, y_m=0.5, distance_m=4.0)
+        more["stamp_ns"] += 10**12
+        send(writer, [incoming(more, first_seq=601)])
+        same(read(kept, writer, wide, names), read(fresh(), writer, wide, names))
+        folded = writer.run(lambda state: state.grid.folded_since(turn)[0])
+        assert kept.derived - derived == len(folded) > 0
+
+
+def test_a_block_is_derived_again_where_what_came_in_beside_it_shows_that_its_ground_changed(tmp_path):
+    """A strip that is too narrow to be a change becomes one, once the strip beside it in the next block changes."""
+    names, window = ("resistance", "resistance_filled"), CellWindow(0, 0, 32, 16)
+    kept, sent = fresh(), 0
+
+    def drive(writer: Writer, columns: range, c_rr: float, after_s: float) -> float:
+        nonlocal sent
+        x, y = (grid.ravel() + 0.5 for grid in np.meshgrid(np.array(columns), np.arange(16)))
+        rows = samples(len(x), x_m=x, y_m=y, distance_m=4.0, c_rr=c_rr, cov_xx_m2=1e-4, cov_yy_m2=1e-4)
+        rows["stamp_ns"] += int(after_s * 1e9)
+        send(writer, [incoming(rows, first_seq=1 + sent)])
+        sent += len(rows)
+        now = read(kept, writer, window, names)
+        same(now, read(fresh(), writer, window, names))
+        return float(now["resistance"][8, 14])
+
+    with closing(open_writer(tmp_path)) as writer:
+        drive(writer, range(32), 0.02, 0.0)
+        narrow = drive(writer, range(13, 16), 0.2, 3600.0)
+        wide = drive(writer, range(16, 19), 0.2, 7200.0)
+        assert wide == pytest.approx(0.2, rel=0.1)
+        assert narrow < wide / 2

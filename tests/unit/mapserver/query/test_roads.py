@@ -13,16 +13,14 @@ from mapserver.query.map_tiles import Tiles
 from protocol.errors import QueryError, Refusal
 from protocol.queries.map_tiles import PLANES
 from protocol.queries.requests import (
-    MAX_LIMIT,
     PointQuery,
     RegionQuery,
-    SegmentsQuery,
     TilesQuery,
     When,
-    WorklistQuery,
     encode_query,
     parse_query,
 )
+from protocol.queries.road_requests import MAX_LIMIT, SegmentsQuery, WorklistQuery
 from protocol.queries.roads import decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import decode_answer
@@ -120,6 +118,28 @@ def test_what_comes_in_shows_at_once_and_as_after_a_restart(writer, tmp_path):
     assert worklist(answers) == worklist(answers_of(writer))
     assert segments(answers) == segments(answers_of(writer))
     assert worklist(answers).rows[0].segment.resistance > 0.055
+
+
+@pytest.mark.parametrize("size", [37, 10_000])
+def test_shuffled_and_rebatched_samples_give_the_same_list(tmp_path, size):
+    """Two machines on one road that was repaired, and on one of their own; whoever sends first, in whatever pieces."""
+    draw, parts = np.random.default_rng(size), {"a": [], "b": []}
+    for i, name in enumerate(parts):
+        for count, c_rr, after_s in ((4, 0.06, 0.0), (3, 0.02, 900.0)):
+            parts[name].append(passes(LINE, count, c_rr, seed=10 * count + i, after_s=after_s + 30.0 * i))
+    rows = {name: np.concatenate([*some, rows_of()[name]]) for name, some in parts.items()}
+    lists = []
+    for shuffled in (False, True):
+        with closing(open_writer(tmp_path / str(shuffled))) as opened:
+            for name in sorted(rows, reverse=shuffled):
+                own = rows[name][draw.permutation(len(rows[name]))] if shuffled else rows[name]
+                step = size if shuffled else len(own)
+                for at in range(0, len(own), step):
+                    send(opened, [incoming(own[at : at + step], 1 + at, machine=name)])
+            answers = answers_of(opened)
+            lists.append((segments(answers).segments, worklist(answers).rows, worklist(answers).changes))
+    assert lists[0] == lists[1]
+    assert lists[0][2], "with changes"
 
 
 def test_the_list_as_of_a_time_is_that_of_then(writer):

@@ -25,11 +25,10 @@ from protocol.queries.requests import (
     PointQuery,
     PointsQuery,
     RegionQuery,
-    SegmentsQuery,
     When,
-    WorklistQuery,
     parse_query,
 )
+from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
 from protocol.queries.roads import Segments, Worklist, encode_segments, encode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES, NamedMachine
@@ -147,11 +146,11 @@ def test_a_worklist_is_a_table_with_what_changed_below(session: Session, capsys)
     head, names, row, changed = capsys.readouterr().out.splitlines()
     assert head == "4.50 kWh/h lost on all roads against a resistance of 0.02, traffic of 1.50 h"
     assert names.split()[:3] == ["stretch", "around", "kWh/h"]
-    assert row.split()[:5] == ["1", "3_-2_ne", "80,", "-44", "3.50"]
+    assert row.split()[:5] == ["1", "3_-2_e", "80,", "-44", "3.50"]
     assert "3.25..3.75" in row
-    assert "3_-2_ne: resistance 0.0625 -> 0.03125, saves 2.50 kWh/h" in changed
+    assert "3_-2_e: resistance 0.0625 -> 0.03125, saves 2.50 kWh/h" in changed
     assert main(["query", "worklist", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["rows"][0]["segment"]["id"] == "3_-2_ne"
+    assert json.loads(capsys.readouterr().out)["rows"][0]["segment"]["id"] == "3_-2_e"
     assert main(["query", "worklist", "--from", str(T0)]) == 0
     assert "no stretch is worse for sure" in capsys.readouterr().out
 
@@ -231,7 +230,7 @@ def test_segments_are_a_table(session: Session, capsys):
     assert session.asked[-1] == SegmentsQuery(fresh=Freshness(3))
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "0.05 km of roads, traffic of 1.50 h"
-    assert lines[2].startswith("3_-2_ne")
+    assert lines[2].startswith("3_-2_e")
     assert "unknown" in lines[3]
     assert main(["query", "segments", "--from", str(T0)]) == 0
     assert capsys.readouterr().out == "no roads are known\n"

@@ -1,4 +1,4 @@
-"""A TCP proxy on loopback with weather: cuts, black holes, slow spells, replies that are held back.
+"""A TCP proxy on loopback with weather: cuts, black holes, slow spells, replies that are held back; it counts bytes.
 
 TCP itself neither repeats nor reorders bytes, so a reply that comes late is what can happen to delivery: it is held
 back for longer than the sender waits, who then sends the same batch again.
@@ -10,8 +10,11 @@ import contextlib
 import socket
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass
+from typing import Literal
 
+Direction = Literal["there", "back"]  # to the port, and from it
 CHUNK = 16384
 
 
@@ -47,6 +50,7 @@ class Proxy:
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         self._closed = threading.Event()
+        self._bytes: Counter[Direction] = Counter()
         self._start(self._accept)
 
     @property
@@ -54,7 +58,12 @@ class Proxy:
         """Where to connect to."""
         return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
 
+    def carried(self, direction: Direction) -> int:
+        """Bytes that it has handed on so far."""
+        return self._bytes[direction]
+
     def set(self, weather: Weather) -> None:
+        """Have other weather from now on."""
         self.weather = weather
         if weather.cut:
             self._drop_links()
@@ -100,18 +109,20 @@ class Proxy:
             far.settimeout(None)
             with self._lock:
                 self._links += [near, far]
-            self._start(self._pump, near, far, "hold_there")
-            self._start(self._pump, far, near, "hold_back")
+            self._start(self._pump, near, far, "there")
+            self._start(self._pump, far, near, "back")
 
-    def _pump(self, source: socket.socket, sink: socket.socket, held_by: str) -> None:
+    def _pump(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
         """Move bytes until either end is gone; what was read before a cut is lost with it."""
         try:
             while data := source.recv(CHUNK):
-                while getattr(self.weather, held_by) and not self._closed.is_set():
+                while getattr(self.weather, f"hold_{direction}") and not self._closed.is_set():
                     time.sleep(0.02)
                 if rate := self.weather.bytes_per_s:
                     time.sleep(len(data) / rate)
                 sink.sendall(data)
+                with self._lock:
+                    self._bytes[direction] += len(data)
         except OSError:
             pass
         for end in (source, sink):

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from protocol.queries.explanations import MOST_LISTED, calibrated, calibrations, why
+from sitegrid.explanations import MOST_LISTED, calibrated, calibrations, why
 from tests.unit.records import machine_state
 
 CALIBRATED = {"zero": -0.0034, "zero_std": 0.0005, "torque_gain": 1.49, "torque_gain_std": 0.012}
