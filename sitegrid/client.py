@@ -228,8 +228,8 @@ class Client:
 
         machine: its values, the name of a kind (`MACHINES`), or its own name on the site. stops: whether it stands at
         the begin and at the end. step_m: of the steps that are answered. unknown: what ground that nobody knows is
-        taken for: "dearest" (the dearest tenth of the known ground around), "refuse", or a
-        rolling resistance coefficient.
+        taken for: "dearest" (as dear as the dearest tenth of the ground around is uphill; the totals say how dear
+        that was), "refuse", or a rolling resistance coefficient.
         """
         fresh = Freshness(after, wait_s)
         places = tuple((float(x), float(y)) for x, y in line)

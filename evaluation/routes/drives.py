@@ -20,6 +20,8 @@ from protocol.queries.routing import RouteTotals
 from protocol.units import GRAVITY_MPS2
 
 Judged = dict[str, float]
+# Legs that are one drive: length and mass within this share, and places along the lines within this distance.
+ALIKE, ALIKE_M, PLACES = 0.05, 10.0, 9
 
 
 def judged_legs(drive: FleetDrive, recorded: Recorded, scene: Scene, cache: Path) -> list[Judged]:
@@ -31,10 +33,30 @@ def judged_legs(drive: FleetDrive, recorded: Recorded, scene: Scene, cache: Path
         places = tuple(map(tuple, line.tolist()))
         return routes.route(RouteQuery(places, leg.machine, leg.stops)).totals
 
+    legs = legs_of(drive, scene, dict(recorded.rows), cache)
     return [
-        _judged(leg, asked(leg, leg.line_m), asked(leg, leg.line_m[::-1]), truth)
-        for leg in legs_of(drive, scene, dict(recorded.rows), cache)
+        {**_judged(leg, asked(leg, leg.line_m), asked(leg, leg.line_m[::-1]), truth), "drive": float(number)}
+        for leg, number in zip(legs, drives_of(legs), strict=True)
     ]
+
+
+def drives_of(legs: Sequence[Leg]) -> list[int]:
+    """Which drive each leg repeats: one line with one load has its errors in common, however often it is driven."""
+    numbers: list[int] = []
+    for i, leg in enumerate(legs):
+        same = (numbers[k] for k in range(i) if _alike(leg, legs[k]))
+        numbers.append(next(same, max(numbers, default=-1) + 1))
+    return numbers
+
+
+def _alike(a: Leg, b: Leg) -> bool:
+    if abs(a.length_m - b.length_m) > ALIKE * a.length_m or abs(a.machine.mass_kg - b.machine.mass_kg) > (
+        ALIKE * a.machine.mass_kg
+    ):
+        return False
+    shares = np.linspace(0, 1, PLACES)
+    first, second = (leg.line_m[np.round(shares * (len(leg.line_m) - 1)).astype(int)] for leg in (a, b))
+    return bool(np.hypot(*(first - second).T).max() < ALIKE_M)
 
 
 def _judged(leg: Leg, there: RouteTotals, back: RouteTotals, truth: Squares) -> Judged:
@@ -66,8 +88,10 @@ def _rolling(leg: Leg, truth: Squares) -> float:
 def seed_figures(legs: Sequence[Judged]) -> dict[str, float]:
     """Of one recording, in percent: root mean square over its legs, means, the worst leg, and shares inside."""
     column = {name: np.array([leg[name] for leg in legs]) for name in legs[0]}
+    holds = [column["energy_inside"][column["drive"] == number].mean() for number in np.unique(column["drive"])]
     return {
         "legs": len(legs),
+        "drives": len(holds),
         "km": float(column["length_m"].sum() / 1000),
         **{
             f"{name}_pct": 100.0 * root_mean_square(column[name]) for name in ("energy", "back", "time", "model", "map")
@@ -78,5 +102,6 @@ def seed_figures(legs: Sequence[Judged]) -> dict[str, float]:
         "model_mean_pct": 100.0 * float(column["model"].mean()),
         "steady_mean_pct": 100.0 * float(column["steady"].mean()),
         **{f"{name}_inside_pct": 100.0 * float(column[f"{name}_inside"].mean()) for name in ("energy", "back", "time")},
+        "drives_inside_pct": 100.0 * float(np.mean(holds)),
         "width_pct": 100.0 * float(column["width"].mean()),
     }

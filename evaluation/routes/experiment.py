@@ -83,7 +83,7 @@ def run(runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[st
 def summarise(name: str, rows: Sequence[dict[str, float]]) -> Row:
     """One row: sums, medians over the seeds, and `max_...`, of the worst seed; `by_seed` has what each seed gave."""
     figures = {key: np.array([row[key] for row in rows]) for key in rows[0]}
-    sums = {key: float(figures.pop(key).sum()) for key in ("legs", "km")}
+    sums = {key: float(figures.pop(key).sum()) for key in ("legs", "drives", "km")}
     medians = {key: float(np.median(values)) for key, values in figures.items()}
     worst = {f"max_{key}": float(figures[key].max()) for key in LIMITS}
     return rounded({"case": name, **sums, **medians, **worst, "by_seed": list(rows)}, DIGITS)

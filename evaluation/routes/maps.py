@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from typing import TypeVar
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS
-from mapserver.query.block_layers import BlockLayers
+from mapserver.query.block_layers import BlockLayers, Look
 from mapserver.query.routes import Routes
 from mapserver.routes.ground import Squares
 from mapserver.routes.route import LAYERS, SURE_VISITS
@@ -44,8 +44,15 @@ class KnownMap:
         return self._names
 
     def routes(self) -> Routes:
-        """What answers queries for routes."""
-        return Routes(self, BlockLayers(self.site.cell_m, self.config), _no_past)  # type: ignore[arg-type]
+        """What answers queries for routes of the map as it is, without roads."""
+        layers = BlockLayers(self.site.cell_m, self.config)
+
+        def look(squares: Set[tuple[int, int]], names: Sequence[str], as_of_ns: int | None, **_: bool) -> Look:
+            if as_of_ns is not None:
+                raise NotImplementedError("nobody asks for the past here")
+            return layers.look_squares(self, squares, names)
+
+        return Routes(self, layers, look)  # type: ignore[arg-type]
 
 
 def true_squares(truth: TruthMap) -> Squares:
@@ -68,7 +75,3 @@ def true_squares(truth: TruthMap) -> Squares:
     if (truth.west_m, truth.south_m) != (0.0, 0.0):
         raise ValueError("a true map begins at the origin")
     return Squares.stacked(truth.cell_m, edge, {(0, 0): layers})
-
-
-def _no_past() -> None:
-    raise NotImplementedError("nobody asks for the past here")

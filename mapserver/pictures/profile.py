@@ -11,7 +11,7 @@ from mapserver.pictures.frame import INK, LEFT, PAD, Colour, Image, text, text_s
 from mapserver.pictures.plotter import Track, draw_resistance
 from protocol.arrays import Floats
 from protocol.queries.answers import Region
-from protocol.queries.routing import RouteAnswer
+from protocol.queries.routing import RouteAnswer, RouteTotals
 
 CHART_PX, GAP_PX, LEAST_WIDTH_PX = 110, 34, 640
 GRID: Colour = (225, 225, 225)
@@ -32,19 +32,25 @@ class _Chart:
 def draw_drive(region: Region, answer: RouteAnswer) -> Image:
     """The map with the line, and what a drive over it takes. region: with the layer `resistance`, around the line."""
     totals, machine = answer.totals, answer.machine
-    track = Track("drive", *answer.line_m.T)
+    tracks = [Track("end", *answer.line_m.T), Track("start", *answer.line_m[:1].T)]
     notes = [
         f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up",
-        f"{totals.unknown:.0%} of it unknown",
+        _unknown(totals),
         f"{machine.mass_kg / 1000:.1f} t, {machine.power_w / 1000:.0f} kW",
         f"{totals.litres:.2f} l of diesel",
     ]
     kwh, low, high = (j / JOULE_PER_KWH for j in (totals.energy_j, totals.energy_low_j, totals.energy_high_j))
     title = f"{kwh:.2f} kWh ({low:.2f} to {high:.2f}), {totals.time_s:.0f} s"
-    top = draw_resistance(region, [track], title, notes)
+    top = draw_resistance(region, tracks, title, notes)
     below = _profile(answer, max(LEAST_WIDTH_PX, top.shape[1]))
     padding = below.shape[1] - top.shape[1]
     return np.concatenate([np.pad(top, ((0, 0), (0, padding), (0, 0)), constant_values=255), below])
+
+
+def _unknown(totals: RouteTotals) -> str:
+    """How much of it is unknown, and what that was taken for."""
+    taken = f", taken as {totals.unknown_resistance:.3f}" if totals.unknown else ""
+    return f"{totals.unknown:.0%} of it unknown{taken}"
 
 
 def _profile(answer: RouteAnswer, width: int) -> Image:

@@ -9,12 +9,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from mapserver.evidence.timeline import Block
 from mapserver.query.block_layers import SQUARE_CELLS, BlockLayers, Look, place_square, squares_of
 from mapserver.query.named_machines import NamedMachines
 from mapserver.query.source import MapSource
-from mapserver.routes.ground import Squares, dearest
-from mapserver.routes.least_cost import Cell, Terrain, least_cost_line, reaches
-from mapserver.routes.route import LAYERS, route
+from mapserver.routes.ground import Squares, squares_at
+from mapserver.routes.least_cost import Cell, Terrain, cost_of, least_cost_line, reaches
+from mapserver.routes.line import steps
+from mapserver.routes.prices import PRICED, around, bare, priced
+from mapserver.routes.route import LAYERS, STEP_M, route
 from protocol.arrays import Bools, Floats, Floats32, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries.places import Place
@@ -23,7 +26,7 @@ from protocol.queries.routing import RouteAnswer, RouteMachine
 from protocol.site.geometry import Bounds, CellWindow
 from protocol.units import GRAVITY_MPS2
 
-AROUND_M = 20.0  # so far around a line the map is read: it says what unknown ground may be like
+EDGE_M = 20.0  # so far beyond the known ground a way may lead: around its corners
 # A way is looked for within the known ground, and no further from a rectangle around its ends than half of their
 # distance, and this: a detour that leads further away costs more than most ground between.
 DETOUR = 0.5
@@ -44,8 +47,14 @@ class Routes:
         self._require_on_site("line", query.line)
         machine = self._machines.resolve(query.machine, query.as_of_ns)
         line = np.array(query.line)
-        squares = _squares_along(line, self._site.cell_m)
-        look, read = self._read(squares, query)
+        places = steps(line, STEP_M).position_m
+        touched = squares_at(places, self._site.cell_m, SQUARE_CELLS)
+
+        def unpriced(read: Squares) -> set[Block]:
+            nobody = ~np.isfinite(read.at(places)["visits"])
+            return squares_at(places[nobody], self._site.cell_m, SQUARE_CELLS) if nobody.any() else set()
+
+        look, read = self._read(touched, query, unpriced)
         return self._answer(query, machine, line, look, read)
 
     def way(self, query: WayQuery) -> RouteAnswer:
@@ -53,15 +62,36 @@ class Routes:
         for name, ends in (("from", [query.start]), ("to", [query.end]), ("avoid", query.avoid)):
             self._require_on_site(name, ends)
         machine, window = self._machines.resolve(query.machine, query.as_of_ns), self._window(query)
-        look, read = self._read(squares_of(window), query)
+        touched = squares_of(window)
+        look, read = self._read(touched, query, lambda read: bare(read, touched))
         terrain, known = self._terrain(query, machine, window, read)
-        start, end = (self._cell(place, window) for place in (query.start, query.end))
-        is_open = _open(terrain, known, query, window, self._site.cell_m)
-        line = self._line(query, replace(terrain, is_open=is_open), known, start, end)
+        ends = start, end = self._cell(query.start, window), self._cell(query.end, window)
+        terrain = replace(terrain, is_open=_open(terrain, known, query, window, self._site.cell_m))
+        lines = [self._line(query, terrain, known, start, end)]
+        if len(lines[0]) > 2 and math.isfinite(cost_of(terrain, np.array(ends))):
+            lines.append(np.array(ends))
         corner = np.array([window.column, window.row])
-        places = np.asarray((line[:, ::-1] + 0.5 + corner) * self._site.cell_m, np.float64)
-        places[0], places[-1] = query.start, query.end
-        return self._answer(query, machine, places, look, read)
+        places = [np.asarray((line[:, ::-1] + 0.5 + corner) * self._site.cell_m, np.float64) for line in lines]
+        for line in places:
+            line[0], line[-1] = query.start, query.end
+        return self._cheapest(query, machine, look, read, places)
+
+    def _cheapest(
+        self, query: WayQuery, machine: RouteMachine, look: Look, read: Squares, lines: Sequence[Floats]
+    ) -> RouteAnswer:
+        """The line that the drive costs least over, which stops and takes curves: cells know nothing of either.
+
+        QueryError as of the first, where no drive is possible over any.
+        """
+        answers, problems = [], []
+        for line in lines:
+            try:
+                answers.append(self._answer(query, machine, line, look, read))
+            except QueryError as problem:
+                problems.append(problem)
+        if not answers:
+            raise problems[0]
+        return min(answers, key=lambda answer: answer.totals.time_s if query.cost == TIME else answer.totals.energy_j)
 
     def _line(self, query: WayQuery, terrain: Terrain, known: Bools, start: Cell, end: Cell) -> Ints:
         for name, cell in (("from", start), ("to", end)):
@@ -95,52 +125,59 @@ class Routes:
         return "`max_grade` and `unknown` together leave none"
 
     def _answer(
-        self, query: RouteQuery | WayQuery, machine: RouteMachine, line: Floats, look: Look, read: Squares | None
+        self, query: RouteQuery | WayQuery, machine: RouteMachine, line: Floats, look: Look, read: Squares
     ) -> RouteAnswer:
-        unknown = None if isinstance(query.unknown, str) else query.unknown
-        if read is None:  # no evidence anywhere near
-            nothing = {name: np.full((1, 1), np.nan) for name in LAYERS}
-            read = Squares.stacked(self._site.cell_m, 1, {(0, 0): nothing})
         steps, totals = route(
             line,
             read,
             machine,
             stops=query.stops,
             step_m=query.step_m,
-            unknown_resistance=unknown,
+            unknown_resistance=_given(query),
             refuse_unknown=query.unknown == REFUSE,
         )
         return RouteAnswer(look.version, look.stamp_ns, line, totals, steps, machine)
 
-    def _read(self, squares: Set[tuple[int, int]], query: RouteQuery | WayQuery) -> tuple[Look, Squares | None]:
+    def _read(
+        self, squares: Set[Block], query: RouteQuery | WayQuery, unpriced: Callable[[Squares], Set[Block]]
+    ) -> tuple[Look, Squares]:
+        """Layers of squares, and of those around the ones with ground to price, which are known once they are read.
+
+        All of one version of the map: what is read again is kept, unless something came in.
+        """
+        wanted = set(squares)
+        while True:
+            look, read = self._read_once(wanted, query)
+            more = around(unpriced(read)) - wanted
+            if not more:
+                return look, read
+            wanted |= more
+
+    def _read_once(self, squares: Set[Block], query: RouteQuery | WayQuery) -> tuple[Look, Squares]:
         look = self._look(squares, LAYERS, query.as_of_ns, repairs=query.repairs)
         layers = self._layers.squares(look, squares, LAYERS)
-        return look, Squares.stacked(self._site.cell_m, SQUARE_CELLS, layers) if layers else None
+        nothing = {min(squares): {name: np.full((SQUARE_CELLS, SQUARE_CELLS), np.nan, np.float32) for name in LAYERS}}
+        return look, Squares.stacked(self._site.cell_m, SQUARE_CELLS, layers or nothing)
 
     def _terrain(
-        self, query: WayQuery, machine: RouteMachine, window: CellWindow, read: Squares | None
+        self, query: WayQuery, machine: RouteMachine, window: CellWindow, read: Squares
     ) -> tuple[Terrain, Bools]:
         """Ground of a window, open everywhere, and which cells of it are known."""
-        shape = (window.rows, window.columns)
-        values: dict[str, Floats32] = {name: np.full(shape, np.nan, np.float32) for name in GROUND}
-        if read:
-            for i, (x, y) in enumerate(read.places.tolist()):
-                for name, layer in values.items():
-                    place_square(layer, window, (x, y), read.layers[name][i])
-        resistance, east, north, visits = values.values()
-        measured, driven = np.isfinite(resistance), np.isfinite(visits)
-        known = measured | (driven & measured.any())
-        if (unmeasured := known & ~measured).any():
-            resistance = np.where(unmeasured, _nearest(resistance, measured), resistance)
-        # whoever chooses a way must not choose what nobody knows: it may be as steep as it may be soft
-        cost = query.unknown if isinstance(query.unknown, float) else dearest(resistance + np.hypot(east, north))
-        if not known.any() and isinstance(query.unknown, str):
+        resistance, east, north, visits = (_in_window(read, name, window) for name in GROUND)
+        known = np.isfinite(resistance) | np.isfinite(visits)
+        given = _given(query)
+        if given is None and not known.any():
             raise _refusal("nobody has driven near these places yet: give `unknown` a resistance")
-        crawl = machine.power_w / (machine.mass_kg * GRAVITY_MPS2 * machine.speed_mps)
-        priced = np.where(known, resistance, cost).astype(np.float64)
+        if to_price := bare(read, squares_of(window)):
+            prices = priced(read, to_price, given)
+            price, price_east, price_north = (_in_window(prices, name, window) for name in PRICED)
+            resistance = np.where(np.isfinite(price), price, resistance)
+            east, north = np.where(np.isfinite(price_east), (price_east, price_north), (east, north))
         east_m, north_m = (np.nan_to_num(grade).astype(np.float64) for grade in (east, north))
+        crawl = machine.power_w / (machine.mass_kg * GRAVITY_MPS2 * machine.speed_mps)
         crawl = crawl if query.cost == TIME else math.inf
-        return Terrain(priced, east_m, north_m, np.ones(shape, bool), self._site.cell_m, crawl), known
+        is_open = np.ones(known.shape, bool)
+        return Terrain(resistance.astype(np.float64), east_m, north_m, is_open, self._site.cell_m, crawl), known
 
     def _window(self, query: WayQuery) -> CellWindow:
         """Where a way is looked for."""
@@ -148,7 +185,7 @@ class Routes:
         reach = LEAST_DETOUR_M + DETOUR * math.dist(query.start, query.end)
         low, high = ends.min(axis=0) - reach, ends.max(axis=0) + reach
         if (cells := self._source.run(lambda state: state.grid.bounds())) is not None:
-            margin = AROUND_M
+            margin = EDGE_M
             first, last = (np.array(cells[side : side + 2]) * self._site.cell_m for side in (0, 2))
             low = np.maximum(low, np.minimum(first, ends.min(axis=0)) - margin)
             high = np.minimum(high, np.maximum(last, ends.max(axis=0)) + margin)
@@ -169,15 +206,17 @@ class Routes:
                 raise _refusal(f"parameter `{name}`: {problem}")
 
 
-def _squares_along(line: Floats, cell_m: float) -> set[tuple[int, int]]:
-    """Squares within AROUND_M of a line (n, 2)."""
-    edge_m = SQUARE_CELLS * cell_m
-    lengths = np.hypot(*np.diff(line, axis=0).T)
-    way = np.concatenate([[0.0], np.cumsum(lengths)])
-    at = np.append(np.arange(0.0, way[-1], min(AROUND_M, edge_m) / 2), way[-1])
-    places = np.stack([np.interp(at, way, axis) for axis in line.T], axis=1)
-    near = [places + AROUND_M * np.array([x, y]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    return set(map(tuple, np.unique(np.floor(np.concatenate(near) / edge_m).astype(int), axis=0).tolist()))
+def _given(query: RouteQuery | WayQuery) -> float | None:
+    """What the query says that unknown ground costs."""
+    return None if isinstance(query.unknown, str) else query.unknown
+
+
+def _in_window(squares: Squares, name: str, window: CellWindow) -> Floats32:
+    """A layer of squares in a window (rows, columns)."""
+    out: Floats32 = np.full((window.rows, window.columns), np.nan, np.float32)
+    for place, values in zip(squares.by_place(), squares.layers[name], strict=True):
+        place_square(out, window, place, values)
+    return out
 
 
 def _open(terrain: Terrain, known: Bools, query: WayQuery, window: CellWindow, cell_m: float) -> Bools:
@@ -193,16 +232,6 @@ def _open(terrain: Terrain, known: Bools, query: WayQuery, window: CellWindow, c
         distance = cv2.distanceTransform(is_open.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         is_open &= distance * cell_m > query.margin_m
     return np.ascontiguousarray(is_open)
-
-
-def _nearest(values: Floats32, known: Bools) -> Floats32:
-    """Values (rows, columns), in each cell that of the nearest known one."""
-    _, label = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    by_label = np.zeros(label.max() + 1, np.float32)
-    by_label[label[known]] = values[known]
-    return np.asarray(by_label[label], np.float32)
 
 
 def _steepness(terrain: Terrain) -> Floats:

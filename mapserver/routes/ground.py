@@ -1,9 +1,4 @@
-"""The ground along a line: layers of cells as a route reads them.
-
-Between the centres of cells values are interpolated, over those of the four around that are known. Ground that is not
-known costs what the dearest tenth of the known ground around costs: at its median, the way would lead through whatever
-nobody has driven.
-"""
+"""Layers of cells as a route reads them: between their centres, over those of the four around that are known."""
 
 from __future__ import annotations
 
@@ -14,7 +9,6 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Floats, Ints
 
-DEAREST = 90.0  # percentile of the known ground that unknown ground is taken for
 LEAST_SHARE = 0.25  # of the weights of four cells: less is a cell's corner, and no ground under a wheel
 HALF = 2**20
 
@@ -58,6 +52,10 @@ class Squares:
             for name, (total, weight) in out.items()
         }
 
+    def by_place(self) -> dict[tuple[int, int], int]:
+        """Index of each square by its column and row."""
+        return {(x, y): i for i, (x, y) in enumerate(self.places.tolist())}
+
     def _find(self, x: Ints, y: Ints) -> tuple[Ints, AnyArray]:
         """Index (n,) of the squares at these places, and whether they are there."""
         keys, wanted = _key(*self.places.T), _key(x, y)
@@ -66,10 +64,11 @@ class Squares:
         return order[at], keys[order[at]] == wanted
 
 
-def dearest(resistance: AnyArray) -> float:
-    """What unknown ground is taken for [-]: DEAREST of the known; NaN where none is known."""
-    known = resistance[np.isfinite(resistance)]
-    return float(np.percentile(known, DEAREST)) if known.size else float("nan")
+def squares_at(position_m: Floats, cell_m: float, edge: int) -> set[tuple[int, int]]:
+    """Columns and rows of the squares, edge cells to a side, that the four cells around places (n, 2) lie in."""
+    first = np.floor(position_m / cell_m - 0.5).astype(int)
+    corners = [first + np.array([x, y]) for x in (0, 1) for y in (0, 1)]
+    return set(map(tuple, np.unique(np.concatenate(corners) // edge, axis=0).tolist()))
 
 
 def _key(x: Ints, y: Ints) -> Ints:

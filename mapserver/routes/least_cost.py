@@ -24,7 +24,7 @@ from protocol.arrays import Bools, Floats, Ints
 Cell = tuple[int, int]  # row and column in a window
 
 LOOK_AHEAD = 64  # places of a line that a straight piece may skip at a time; the next pass skips as many of the rest
-BAND = 8  # cells: lines that were found in a wider one cost the same
+BAND = 16  # cells: in one of 8 one drawn map in a hundred has its cheapest line outside, 2 % cheaper; in 24 none more
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ MAX_STEPS = 10_000
 MAX_GRADE = 1.0
 MAX_MARGIN_M = 100.0
 ENERGY, TIME = "energy", "time"
-DEAREST, REFUSE = "dearest", "refuse"  # of unknown ground: as dear as the dearest tenth of the known; or not at all
+DEAREST, REFUSE = "dearest", "refuse"  # of unknown ground: as dear as the dearest tenth around, uphill; or not at all
 
 # Parameters of a machine, and its attributes.
 _MACHINE = {

@@ -115,7 +115,8 @@ class RouteSteps:
 class RouteTotals:
     """All of a route. low, high: its 90 % interval. lift_m: how much higher its end is.
 
-    unknown, unmeasured: shares of its length, as of the steps.
+    unknown, unmeasured: shares of its length, as of the steps. unknown_resistance: what its unknown ground was taken
+    for, the mean of it; 0 where none is unknown.
 
     energy_j: drive force times way. At the wheels it is more by their slip, which the map does not know: 1 to 4 % on
     firm ground, 10 % in sand. fuel_j: over the machine's efficiency.
@@ -125,6 +126,7 @@ class RouteTotals:
     lift_m: float
     unknown: float
     unmeasured: float
+    unknown_resistance: float
     energy_j: float
     energy_low_j: float
     energy_high_j: float

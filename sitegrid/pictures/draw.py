@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from argparse import Namespace
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +32,7 @@ from sitegrid.explanations import calibrations
 from sitegrid.process.lifetime import note, say, stop_flag
 
 AROUND_M = 30.0  # of the map around a drive
+STEP_M, MOST_STEPS = 5.0, 1000  # of a drive's profile
 MAX_POSES = 50_000  # of one machine: nearly three hours at 5 Hz
 LAYERS = ("resistance", "grade_east", "grade_north")
 SAMPLES_FOLLOW = "samples follow a minute or two behind"  # the smoother's lag, which only agents know
@@ -74,17 +77,27 @@ def _draw_if_possible(client: Client, arguments: Namespace, tracks: list[Track])
 
 def _query(arguments: Namespace) -> RouteQuery | WayQuery | None:
     """What is asked of a drive, if one is to be drawn."""
-    if arguments.line:
-        query = parse_query("route", {"line": _text(arguments.line), **dict(arguments.set)})
-    elif arguments.between:
-        ends = {"from": _text(arguments.between[:2]), "to": _text(arguments.between[2:])}
-        query = parse_query("way", {**ends, **dict(arguments.set)})
+    if arguments.line or arguments.between:
+        places = arguments.line or arguments.between
+        asked = {"step": text_of(_step_m(places)), **dict(arguments.set)}
+        if arguments.line:
+            query = parse_query("route", {"line": _text(places), **asked})
+        else:
+            query = parse_query("way", {"from": _text(places[:2]), "to": _text(places[2:]), **asked})
     elif arguments.set:
         raise ConfigError("--set", "is of a drive: give `--line` or `--between` too")
     else:
         return None
     assert isinstance(query, RouteQuery | WayQuery)
     return query
+
+
+def _step_m(places: Sequence[float]) -> float:
+    """Of a profile along these places: finer than its pixels on a usual site, and no more than it has of them."""
+    even = places[: len(places) // 2 * 2]
+    corners = zip(even[::2], even[1::2], strict=True)
+    length_m = sum(math.dist(a, b) for a, b in pairwise(corners))
+    return max(STEP_M, length_m / MOST_STEPS) if math.isfinite(length_m) else STEP_M
 
 
 def _text(values: Sequence[float]) -> str:

@@ -129,7 +129,7 @@ async def _drive(feed: SiteFeed, name: str, parameters: Parameters, places: Sequ
     assert isinstance(query, RouteQuery | WayQuery)
     answer = await feed.ask(feed.client.drive, query)
     totals = {**asdict(answer.totals), "litres": answer.totals.litres}
-    ground = {"line": answer.line_m, "totals": totals, "steps": vars(answer.steps)}
+    ground = {"line": answer.line_m, "totals": totals, "steps": vars(answer.steps), "machine": asdict(answer.machine)}
     return as_json({**ground, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
 
 

@@ -296,7 +296,7 @@ ROUTE = RouteAnswer(
     version=records.MapVersion(STORE, 17, 3),
     stamp_ns=T0 + 9,
     line_m=np.array([[0.0, 0.0], [30.0, 40.0]]),
-    totals=RouteTotals(50.0, 1.5, 0.5, 0.25, 1e6, 9e5, 1.25e6, 2e5, 4e6, 20.0, 19.5, 21.0),
+    totals=RouteTotals(50.0, 1.5, 0.5, 0.25, 0.0625, 1e6, 9e5, 1.25e6, 2e5, 4e6, 20.0, 19.5, 21.0),
     steps=RouteSteps(*(np.array([i + 0.5, i - 0.25]) for i in range(8)), np.array([0.75, np.nan]), *np.ones((6, 2))),
     machine=RouteMachine(22_000.0, 6.0),
 )

@@ -19,7 +19,7 @@ export async function build(page, signal) {
   page.redraw();
   if (route.places.length < 2) return [choices(page), hint(page)];
   try {
-    const answer = await ask(page, signal), straight = route.cheapest ? await askStraight(page, signal, answer) : null;
+    const answer = await ask(page, signal), straight = route.cheapest ? await askStraight(page, signal) : null;
     route.answer = answer;
     const at = (place) => { route.at = place; page.redraw(); };
     return [choices(page), totals(page, answer, straight), part("Along the way", "hatched: unknown", ...profile(answer, page.ink, at),
@@ -30,23 +30,21 @@ export async function build(page, signal) {
   }
 }
 
-// The straight line between the ends, unknown ground as dear as on the cheapest one; without its price they cannot be compared.
-async function askStraight(page, signal, { steps }) {
-  const dear = steps.resistance[steps.unknown.findIndex((share) => share > 0.999)];
+// The straight line between the ends: unknown ground has the same price on both.
+async function askStraight(page, signal) {
   try {
-    const { totals: straight } = await ask(page, signal, { unknown: dear });
-    return { ...straight, comparable: dear !== undefined || straight.unknown < 0.005 };
+    return (await ask(page, signal, true)).totals;
   } catch (error) {
     if (signal.aborted) throw error;
     return null; // as where a machine cannot climb it
   }
 }
 
-function ask(page, signal, straight = null) {
+function ask(page, signal, straight = false) {
   const { route } = page, [from, to] = [route.places[0], route.places.at(-1)].map((place) => place.join());
   const length = route.places.slice(1).reduce((sum, place, i) => sum + Math.hypot(place[0] - route.places[i][0], place[1] - route.places[i][1]), 0);
   const same = { machine: route.machine, mass: route.mass_t === null ? null : 1000 * route.mass_t, step: Math.max(2, Math.ceil(length / STEPS)), as_of: page.asOf() };
-  if (straight) return getJson(page.path("route"), { line: `${from};${to}`, ...same, ...straight }, signal);
+  if (straight) return getJson(page.path("route"), { line: `${from};${to}`, ...same }, signal);
   if (route.cheapest) return getJson(page.path("way"), { from, to, cost: route.cost, ...same }, signal);
   return getJson(page.path("route"), { line: route.places.map((place) => place.join()).join(";"), ...same }, signal);
 }
@@ -78,23 +76,21 @@ function hint(page) {
 const kwh = (joules) => figure(joules / 3.6e6);
 export const clock = (seconds) => { const whole = Math.round(seconds), minutes = Math.floor(whole / 60); return minutes < 60 ? `${minutes}:${String(whole % 60).padStart(2, "0")}` : `${Math.floor(minutes / 60)}:${String(minutes % 60).padStart(2, "0")}:${String(whole % 60).padStart(2, "0")}`; };
 
-function totals(page, { totals: all, steps }, straight) {
+function totals(page, { totals: all }, straight) {
   const lift = Math.abs(all.lift_m) < 0.05 ? "level" : `${all.lift_m > 0 ? "up" : "down"} ${Math.abs(all.lift_m).toFixed(1)} m`;
-  const unknown = steps.unknown.findIndex((share) => share >= 0.5);
   return element("section", { className: "part" },
     element("div", { className: "totals" },
       amount(kwh(all.energy_j), "kWh", `${kwh(all.energy_low_j)} to ${kwh(all.energy_high_j)}`),
       amount(clock(all.time_s), all.time_s < 3600 ? "min" : "h", `${clock(all.time_low_s)} to ${clock(all.time_high_s)}`),
       amount(metres(all.length_m), "", lift)),
     straight ? element("p", { className: "say compare" }, compared(page, all, straight)) : null,
-    all.unknown > 0.005 && unknown >= 0 ? element("p", { className: "change unsure" }, element("b", {}, `${Math.max(1, Math.round(100 * all.unknown))} % unknown. `), `Nobody drove there: taken as ${(100 * steps.resistance[unknown]).toFixed(1)} %, the dearest tenth of the ground around.`) : null);
+    all.unknown > 0.005 ? element("p", { className: "change unsure" }, element("b", {}, `${Math.max(1, Math.round(100 * all.unknown))} % unknown. `), `Nobody drove there: taken as ${(100 * all.unknown_resistance).toFixed(1)} %, as dear as the dearest tenth of the ground around.`) : null);
 }
 
 function compared(page, all, straight) {
   const name = page.route.cost === "time" ? "time_s" : "energy_j", share = straight[name] / all[name] - 1;
   const percents = Math.round(100 * Math.abs(share)), cost = name === "time_s" ? `${clock(straight.time_s)} min` : `${kwh(straight.energy_j)} kWh`;
   const unknown = straight.unknown > 0.005 ? `, with ${Math.max(1, Math.round(100 * straight.unknown))} % of it unknown` : "";
-  if (!straight.comparable) return `Of the straight line ${Math.round(100 * straight.unknown)} % is unknown ground.`;
   return percents ? `The straight line would cost ${cost}, ${percents} % ${share > 0 ? "more" : "less"}${unknown}.` : `The straight line costs the same${unknown}.`;
 }
 

@@ -25,11 +25,15 @@ LEG = {
     "time_inside": 0.0,
     "back_inside": 1.0,
     "width": 0.2,
+    "drive": 0.0,
 }
 
 
 def test_figures_of_a_seed_and_of_all():
     seed = seed_figures([LEG, {**LEG, "energy": -0.04, "energy_inside": 0.0}])
+    other = {**LEG, "drive": 1.0}
+    three = seed_figures([LEG, {**LEG, "energy_inside": 0.0}, other])
+    assert (three["drives"], three["drives_inside_pct"], seed["drives"]) == (2, 75.0, 1)
     assert seed["energy_pct"] == pytest.approx(100 * np.sqrt((0.03**2 + 0.04**2) / 2))
     assert (seed["energy_mean_pct"], seed["energy_worst_pct"]) == (pytest.approx(-0.5), pytest.approx(4.0))
     assert (seed["energy_inside_pct"], seed["legs"], seed["km"]) == (50.0, 2, 1.0)
@@ -70,7 +74,7 @@ def test_the_true_map_costs_what_it_must():
     truth = TruthMap(0.0, 0.0, flat + 0.04, flat + 0.01, flat)
     _, totals = route(np.array([[5.0, 10.0], [45.0, 10.0]]), true_squares(truth), ways.SLOW, stops=(False, False))
     assert totals.energy_j == pytest.approx(ways.SLOW.mass_kg * GRAVITY_MPS2 * 0.05 * 40, rel=1e-5)
-    assert totals.energy_high_j - totals.energy_low_j < 0.13 * totals.energy_j  # of drives alone: the ground is sure
+    assert totals.energy_high_j - totals.energy_low_j < 0.15 * totals.energy_j  # of drives, and of maps at their best
     with pytest.raises(ValueError, match="begins at the origin"):
         true_squares(TruthMap(1.0, 0.0, flat, flat, flat))
 

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from evaluation.ground.truth import LoadTrack
-from evaluation.routes.legs import _laps, _spans, _stated_kg
+from evaluation.routes.drives import drives_of
+from evaluation.routes.legs import Leg, _laps, _spans, _stated_kg
 from protocol.machine.samples import empty
+from protocol.queries.routing import RouteMachine
 
 HZ = 10
 
@@ -62,3 +64,15 @@ def test_the_mass_is_what_samples_of_the_leg_state():
     rows["stamp_ns"], rows["mass_kg"] = np.arange(5), [1e4, 2e4, np.nan, 3e4, 9e4]
     assert _stated_kg(rows, np.array([1, 3]), 5e3) == 2.5e4
     assert _stated_kg(rows, np.array([2, 2]), 5e3) == 5e3
+
+
+def test_legs_over_one_line_with_one_load_are_one_drive():
+    x = np.arange(400.0)
+    there = np.stack([x, 0 * x], axis=1)
+    truck, empty_truck = RouteMachine(mass_kg=44_000.0), RouteMachine(mass_kg=22_000.0)
+
+    def leg(line, machine=truck):
+        return Leg(line, machine, (True, True), 1.0, 1.0)
+
+    legs = [leg(there), leg(there + 2.0), leg(there[::-1]), leg(there, empty_truck), leg(there[:200]), leg(there - 1.0)]
+    assert drives_of(legs) == [0, 0, 1, 2, 3, 0]

@@ -119,6 +119,56 @@ def test_unknown_ground_is_dear_refused_or_as_told(tmp_path):
             ask(answers, WayQuery((-30.0, -30.0), (0.0, 0.0), SLOW, unknown=REFUSE))
 
 
+def test_a_way_keeps_to_a_road_of_fifteen_degrees(tmp_path):
+    """Unknown ground beside it is no way up for nothing, though most of what is known is even."""
+    up = lambda x, y: np.where(abs(x) < 10, 0.27, 0.0)  # noqa: E731
+    beside = lambda x, y: (abs(y) > 2) & (abs(x) < 45)  # noqa: E731
+    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.03 + 0 * x, up, beside))
+    with closer:
+        for ends in (((-50.0, 0.0), (50.0, 0.0)), ((-50.0, 0.0), (50.0, 20.0)), ((-50.0, -30.0), (50.0, 30.0))):
+            way = ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
+            assert way.totals.lift_m == pytest.approx(20 * 0.27, rel=0.2)
+            middle = ask(answers, RouteQuery(tuple(map(tuple, way.line_m.tolist())), SLOW, ROLLING, step_m=1.0)).steps
+            assert abs(middle.y_m[abs(middle.x_m) < 10]).max() < 4.0
+        off = ask(answers, RouteQuery(((-50, 0), (-40, 20), (40, 20), (50, 0)), SLOW, ROLLING)).totals
+        assert off.unknown > 0.6
+        assert off.lift_m == pytest.approx(20 * 0.27, rel=0.1), "heights at both ends of the unknown are known"
+
+
+def test_unknown_ground_costs_the_same_whoever_asks_from_wherever(tmp_path):
+    gap = lambda x, y: (abs(x) < 14) & (abs(y) < 50)  # noqa: E731
+    soils = lambda x, y: np.where(y > 45, 0.08, np.where(x < 0, 0.02, 0.05))  # noqa: E731
+    closer, answers = answers_on(tmp_path, ground(soils, lambda x, y: 0.001 * x, skipped=gap))
+    with closer:
+        for ends in (((-20.0, 0.0), (20.0, 0.0)), ((-55.0, 40.0), (55.0, -33.0)), ((20.0, -55.0), (-30.0, 58.0))):
+            way = ask(answers, WayQuery(*ends, SLOW))
+            line = tuple(map(tuple, way.line_m.tolist()))
+            again, straight = ask(answers, RouteQuery(line, SLOW)), ask(answers, RouteQuery(ends, SLOW))
+            assert again.totals == way.totals
+            assert way.totals.energy_j <= straight.totals.energy_j
+        long, short = (ask(answers, RouteQuery(((-x, 3.0), (x, 3.0)), SLOW, step_m=1.0)).steps for x in (58.0, 12.0))
+        assert long.resistance[46:70] == pytest.approx(short.resistance)
+        alone = ask(answers, RouteQuery(((-2.0, 3.0), (2.0, 3.0)), SLOW)).totals
+        assert alone.unknown_resistance == pytest.approx(short.resistance[10:14].mean())
+        assert ask(answers, RouteQuery(((20.0, 0.0), (50.0, 0.0)), SLOW)).totals.unknown_resistance == 0.0
+
+
+def test_no_drive_over_the_way_is_dearer_than_straight_on(tmp_path):
+    """Cells know of no stops and curves: a way around that saves less than they cost is none."""
+    rough = lambda x, y: (abs(x) < 8) & (y > -4)  # noqa: E731
+    for share in (1.02, 1.1, 1.3):
+        closer, answers = answers_on(
+            tmp_path / str(share), ground(lambda x, y, over=share: np.where(rough(x, y), 0.03 * over, 0.03))
+        )
+        with closer:
+            ends = (-30.0, 0.0), (30.0, 0.0)
+            for cost, total in (("energy", "energy_j"), (TIME, "time_s")):
+                way, straight = ask(answers, WayQuery(*ends, cost=cost)), ask(answers, RouteQuery(ends))
+                assert getattr(way.totals, total) <= getattr(straight.totals, total)
+            limited = ask(answers, WayQuery(*ends, margin_m=6.0, avoid=((0.0, 0.0),)))
+            assert len(limited.line_m) > 2, "straight on leads past what it is to avoid"
+
+
 def test_margins_keep_away_from_parked_machines(tmp_path):
     closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x))
     with closer:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapserver.routes.ground import Squares, dearest
+from mapserver.routes.ground import Squares
 
 
 def test_a_plane_is_read_exactly_between_the_centres_of_cells_and_over_edges_of_squares() -> None:
@@ -24,8 +24,3 @@ def test_unknown_cells_count_nothing_and_alone_are_unknown() -> None:
     field = Squares.stacked(1.0, 4, {(0, 0): {"a": values}})
     assert field.at(np.array([[1.5, 1.5], [1.9, 1.5]]))["a"].tolist() == [0.03, 0.03]
     assert np.isnan(field.at(np.array([[2.4, 1.5], [2.4, 2.4], [-5.0, 1.0], [100.0, 1.0]]))["a"]).all()
-
-
-def test_unknown_ground_is_as_dear_as_the_dearest_tenth() -> None:
-    assert dearest(np.append(np.linspace(0.01, 0.11, 101), np.nan)) == pytest.approx(0.1)
-    assert np.isnan(dearest(np.full(3, np.nan)))

@@ -79,6 +79,13 @@ def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
     assert unsure.energy_high_j - unsure.energy_low_j > 2 * (sure.energy_high_j - sure.energy_low_j)
 
 
+def test_no_line_is_so_long_that_errors_of_a_map_vanish() -> None:
+    """What scales and drives err in is common to all of it."""
+    _, totals = route(line((1, 1), (219, 219), (1, 219), (219, 1)), fields(0.1, std=1e-6), SLOW, stops=ROLLING)
+    half = (totals.energy_high_j - totals.energy_low_j) / 2 / totals.energy_j
+    assert half == pytest.approx(1.645 * math.hypot(0.03, 0.02), rel=0.1)
+
+
 def test_errors_along_a_line_average_out_but_not_over_short_stretches() -> None:
     std, step = np.full(2000, 0.01), np.full(2000, 1.0)
     assert mean_std(std[:5], step[:5]) == pytest.approx(0.01, rel=0.1)
@@ -92,7 +99,7 @@ def test_unknown_ground_counts_as_the_dearest_and_is_said() -> None:
     layers.layers["visits"][0, :, 80:120] = np.nan
     steps, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, step_m=10)
     assert (totals.unknown, totals.unmeasured) == (pytest.approx(40 / 130, abs=0.02), 0.0)
-    assert steps.resistance[8] == pytest.approx(0.08)
+    assert steps.resistance[8] == totals.unknown_resistance == pytest.approx(0.08, rel=0.02)
     assert np.isnan(steps.confidence[8])
     _, given = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, unknown_resistance=0.02)
     assert given.energy_j == pytest.approx(WEIGHT_N * 0.02 * 130, rel=0.01)

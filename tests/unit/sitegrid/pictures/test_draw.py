@@ -76,10 +76,15 @@ def arguments(**given):
 def test_a_drive_is_asked_as_the_options_say():
     assert _query(arguments()) is None
     line = _query(arguments(line=[0.0, 1.0, 30.0, 40.0], set=[("machine", "truck"), ("mass", "30000")]))
-    assert line == RouteQuery(((0.0, 1.0), (30.0, 40.0)), replace(MACHINES["truck"], mass_kg=30_000.0))
+    assert line == RouteQuery(((0.0, 1.0), (30.0, 40.0)), replace(MACHINES["truck"], mass_kg=30_000.0), step_m=5.0)
     assert _query(arguments(between=[0.0, 1.0, 30.0, 40.0], set=[("cost", "time")])) == WayQuery(
-        (0.0, 1.0), (30.0, 40.0), cost="time"
+        (0.0, 1.0), (30.0, 40.0), cost="time", step_m=5.0
     )
+    coarse = _query(arguments(between=[0.0, 1.0, 30.0, 40.0], set=[("step", "10")]))
+    assert coarse == WayQuery((0.0, 1.0), (30.0, 40.0), step_m=10.0)
+    long = _query(arguments(line=[0.0, 0.0, 60_000.0, 0.0]))
+    assert isinstance(long, RouteQuery)
+    assert long.step_m == 60.0, "one step a pixel"
     with pytest.raises(ConfigError, match="--set: is of a drive"):
         _query(arguments(set=[("mass", "3")]))
     with pytest.raises(QueryError, match="parameter `line`: 3 numbers"):

@@ -1,0 +1,144 @@
+"""Routes at every edge, client, command and HTTP: machines by name, a restart, and what is refused; real processes."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+
+from protocol.errors import QueryError
+from protocol.queries.places import MAX_PLACES
+from protocol.queries.routing import MACHINES, NamedMachine
+from sitegrid import Client, RouteAnswer
+from sitegrid.process.children import Children
+from tests.integration.hauling_site import hauling_site
+from tests.integration.web_site import NAME, WebSite
+
+pytestmark = pytest.mark.processes
+Place = tuple[float, float]
+ROAD: tuple[Place, Place] = ((20.0, 10.0), (150.0, 10.0))
+LINE: tuple[Place, ...] = ((40.0, 10.0), (10.0, 40.0), (40.0, 130.0))
+ACROSS = [(90.0, float(y)) for y in range(21)]  # a road, and its edges
+BLOCKED = {"margin": "1", "avoid": ",".join(f"{x:g},{y:g}" for x, y in ACROSS), "unknown": "refuse"}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
+    folder = tmp_path_factory.mktemp("edges")
+    with Children(folder) as children:
+        made = hauling_site(folder, children)
+        assert all(child.pid for child in (made.server, made.web))
+        yield made
+
+
+def command(site: WebSite, *words: str) -> subprocess.CompletedProcess[str]:
+    begin = (sys.executable, "-m", "sitegrid.cli", "query", "--endpoint", site.endpoint, "--site", NAME)
+    return subprocess.run([*begin, *words], capture_output=True, text=True, check=False, timeout=120)
+
+
+def numbers(line: tuple[Place, ...]) -> list[str]:
+    return [f"{value:g}" for place in line for value in place]
+
+
+def asked(site: WebSite, kind: str, places: tuple[Place, ...], values: dict[str, str]) -> dict[str, str]:
+    """What command and HTTP say of a drive that all three refuse; the command's last line alone."""
+    settings = [word for name, value in values.items() for word in ("--set", f"{name}={value}")]
+    said = command(site, kind, *numbers(places), *settings)
+    assert said.returncode in (1, 2), said.stdout
+    assert "Traceback" not in said.stderr
+    text = ";".join(",".join(numbers((place,))) for place in places)
+    ends = dict(zip(("from", "to"), text.split(";"), strict=False))
+    answer = site.get(kind, {**({"line": text} if kind == "route" else ends), **values})
+    assert answer.status in (400, 413, 414), answer.body
+    return {"command": said.stderr.strip().splitlines()[-1], "http": answer.json["detail"]}
+
+
+@pytest.mark.parametrize(
+    ("kind", "places", "values", "ask", "words"),
+    [
+        ("route", ((20.0, 10.0),), {}, lambda c: c.route([(20.0, 10.0)]), "a line has at least two"),
+        ("route", (ROAD[0],) * 2, {}, lambda c: c.route([ROAD[0]] * 2), "places 1 and 2 are the same"),
+        ("route", (ROAD[0], (math.nan, 1.0)), {}, lambda c: c.route([ROAD[0], (math.nan, 1.0)]), "`line`"),
+        ("route", (ROAD[0], (9e4, 1.0)), {}, lambda c: c.route([ROAD[0], (9e4, 1.0)]), "is off the site"),
+        ("route", (ROAD[0], (2e5, 1.0)), {}, lambda c: c.route([ROAD[0], (2e5, 1.0)]), "km, over 100 km"),
+        ("route", ROAD, {"mass": "0"}, lambda c: c.route(ROAD, named(mass_kg=0.0)), "mass"),
+        ("route", ROAD, {"mass": "2e6"}, lambda c: c.route(ROAD, named(mass_kg=2e6)), "mass"),
+        ("route", ROAD, {"efficiency": "0"}, lambda c: c.route(ROAD, named(efficiency=0.0)), "efficiency"),
+        ("route", ROAD, {"efficiency": "1.5"}, lambda c: c.route(ROAD, named(efficiency=1.5)), "efficiency"),
+        ("route", ROAD, {"machine": "digger-7"}, lambda c: c.route(ROAD, "digger-7"), "'digger-7' has sent nothing"),
+        ("way", (ROAD[0],) * 2, {}, lambda c: c.way(ROAD[0], ROAD[0]), "the same place as `from`"),
+        ("way", ROAD, BLOCKED, lambda c: blocked(c), "no way: `margin` leaves none"),
+        ("way", ROAD, {"max_grade": "0"}, lambda c: c.way(*ROAD, max_grade=0.0), "max_grade"),
+        (
+            "way",
+            ((60.0, 40.0), ROAD[1]),
+            {"unknown": "refuse"},
+            lambda c: c.way((60.0, 40.0), ROAD[1], unknown="refuse"),
+            "parameter `from`: unknown ground",
+        ),
+    ],
+)
+def test_bad_input_is_named_alike_at_every_edge(
+    site: WebSite,
+    kind: str,
+    places: tuple[Place, ...],
+    values: dict[str, str],
+    ask: Callable[[Client], RouteAnswer],
+    words: str,
+):
+    with pytest.raises((QueryError, ValueError), match=words) as refused:
+        ask(site.client)
+    assert "\n" not in str(refused.value)
+    for edge, problem in asked(site, kind, places, values).items():
+        assert words in problem, edge
+
+
+def named(**values: float) -> NamedMachine:
+    return NamedMachine("hauler-1", tuple(values.items()))
+
+
+def blocked(client: Client) -> RouteAnswer:
+    return client.way(*ROAD, margin_m=1.0, avoid=ACROSS, unknown="refuse")
+
+
+def test_more_places_than_a_line_may_have_are_named(site: WebSite):
+    many = tuple((20.0 + 0.01 * i, 10.0) for i in range(MAX_PLACES + 1))
+    with pytest.raises(QueryError, match=f"{MAX_PLACES + 1} places"):
+        site.client.route(many)
+    said = command(site, "route", *numbers(many))
+    assert said.returncode in (1, 2)
+    assert f"{MAX_PLACES + 1} places" in said.stderr
+
+
+def test_a_way_is_never_dearer_to_drive_than_straight_on(site: WebSite):
+    """Also between roads, over ground where nobody was, whatever the detour has of curves."""
+    for ends in (((40.0, 10.0), (40.0, 130.0)), ((150.0, 10.0), (150.0, 70.0)), ((20.0, 70.0), (90.0, 10.0))):
+        for cost, total in (("energy", "energy_j"), ("time", "time_s")):
+            way = site.client.way(*ends, "truck", cost=cost)
+            straight = site.client.route(ends, "truck")
+            assert getattr(way.totals, total) <= getattr(straight.totals, total)
+            again = site.client.route(way.line_m.tolist(), "truck")
+            assert again.totals == way.totals
+            assert not straight.totals.unknown or straight.totals.unknown_resistance > 0.02
+
+
+def test_a_route_of_a_named_machine_is_the_first_thing_that_a_server_is_asked_after_a_restart(site: WebSite):
+    before = site.client.route(LINE, "hauler-1")
+    assert before.machine != MACHINES["loader"], "its samples say what it weighs"
+    again = site.client.route(LINE, replace(before.machine))
+    assert again.totals == before.totals
+    assert site.get("route", {"line": "20,10;150,10", "machine": "hauler-1"}).json["machine"]["mass_kg"] == (
+        before.machine.mass_kg
+    )
+    old = site.server.pid
+    site.server.send(signal.SIGKILL)
+    site.server.wait(30)
+    site.server = site.start_server()
+    assert site.server.pid != old
+    after = site.client.route(LINE, "hauler-1")
+    assert (after.totals, after.machine, after.merged) == (before.totals, before.machine, before.merged)

@@ -1,0 +1,82 @@
+"""Prices of ground where nobody was."""
+
+import numpy as np
+import pytest
+
+from mapserver.routes.ground import Squares
+from mapserver.routes.prices import LOOSE, NEEDS, RESISTANCE, around, bare, priced
+
+EDGE = 32
+HERE = {(0, 0)}
+
+
+def squares(made: dict[tuple[int, int], dict[str, object]], std: float = 0.001) -> Squares:
+    """Of resistance, grade (east) and where machines were; NaN where nothing is said."""
+    out = {}
+    for place, values in made.items():
+        layers = {name: np.full((EDGE, EDGE), np.nan) for name in NEEDS}
+        layers["resistance_filled"][:] = values.get("resistance", np.nan)
+        layers["grade_east_filled"][:] = values.get("grade", 0.0)
+        layers["grade_north_filled"][:] = 0.0
+        layers["resistance_filled_std"][:] = values.get("std", std)
+        layers["visits"][:] = np.where(values.get("driven", True), 3.0, np.nan)
+        out[place] = layers
+    return Squares.stacked(0.5, EDGE, out)
+
+
+def half(known: float, beyond: float = np.nan) -> np.ndarray:
+    return np.where(np.arange(EDGE) < EDGE // 2, known, beyond) + np.zeros((EDGE, 1))
+
+
+def test_unknown_ground_is_as_dear_as_the_dearest_tenth_around_uphill() -> None:
+    gravel, slope = half(0.03), half(0.04)
+    one = squares({(0, 0): {"resistance": gravel, "grade": slope, "driven": np.isfinite(gravel)}})
+    price = priced(one, HERE, None).layers[RESISTANCE][0]
+    assert np.isnan(price[:, : EDGE // 2]).all()
+    assert price[:, EDGE // 2 :] == pytest.approx(0.07, rel=0.02)
+    dear = squares({(0, 0): {"resistance": gravel, "driven": np.isfinite(gravel)}, (0, 1): {"resistance": 0.12}})
+    assert priced(dear, HERE, None).layers[RESISTANCE][0][0, -1] == pytest.approx(0.12, rel=0.02)
+    assert priced(dear, HERE, 0.05).layers[RESISTANCE][0][0, -1] == pytest.approx(0.05)
+
+
+def test_what_is_filled_in_costs_more_the_less_sure_it_is() -> None:
+    road = half(0.03, 0.03)
+    driven = np.arange(EDGE) < EDGE // 2
+    std = np.where(driven, 0.001, 0.03 * np.linspace(0.0, 1.3, EDGE)) + np.zeros((EDGE, 1))
+    beside = {"resistance": road, "std": std, "driven": driven & np.ones((EDGE, 1), bool)}
+    one = squares({(0, 0): beside, (1, 0): {"resistance": 0.13}})
+    price = priced(one, HERE, None).layers[RESISTANCE][0][5, EDGE // 2 :]
+    assert (np.diff(price) > 0).all()
+    assert price[-1] == pytest.approx(0.13, rel=0.02)
+    assert 0.03 < price[0] < 0.09
+
+
+def test_a_price_is_the_same_whatever_else_was_read() -> None:
+    draw = np.random.default_rng(5)
+    made = {}
+    for x in range(-2, 4):
+        for y in range(-2, 4):
+            values = np.exp(draw.normal(-3.5, 0.5, (EDGE, EDGE)))
+            made[x, y] = {"resistance": values, "grade": draw.normal(0, 0.1), "driven": draw.random((EDGE, EDGE)) < 0.3}
+    everything, near = squares(made), squares({place: made[place] for place in around(HERE)})
+    few = priced(near, HERE, None).layers[RESISTANCE][0]
+    many = priced(everything, {(1, 1), (0, 0), (0, 1)}, None)
+    assert np.array_equal(few, many.layers[RESISTANCE][many.by_place()[0, 0]], equal_nan=True)
+
+
+def test_far_from_everything_ground_is_as_loose_as_sand_unless_somebody_says_what_it_is() -> None:
+    far = squares({(3, 0): {"resistance": 0.03}})
+    assert (priced(far, HERE, None).layers[RESISTANCE] == LOOSE).all()
+    assert (priced(far, HERE, 0.04).layers[RESISTANCE] == 0.04).all()
+
+
+def test_what_was_driven_and_not_measured_is_as_the_nearest_that_was() -> None:
+    one = squares({(0, 0): {"resistance": half(0.04)}})
+    assert priced(one, HERE, None).layers[RESISTANCE][0][:, EDGE // 2 :] == pytest.approx(0.04)
+
+
+def test_squares_are_bare_where_any_cell_was_never_driven() -> None:
+    driven = np.ones((EDGE, EDGE), bool)
+    driven[3, 4] = False
+    some = squares({(0, 0): {"resistance": 0.03}, (1, 0): {"resistance": 0.03, "driven": driven}})
+    assert bare(some, {(0, 0), (1, 0), (5, 5)}) == {(1, 0), (5, 5)}
