@@ -97,7 +97,7 @@ def machine_names(folder: Path) -> list[str]:
 
 def _row(drive: BenchDrive, folder: Path, edition: Edition) -> Row:
     hashes = {"recording": recording_hash(folder), "samples": file_hash([folder / SAMPLES_FILE], folder)}
-    published = published_hashes().get(_edition_key(edition), {}).get(drive.name)
+    published = published_hashes().get(edition_key(edition), {}).get(drive.name)
     is_published = None if published is None else published == hashes
     return {
         "name": drive.name,
@@ -108,7 +108,8 @@ def _row(drive: BenchDrive, folder: Path, edition: Edition) -> Row:
     }
 
 
-def _edition_key(edition: Edition) -> str:
+def edition_key(edition: Edition) -> str:
+    """Its name among the published hashes."""
     return f"{edition.seconds:g} s {edition.world or 'as scenarios have it'}"
 
 

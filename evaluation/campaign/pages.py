@@ -5,7 +5,7 @@
 
 A page says where a table belongs, which report it is of and which table, and ends it with `<!-- end -->`:
 
-    <!-- table: roads.json made -->          command, commit, date and seeds
+    <!-- table: roads.json made -->          command, commit, date, seeds and processor time
     <!-- table: roads.json goals -->         all goals, missed ones in bold
     <!-- table: roads.json haul_road -->     all figures of the row of this case, seed by seed
     <!-- table: paper.json forecasts -->     a list of rows, with all columns of plain values
@@ -71,10 +71,14 @@ def _cases(report: Report) -> list[Row]:
 def made_table(report: Report) -> str:
     """Where a report comes from."""
     seeds, made = report.get("seeds", []), report[MADE]
-    return markdown(
-        ["command", "commit", "date", "seeds"],
-        [[f"`{made['command']}`", made["commit"], made["date"], ", ".join(map(str, seeds))]],
-    )
+    line = [f"`{made['command']}`", made["commit"], made["date"], _span(seeds), text_of(made["processor_min"])]
+    return markdown(["command", "commit", "date", "seeds", "minutes of processor time, of what was not kept"], [line])
+
+
+def _span(seeds: Sequence[int]) -> str:
+    """Seeds in short where they follow one another."""
+    follow = len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[0] + len(seeds)))
+    return f"{seeds[0]} to {seeds[-1]}" if follow else ", ".join(map(str, seeds))
 
 
 def goals_table(report: Report) -> str:

@@ -5,6 +5,7 @@ Results are kept by what they depend on, so whatever a report has, the code that
 
 from __future__ import annotations
 
+import resource
 import shlex
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -20,9 +21,15 @@ WITHOUT = ("--data", "--out", "--plots", "--processes", "--tensor")
 
 
 def made_by(words: Sequence[str]) -> Row:
-    """Of a report: `command` (words: what follows `sitegrid`), `commit`, and `date` of its printing."""
+    """Of a report: `command` (words: what follows `sitegrid`), `commit`, `date` of its printing, and `processor_min`.
+
+    The latter is of this process and its workers so far: of what was not kept from an earlier run.
+    """
     command = shlex.join(["sitegrid", *_lasting(words)])
-    return {"command": command, "commit": commit_of(ROOT), "date": datetime.now(UTC).date().isoformat()}
+    used = [resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    minutes = sum(each.ru_utime + each.ru_stime for each in used) / 60
+    today = datetime.now(UTC).date().isoformat()
+    return {"command": command, "commit": commit_of(ROOT), "date": today, "processor_min": round(minutes, 1)}
 
 
 def commit_of(folder: Path) -> str:

@@ -10,7 +10,7 @@ from evaluation.campaign.recordings import PAPER, PlannedDrive, Setup
 from evaluation.fleet.drives import Agent, planned
 from evaluation.paper.maps import Fleet
 from evaluation.positions.configurations import HEADLINE, PROFILES, Configuration, configurations
-from evaluation.positions.published import PLOTTING
+from evaluation.positions.published import PLOTTING, POSITIONS
 
 FLEET_SHARE = 0.75  # of the length of other recordings: 900 s, as `eval fleet` has
 MACHINES = 4
@@ -69,7 +69,7 @@ class Plan:
 
     seeds: Sequence[int]
     seconds: float
-    positions: tuple[Configuration, ...] = tuple(configurations())
+    positions: tuple[Configuration, ...] = tuple(row for row in configurations() if row.group in POSITIONS)
     sources: tuple[MapSource, ...] = (*ALONE, *FLEETS)
     setup: Setup = PAPER
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +19,14 @@ from evaluation.fleet import drives
 from evaluation.fleet.drives import scene
 from evaluation.maps.score import driven_cells, pooled_by_border, region_of, score, score_driven, true_layers
 from evaluation.maps.uncertainty import Believed, coverage_pct, forecast_row, layers_forecast, pooled
-from evaluation.paper import maps
+from evaluation.paper import days, maps
+from evaluation.paper.days import SecondDay, day_rows
 from evaluation.paper.drives import MACHINES, QUICK, RECOMMENDED, MapSource, Plan
-from evaluation.paper.maps import AS_TRUE, FORECASTS, KINDS, PAPERS, SERVED, MadeMaps, MapKind
+from evaluation.paper.maps import AS_TRUE, FORECASTS, KINDS, PAPERS, SERVED, Fleet, MadeMaps, MapKind
 from evaluation.paper.tensor import write_tensor
 from evaluation.positions import table
 from evaluation.positions.configurations import Configuration
-from evaluation.positions.published import PLOTTING, POSITIONS, Published
+from evaluation.positions.published import PLOTTING, POSITIONS, REMARKS, Published
 from evaluation.positions.table import ScoredRun
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from protocol.errors import SitegridError
@@ -91,8 +93,10 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
         figures = {kind: [_figures(each, kind, runner) for each in outcomes.all_of(source)] for kind in KINDS}
         rows += [map_row(source, kind, of_kind, figures[AS_TRUE]) for kind, of_kind in figures.items()]
     fleets = [source for source in plan.sources if source.machines > 1]
+    of_days = [row for source in fleets for row in _days(runner, plan, source)]
     forecasts = [row for source in fleets for row in forecast_rows(source, outcomes, runner)]
     coverage = [row for source in fleets for row in coverage_rows(source, outcomes, runner)]
+    judged = (GOALS, rows), (CALIBRATED, forecasts), (COVERED, coverage), (days.GOALS, of_days)
     report: Report = {
         "seeds": list(plan.seeds),
         "seconds": plan.seconds,
@@ -100,8 +104,10 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
         "rows": rows,
         "forecasts": forecasts,
         "coverage": coverage,
-        "goals": [] if plan == QUICK else judge(GOALS, rows) + judge(CALIBRATED, forecasts) + judge(COVERED, coverage),
+        "days": of_days,
+        "goals": [] if plan == QUICK else [row for goals, those in judged for row in judge(goals, those)],
         "contradictions": contradictions(),
+        "remarks": list(REMARKS),
     }
     return report, outcomes
 
@@ -130,6 +136,20 @@ def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
     return [
         MapOutcome(source, source.drive(seed, plan), each) for (source, seed), each in zip(pairs, made, strict=True)
     ]
+
+
+def _days(runner: Runner, plan: Plan, source: MapSource) -> list[Row]:
+    """Rows of two days, of the same machines and of others; none of one seed alone, after which nobody comes."""
+    drives_of = [source.drive(seed, plan) for seed in plan.seeds]
+    kinds: dict[str, list[tuple[PlannedDrive | None, PlannedDrive]]] = {
+        "the same": [(None, drive) for drive in drives_of[1:]],
+        "others": [*pairwise(drives_of)],
+    }
+    rows = []
+    for who, pairs in kinds.items():
+        tasks = [replay_task(SecondDay(Fleet(source.agents), first), second) for first, second in pairs]
+        rows += day_rows({**_of(source), "second_day": who}, runner.run(days.EXPERIMENT, tasks)) if tasks else []
+    return rows
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------

@@ -141,8 +141,8 @@ def make_maps(live: Rows, final: Rows, true: Scene) -> MadeMaps:
     hits = hits_of(in_order(samples[SERVED].values()), "resistance", window_of(truth))
     said = [method(hits) for method in FORECASTS.values()]
     forecasts = np.array([[each.kind, each.confidence] for each in said], np.float32)
-    rmse_m = np.array([_rmse_m(rows, true) for rows in (live, final)])
-    return MadeMaps(out, forecasts.reshape(-1, 2, *truth.c_rr.shape), rmse_m, sum(map(len, final.values())))
+    errors_m = np.array([rmse_m(rows, true) for rows in (live, final)])
+    return MadeMaps(out, forecasts.reshape(-1, 2, *truth.c_rr.shape), errors_m, sum(map(len, final.values())))
 
 
 def _by_truth(rows: Table, name: str, data: Tampered, true: Scene) -> Table:
@@ -150,7 +150,7 @@ def _by_truth(rows: Table, name: str, data: Tampered, true: Scene) -> Table:
     return corrected(rows, [as_correction(name, error) for error in true_errors(data, name, true, 1)])
 
 
-def _rmse_m(rows: Rows, true: Scene) -> tuple[float, float]:
+def rmse_m(rows: Rows, true: Scene) -> tuple[float, float]:
     """Root mean square errors of places, east and north, where the truth is known."""
     off_m = np.concatenate([_off_m(table, true, name) for name, table in rows.items()])
     known = off_m[np.isfinite(off_m).all(axis=1)]

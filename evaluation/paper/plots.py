@@ -46,12 +46,14 @@ Titled = tuple[str, MapOutcome, MapKind]
 
 def draw(report: Report, outcomes: Outcomes, runner: Runner, folder: Path) -> list[Path]:
     """Draw all pictures of a report into a folder; returns their paths."""
-    maps = _shown(outcomes)
+    maps, fleets = (_shown(outcomes, several=several) for several in (False, True))
     alone = [outcomes.all_of(source)[0] for source in outcomes.plan.sources if source.machines == 1]
     drawn: dict[str, Callable[[], Figure]] = {
         "truth": partial(draw_truth, maps[0][1], runner),
         "maps": partial(draw_maps, maps, runner),
         "differences": partial(draw_differences, maps, runner),
+        "fleet_maps": partial(draw_maps, fleets, runner),
+        "fleet_differences": partial(draw_differences, fleets, runner),
         "tracks": partial(draw_tracks, alone, runner),
         "errors": partial(draw_errors, alone, runner),
     }
@@ -60,21 +62,22 @@ def draw(report: Report, outcomes: Outcomes, runner: Runner, folder: Path) -> li
     return pictures.draw_all(drawn, folder)
 
 
-def _shown(outcomes: Outcomes) -> list[Titled]:
-    """The maps that are shown: the paper's of each configuration, then this project's."""
+def _shown(outcomes: Outcomes, *, several: bool) -> list[Titled]:
+    """The maps that are shown: of one machine the paper's of each configuration, then this project's; or of fleets."""
     out: list[Titled] = []
     for source in outcomes.plan.sources:
+        if several != (source.machines > 1):
+            continue
         first, row = outcomes.all_of(source)[0], source.configuration
         name = f"{row.filter.upper()}, {row.imu} IMU, {row.gps} GPS"
         if source.machines == 1 and row.profile == "paper":
             out.append((f"the paper's plotter\n{name}", first, PAPERS))
         elif source.machines == 1 and row.filter == "ukf" and row.gps == 2:
             out.append((f"soft votes, true values\n{name}", first, OURS))
-        elif source.machines > 1:
+        elif several:
             site = f"{source.machines} machines, {source.scenario} {source.preset}"
             out += [
-                (f"soft votes, true values\n{site}", first, OURS),
-                (f"soft votes, estimates\n{site}", first, SERVED),
+                (f"{values}\n{site}", first, kind) for values, kind in (("true values", OURS), ("estimates", SERVED))
             ]
     return out
 
@@ -267,7 +270,7 @@ def draw_reliability(forecasts: Sequence[Row]) -> Figure:
         head(column[0], " ".join(site), 9)
         column[0].set(xlim=(0, 1), ylim=(0, 1.02), ylabel="share that is right")
         column[1].set(xlim=(0, 1), yscale="log", ylabel="cells", xlabel="confidence")
-        column[0].legend(loc="lower right")  # who is sure and wrong is rare
+        column[0].legend(loc="lower right")
     head(
         figure, "Reliability over driven cells, all seeds; on the dotted line confidence is what is right", 9, "normal"
     )

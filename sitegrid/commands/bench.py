@@ -42,7 +42,8 @@ def run(arguments: Namespace) -> int:
     title = {"make": "fleets drive, agents make samples", "score": "maps are compared with the truth"}[arguments.what]
     with Display(title, headless=arguments.json) as display:
         if arguments.what == "make":
-            report = {"rows": recordings.make(Runner(arguments.data, processes, display.show), edition)}
+            rows = recordings.make(Runner(arguments.data, processes, display.show), edition)
+            report = {"edition": recordings.edition_key(edition), "rows": rows}
         else:
             report = scores.run(arguments.data, edition, arguments.entries, processes, display.show)
     if arguments.json:

@@ -32,6 +32,7 @@ def test_it_is_never_uploaded_and_has_its_extras(root: Path):
             "postgres",
             "server",
             "sim",
+            "entries",
             "eval",
             "web",
             "export",

@@ -1,4 +1,4 @@
-"""Gaussian processes by scikit-learn, one per block of ground: `pip install scikit-learn==1.9.1` where it is run.
+"""Gaussian processes by scikit-learn (extra `entries`), one per block of ground.
 
 `python -m evaluation.benchmark.adapters.gaussian_process BENCH_DATA ENTRY`. The samples of a cell are averaged first;
 resistance is regressed as its logarithm, so that concrete counts as much as sand. Lengths and variances are set, not

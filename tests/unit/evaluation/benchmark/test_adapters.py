@@ -54,7 +54,7 @@ def test_samples_are_read_oldest_first(recording: Path):
 @pytest.mark.parametrize("name", ["cell_filter", "gaussian_process"])
 def test_a_method_knows_both_kinds_of_ground_and_the_slope(name: str, recording: Path):
     if name == "gaussian_process":
-        pytest.importorskip("sklearn", reason="a library of that entry alone")
+        pytest.importorskip("sklearn", reason="needs the extra `entries`")
         from evaluation.benchmark.adapters.gaussian_process import gaussian_process as method
     else:
         method = cell_filter

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.benchmark import recordings, scores
+from evaluation.benchmark import publish, recordings, scores
 from evaluation.benchmark.recordings import FULL, QUICK, file_hash
 from evaluation.benchmark.scores import FIGURES, Entry, figures_of, summarise
 from evaluation.campaign.experiment import Runner
@@ -18,6 +18,7 @@ from sitegrid import cli
 from sitegrid.process.lifetime import plain
 from tests.unit.evaluation.fleet.scenes import made_scene
 
+PUBLISHED = recordings.published_hashes()
 STORED = Path(__file__).parent / "quick.json"
 
 
@@ -159,6 +160,19 @@ def test_a_recording_that_differs_from_the_published_one_is_seen(made, data: Pat
     assert [row["published"] for row in recordings.make(Runner(data), QUICK)] == [False, False]
     monkeypatch.setattr(recordings, "published_hashes", dict)
     assert [row["published"] for row in recordings.make(Runner(data), replace(QUICK))] == [None, None]
+
+
+@pytest.mark.slow
+def test_what_was_made_can_be_published(made, monkeypatch, tmp_path: Path):
+    report = tmp_path / "made.json"
+    report.write_text(json.dumps({"edition": recordings.edition_key(QUICK), "rows": plain(made)}))
+    hashes = tmp_path / "hashes.json"
+    hashes.write_text('{"other": {}}')
+    monkeypatch.setattr(publish, "HASHES", hashes)
+    monkeypatch.setattr(recordings, "HASHES", hashes)
+    assert publish.main([str(report)]) == 0
+    key = recordings.edition_key(QUICK)
+    assert json.loads(hashes.read_text()) == {"other": {}, key: PUBLISHED[key]}
 
 
 def published() -> dict:

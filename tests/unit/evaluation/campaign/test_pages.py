@@ -7,7 +7,7 @@ from evaluation.campaign.pages import NOT_MEASURED, filled, main, text_of
 from protocol.errors import ConfigError
 
 RESULTS = Path(__file__).parents[4] / "docs" / "results"
-MADE = {"command": "sitegrid eval roads --json", "commit": "1234abcd", "date": "2026-11-23"}
+MADE = {"command": "sitegrid eval roads --json", "commit": "1234abcd", "date": "2026-11-23", "processor_min": 61.5}
 REPORT = {
     "made": MADE,
     "seeds": [1000, 1001],
@@ -59,10 +59,12 @@ def test_a_row_has_all_its_figures(folder):
 
 def test_a_report_says_where_it_comes_from(folder):
     assert filled(page("made"), folder).splitlines()[2:5] == [
-        "| command | commit | date | seeds |",
-        "| --- | --- | --- | --- |",
-        "| `sitegrid eval roads --json` | 1234abcd | 2026-11-23 | 1000, 1001 |",
+        "| command | commit | date | seeds | minutes of processor time, of what was not kept |",
+        "| --- | --- | --- | --- | --- |",
+        "| `sitegrid eval roads --json` | 1234abcd | 2026-11-23 | 1000, 1001 | 61.5 |",
     ]
+    (folder / "roads.json").write_text(json.dumps({**REPORT, "seeds": [3, 4, 5]}))
+    assert "| 2026-11-23 | 3 to 5 |" in filled(page("made"), folder)
 
 
 def test_rows_stand_with_their_plain_values(folder):

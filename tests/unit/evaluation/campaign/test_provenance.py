@@ -20,8 +20,10 @@ def test_a_command_lasts_without_the_places_of_one_computer(words: str, command:
     assert made_by(words.split())["command"] == command
 
 
-def test_a_report_has_the_day():
-    assert re.fullmatch(r"20\d\d-\d\d-\d\d", made_by([])["date"])
+def test_a_report_has_the_day_and_what_it_cost():
+    made = made_by([])
+    assert re.fullmatch(r"20\d\d-\d\d-\d\d", made["date"])
+    assert 0.0 < made["processor_min"] < 60.0
 
 
 def git(folder: Path, *words: str) -> str:
