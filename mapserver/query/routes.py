@@ -247,5 +247,6 @@ def warm_up() -> None:
     resistance, level = np.full((8, 8), 0.02), np.zeros((8, 8))
     terrain = Terrain(resistance, level, level, resistance > 0, 1.0)
     least_cost_line(terrain, (0, 0), (7, 5))
+    cost_of(terrain, np.array([(0, 0), (7, 5)]))
     ground = {name: resistance.astype(np.float32) for name in LAYERS}
     route(np.array([[1.0, 1.0], [7.0, 7.0]]), Squares.stacked(1.0, 8, {(0, 0): ground}), RouteMachine())

@@ -218,4 +218,6 @@ def test_command_prints_rows(monkeypatch, capsys, tmp_path: Path) -> None:
     words = ["eval", "fleet", "--seeds", "2", "--first-seed", "3", "--seconds", "60", "--out", str(tmp_path), "--json"]
     assert cli.main(words) == 0
     assert asked == [{"seeds": range(3, 5), "seconds": 60.0}]
-    assert json.loads(capsys.readouterr().out) == {"rows": []}
+    printed = json.loads(capsys.readouterr().out)
+    assert printed.pop("made")["command"].startswith("sitegrid eval fleet --seeds 2 --first-seed 3 --seconds 60")
+    assert printed == {"rows": []}
