@@ -65,10 +65,19 @@ class _Scale:
 def draw_resistance(
     region: Region, tracks: Sequence[Track] = (), title: str = "Rolling resistance", notes: Sequence[str] = ()
 ) -> Image:
-    """Draw the layer `resistance` in the paper's classes and colours. notes: lines below the legend."""
+    """Draw the layer `resistance` in the paper's classes and colours. notes: lines below the legend.
+
+    Where the region has the layer `resistance_filled` too, it is drawn pale in the gaps.
+    """
     entries = [LegendEntry(zone.bgr, f"{zone.name}  {zone.c_rr:g}") for zone in ZONES]
     scale = _scale(region)
     ground = _paint(resistance_class(region["resistance"]), entries, scale)
+    if "resistance_filled" in region.layers:
+        pale = [LegendEntry(_pale(entry.colour), entry.text) for entry in entries]
+        filled = _paint(resistance_class(region["resistance_filled"]), pale, scale)
+        gaps = (ground == UNKNOWN_COLOUR).all(axis=-1)
+        ground[gaps] = filled[gaps]
+        entries = [*entries, LegendEntry(pale[1].colour, "pale: filled in")]
     return _finish(ground, scale, entries, tracks, title, notes)
 
 

@@ -30,7 +30,10 @@ class _Chart:
 
 
 def draw_drive(region: Region, answer: RouteAnswer) -> Image:
-    """The map with the line, and what a drive over it takes. region: with the layer `resistance`, around the line."""
+    """The map with the line, and what a drive over it takes.
+
+    region: around the line, with `resistance`, and with `resistance_filled` as a drive counts filled ground as known.
+    """
     totals, machine = answer.totals, answer.machine
     tracks = [Track("end", *answer.line_m.T), Track("start", *answer.line_m[:1].T)]
     notes = [

@@ -33,6 +33,15 @@ def test_each_zone_has_its_colour_and_unknown_is_pale():
     assert shown == [*(zone.bgr for zone in ZONES), plotter.UNKNOWN_COLOUR]
 
 
+def test_filled_gaps_are_pale_and_known_ground_is_not():
+    known = np.array([[ZONES[4].c_rr, NAN, NAN]], np.float32)
+    filled = np.array([[ZONES[4].c_rr, ZONES[4].c_rr, NAN]], np.float32)
+    image = draw_resistance(region(3, 1, resistance=known, resistance_filled=filled))
+    shown = [cell_colour(image, column, 0, 1, plotter.MAX_CELL_PX) for column in range(3)]
+    pale = tuple(round(0.42 * part + 0.58 * 255) for part in ZONES[4].bgr)
+    assert shown == [ZONES[4].bgr, pale, plotter.UNKNOWN_COLOUR]
+
+
 def test_north_is_up_and_east_is_right():
     values = np.full((4, 4), 0.008)
     values[3, 0] = 0.25  # north-west
