@@ -3,23 +3,29 @@
 The paper's method runs on the field's textbook library, as its readers would build it; the square-root filters beside
 it (`ekf.py`, `ukf.py`) are those of the profile `default`. The sums are filterpy's; what it leaves to its users is
 added: models, wrapped angles, gates, and sigma points drawn again before each measurement, since its `update` reuses
-those of `predict`. The models answer for all sigma points at once, not point after point.
+those of `predict`. The models answer for all sigma points at once, not point after point. So are the sums made,
+in filterpy's order: no bit of a result differs.
 
 With the paper's lambda = 3 - n the weight of the central point is negative, and P - K S K^T is a difference: what comes
 out may be no covariance. Then nothing is left to go on with, and `DivergedError` says so.
 """
 
 import math
+from collections.abc import Callable
 from functools import lru_cache, partial
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+from scipy.linalg.lapack import dpotrf
 
 from agents.localisation.filters.belief import Belief, Conditioned, DivergedError, Measurement, Model, Motion
 from agents.localisation.filters.square_root import noise_root, refused, wrapped, wrapped_state
 from protocol.arrays import Floats
 
+Mean = Callable[[Floats, Floats], Floats]  # of points, with weights
+Residual = Callable[[Floats, Floats], Floats]
 ALPHA, BETA = 1.0, 1.0  # with kappa = 3 - n the paper's lambda, and the weights of `Ukf`
+SPREAD = 3.0  # lambda + n
 
 
 class _Extended(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -32,13 +38,28 @@ class _Extended(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x = self.f(self.x[None])[0]
 
 
+class _Points(MerweScaledSigmaPoints):  # type: ignore[misc]
+    """Drawn at once: the rows of the root of (lambda + n) P, added to the mean and taken off it."""
+
+    def sigma_points(self, x: Floats, P: Floats) -> Floats:
+        n, U = self.n, _upper_root(SPREAD * P)
+        points = np.empty((2 * n + 1, n))
+        points[0] = x
+        np.add(x, U, out=points[1 : n + 1])
+        np.subtract(x, U, out=points[n + 1 :])
+        return points
+
+
 class _Unscented(UnscentedKalmanFilter):  # type: ignore[misc]
-    """With a motion of all sigma points at once."""
+    """With a motion and sums of all sigma points at once."""
 
     f: Model
 
     def compute_process_sigmas(self, dt: float, fx: object = None, **_: object) -> None:  # noqa: ARG002
         self.sigmas_f = self.f(self.points_fn.sigma_points(self.x, self.P))
+
+    def cross_variance(self, x: Floats, z: Floats, sigmas_f: Floats, sigmas_h: Floats) -> Floats:
+        return _weighted(self.Wc, self.residual_x(sigmas_f, x), self.residual_z(sigmas_h, z))
 
 
 class TextbookEkf:
@@ -75,7 +96,7 @@ class TextbookUkf:
         stock = _Unscented(n, 1, 0.0, None, None, _sigma_points(n))
         stock.x, stock.P, stock.Q, stock.f = belief.x, belief.P, motion.Q, motion.f
         try:
-            stock.predict()  # it draws points of the prediction too
+            stock.predict(UT=_transformed)  # it draws points of the prediction too
         except ValueError:  # LinAlgError is one
             raise DivergedError("the covariance is not positive definite") from None
         return _believed(stamp_ns, wrapped_state(stock.x, motion.angles), stock.P)
@@ -86,12 +107,12 @@ class TextbookUkf:
             return refused(belief, measurement)
         n, angles, points = len(belief.x), measurement.angles, _sigma_points(len(belief.x))
         circular = {"z_mean_fn": partial(_mean, angles=angles), "residual_z": partial(_difference, angles=angles)}
-        stock = UnscentedKalmanFilter(n, len(measurement.z), 0.0, None, None, points, **(circular if angles else {}))
+        stock = _Unscented(n, len(measurement.z), 0.0, None, None, points, **(circular if angles else {}))
         stock.x, stock.P = belief.x, belief.P
         try:
             stock.sigmas_f = points.sigma_points(stock.x, stock.P)
-            seen = iter(measurement.h(stock.sigmas_f))
-            stock.update(measurement.z, R=measurement.R, hx=lambda _: next(seen))
+            seen = iter(measurement.h(stock.sigmas_f).tolist())  # filterpy stacks lists faster than arrays
+            stock.update(measurement.z, R=measurement.R, UT=_transformed, hx=lambda _: next(seen))
         except ValueError:  # LinAlgError is one
             raise DivergedError("the covariance is not positive definite") from None
         return _concluded(belief, measurement, stock)
@@ -99,7 +120,37 @@ class TextbookUkf:
 
 @lru_cache
 def _sigma_points(n: int) -> MerweScaledSigmaPoints:
-    return MerweScaledSigmaPoints(n, ALPHA, BETA, 3.0 - n)
+    return _Points(n, ALPHA, BETA, SPREAD - n)
+
+
+def _upper_root(P: Floats) -> Floats:
+    """Upper Cholesky factor, as scipy's `cholesky` has it for more than twice the time; raises ValueError."""
+    U: Floats
+    U, info = dpotrf(P)
+    if info or not math.isfinite(U[-1, -1]):
+        raise ValueError("not positive definite")
+    return U
+
+
+def _transformed(
+    points: Floats, Wm: Floats, Wc: Floats, noise: Floats, mean: Mean | None, residual: Residual
+) -> tuple[Floats, Floats]:
+    """Mean (k,) and covariance (k, k) of points (m, k), as filterpy's `unscented_transform` has them."""
+    x = Wm.dot(points) if mean is None else mean(points, Wm)
+    y = residual(points, x)
+    P = y.T.dot(np.multiply(Wc[:, None], y, order="C")) if residual is np.subtract else _weighted(Wc, y, y)
+    return x, P + noise
+
+
+def _weighted(weights: Floats, a: Floats, b: Floats) -> Floats:
+    """Sum (n, k) of weights (m,) times the outer products of a (m, n) and b (m, k), one after the other.
+
+    numpy adds in this order along an axis whose values do not adjoin; those that do, in pairs.
+    """
+    terms = np.multiply(a[:, :, None], b[:, None, :], order="C")
+    terms *= weights[:, None, None]
+    total: Floats = terms.sum(axis=0) if terms[0].size > 1 else terms.cumsum(axis=0)[-1]
+    return total
 
 
 def _is_usable(measurement: Measurement) -> bool:
