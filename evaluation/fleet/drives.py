@@ -20,6 +20,7 @@ from protocol.arrays import Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, Reading, Torque
+from protocol.site.site_config import SiteConfig
 from sim.recorder import TRACKS_FOLDER
 from sim.scenario.file import load_scenario
 from sim.truth import MAP_FILE, TruthMap
@@ -128,8 +129,7 @@ def _logs(folder: Path) -> list[Path]:
 def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
     """Run one machine's pipeline."""
     assert task.drive
-    log = open_log(_logs(task.drive.folder(cache))[task.variant.index])
-    machine, readings = log.machine, tuple(log.readings())
+    site, machine, readings = _read(_logs(task.drive.folder(cache))[task.variant.index])
     if task.variant.first_s:
         end_ns = readings[0].stamp_ns + round(task.variant.first_s * 1e9)
         readings = tuple(reading for reading in readings if reading.stamp_ns <= end_ns)
@@ -140,8 +140,15 @@ def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
     if chosen := task.variant.configuration:
         machine = select(machine, chosen.gps, chosen.imu)
         options = replace(chosen.options, estimation=estimation)
-    made = all_samples(Pipeline(log.site, machine, options), readings)
+    made = all_samples(Pipeline(site, machine, options), readings)
     return AgentSamples(np.asarray(made.final), np.asarray(made.pending))
+
+
+@lru_cache(maxsize=1)  # the configurations of a lone machine come one after the other
+def _read(folder: Path) -> tuple[SiteConfig, MachineConfig, tuple[Reading, ...]]:
+    """What the agent of a machine may know and read, of its log folder."""
+    log = open_log(folder)
+    return log.site, log.machine, tuple(log.readings())
 
 
 def spoiled(machine: MachineConfig, readings: Iterable[Reading]) -> tuple[MachineConfig, tuple[Reading, ...]]:
