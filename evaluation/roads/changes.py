@@ -43,14 +43,14 @@ CELL_M = 1.0
 
 @dataclass(frozen=True)
 class Changes:
-    """What of one recording changed, and what was said. of: which kind of place.
+    """What of one recording changed, and what was said. kind: which places.
 
     Lists are of the places that truly changed and were driven before and since: passes: how many since; needed: how
     many until it was shown, and minutes: from the first of them, None for never. said: how many places are said to have
     changed in the end; right: how many of them did. km2_days: known area times the time of the recording.
     """
 
-    of: str
+    kind: str
     passes: list[int]
     needed: list[int | None]
     minutes: list[float | None]
@@ -72,7 +72,7 @@ def pooled(parts: Sequence[Changes]) -> Row:
         recalls[f"recall_{least}_pct"] = _percent(len(shown), len(driven))
         recalls[f"by_{least}_pct"] = _percent(sum(needed <= least for needed in shown), len(driven))
     return {
-        "of": parts[0].of,
+        "kind": parts[0].kind,
         "changed": len(each),
         "said": said,
         "precision_pct": _percent(sum(part.right for part in parts), said),
@@ -104,44 +104,41 @@ class ChangedGround:
     changed: Bools
 
     @classmethod
-    def of(cls, drive: RoadDrive, scene: Scene, cache: Path) -> ChangedGround:
+    def of_drive(cls, drive: RoadDrive, scene: Scene, cache: Path) -> ChangedGround:
         """That of a recording."""
         ground = load_scenario(str(drive.folder(cache) / "scenario.toml")).ground
         before, after = true_ground(ground, drive.seed).truth.c_rr, scene.truth.c_rr
         return cls(window_of(scene.truth), np.maximum(before / after, after / before) > UNTOUCHED)
 
 
-def changes(recorded: Recorded, whole: Segments, found: SegmentRepairs, ground: ChangedGround) -> list[Changes]:
+def changes(recorded: Recorded, whole: Segments, seen: SegmentRepairs, ground: ChangedGround) -> list[Changes]:
     """Of segments, of cells as they are read usually, and of cells with `repairs`."""
     half_ns, window = recorded.half_ns, ground.window
     shape = (window.rows, window.columns)
     far = cv2.dilate(ground.changed.astype(np.uint8), np.ones((2 * ALARM_CELLS + 1,) * 2, np.uint8)) == 0
-    since_ns = {of: np.zeros(shape, np.int64) for of in (CELLS, CELLS_REPAIRS)}
-    false: dict[str, Bools] = {of: np.zeros(shape, np.bool_) for of in since_ns}
+    since_ns = {kind: np.zeros(shape, np.int64) for kind in (CELLS, CELLS_REPAIRS)}
+    false: dict[str, Bools] = {kind: np.zeros(shape, np.bool_) for kind in since_ns}
     grid = Grid(CELL_M, FoldConfig())
-    for now_ns, said in maps_of_changes(recorded, whole, found, window, grid):
-        for of, here in said.items():
-            since_ns[of] = np.where(here, np.where(since_ns[of] > 0, since_ns[of], now_ns), 0)
-            false[of] |= here if now_ns < half_ns else here & far
-    resistance = read_cells(view_of(grid, window, ServerConfig()), window, ("resistance",), CELL_M, ServerConfig())
-    known_km2 = int(np.isfinite(resistance["resistance"]).sum()) * CELL_M**2 / 1e6
-    km2_days = known_km2 * (recorded.end_ns - recorded.start_ns) / 1e9 / DAY_S
-    passes = CellPasses.of(recorded.tracks.values(), window)
+    for now_ns, said in maps_of_changes(recorded, whole, seen, window, grid):
+        for kind, here in said.items():
+            since_ns[kind] = np.where(here, np.where(since_ns[kind] > 0, since_ns[kind], now_ns), 0)
+            false[kind] |= here if now_ns < half_ns else here & far
+    km2_days = _known_km2(grid, window) * (recorded.end_ns - recorded.start_ns) / 1e9 / DAY_S
+    passes = CellPasses.of_tracks(recorded.tracks.values(), window)
     return [
-        _of_segments(found, km2_days),
-        *(_of_cells(of, since_ns[of], false[of], passes, ground, half_ns, km2_days) for of in since_ns),
+        _of_segments(seen, km2_days),
+        *(_of_cells(kind, since_ns[kind], false[kind], passes, ground, half_ns, km2_days) for kind in since_ns),
     ]
 
 
 def maps_of_changes(
-    recorded: Recorded, whole: Segments, found: SegmentRepairs, window: CellWindow, grid: Grid
+    recorded: Recorded, whole: Segments, seen: SegmentRepairs, window: CellWindow, grid: Grid
 ) -> Iterator[tuple[int, dict[str, Bools]]]:
     """Fold a recording into a grid; every STEP_S, a stamp and which cells (rows, columns) are said to have changed."""
     config = ServerConfig()
     rows = np.concatenate(list(recorded.rows.values()))
-    names = np.repeat(
-        np.array([name_hash(name) for name in recorded.rows], np.uint64), [len(each) for each in recorded.rows.values()]
-    )
+    hashes = np.array([name_hash(name) for name in recorded.rows], np.uint64)
+    names = np.repeat(hashes, [len(table) for table in recorded.rows.values()])
     order = np.argsort(rows["stamp_ns"], kind="stable")
     rows, names, done = rows[order], names[order], 0
     step_ns = round(STEP_S * 1e9)
@@ -150,11 +147,14 @@ def maps_of_changes(
         grid.fold_all(rows[done:end], names[done:end])
         done = end
         pages = view_of(grid, window, config).pages
-        repaired = ages(whole, [each for each in found.shown if each.seen_ns <= now_ns], CELL_M)
-        yield (
-            now_ns,
-            {of: _said(pages, window, known, config) for of, known in ((CELLS, {}), (CELLS_REPAIRS, repaired))},
-        )
+        known = {CELLS: {}, CELLS_REPAIRS: ages(whole, [one for one in seen.shown if one.seen_ns <= now_ns], CELL_M)}
+        yield now_ns, {kind: _said(pages, window, since, config) for kind, since in known.items()}
+
+
+def _known_km2(grid: Grid, window: CellWindow) -> float:
+    config = ServerConfig()
+    layers = read_cells(view_of(grid, window, config), window, ("resistance",), CELL_M, config)
+    return int(np.isfinite(layers["resistance"]).sum()) * CELL_M**2 / 1e6
 
 
 def _said(pages: Pages, window: CellWindow, known: Ages, config: ServerConfig) -> Bools:
@@ -165,24 +165,24 @@ def _said(pages: Pages, window: CellWindow, known: Ages, config: ServerConfig) -
     return out > 0
 
 
-def _of_segments(found: SegmentRepairs, km2_days: float) -> Changes:
-    driven = [each for each in found.true if len(each.passes_ns)]
+def _of_segments(seen: SegmentRepairs, km2_days: float) -> Changes:
+    driven = [each for each in seen.true if len(each.passes_ns)]
     return Changes(
-        of=SEGMENTS,
+        kind=SEGMENTS,
         passes=[len(each.passes_ns) for each in driven],
         needed=[each.needed for each in driven],
         minutes=[
             None if each.shown_ns is None else (each.shown_ns - int(each.passes_ns[0])) / MINUTE_NS for each in driven
         ],
-        said=len(found.shown),
-        right=len(found.shown) - len(found.false),
-        false_alarms=len(found.false),
+        said=len(seen.shown),
+        right=len(seen.shown) - len(seen.false),
+        false_alarms=len(seen.false),
         km2_days=km2_days,
     )
 
 
 def _of_cells(
-    of: str, since_ns: Ints, false: Bools, passes: CellPasses, ground: ChangedGround, half_ns: int, km2_days: float
+    kind: str, since_ns: Ints, false: Bools, passes: CellPasses, ground: ChangedGround, half_ns: int, km2_days: float
 ) -> Changes:
     """since_ns (rows, columns): from when on cells were said to have changed, to the end; 0 for those that are not."""
     since, later = since_ns.ravel(), passes.begin_ns >= half_ns
@@ -196,7 +196,7 @@ def _of_cells(
     minutes = np.maximum(since - first_ns, 0)[cells] / MINUTE_NS
     areas, _ = cv2.connectedComponents(false.astype(np.uint8), connectivity=8)
     return Changes(
-        of=of,
+        kind=kind,
         passes=driven[1][cells].tolist(),
         needed=[count if known else None for count, known in zip(needed[cells].tolist(), shown, strict=True)],
         minutes=[value if known else None for value, known in zip(minutes.tolist(), shown, strict=True)],
@@ -219,13 +219,14 @@ class CellPasses:
     end_ns: Ints
 
     @classmethod
-    def of(cls, tracks: Iterable[TrueTrack], window: CellWindow) -> CellPasses:
+    def of_tracks(cls, tracks: Iterable[TrueTrack], window: CellWindow) -> CellPasses:
         """Those of machines in a window."""
         parts = [_passes(track, window) for track in tracks]
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def _passes(track: TrueTrack, window: CellWindow) -> tuple[Ints, Ints, Ints]:
+    """One machine's, as CellPasses has them: stays on cells, of which those of the same minute are joined."""
     driven_m = np.cumsum(track.step_m)
     at_m = np.arange(0.0, driven_m[-1] + TRACK_STEP_M, TRACK_STEP_M)
     column, row = (

@@ -160,9 +160,10 @@ def _solve(task: Task[Judging], cache: Path) -> Judged:
     recorded = _recorded(drive, cache)
     whole = roads(recorded.rows)
     if what.case.repairs:
-        found, ground = SegmentRepairs.of(recorded, whole), ChangedGround.of(drive, scene(drive, cache), cache)
-        detected = changes(recorded, whole, found, ground)
-        return Judged(repair_figures(recorded, whole, found), [asdict(each) for each in detected])
+        seen = SegmentRepairs.of_recording(recorded, whole)
+        ground = ChangedGround.of_drive(drive, scene(drive, cache), cache)
+        detected = changes(recorded, whole, seen, ground)
+        return Judged(repair_figures(recorded, whole, seen), [asdict(each) for each in detected])
     figures = road_figures(recorded, whole) | traffic_figures(recorded, whole)
     if what.other is None:
         return Judged(figures | {"kept_day_pct": math.nan})

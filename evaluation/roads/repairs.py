@@ -58,7 +58,7 @@ class SegmentRepairs:
     halves: tuple[TrueTraffic, TrueTraffic]
 
     @classmethod
-    def of(cls, recorded: Recorded, whole: Segments) -> SegmentRepairs:
+    def of_recording(cls, recorded: Recorded, whole: Segments) -> SegmentRepairs:
         """Those of a recording, on the roads of all of it."""
         ledgers, kept = Ledgers(whole), PassTally()
         for name, table in recorded.rows.items():
@@ -93,11 +93,11 @@ def shown_at(later: Mapping[str, Ints], machines: Collection[str], seen: int | N
     return min(ends_ns, default=(seen + 1) * MINUTE_NS)
 
 
-def repair_figures(recorded: Recorded, whole: Segments, found: SegmentRepairs) -> dict[str, float]:
+def repair_figures(recorded: Recorded, whole: Segments, seen: SegmentRepairs) -> dict[str, float]:
     """Counts of repairs and of false alarms, and the work that they save an hour [J], known and true."""
-    before, after = found.halves
-    judged = [each for each in found.true if len(each.passes_ns) > SEEN[-1]]
-    repaired = [each.segment for each in found.true]
+    before, after = seen.halves
+    judged = [each for each in seen.true if len(each.passes_ns) > SEEN[-1]]
+    repaired = [each.segment for each in seen.true]
     halves = recorded.part(0, recorded.half_ns), recorded.part(recorded.half_ns)
     saved = [
         losses(Ledgers(whole).ledger(tally_of(part).table(), Tally().slot_ns), whole, TARGET).work_j for part in halves
@@ -105,9 +105,9 @@ def repair_figures(recorded: Recorded, whole: Segments, found: SegmentRepairs) -
     return {
         "repairs": len(judged),
         **{f"seen_{most}": sum(each.needed is not None and each.needed <= most for each in judged) for most in SEEN},
-        "looks": found.looks,
-        "false_alarms": len(found.false),
-        **_cells_shown(recorded, whole, found.shown, (before.c_rr, after.c_rr), [each.segment for each in judged]),
+        "looks": seen.looks,
+        "false_alarms": len(seen.false),
+        **_cells_shown(recorded, whole, seen.shown, (before.c_rr, after.c_rr), [each.segment for each in judged]),
         "saved_j": float((saved[0] - saved[1])[repaired].sum()),
         "true_saved_j": float((before.work_j - after.work_j)[repaired].sum()),
     }

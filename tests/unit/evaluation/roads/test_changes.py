@@ -43,19 +43,19 @@ def drive(later: int, *, repaired: bool = True) -> Recorded:
     return Recorded(rows, tracks, START_NS, START_NS + round(2 * HALF_S * 1e9))
 
 
-def found(recorded: Recorded) -> tuple[SegmentRepairs, dict[str, Changes]]:
+def judged(recorded: Recorded) -> tuple[SegmentRepairs, dict[str, Changes]]:
     whole = roads(recorded.rows)
-    seen = SegmentRepairs.of(recorded, whole)
-    return seen, {each.of: each for each in changes(recorded, whole, seen, changed_ground())}
+    seen = SegmentRepairs.of_recording(recorded, whole)
+    return seen, {each.kind: each for each in changes(recorded, whole, seen, changed_ground())}
 
 
 @pytest.mark.slow
 def test_a_repaired_stretch_has_the_figures_that_are_stored():
     """A segment has the cells of its line, also those before and behind the stretch: figures of `cells, repairs`."""
-    _, each = found(drive(7))
-    rows = {of: rounded(pooled([part]), 1) for of, part in each.items()}
+    _, each = judged(drive(7))
+    rows = {kind: rounded(pooled([part]), 1) for kind, part in each.items()}
     kept = ("changed", "said", "precision_pct", "recall_1_pct", "by_2_pct", "delay_passes", "false_alarms")
-    assert {of: [row[name] for name in kept] for of, row in rows.items()} == {
+    assert {kind: [row[name] for name in kept] for kind, row in rows.items()} == {
         SEGMENTS: [2, 3, 100.0, 100.0, 100.0, 2.0, 0],
         CELLS: [120, 236, 100.0, 98.3, 1.7, 3.0, 0],
         CELLS_REPAIRS: [120, 374, 79.9, 100.0, 98.3, 1.0, 1],
@@ -64,7 +64,7 @@ def test_a_repaired_stretch_has_the_figures_that_are_stored():
 
 @pytest.mark.slow
 def test_a_change_that_nothing_shows_is_found_nowhere():
-    _, each = found(drive(3, repaired=False))
+    _, each = judged(drive(3, repaired=False))
     for part in each.values():
         assert (part.said, part.right, part.false_alarms) == (0, 0, 0)
     assert set(each[CELLS].needed) == {None}
@@ -77,7 +77,7 @@ def test_a_change_that_nothing_shows_is_found_nowhere():
 def test_what_is_said_of_ground_that_did_not_change_is_wrong_and_an_alarm():
     recorded, nothing = drive(7), ChangedGround(WINDOW, np.zeros((WINDOW.rows, WINDOW.columns), np.bool_))
     whole = roads(recorded.rows)
-    for part in changes(recorded, whole, SegmentRepairs.of(recorded, whole), nothing)[1:]:
+    for part in changes(recorded, whole, SegmentRepairs.of_recording(recorded, whole), nothing)[1:]:
         assert part.said > 200
         assert (part.right, part.false_alarms, part.passes) == (0, 1, [])
 
@@ -92,14 +92,14 @@ def track(*points: tuple[float, float, float]) -> TrueTrack:
 
 def test_what_a_machine_drives_on_a_cell_within_a_minute_is_one_pass():
     line = track((0, 0.5, 0.5), (10, 4.5, 0.5), (20, 0.5, 0.5), (30, 4.5, 0.5), (200, 4.5, 0.5), (240, 0.5, 0.5))
-    over = CellPasses.of([line], CellWindow(0, 0, 4, 1))
+    over = CellPasses.of_tracks([line], CellWindow(0, 0, 4, 1))
     assert over.cell.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
     assert over.begin_ns[over.cell == 0] / 1e9 == pytest.approx([0, 235], abs=1)
     assert over.end_ns[over.cell == 0] / 1e9 == pytest.approx([21.25, 240], abs=1)
 
 
 def test_who_stands_on_a_cell_passes_it_once():
-    over = CellPasses.of(
+    over = CellPasses.of_tracks(
         [track((0, 0.5, 0.5), (10, 2.5, 0.5), (300, 2.5, 0.5), (310, 5.5, 0.5))], CellWindow(0, 0, 6, 1)
     )
     assert over.cell.tolist() == list(range(6))
@@ -108,7 +108,7 @@ def test_who_stands_on_a_cell_passes_it_once():
 
 def test_two_machines_have_a_pass_each_and_what_is_outside_counts_nowhere():
     ways = [track((0, -3.0, 0.5), (10, 2.0, 0.5)), track((5, 1.5, 3.0), (9, 1.5, -3.0))]
-    over = CellPasses.of(ways, CellWindow(0, 0, 2, 2))
+    over = CellPasses.of_tracks(ways, CellWindow(0, 0, 2, 2))
     assert sorted(over.cell.tolist()) == [0, 1, 1, 3]
 
 
@@ -116,7 +116,7 @@ def test_figures_are_of_all_places_of_all_recordings():
     one = Changes("cells", [1, 2, 3, 5], [1, None, 3, 2], [0.0, None, 4.0, 2.0], 10, 8, 1, 0.25)
     other = Changes("cells", [3], [None], [None], 0, 0, 0, 0.25)
     assert pooled([one, other]) == {
-        "of": "cells",
+        "kind": "cells",
         "changed": 5,
         "said": 10,
         "precision_pct": 80.0,
@@ -137,10 +137,10 @@ def test_figures_are_of_all_places_of_all_recordings():
 
 
 def test_rows_are_of_each_kind_and_none_without_repairs():
-    part = {"of": "cells", "passes": [2], "needed": [2], "minutes": [1.23456]}
+    part = {"kind": "cells", "passes": [2], "needed": [2], "minutes": [1.23456]}
     part |= {"said": 1, "right": 1, "false_alarms": 0, "km2_days": 0.001}
-    rows = experiment.change_rows([[part, {**part, "of": "segments"}]] * 2)
-    assert [(row["of"], row["changed"], row["delay_min"]) for row in rows] == [
+    rows = experiment.change_rows([[part, {**part, "kind": "segments"}]] * 2)
+    assert [(row["kind"], row["changed"], row["delay_min"]) for row in rows] == [
         ("cells", 2, 1.235),
         ("segments", 2, 1.235),
     ]
