@@ -166,9 +166,9 @@ class Client:
             tiles += answer.tiles
         return replace(first, tiles=tuple(tiles), next_place=None)
 
-    def why(self, x_m: float, y_m: float, *, as_of_ns: int | None = None) -> CellReasons:
+    def why(self, x_m: float, y_m: float, *, as_of_ns: int | None = None, repairs: bool = False) -> CellReasons:
         """Everything that is known of the cell at a position in `map`: votes, passes, machines, changes."""
-        return decode_why(self._ask(requests.WhyQuery(float(x_m), float(y_m), as_of_ns)))
+        return decode_why(self._ask(requests.WhyQuery(float(x_m), float(y_m), as_of_ns, repairs)))
 
     def segments(
         self,

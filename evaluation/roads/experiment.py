@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,10 @@ from evaluation.campaign.experiment import Experiment, Runner, Task, read_result
 from evaluation.campaign.figures import Goal, Report, Row, judge, rounded
 from evaluation.fleet import drives
 from evaluation.fleet.drives import Agent, AgentSamples, scene
+from evaluation.roads.changes import ChangedGround, Changes, changes, pooled
 from evaluation.roads.drives import RoadDrive, planned
-from evaluation.roads.score import Recorded, kept_after, repair_figures, road_figures, roads, traffic_figures
+from evaluation.roads.repairs import SegmentRepairs, repair_figures
+from evaluation.roads.score import Recorded, kept_after, road_figures, roads, traffic_figures
 from protocol.errors import ConfigError
 
 REPAIRS_S = 1500.0 / 900.0  # times as long as the other recordings: passes before, and after
@@ -82,9 +84,10 @@ class Judging:
 
 @dataclass(frozen=True)
 class Judged:
-    """Figures of one recording, by name."""
+    """Figures of one recording, by name. changes: `Changes` as plain values, of repairs alone."""
 
     figures: dict[str, float]
+    changes: list[Row] = field(default_factory=list)
 
 
 def run(runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[RoadCase] = CASES) -> tuple[Report, None]:
@@ -92,7 +95,7 @@ def run(runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[Ro
 
     Case by case, each seed judged as it is replayed, so that a run that is broken off has whole rows to go on from.
     """
-    table = []
+    table, detected = [], []
     for case in cases:
         runner.run(drives.EXPERIMENT, [task for seed in seeds for task in agent_tasks(case.drive(seed, seconds))])
         others = [*seeds[1:], seeds[0]] if len(seeds) > 1 else [None]
@@ -100,10 +103,12 @@ def run(runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[Ro
             replay_task(Judging(case, seconds, None if case.repairs else other), case.drive(seed, seconds))
             for seed, other in zip(seeds, others, strict=True)
         ]
-        table.append(summarise(case, [judged.figures for judged in runner.run(EXPERIMENT, tasks)]))
+        judged = runner.run(EXPERIMENT, tasks)
+        table.append(summarise(case, [each.figures for each in judged]))
+        detected += change_rows([each.changes for each in judged])
     goals = [goal for goal in GOALS if goal.row["case"] in {case.name for case in cases}]
-    report = {"seeds": list(seeds), "seconds": seconds, "rows": table, "goals": judge(goals, table)}
-    return report | {"beyond": beyond(goals, table, seeds)}, None
+    report = {"seeds": list(seeds), "seconds": seconds, "rows": table, "changes": detected}
+    return report | {"goals": judge(goals, table), "beyond": beyond(goals, table, seeds)}, None
 
 
 def beyond(goals: Sequence[Goal], table: Sequence[Row], seeds: Sequence[int]) -> list[Row]:
@@ -151,10 +156,14 @@ def _recorded(drive: RoadDrive, cache: Path) -> Recorded:
 def _solve(task: Task[Judging], cache: Path) -> Judged:
     """Judge one recording."""
     what = task.variant
-    recorded = _recorded(what.case.drive(task.seed, what.seconds), cache)
+    drive = what.case.drive(task.seed, what.seconds)
+    recorded = _recorded(drive, cache)
     whole = roads(recorded.rows)
     if what.case.repairs:
-        return Judged(repair_figures(recorded, whole))
+        seen = SegmentRepairs.of_recording(recorded, whole)
+        ground = ChangedGround.of_drive(drive, scene(drive, cache), cache)
+        detected = changes(recorded, whole, seen, ground)
+        return Judged(repair_figures(recorded, whole, seen), [asdict(each) for each in detected])
     figures = road_figures(recorded, whole) | traffic_figures(recorded, whole)
     if what.other is None:
         return Judged(figures | {"kept_day_pct": math.nan})
@@ -185,6 +194,12 @@ def summarise(case: RoadCase, rows: Sequence[dict[str, float]]) -> Row:
         },
         DIGITS,
     )
+
+
+def change_rows(by_seed: Sequence[Sequence[Row]]) -> list[Row]:
+    """A row for each kind of place, of all seeds; none where nothing was repaired."""
+    kinds = zip(*([Changes(**row) for row in own] for own in by_seed), strict=True)
+    return [rounded(pooled(of_kind), DIGITS, km2_days=8) for of_kind in kinds]
 
 
 def _percent_off(value: float, true: float) -> float:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,34 +12,27 @@ from scipy.spatial import cKDTree
 from evaluation.fleet.cases import Rows
 from evaluation.fleet.drives import FleetDrive, Scene
 from evaluation.fleet.solving import calibrated, of_machine
-from evaluation.roads.truth import TrueTrack, TrueTraffic, true_passes, true_tracks, true_traffic
-from mapserver.config import ServerConfig
+from evaluation.roads.truth import TrueTrack, TrueTraffic, true_tracks, true_traffic
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import corrected
-from mapserver.query.views import read_cells, view_of
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.loss import SIGMA_90, Losses, losses
 from mapserver.roads.network import network
-from mapserver.roads.passes import PassTally
-from mapserver.roads.repairs import Repair, ages, repairs
 from mapserver.roads.segments import Segments, segments
 from mapserver.roads.skeleton import Skeletons
 from mapserver.roads.tally import PER_M, Tally
 from mapserver.roads.worklist import TIE_SHARE, ranked
-from protocol.arrays import Bools, Floats, Ints
-from protocol.site.geometry import BLOCK_CELLS, CellWindow
+from protocol.arrays import Bools, Floats
+from protocol.site.geometry import CellWindow
 
 TARGET = 0.02
 NEAR_M = 3.0  # of a road
 SPACING_M = 0.5  # of points on roads that are looked at
 LEAST_PASSES = 1.5  # true ones, for a segment to be judged
 TOP = 10
-CHANGED = (1.5, 4.0)  # factors of c_rr that a repair is judged by
-UNTOUCHED = 1.1  # less is no change: its share of a segment lies at a border
-SEEN = (2, 3)  # passes after which a repair should be seen
 SHARE_OFF = 0.1  # of metres that go in one direction: more is the wrong direction
-MINUTE_NS, DAY_NS = 60_000_000_000, 86_400_000_000_000
+DAY_NS = 86_400_000_000_000
 STEP_M = 0.02  # in a tenth of a second: a machine that moves
 EVERYWHERE = CellWindow(-20_000, -20_000, 40_000, 40_000)
 
@@ -203,84 +195,3 @@ def kendall(one: Floats, other: Floats, one_tie: float, other_tie: float) -> flo
         signs.append(np.where(np.abs(difference) < tie, 0.0, np.sign(difference)))
     pairs = np.sqrt((signs[0] != 0).sum() * float((signs[1] != 0).sum()))
     return float((signs[0] * signs[1]).sum() / max(pairs, 1.0))
-
-
-def repair_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
-    """Counts of repairs and of false alarms, and the work that they save an hour [J], known and true."""
-    ledgers, kept = Ledgers(whole), PassTally()
-    for name, table in recorded.rows.items():
-        kept.add(table, np.full(len(table), name_hash(name), np.uint64))
-    passes = kept.passes(ledgers)
-    shown, looks = repairs(passes)
-    half_ns, tracks = recorded.half_ns, tuple(recorded.tracks.values())
-    halves = ((0, half_ns), (half_ns, 2**62))
-    before, after = (true_traffic(tracks, ledgers, TARGET, *half) for half in halves)
-    factor = np.maximum(before.c_rr / after.c_rr, after.c_rr / before.c_rr)
-    half_minute = half_ns // MINUTE_NS
-    repaired = np.flatnonzero((factor >= CHANGED[0]) & (factor <= CHANGED[1]))
-    seen_by = {each.segment: each.seen for each in reversed(shown) if each.minute >= half_minute - 1}
-    names = sorted(recorded.rows, key=name_hash)  # in the order of their numbers
-    needed, judged = [], []
-    for segment in repaired.tolist():
-        later = {name: true_passes(track, ledgers, segment, half_ns) for name, track in recorded.tracks.items()}
-        if sum(map(len, later.values())) > SEEN[-1]:
-            judged.append(segment)
-            last = (passes.segment == segment) & (passes.minute == seen_by.get(segment, -1))
-            needed.append(_needed(later, [names[i] for i in passes.machine[last]], seen_by.get(segment)))
-    false = [each for each in shown if factor[each.segment] < UNTOUCHED or each.minute < half_minute - 1]
-    saved = [
-        losses(Ledgers(whole).ledger(tally_of(part).table(), Tally().slot_ns), whole, TARGET).work_j
-        for part in (recorded.part(*half) for half in halves)
-    ]
-    return {
-        "repairs": len(judged),
-        **{f"seen_{most}": int(sum(count <= most for count in needed)) for most in SEEN},
-        "looks": looks,
-        "false_alarms": len(false),
-        **_cells_shown(recorded, whole, shown, (before.c_rr, after.c_rr), judged),
-        "saved_j": float((saved[0] - saved[1])[repaired].sum()),
-        "true_saved_j": float((before.work_j - after.work_j)[repaired].sum()),
-    }
-
-
-def _needed(later: Mapping[str, Ints], machines: Collection[str], seen: int | None) -> float:
-    """How many true passes there were until, and with, the one that showed a change: in this minute, by one of these.
-
-    later: stamps at which each machine had passed, after the change.
-    """
-    if seen is None:
-        return math.inf
-    ends_ns = [stamp for name in machines for stamp in later[name].tolist() if stamp >= seen * MINUTE_NS]
-    shown_ns = min(ends_ns, default=(seen + 1) * MINUTE_NS)
-    return sum(int((stamps <= shown_ns).sum()) for stamps in later.values())
-
-
-def _cells_shown(
-    recorded: Recorded, whole: Segments, shown: Sequence[Repair], true: tuple[Floats, Floats], judged: Sequence[int]
-) -> dict[str, float]:
-    """How many cells judged segments have, and how many are nearer to what is true after the repair than to before.
-
-    changed: read by changes of cells alone; since: as well as by those of segments.
-    """
-    grid, config = grid_of(recorded.rows), ServerConfig()
-    everything = [Repair(segment, 1, 1, 0.0, 0.0) for segment in judged]
-    blocks = ages(whole, everything, 1.0)
-    out = {"cells": 0.0, "cells_changed": 0.0, "cells_since": 0.0}
-    if not blocks:
-        return out
-    n = BLOCK_CELLS
-    places = np.concatenate([np.argwhere(own.reshape(n, n))[:, ::-1] + n * np.array(at) for at, own in blocks.items()])
-    left, bottom = places.min(axis=0).tolist()
-    columns, rows = (places.max(axis=0) + 1 - places.min(axis=0)).tolist()
-    window = CellWindow(left, bottom, columns, rows)
-    middles = np.concatenate([whole.line(i) for i in judged])
-    owner = np.repeat(judged, [len(whole.line(i)) for i in judged])
-    own = owner[cKDTree(middles).query(places + 0.5)[1]]
-    for name, known in (("cells_changed", {}), ("cells_since", ages(whole, shown, 1.0))):
-        view = replace(view_of(grid, window, config), ages=known)
-        c_rr = read_cells(view, window, ("resistance",), 1.0, config)["resistance"]
-        values = c_rr[places[:, 1] - bottom, places[:, 0] - left].astype(np.float64)
-        before, after = (values_of[own] for values_of in true)
-        out[name] = float((np.abs(values - after) < np.abs(values - before)).sum())
-        out["cells"] = float(np.isfinite(values).sum())
-    return out

@@ -75,6 +75,10 @@ class Answers:
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
 
     @property
+    def _reach(self) -> int:
+        return reach_blocks(self._site.cell_m, self._config.change)
+
+    @property
     def _past(self) -> PastMaps:
         return PastMaps(self._source.location, self._source.past, self._config)
 
@@ -227,7 +231,10 @@ class Answers:
     def why(self, query: WhyQuery) -> CellReasons:
         """Everything that is known of the cell that a position lies in."""
         window = self._cell(query.x_m, query.y_m)
-        view = self._view(window, query.as_of_ns)
+        if query.repairs:
+            view = self._roads.view(window, self._reach, query.as_of_ns)
+        else:
+            view = self._view(window, query.as_of_ns)
         names = self._source.run(lambda state: [name for name in state.machines() if name not in state.facts.excluded])
         return reasons(view, (window.column, window.row), names, self._site.cell_m, self._config)
 
@@ -272,8 +279,7 @@ class Answers:
             return self._now(lambda state: self._layers.look(state, window, names), repairs=repairs)
         wide = widened(window, cell_layers.margin_cells(names, self._site.cell_m, self._config.read))
         if repairs:
-            reach = reach_blocks(self._site.cell_m, self._config.change)
-            return self._layers.look_at(self._roads.view(wide, reach, as_of_ns))
+            return self._layers.look_at(self._roads.view(wide, self._reach, as_of_ns))
         return self._layers.look_at(self._view(wide, as_of_ns))
 
     def _now(self, look: Callable[[MapState | StillMap], Look], *, repairs: bool) -> Look:

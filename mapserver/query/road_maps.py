@@ -157,8 +157,8 @@ class RoadMaps:
         except QueryError as error:  # asked again after LATELY_S
             log.warning("no road map reason=%s problem=%r", error.reason, str(error))
 
-    def view(self, window: CellWindow, reach: int, as_of_ns: int) -> View:
-        """Evidence of a window and of `reach` blocks around as of a time, with the ages that changes of roads give."""
+    def view(self, window: CellWindow, reach: int, as_of_ns: int | None) -> View:
+        """Evidence of a window and of `reach` blocks around, with the ages of roads; now, or as of a time."""
         roads, (left, bottom, right, top) = self.read(as_of_ns), _blocks_of(surroundings(window, reach))
         near = {
             block: pages

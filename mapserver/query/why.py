@@ -35,7 +35,7 @@ def reasons(
     """
     block = cell[0] // BLOCK_CELLS, cell[1] // BLOCK_CELLS
     pages = view.pages.get(block, ())
-    first = valid_pages(view.pages, cell_m, config.change).get(block)
+    first = valid_pages(view.pages, cell_m, config.change, view.ages).get(block)
     place = cell[1] % BLOCK_CELLS * BLOCK_CELLS + cell[0] % BLOCK_CELLS
     holds = _one(evidence([pages], None if first is None else [first]), place)
     everything = _one(evidence([pages]), place)

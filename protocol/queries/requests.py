@@ -203,11 +203,12 @@ class TilesQuery:
 
 @dataclass(frozen=True)
 class WhyQuery:
-    """Everything that is known of the cell at a position in `map` [m]."""
+    """Everything that is known of the cell at a position in `map` [m]. repairs: as in `When`."""
 
     x_m: float
     y_m: float
     as_of_ns: int | None = None
+    repairs: bool = False
     fresh = ANY_ROW
 
     name = "why"
@@ -250,7 +251,7 @@ def encode_query(query: MapQuery) -> dict[str, str]:
             return _of_tiles(query)
         case WhyQuery():
             place = {"x": ps.text_of(query.x_m), "y": ps.text_of(query.y_m)}
-            return place | ps.text_of_stamps({"as_of": query.as_of_ns})
+            return place | ps.text_of_stamps({"as_of": query.as_of_ns}) | ({"repairs": "1"} if query.repairs else {})
     parameters = {}
     if isinstance(query, PointQuery | PointsQuery | RegionQuery | HistoryQuery):
         parameters = _of_map(query)
@@ -267,7 +268,9 @@ def reads_past(query: MapQuery) -> bool:
     """Whether the server has to read its journal for a query, which takes a while."""
     if isinstance(query, RoadQuery):
         return True
-    if isinstance(query, TilesQuery | WhyQuery | RouteQuery | WayQuery):
+    if isinstance(query, WhyQuery):
+        return query.as_of_ns is not None or query.repairs
+    if isinstance(query, TilesQuery | RouteQuery | WayQuery):
         return query.as_of_ns is not None
     if isinstance(query, PointQuery | PointsQuery | RegionQuery):
         return query.when != NOW
@@ -370,7 +373,8 @@ def _parse_tiles(parameters: ps.Parameters) -> TilesQuery:
 
 
 def _parse_why(parameters: ps.Parameters) -> WhyQuery:
-    return WhyQuery(*_place(parameters), ps.stamp(parameters, "as_of"))
+    repairs = ps.flag(parameters, "repairs", default=False)
+    return WhyQuery(*_place(parameters), ps.stamp(parameters, "as_of"), repairs)
 
 
 _FRESH = ("after", "wait")
@@ -384,7 +388,7 @@ _QUERIES: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], MapQuery]]]
     "calibration": (_FRESH, lambda parameters: CalibrationQuery(ps.freshness(parameters))),
     "changes": (("after",), lambda parameters: ChangesQuery(ps.count(parameters, "after"))),
     "tiles": (("store", "row", "fact", "as_of", "place"), _parse_tiles),
-    "why": (("x", "y", "as_of"), _parse_why),
+    "why": (("x", "y", "as_of", "repairs"), _parse_why),
     "segments": ((*SEGMENTS, *_FRESH), parse_segments),
     "worklist": ((*WORKLIST, *_FRESH), parse_worklist),
     "route": ((*ROUTE, *_FRESH), parse_route),

@@ -22,11 +22,8 @@ PLACE |= {"lat": "latitude [deg], with lon in place of x and y", "lon": "longitu
 AS_OF = {"as_of": "the map as of this time, ISO 8601 or nanoseconds since 1970 (UTC)"}
 LAYERS = {"layers": "names, comma-separated; without it all"}
 BOUNDS = {"bounds": "west,south,east,north [m]"}
-WHEN = {
-    **AS_OF,
-    "minus": "less the map as of this time, value by value",
-    "repairs": "1: cells of roads whose ground changed, from the samples since (default 0)",
-}
+REPAIRS = {"repairs": "1: cells of roads whose ground changed, from the samples since (default 0)"}
+WHEN = {**AS_OF, "minus": "less the map as of this time, value by value", **REPAIRS}
 GEOJSON = ("application/geo+json",)
 
 

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion
 from protocol.queries.parameters import text_of
-from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery
+from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, WhyQuery
 from sitegrid.web import features, roads, values
 from sitegrid.web.problems import bad
 from sitegrid.web.resource import (
@@ -19,6 +19,7 @@ from sitegrid.web.resource import (
     GEOJSON,
     LAYERS,
     PLACE,
+    REPAIRS,
     WHEN,
     Resource,
     as_geojson,
@@ -59,7 +60,12 @@ async def points(feed: SiteFeed, parameters: Parameters) -> Response:
 async def why(feed: SiteFeed, parameters: Parameters) -> Response:
     """Everything that is known of the cell at a position."""
     x_m, y_m = values.place(parameters, await feed.projection())
-    return as_json(await feed.ask(feed.client.why, x_m, y_m, as_of_ns=values.stamp(parameters, "as_of")))
+    rest = {name: text for name, text in parameters.items() if name not in PLACE}
+    query = parsed("why", {**rest, "x": text_of(x_m), "y": text_of(y_m)}, TIMES)
+    assert isinstance(query, WhyQuery)
+    return as_json(
+        await feed.ask(feed.client.why, query.x_m, query.y_m, as_of_ns=query.as_of_ns, repairs=query.repairs)
+    )
 
 
 async def region(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -166,7 +172,7 @@ RESOURCES: dict[str, Resource] = {
     "points": Resource(
         points, "Layers of the cells at many positions", {"places": "x,y;x,y;... [m]", **LAYERS, **WHEN}
     ),
-    "why": Resource(why, "Why the cell at a position has its value", {**PLACE, **AS_OF}),
+    "why": Resource(why, "Why the cell at a position has its value", {**PLACE, **AS_OF, **REPAIRS}),
     "region": Resource(
         region,
         "Layers of a rectangle or a polygon of cells",

@@ -147,7 +147,7 @@ def _selectors() -> Iterator[Decoder]:
         requests.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
         requests.TilesQuery(MapVersion("0123456789abcdef", 17, 3)),
         requests.TilesQuery(as_of_ns=T0, place=(-3, 12)),
-        requests.WhyQuery(12.0, 40.5, T0),
+        requests.WhyQuery(12.0, 40.5, T0, repairs=True),
         SegmentsQuery(T0, T0 + 10**12, None, Bounds(0.0, 0.0, 200.0, 150.0), "loader-1", fresh),
         WorklistQuery(0.03, 0.4, 10, None, None, T0, None, "", fresh),
         requests.MachinesQuery(fresh),

@@ -104,6 +104,9 @@ def test_a_repaired_road_is_read_as_it_is_since(web: WebSite):
     plain, since = (web.get("point", {**asked, "repairs": given}).json["values"]["resistance"] for given in (0, 1))
     assert since == web.client.point(x_m, y_m, ["resistance"], repairs=True).values["resistance"]
     assert abs(since - change.after) < abs(plain - change.after)
+    why = web.get("why", {"x": x_m, "y": y_m, "repairs": 1}).json
+    assert why["values"]["resistance"] == pytest.approx(since)
+    assert why["before"]["resistance"] == pytest.approx(change.before, rel=0.2)
     bounds = {"bounds": f"{x_m - 2},{y_m - 2},{x_m + 2},{y_m + 2}", "layers": "resistance", "repairs": 1}
     ours = web.client.region((x_m - 2, y_m - 2, x_m + 2, y_m + 2), ["resistance"], repairs=True)
     answer = web.get("region", bounds).json["layers"]["resistance"]

@@ -9,7 +9,7 @@ export const title = "Why this value?";
 export async function build(page, signal) {
   const [column, row] = page.cell;
   const at = { x: (column + 0.5) * page.map.cell_m, y: (row + 0.5) * page.map.cell_m, as_of: page.asOf() };
-  const why = await getJson(page.path("why"), at, signal);
+  const why = await getJson(page.path("why"), { ...at, repairs: at.as_of ? undefined : 1 }, signal);
   const where = `${(column * why.cell_m).toFixed(0)} to ${((column + 1) * why.cell_m).toFixed(0)} m E, ${(row * why.cell_m).toFixed(0)} to ${((row + 1) * why.cell_m).toFixed(0)} m N`;
   if (!why.metres) {
     return [element("section", { className: "part" }, element("p", { className: "say" }, "Nobody has driven over this cell. It stays hatched until a machine crosses it."), element("p", { className: "note" }, where))];

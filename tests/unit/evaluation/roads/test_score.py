@@ -7,7 +7,7 @@ from scipy.stats import kendalltau
 from evaluation.campaign.figures import judge
 from evaluation.roads import experiment
 from evaluation.roads.drives import BAD, planned
-from evaluation.roads.score import MINUTE_NS, Recorded, _needed, kendall, kept_after, roads
+from evaluation.roads.score import Recorded, kendall, kept_after, roads
 from protocol.errors import ConfigError
 from sim.scenario.file import load_scenario
 from tests.unit.mapserver.roads.drives import along, passes
@@ -125,12 +125,3 @@ def test_seeds_far_beyond_a_goal_are_named():
     table = [{"case": "haul_road", "by_seed": [good, bad]}]
     named = experiment.beyond(goals, table, [7, 8])
     assert {(row["name"], row["seed"], row["value"]) for row in named} == {(name, 8, bad[name]) for name in bad}
-
-
-def test_a_change_needs_the_passes_until_the_one_that_showed_it():
-    later = {"a": np.array([10, 40]) * MINUTE_NS, "b": np.array([11, 20]) * MINUTE_NS + 7, "c": np.array([], np.int64)}
-    assert _needed(later, ["b"], 11) == 2  # and not what drove in the rest of that minute
-    assert _needed(later, ["b"], 19) == 3  # it began in that minute, and ended later
-    assert _needed(later, ["a"], 40) == 4
-    assert _needed(later, ["c"], 11) == 2  # it was over half of the segment in no true pass
-    assert _needed(later, [], None) == np.inf

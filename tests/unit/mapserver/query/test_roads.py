@@ -17,6 +17,7 @@ from protocol.queries.requests import (
     RegionQuery,
     TilesQuery,
     When,
+    WhyQuery,
     encode_query,
     parse_query,
 )
@@ -214,6 +215,8 @@ def test_bounds_off_the_site_are_refused(writer):
         SegmentsQuery(5, 7, 9, Bounds(-1, -2, 3, 4), "a"),
         WorklistQuery(),
         PointQuery(1.0, 2.0, when=When(5, 6, repairs=True)),
+        WhyQuery(1.0, 2.0),
+        WhyQuery(1.0, 2.0, 5, repairs=True),
         WorklistQuery(0.03, 0.4, 7, 5, 7, 9, Bounds(-1, -2, 3, 4), "a b"),
     ],
 )
@@ -294,6 +297,24 @@ def test_a_found_change_begins_a_new_age_of_its_cells(repaired):
     point = answers.point(PointQuery(40.0, 10.0, ("resistance",), when=When(repairs=True)))
     assert point.values["resistance"] == pytest.approx(0.02, rel=0.2)
     assert point.merged == worklist(answers).merged
+
+
+def test_reasons_are_of_the_value_that_is_read_with_repairs(repaired):
+    opened, then_ns = repaired
+    answers = answers_of(opened)
+    now, plain, then = (
+        answers.why(WhyQuery(40.0, 10.0, as_of_ns, repairs))
+        for as_of_ns, repairs in ((None, True), (None, False), (then_ns, True))
+    )
+    for repairs, reasons in ((True, now), (False, plain)):
+        point = answers.point(PointQuery(40.0, 10.0, ("resistance", "visits"), when=When(repairs=repairs)))
+        assert {name: reasons.values[name] for name in point.values} == pytest.approx(point.values)
+        assert reasons.merged == point.merged
+    assert now.before["resistance"] == pytest.approx(0.06, rel=0.2)
+    assert now.changed_ns > then_ns
+    assert np.sum(now.resistance.votes) + np.sum(now.resistance.before) == pytest.approx(np.sum(plain.resistance.votes))
+    assert (plain.changed_ns, plain.before["resistance"]) == (0, None)
+    assert (then.changed_ns, then.values["resistance"]) == (0, pytest.approx(0.06, rel=0.2))
 
 
 def drive(answers, line=((15.0, 10.0), (205.0, 10.0)), **more):
