@@ -80,14 +80,14 @@ def test_each_step_of_a_drive_is_that_of_our_own_filter(
 def test_no_bit_differs_from_the_library(n: int, k: int, angles: bool) -> None:
     """Random beliefs, motions and measurements; filterpy goes from sigma point to sigma point."""
     of_motion, of_sensor = (0,) * angles, tuple(range(0, k, 2)) * angles
-    of = np.arange(k) % n  # states that are seen
+    seen = np.arange(k) % n  # states
     for seed in range(10):
         rng = np.random.default_rng(seed)
         belief = Belief(0, 2 * rng.normal(size=n), spread(rng, n))
         F, H = rng.normal(size=(n, n)), rng.normal(size=(k, n))
         # The order of columns is that of our models, whose values adjoin by state.
         f: Model = lambda s: np.asfortranarray(s + 0.1 * s * s)  # noqa: E731
-        h: Model = lambda s: np.asfortranarray(s[:, of] * s[:, :1])  # noqa: E731
+        h: Model = lambda s: np.asfortranarray(s[:, seen] * s[:, :1])  # noqa: E731
         moves = Motion(f, constant(F), spread(rng, n), of_motion)
         sensed = Measurement("a", 0, 3 * rng.normal(size=k), spread(rng, k), h, constant(H), of_sensor)
         for ours, theirs in ((TextbookUkf(), LibraryUkf()), (TextbookEkf(), LibraryEkf())):
