@@ -1,9 +1,9 @@
 """From readings to steps of the force balance: drive force over weight, less what the motion takes.
 
-With F the drive force, f the specific force ahead at `base_link`, a the wheels' acceleration, m the mass and lambda the
-rotating mass factor,
+With F the drive force, f the specific force ahead at `base_link`, a the wheels' acceleration, m the mass with
+payload, m_0 the one without, and lambda the rotating mass factor, which is stated of m_0: a load does not rotate,
 
-    F / (m g) - (f - g squat) / g - (lambda - 1) a / g  =  direction c_rr cos(slope)
+    F / (m g) - (f - g squat) / g - (lambda - 1) (m_0 / m) a / g  =  direction c_rr cos(slope)
 
 The accelerometer measures gravity's share of the slope as well, so the grade cancels.
 
@@ -159,7 +159,8 @@ class Balancer:
         on_front = front_share(machine, self.payload_kg, force)
         squat = squat_rad(machine, self.payload_kg, force)
         bend = self._climb_of_bend(on_front, squat)
-        unbalanced = share - force / g + squat - bend - (machine.rotating_mass_factor - 1) * accel / g
+        rotating = (machine.rotating_mass_factor - 1) * machine.mass_kg / self.mass_kg
+        unbalanced = share - force / g + squat - bend - rotating * accel / g
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
         self._force_sums, self._torque_sums = NO_SUMS, (0, 0.0)
         return Balance(
