@@ -20,6 +20,9 @@ STALE_S = 0.5  # torque or wheel readings older than this are missing
 MIN_SPEED_MPS = 0.4  # slower is a standstill
 MAX_PITCH_RADPS = 0.026  # 1.5 deg/s: at 2 m/s the slope changes by more than 2 degrees from axle to axle
 MAX_BRAKE_MPS2 = 1.5  # the wheels slow down faster than by any resistance but that of sand
+# Of drive force over weight, in the direction of travel: who pulls so much does not brake; sand or a ramp slows it down.
+# Above noise and zero of the torque of one that coasts, below the resistance of any ground but concrete and gravel.
+PULLS_SHARE = 0.02
 MAX_C_RR = 0.45  # no ground that a machine drives on resists more: the bucket digs
 MIN_C_RR = -0.08  # the ground pushes: the torque that does it is missing, and no accelerometer's zero is so far off
 MAX_SLIP_MPS2 = 1.0  # the wheels' acceleration is this far from the body's: they spin or lock
@@ -31,6 +34,7 @@ FROZEN_S, FROZEN_SHARE = 2.0, 0.03
 MAX_SHARE = 1.2  # of drive force over weight: no tyre drives with much more than its load
 # Drive force per force that the motion takes: 1 if units are right; a scale error of sensors is far smaller.
 MIN_GAIN, MAX_GAIN = 0.4, 2.5
+PUSHES = -0.03  # c_rr by a balance that no zero of a sensor explains, nor a jolt: the ground seems to push
 SMOOTH_S = 1.0  # over which the two are smoothed before they are compared
 FORGET_S = 120.0  # how long their comparison is remembered
 LEAST_COMPARED_S = 20.0
@@ -72,9 +76,7 @@ class Plausibility:
         if drives:
             self._gain.update(balance)
             self._resisted += min(balance.dt_s / SMOOTH_S, 1.0) * (resistance - self._resisted)
-        if self._resisted < MIN_C_RR or not MIN_GAIN <= self._gain.value <= MAX_GAIN:
-            return "torque_implausible"
-        return ""
+        return "torque_implausible" if self._resisted < MIN_C_RR or self._gain.is_wrong else ""
 
     def _unsteady(self, balance: Balance, resistance: float) -> str:
         """Whether forces that the balance does not include act, or acted a moment ago."""
@@ -82,13 +84,19 @@ class Plausibility:
         self._mismatch_mps2 += min(balance.dt_s / MEAN_S, 1.0) * (difference - self._mismatch_mps2)
         if abs(self._mismatch_mps2) > MAX_SLIP_MPS2:
             self._hold = "slip", HOLD_S
-        elif -balance.direction * balance.accel_mps2 > MAX_BRAKE_MPS2:
+        elif _brakes(balance):
             self._hold = "braking", HOLD_S
         elif resistance > MAX_C_RR:
             self._hold = "digging", HOLD_S
         reason, left_s = self._hold
         self._hold = reason, left_s - balance.dt_s
         return reason if left_s > 0 else ""
+
+
+def _brakes(balance: Balance) -> bool:
+    """Whether the machine slows down fast, and not because the ground does it while it pulls."""
+    slows_mps2 = -balance.direction * balance.accel_mps2
+    return slows_mps2 > MAX_BRAKE_MPS2 and balance.direction * balance.share < PULLS_SHARE
 
 
 class _Frozen:
@@ -116,12 +124,18 @@ class _Gain:
     """Drive force per force that the motion takes: slope of a regression of one on the other, 1 if units are right.
 
     Both vary together as the machine starts, stops and climbs. Only their common variation counts, so neither zeros nor
-    resistances matter. 1 until they have varied enough.
+    resistances that stay the same matter. 1 until they have varied enough.
+
+    Resistance that varies with the motion does matter: sand takes force and slows the machine down, so that more force
+    comes with less acceleration, as if the sign were wrong. But it resists all the time. With gain k, c_rr by a balance
+    is (k - 1) times the motion's force, and k times c_rr: where the motion takes force, or gives it, that falls below 0.
+    So a gain is wrong only if the ground seems to have pushed as well.
     """
 
     def __init__(self) -> None:
         self._weight = self._x = self._y = self._xx = self._xy = 0.0
         self._means = (0.0, 0.0)
+        self._least = 0.0  # c_rr of late
 
     def update(self, balance: Balance) -> None:
         """Add a balance of a machine that drives."""
@@ -131,6 +145,7 @@ class _Gain:
         share = min(balance.dt_s / SMOOTH_S, 1.0)
         x, y = (mean + share * (new - mean) for mean, new in zip(self._means, news_xy, strict=True))
         self._means = (x, y)
+        self._least = min(fade * self._least, balance.direction * (y - x))
         sums = (self._weight, self._x, self._y, self._xx, self._xy)
         news = (1.0, x, y, x * x, x * y)
         self._weight, self._x, self._y, self._xx, self._xy = (
@@ -138,7 +153,12 @@ class _Gain:
         )
 
     @property
-    def value(self) -> float:
+    def is_wrong(self) -> bool:
+        """Whether no scale error of a sensor explains it, nor the ground."""
+        return self._least < PUSHES and not MIN_GAIN <= self._value <= MAX_GAIN
+
+    @property
+    def _value(self) -> float:
         """The slope [-]."""
         if self._weight < LEAST_COMPARED_S:
             return 1.0

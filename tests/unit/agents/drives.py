@@ -169,7 +169,8 @@ def drive_n(vehicle: MachineConfig, ground: Ground, leg: Leg, v: float) -> float
     if leg.bend_rad:
         on_front = front_share(vehicle, leg.payload_kg, leg.accel_mps2 + GRAVITY_MPS2 * uphill)
         uphill += on_front * (math.sin(ground.turned(leg.bend_rad).ahead_rad) - uphill)
-    return mass * (vehicle.rotating_mass_factor * leg.accel_mps2 + GRAVITY_MPS2 * (uphill + rolling))
+    rotating_kg = (vehicle.rotating_mass_factor - 1) * vehicle.mass_kg  # a load does not rotate
+    return (mass + rotating_kg) * leg.accel_mps2 + mass * GRAVITY_MPS2 * (uphill + rolling)
 
 
 def _imu(sensor: SensorConfig, vehicle: MachineConfig, ground: Ground, leg: Leg, v: float, stamp_ns: int) -> Imu:

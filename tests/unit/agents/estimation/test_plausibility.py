@@ -64,8 +64,10 @@ CASES = [  # a change of the steady balance, and why it is withheld
     ({"speed_mps": -0.39}, "standstill"),
     ({"pitch_radps": 0.03}, "pitch_transient"),
     ({"pitch_radps": -0.03}, "pitch_transient"),
-    ({"accel_mps2": -1.6, "body_mps2": -1.6}, "braking"),
+    ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.0}, "braking"),
+    ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.019}, "braking"),  # coasts, by a torque sensor with a zero
     ({"accel_mps2": 1.6, "body_mps2": 1.6, "speed_mps": -2.0, "unbalanced": -0.04}, "braking"),
+    ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": -0.1}, "braking"),
     ({"unbalanced": 0.46}, "digging"),
     ({"unbalanced": -0.46, "speed_mps": -2.0}, "digging"),
     ({"accel_mps2": 8.0}, "slip"),  # low-passed: a sixth of it counts at once
@@ -78,6 +80,8 @@ CASES = [  # a change of the steady balance, and why it is withheld
     ({"speed_mps": -0.41, "unbalanced": -0.04}, ""),
     ({"pitch_radps": 0.025}, ""),
     ({"accel_mps2": 1.6, "body_mps2": 1.6}, ""),  # accelerates
+    ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.03, "unbalanced": 0.25}, ""),  # pulls: sand slows it down
+    ({"accel_mps2": 1.6, "body_mps2": 1.6, "speed_mps": -2.0, "share": -0.03, "unbalanced": -0.25}, ""),  # in reverse
     ({"accel_mps2": -1.4, "body_mps2": -1.4}, ""),
     ({"unbalanced": 0.44}, ""),
     ({"unbalanced": -0.44}, ""),  # forwards: nothing that digs
@@ -100,7 +104,7 @@ def test_reason_of_one_balance(changes: dict[str, float], reason: str) -> None:
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"accel_mps2": -2.0, "body_mps2": -2.0}, "braking"),
+        ({"accel_mps2": -2.0, "body_mps2": -2.0, "share": 0.0}, "braking"),
         ({"unbalanced": 0.6}, "digging"),
         ({"accel_mps2": 8.0}, "slip"),
     ],
@@ -188,6 +192,26 @@ def test_resistance_alone_does_not_look_like_a_wrong_unit() -> None:
     """Sand and asphalt in turn: the drive force changes, and what the motion takes does not."""
     steps = [after(i, share=c, unbalanced=c) for i in range(4000) for c in [0.25 if i // 200 % 2 else 0.01]]
     assert set(reasons(steps)) == {""}
+
+
+def test_sand_that_slows_a_machine_down_does_not_look_like_a_wrong_unit() -> None:
+    """It takes more force while it slows the machine down, and less as that speeds up again behind it."""
+    steps = []
+    for i in range(4000):
+        phase = i % 400  # 20 s: 4 s of sand, 4 s to get up to speed again
+        c, taken = (0.25, -0.12) if phase < 80 else (0.02, 0.12) if phase < 160 else (0.02, 0.0)
+        steps.append(after(i, share=c + taken, unbalanced=c, accel_mps2=9.81 * taken, body_mps2=9.81 * taken))
+    assert set(reasons(steps)) == {""}
+
+
+@pytest.mark.parametrize("gain", [1 / 1000, 0.3, 3.0, -1.0])
+def test_torque_in_a_wrong_unit_is_implausible_on_changing_ground_too(gain: float) -> None:
+    steps = [
+        replace(b, share=gain * (b.share + extra), unbalanced=gain * (b.share + extra) - (b.share - b.unbalanced))
+        for i, b in enumerate(at_work(120))
+        for extra in [0.2 if i % 400 < 80 else 0.0]
+    ]
+    assert reasons(steps).count("torque_implausible") > 0.6 * len(steps)
 
 
 def test_a_machine_that_never_varies_proves_nothing() -> None:
