@@ -18,7 +18,9 @@ FAULTS = frozenset({"accelerometer", "no_torque", "no_wheels", "torque_frozen", 
 FORCE_NORMS_MPS2 = (5.0, 15.0)
 STALE_S = 0.5  # torque or wheel readings older than this are missing
 MIN_SPEED_MPS = 0.4  # slower is a standstill
-MAX_PITCH_RADPS = 0.026  # 1.5 deg/s: at 2 m/s the slope changes by more than 2 degrees from axle to axle
+# The pitch rate over the speed is the change of slope per metre: with more than this, the axles stand on slopes that
+# differ by 2 to 3 degrees. A machine that is slower than SLOW_MPS pitches by its own forces as well.
+MAX_CURVE_RADPM, SLOW_MPS = 0.013, 2.0
 MAX_BRAKE_MPS2 = 1.5  # the wheels slow down faster than by any resistance but that of sand
 # Of drive force over weight, in the direction of travel: who pulls so much does not brake; sand or a ramp slows it down.
 # Above noise and zero of the torque of one that coasts, below the resistance of any ground but concrete and gravel.
@@ -59,7 +61,7 @@ class Plausibility:
             return fault
         if abs(balance.speed_mps) < MIN_SPEED_MPS:
             return "standstill"
-        if abs(balance.pitch_radps) > MAX_PITCH_RADPS:
+        if abs(balance.pitch_radps) > MAX_CURVE_RADPM * max(abs(balance.speed_mps), SLOW_MPS):
             return "pitch_transient"
         return self._unsteady(balance, resistance)
 
