@@ -4,7 +4,9 @@
 
 over any closed tour, with or without slopes. Slopes are those of the accelerometer alone, less the wheels'
 acceleration: a filter's would lag behind the ramps, and what that acceleration is wrong by is gone when the speed is
-what it was (acceleration summed over distance is half the change of the speed's square). Distances are those of
+what it was (acceleration summed over distance is half the change of the speed's square). A jolt is the exception, as at
+the foot of a ramp or where wheels spin on sand: for this moment the accelerometer is at its end, or the wheels'
+acceleration is none of the machine's, and the filter's slope, by the gyros, is the better one. Distances are those of
 positions: they are level, and wheels slip uphill.
 
 The machine leaves a mark in each cell that it passes. In a cell with a mark a tour is closed; then the marks of the
@@ -23,6 +25,7 @@ CELL_M = 2.0
 LEAST_M = 60.0  # a shorter tour shows less than the data sheet
 JUMP_M = 1.0  # of a position against the wheels' travel, beside half of it: it was not driven, or wheels spun
 MAX_GAP_NS = 300_000_000  # between balances
+MAX_JOLT_S = 2.0  # one that lasts longer is a broken accelerometer, or a machine that digs in
 MOST_STD_M = 3.0  # a less sure position is no place to come back to
 KEPT = 5000  # marks: 10 km, an hour on a haul road
 # Standard deviation of the rise of a tour: of unevenness where it closes, and per root of a metre driven.
@@ -61,18 +64,24 @@ class ClosedTours:
         self._marks: dict[tuple[int, int], _Mark] = {}  # by cell, in the order of the track
         self._sums = _Mark()
         self._last: Balance | None = None
+        self._jolted_s = 0.0
         self._place_m = (0.0, 0.0)  # at the end of the last step
         self._step = (0.0, 0.0, 0.0)  # under way, by the wheels: rise, travel, distance
 
-    def update(self, balance: Balance, pose: PoseBelief | None) -> Tour | None:
-        """Add a balance at a pose; returns the tour that it closes. Without a pose there is no track to follow."""
+    def update(self, balance: Balance, pose: PoseBelief | None, *, is_jolted: bool = False) -> Tour | None:
+        """Add a balance at a pose; returns the tour that it closes. Without a pose there is no track to follow.
+
+        is_jolted: whether forces act that are no slope, or the wheels slip.
+        """
         last, self._last = self._last, balance
-        if pose is None or last is None or balance.stamp_ns - last.stamp_ns > MAX_GAP_NS:
+        self._jolted_s = self._jolted_s + balance.dt_s if is_jolted else 0.0
+        is_lost = self._jolted_s > MAX_JOLT_S
+        if pose is None or last is None or is_lost or balance.stamp_ns - last.stamp_ns > MAX_GAP_NS:
             self._begin(pose)
             return None
         driven_m = balance.distance_m - last.distance_m
         travel_m = balance.direction * driven_m
-        sine = max(-MAX_SINE, min(MAX_SINE, balance.sine_x))
+        sine = max(-MAX_SINE, min(MAX_SINE, math.sin(balance.slope_x) if is_jolted else balance.sine_x))
         rise, travel, distance = self._step
         self._step = rise + travel_m * math.tan(math.asin(sine)), travel + travel_m, distance + driven_m
         return self._end_step(balance, pose) if abs(self._step[1]) >= STEP_M else None

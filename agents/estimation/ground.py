@@ -28,7 +28,7 @@ MASSES = ("message", "known", "estimated")
 KEPT = 400  # steps: 20 s
 NEAR_NS = 200_000_000  # a stamp this far from a step has no slope
 SILENT_NS = 1_000_000_000  # other sensors have readings, but no step was made for so long
-UNFOLLOWED = frozenset({"accelerometer", "no_wheels", "slip"})  # then nobody knows how far it was, or how steep
+JOLTS = frozenset({"accelerometer", "slip"})  # then the accelerometer does not show the slope ahead
 LOADING_S = 3.0  # a machine that stands so long may have loaded or dumped
 MODEL_STD = 0.0015  # error of the balance itself [-], which no calibration removes
 
@@ -231,9 +231,10 @@ class GroundEstimator:
 
     def _follow(self, balance: Balance, pose: PoseBelief | None) -> None:
         """Follow the track; what a tour shows takes effect at once, since a machine on tours may never stand."""
-        if self._judged[-1].reason in UNFOLLOWED:
+        reason = self._judged[-1].reason
+        if reason == "no_wheels":  # then nobody knows how far it was
             self._tours.interrupt()
-        elif tour := self._tours.update(balance, pose):
+        elif tour := self._tours.update(balance, pose, is_jolted=reason in JOLTS):
             self._calibrator.add_tour(tour)
             self._apply_calibration(balance.stamp_ns)
 
