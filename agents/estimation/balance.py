@@ -24,6 +24,7 @@ from protocol.units import GRAVITY_MPS2
 
 STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
 MAX_PAUSE_S = 1.0  # of the IMU, or of the wheels' readings, before their last values no longer count
+SLOW_MPS = 2.0  # a slower machine pitches by its own forces rather than by the ground
 NO_SUMS = (0.0,) * 4
 
 
@@ -160,7 +161,8 @@ class Balancer:
         squat = squat_rad(machine, self.payload_kg, force)
         bend = self._climb_of_bend(on_front, squat)
         rotating = (machine.rotating_mass_factor - 1) * machine.mass_kg / self.mass_kg
-        unbalanced = share - force / g + squat - bend - rotating * accel / g
+        curve = self._climb_of_curve(on_front, rate, speed)
+        unbalanced = share - force / g + squat - bend - curve - rotating * accel / g
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
         self._force_sums, self._torque_sums = NO_SUMS, (0, 0.0)
         return Balance(
@@ -191,6 +193,15 @@ class Balancer:
         """
         c, s = math.cos(self._bend_rad), math.sin(self._bend_rad)
         return on_front * ((self._slope.ahead.sine - squat) * (c - 1) + self._slope.left.sine * s)
+
+    def _climb_of_curve(self, on_front: float, pitch_radps: float, speed_mps: float) -> float:
+        """Sine of the slope under both axles, by their loads, less that of the line from one to the other [-].
+
+        The accelerometer measures the line's. Where the slope changes with the way, by pitch rate over speed per metre,
+        the front axle's is half a wheelbase's change steeper, the rear one's as much less steep.
+        """
+        faster_mps = math.copysign(max(abs(speed_mps), SLOW_MPS), speed_mps)
+        return (on_front - 0.5) * self._machine.wheelbase_m * pitch_radps / faster_mps
 
     def _wheels_s(self) -> float:
         return (self._imu_ns - self._wheels_ns) * 1e-9 if self._wheels_ns else math.inf

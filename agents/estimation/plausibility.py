@@ -7,7 +7,7 @@ in the wrong unit.
 
 import math
 
-from agents.estimation.balance import Balance
+from agents.estimation.balance import SLOW_MPS, Balance
 from protocol.units import GRAVITY_MPS2
 
 # Reasons that make the slope worthless too: such a sample says that the machine was there, and how heavy.
@@ -19,11 +19,11 @@ FORCE_NORMS_MPS2 = (5.0, 15.0)
 STALE_S = 0.5  # torque or wheel readings older than this are missing
 MIN_SPEED_MPS = 0.4  # slower is a standstill
 # The pitch rate over the speed is the change of slope per metre: with more than this, the axles stand on slopes that
-# differ by 2 to 3 degrees. A machine that is slower than SLOW_MPS pitches by its own forces as well.
-MAX_CURVE_RADPM, SLOW_MPS = 0.013, 2.0
+# differ by 2 to 3 degrees.
+MAX_CURVE_RADPM = 0.013
 MAX_BRAKE_MPS2 = 1.5  # the wheels slow down faster than by any resistance but that of sand
-# Of drive force over weight, in the direction of travel: who pulls so much does not brake; sand or a ramp slows it down.
-# Above noise and zero of the torque of one that coasts, below the resistance of any ground but concrete and gravel.
+# Of drive force over weight, in the direction of travel: who pulls more does not brake, but sand or a ramp slows it
+# down. Above noise and zero of the torque of one that coasts, and no more than gravel resists.
 PULLS_SHARE = 0.02
 MAX_C_RR = 0.45  # no ground that a machine drives on resists more: the bucket digs
 MIN_C_RR = -0.08  # the ground pushes: the torque that does it is missing, and no accelerometer's zero is so far off
@@ -129,8 +129,8 @@ class _Gain:
     resistances that stay the same matter. 1 until they have varied enough.
 
     Resistance that varies with the motion does matter: sand takes force and slows the machine down, so that more force
-    comes with less acceleration, as if the sign were wrong. But it resists all the time. With gain k, c_rr by a balance
-    is (k - 1) times the motion's force, and k times c_rr: where the motion takes force, or gives it, that falls below 0.
+    comes with less acceleration, as if the sign were wrong. But sand resists all the time. With a wrong gain k, c_rr by
+    a balance is k c_rr plus (k - 1) times the motion's force, which falls below 0 as the machine climbs or slows down.
     So a gain is wrong only if the ground seems to have pushed as well.
     """
 

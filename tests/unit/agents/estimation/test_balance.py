@@ -120,6 +120,18 @@ def test_bent_machine_on_a_side_slope_climbs_with_its_front_axle(bend_rad: float
     assert straight.unbalanced == pytest.approx(0.04 + extra, abs=1e-3)
 
 
+@pytest.mark.parametrize("legs", [FORWARDS, REVERSE], ids=["forwards", "reverse"])
+@pytest.mark.parametrize(("on_front", "share"), [(1.5 / 3.3, -0.5 + 1.5 / 3.3), (0.7, 0.2)])
+def test_axles_on_a_curve_stand_on_two_slopes(legs: list[Leg], on_front: float, share: float) -> None:
+    """By hand: 0.01 rad per metre over 3.3 m; the front axle's load is on its steeper half where it is concave."""
+    vehicle = loader(axle_stiffness_npm=0.0, cog_height_m=0.0, load_centre_m=3.3 * on_front)
+    made = drive(legs, vehicle, ground=Ground(0.04)).readings
+    speed_mps = 2.0 if legs is FORWARDS else -2.0
+    concave = [replace(r, gyro_y_radps=-0.01 * speed_mps) if isinstance(r, Imu) else r for r in made]
+    level, curved = (balances(vehicle, readings)[-1] for readings in (made, concave))
+    assert level.unbalanced - curved.unbalanced == pytest.approx(share * 3.3 * 0.01, rel=0.02)
+
+
 def test_bent_machine_uphill_climbs_less() -> None:
     vehicle = loader(axle_stiffness_npm=0.0, cog_height_m=0.0)
     legs = [Leg(2), Leg(4, 0.5, bend_rad=0.6), Leg(6, bend_rad=0.6)]

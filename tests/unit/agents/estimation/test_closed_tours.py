@@ -49,6 +49,7 @@ class Track:
         self.stamp_ns, self.distance_m = START_NS, 0.0
         self.shift_m = (0.9, 0.9)  # of the pose against the true place: no track runs between two cells
         self.slip: Callable[[float], float] = lambda slope: 1.0  # wheels' distance per metre
+        self.jolts: Callable[[Place], bool] = lambda place: False
 
     def drive(self, *corners: Place) -> Track:
         for place, ahead in points(corners):
@@ -73,7 +74,10 @@ class Track:
     def feed(self, balance: Balance, place: Place) -> None:
         x, y = place[0] + self.shift_m[0], place[1] + self.shift_m[1]
         pose = PoseBelief(self.stamp_ns, x, y, 0.0, SPEED_MPS, self.std_m**2 * np.eye(2))
-        if tour := self.tours.update(balance, pose):
+        is_jolted = self.jolts(place)
+        if is_jolted:  # the accelerometer shows anything
+            balance = replace(balance, sine_x=0.5)
+        if tour := self.tours.update(balance, pose, is_jolted=is_jolted):
             self.shown.append(tour)
 
     def _slope(self, place: Place, ahead: Place) -> float:
@@ -176,6 +180,21 @@ def test_an_interruption_and_a_missing_pose_tear_the_track() -> None:
         interrupt(track)
         assert not track.drive((90.0, 90.0), (0.0, 90.0), (0.0, 0.0), (60.0, 0.0)).shown
         assert track.tours.torn == 1
+
+
+def test_jolts_do_not_tear_the_track_and_their_slope_is_the_gyros() -> None:
+    track = Track(ramp)
+    track.jolts = lambda place: 28.0 < place[0] < 32.0  # a second at the foot of the ramp
+    track.drive(*SQUARE, (30.0, 0.0))
+    assert [tour.zero for tour in track.shown] == pytest.approx([ZERO], abs=2e-4)
+    assert track.tours.torn == 0
+
+
+def test_a_jolt_that_does_not_end_tears_the_track() -> None:
+    track = Track(ramp)
+    track.jolts = lambda place: 20.0 < place[0] < 20.0 + 1.5 * closed_tours.MAX_JOLT_S * SPEED_MPS
+    assert not track.drive(*SQUARE, (18.0, 0.0)).shown
+    assert track.tours.torn == 2  # there and back
 
 
 def test_an_unsure_position_is_no_place_to_come_back_to() -> None:
