@@ -416,6 +416,19 @@ def test_a_machine_that_drives_round_and_round_finds_its_zero_and_applies_it_as_
     assert EstimatorRun(VEHICLE, EstimationConfig(estimator)).feed(readings).estimator.calibration.zero == 0.0
 
 
+@pytest.mark.slow
+def test_a_jolt_on_the_way_does_not_hide_the_zero() -> None:
+    """Three steps of the balance at the end of what is plausible, as at the foot of a ramp."""
+    made = off(drive([STAND, START, Leg(80, turn_radps=0.1)], VEHICLE).readings, 0.06)
+    jolt_ns = range(START_NS + 40_000_000_000, START_NS + 40_150_000_000)
+    readings = [replace(r, force_z_mps2=17.0) if isinstance(r, Imu) and r.stamp_ns in jolt_ns else r for r in made]
+    run = EstimatorRun(VEHICLE, EstimationConfig(), knows_place=True).feed(readings)
+    health = run.estimator.health()["calibration"]
+    assert "accelerometer" in [e.reason for e in run.between(39, 42)]
+    assert (health["tours"], health["torn"]) == (1, 0)
+    assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)  # one tour, and the data sheet
+
+
 def test_calibration_from_before_is_used_at_once() -> None:
     zero = -0.06 / GRAVITY_MPS2
     known = Calibration(zero, 0.0, ((1e-7, 0.0), (0.0, 1e-4)), START_NS - 10**10, 400)
