@@ -99,6 +99,7 @@ class Server:
         self._pool = AnswerPool("command", COMMAND_THREADS, MOST_COMMANDS)
         self._queries = MapQueryable(readers, keys.map_queries_all(site.name), source, self.answers)
         self._rows = JournalQueryable(readers, keys.journal(site.name), source)
+        self.answers.start()
         self._queryables = [
             ingest.declare_queryable(keys.ingest_all(site.name), self._on_batch),
             readers.declare_queryable(keys.admin_all(site.name), self._on_command),
@@ -126,6 +127,7 @@ class Server:
         self._queries.stop()
         self._rows.close()
         self._queries.close()
+        self.answers.close()
         self._pool.close()
         self._upkeep.close()
         self._changed.undeclare()  # type: ignore[no-untyped-call]

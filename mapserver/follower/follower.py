@@ -61,6 +61,7 @@ class Follower:
         if self._copying:
             self._copying.start()
         self.following.start()
+        self.answers.start()
 
     @property
     def is_shown(self) -> bool:
@@ -94,6 +95,7 @@ class Follower:
         if self._copying:
             self._copying.stop()
         self._queries.close()
+        self.answers.close()
         self._identity.undeclare()  # type: ignore[no-untyped-call]
         self.following.close()
         if self._copying:

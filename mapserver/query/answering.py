@@ -74,6 +74,14 @@ class Answers:
         self._tiles = Tiles(source, self._roads.lately)
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
 
+    def start(self) -> None:
+        """Make roads beside the questions from here on, until closed."""
+        self._roads.start()
+
+    def close(self) -> None:
+        """End what is made beside the questions."""
+        self._roads.close()
+
     @property
     def _reach(self) -> int:
         return reach_blocks(self._site.cell_m, self._config.change)
@@ -96,6 +104,8 @@ class Answers:
 
     def answer(self, query: MapQuery) -> bytes:
         """Answer one query; QueryError says what is wrong with it."""
+        if query.fresh.after and _reads_roads(query):
+            self._roads.reach(query.fresh.after)
         match query:
             case PointQuery():
                 return codec.encode_point(self.point(query))
@@ -283,7 +293,7 @@ class Answers:
         return self._layers.look_at(self._view(wide, as_of_ns))
 
     def _now(self, look: Callable[[MapState | StillMap], Look], *, repairs: bool) -> Look:
-        """Look at the map as it is; repairs: with the ages of roads, at the version that these are of."""
+        """Look at the map as it is; repairs: with the ages of roads, at the version that the newest of these are of."""
         return look(self._roads.read().still) if repairs else self._source.run(look)
 
     def _piece(self, reading: Reading, pieces: PieceGrid, number: int, cursor: int) -> Region:
@@ -335,6 +345,18 @@ class Answers:
             HistorySpan(first_ns, last_ns, dict(zip(names, of_span, strict=True)))
             for first_ns, last_ns, *of_span in zip(*columns, strict=True)
         )
+
+
+def _reads_roads(query: MapQuery) -> bool:
+    """Whether an answer is of roads as they are now."""
+    match query:
+        case SegmentsQuery() | WorklistQuery():
+            return query.as_of_ns is None
+        case RouteQuery() | WayQuery():
+            return query.repairs and query.as_of_ns is None
+        case PointQuery() | PointsQuery() | RegionQuery():
+            return query.when.repairs and query.when.as_of_ns is None
+    return False
 
 
 def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,6 +1,9 @@
 """Road maps: roads, the tally of what drove on them, and the changes of their ground; now, and as of any time.
 
-The tally follows the journal; roads and changes are made as somebody asks, from the same version of the map.
+The tally follows the journal; roads and changes are made from the same version of the map, beside the questions: who
+asks is answered from the newest that are made, while these are of the last seconds.
+
+It is one module because what makes roads and what says which may be read have to agree on their version and age.
 """
 
 from __future__ import annotations
@@ -8,6 +11,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from weakref import ref
@@ -37,7 +42,13 @@ from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 log = logging.getLogger("mapserver.query.road_maps")
-LATELY_S, PATIENCE_S = 10.0, 2.0  # how old ages may be for a picture, and how long it waits for them
+# How much older than a question its roads may be: a repair is seen after two or three passes, which take minutes, and a
+# road is planned on for minutes more. A new map each second costs whoever asks, and those who wait for him, 0.1 s.
+FRESH_S = 10.0
+EVERY_S = FRESH_S / 2  # between two makings: one that takes as long still ends in time
+ASKED_S = 600.0  # so long after the last question roads are still made for the next one
+PATIENCE_S = 2.0  # how long a picture waits for roads before it goes without newer ones
+END_S = 1.0  # at the end, what is being made may take so long; nobody waits for it
 LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older journals are not read for it
 
 
@@ -112,50 +123,119 @@ class Traffic:
         self.passes.add(rows, names)
 
 
-class RoadMaps:
-    """Makes road maps of one source. For any thread; one at a time works."""
+@dataclass(frozen=True)
+class _Newest:
+    """The newest roads that are made, and when the map was last looked at that they are of [s of the clock]."""
 
-    def __init__(self, source: MapSource) -> None:
+    roads: RoadMap
+    looked_s: float
+
+
+@contextmanager
+def _journal_read() -> Iterator[None]:
+    """Say what is wrong with a journal to who asks."""
+    try:
+        yield
+    except StoreError as error:
+        raise QueryError(Refusal.STORE, str(error)) from None
+
+
+class RoadMaps:
+    """Makes road maps of one source. For any thread; one at a time makes those of now."""
+
+    def __init__(self, source: MapSource, clock: Callable[[], float] = time.monotonic) -> None:
+        """clock: steady, in seconds."""
         self._source, self._cell_m, self._config = source, source.site.cell_m, source.config
+        self._clock = clock
         self._lock = threading.Lock()
         self._skeletons = Skeletons(self._cell_m)
-        self._made: RoadMap | None = None
-        self._making: threading.Thread | None = None
-        self._made_s = -LATELY_S
+        self._newest: _Newest | None = None
+        self._asked_s = clock()
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
         self._begin("", NO_FACTS)
 
     def _begin(self, store: str, facts: Facts) -> None:
         """Follow the journal anew."""
         self._traffic, self._followed, self._with = Traffic(), 0, (store, facts)
 
+    def start(self) -> None:
+        """Make roads beside the questions from here on, until closed; without this, those who ask make them."""
+        self._thread = threading.Thread(target=self._run, name="roads", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Make no more."""
+        self._ended.set()
+        if self._thread:
+            self._thread.join(END_S)
+
     def read(self, as_of_ns: int | None = None, machine: str = "") -> RoadMap:
-        """The roads now or as of a time; machine: with its traffic alone. Raises QueryError."""
+        """The roads as of a time, or of the last FRESH_S; machine: with its traffic alone. Raises QueryError."""
         if machine and not self._source.run(lambda state: machine in state.machines()):
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing")
-        try:
+        with _journal_read():
             if as_of_ns is not None:
                 return self._as_of(as_of_ns, machine)
-            with self._lock:
-                roads = self._now()
+            roads = self._lately()
             return self._alone(roads, machine) if machine else roads
-        except StoreError as error:
-            raise QueryError(Refusal.STORE, str(error)) from None
+
+    def reach(self, row: int) -> None:
+        """Have roads of this journal row or a later one from here on. Raises QueryError."""
+        with _journal_read(), self._lock:
+            if not self._newest or self._newest.roads.version.row < row:
+                self._now()
 
     def lately(self) -> Ages:
         """Ages of cells as of some seconds ago, for pictures; none while the journal is read for the first time."""
-        now_s = time.monotonic()
-        if now_s - self._made_s >= LATELY_S and not (self._making and self._making.is_alive()):
-            self._made_s = now_s
-            self._making = threading.Thread(target=self._make, name="roads", daemon=True)
-            self._making.start()
-            self._making.join(PATIENCE_S)
-        return self._made.ages if self._made else {}
-
-    def _make(self) -> None:
         try:
-            self.read()
-        except QueryError as error:  # asked again after LATELY_S
+            with _journal_read():
+                self._lately(PATIENCE_S)
+        except QueryError as error:  # asked again with the next picture
             log.warning("no road map reason=%s problem=%r", error.reason, str(error))
+        return self._newest.roads.ages if self._newest else {}
+
+    def renew(self) -> None:
+        """Make roads of the map as it is, unless nobody has asked for long."""
+        if self._clock() - self._asked_s < ASKED_S:
+            with _journal_read(), self._lock:
+                self._now()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                self.renew()
+            except QueryError as error:  # who asks is answered so, too
+                log.info("no road map reason=%s problem=%r", error.reason, str(error))
+            except Exception:  # a bug must not end the thread
+                log.exception("no road map")
+            if self._ended.wait(EVERY_S):
+                return
+
+    def _lately(self, patience_s: float = -1.0) -> RoadMap:
+        """The newest roads, none older than FRESH_S: who waits for those in the making takes them, however long it was.
+
+        patience_s: how long to wait for whoever makes some; beyond, and QueryError. Negative: for as long as it takes.
+        """
+        asked_s = self._asked_s = self._clock()
+        if roads := self._fresh(asked_s):
+            return roads
+        if not self._lock.acquire(timeout=patience_s):
+            raise QueryError(Refusal.OVERLOADED, "roads are still being made")
+        try:
+            return self._fresh(asked_s) or self._now()
+        finally:
+            self._lock.release()
+
+    def _fresh(self, asked_s: float) -> RoadMap | None:
+        """Roads that a question of this time may be answered from: of the map's facts, and of its last seconds."""
+        newest = self._newest
+        if newest is None:
+            return None
+        own, now = newest.roads.version, self._source.run(lambda state: state.version)
+        is_of_map = (own.store, own.fact) == (now.store, now.fact) and own.row <= now.row
+        in_time = own == now or asked_s - newest.looked_s <= FRESH_S
+        return newest.roads if is_of_map and in_time else None
 
     def view(self, window: CellWindow, reach: int, as_of_ns: int | None) -> View:
         """Evidence of a window and of `reach` blocks around, with the ages of roads; now, or as of a time."""
@@ -168,9 +248,12 @@ class RoadMaps:
         return View(near, roads.version, roads.stamp_ns, roads.ages)
 
     def _now(self) -> RoadMap:
+        """Make roads of the map as it is, unless those that are made are of it."""
+        looked_s, newest = self._clock(), self._newest
         # the version alone first: pages of all blocks take milliseconds of whoever owns them
-        if self._made and self._made.version == self._source.run(lambda state: state.version):
-            return self._made
+        if newest and newest.roads.version == self._source.run(lambda state: state.version):
+            self._newest = replace(newest, looked_s=looked_s)
+            return newest.roads
         grid, version, facts, newest_ns = self._source.run(_all)
         if self._with != (version.store, facts):
             self._begin(version.store, facts)
@@ -178,8 +261,10 @@ class RoadMaps:
         self._followed = version.row
         ledgers = Ledgers(segments(network(self._skeletons.skeleton(grid.all_pages))))
         made = self._map(ledgers, self._traffic, grid.all_pages, facts, version, newest_ns)
-        self._made = replace(made, grid=grid)
-        return self._made
+        roads = replace(made, grid=grid)
+        _ = roads.still  # with the ages, here and not in the first question
+        self._newest = _Newest(roads, looked_s)
+        return roads
 
     def _as_of(self, as_of_ns: int, machine: str) -> RoadMap:
         version, facts = self._source.run(lambda state: (state.version, state.facts))

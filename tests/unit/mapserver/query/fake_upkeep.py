@@ -39,7 +39,10 @@ def answers_of(writer: Writer, upkeep: FakeUpkeep | None = None) -> Answers:
 
 
 def answered(answers: Answers, name: str, parameters: dict[str, str]) -> bytes:
-    """Parse a query, wait for the row that it asks for, and answer it."""
+    """Parse a query, wait for the row that it asks for, the newest unless it says which, and answer it."""
+    newest = answers._source.run(lambda state: state.version.row)
+    if parameters.get("as_of") is None and name in ("segments", "worklist", "route", "way"):
+        parameters = {"after": str(newest), **parameters}
     query, waited = parse_query(name, parameters), Future()
     answers._source.waits.add(query.fresh.after, query.fresh.wait_s, waited.set_result)
     if error := waited.result(WAIT_S):

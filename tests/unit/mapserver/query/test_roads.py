@@ -1,5 +1,7 @@
 """Roads and worklists as they are answered: now and as of any time, by what the map is made of."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import numpy as np
@@ -10,7 +12,8 @@ from mapserver.journal.facts import Facts
 from mapserver.query import road_maps
 from mapserver.query.answering import LAYERS_DERIVED
 from mapserver.query.map_tiles import Tiles
-from protocol.errors import QueryError, Refusal
+from mapserver.query.road_maps import ASKED_S, FRESH_S, RoadMaps
+from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.map_tiles import PLANES
 from protocol.queries.requests import (
     PointQuery,
@@ -26,7 +29,7 @@ from protocol.queries.roads import decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import decode_answer
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import incoming, open_writer, send
+from tests.unit.mapserver.data import WAIT_S, incoming, open_writer, send, wait_for
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
 from tests.unit.mapserver.roads.drives import START_NS, along, passes
 
@@ -392,14 +395,153 @@ def test_tiles_show_a_repair_with_the_next_row(repaired):
 
 def test_pictures_have_the_ages_of_some_seconds_ago(repaired, monkeypatch):
     opened, _ = repaired
-    monkeypatch.setattr(road_maps, "PATIENCE_S", 60.0)
     roads = answers_of(opened)._roads
     known = roads.lately()
     assert known.keys() == roads.read().ages.keys() != set()
     send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine="c")])
     assert roads.lately() is known, "asked again at once: as it was"
-    monkeypatch.setattr(road_maps, "LATELY_S", 0.0)
+    monkeypatch.setattr(road_maps, "FRESH_S", 0.0)
     assert roads.lately() is not known
+
+
+def come(opened, machine="c"):
+    """One more pass on the second road: a newer map."""
+    send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine=machine)])
+
+
+class Clock:
+    """Steady seconds, as told."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_roads_are_those_of_the_last_seconds_and_say_which(repaired):
+    opened, _ = repaired
+    clock = Clock()
+    roads = RoadMaps(answers_of(opened)._source, clock)
+    first = roads.read()
+    come(opened)
+    clock.now_s += FRESH_S
+    assert roads.read() is first, "no older than they may be, and the version says which"
+    clock.now_s += 0.1
+    second = roads.read()
+    assert (first.version.row, second.version.row) == (4, 5)
+    clock.now_s += 100 * FRESH_S
+    assert roads.read() is second, "nothing came in since, however long ago"
+
+
+def test_who_waits_for_a_row_gets_roads_of_it(repaired):
+    opened, then_ns = repaired
+    answers = answers_of(opened)
+    asked = encode_query(RouteQuery(((15.0, 10.0), (205.0, 10.0))))
+    first = answered(answers, "route", asked)
+    come(opened)
+    assert answered(answers, "route", {**asked, "after": "4"}) == first
+    assert decode_answer(answered(answers, "route", {**asked, "after": "5"})).merged == 5
+    of_now, then = (worklist(answers, as_of_ns=as_of_ns) for as_of_ns in (None, then_ns))
+    assert (of_now.merged, then.merged) == (5, 5)
+
+
+def test_roads_of_another_fact_are_of_no_use(repaired):
+    opened, _ = repaired
+    roads = answers_of(opened)._roads
+    known = roads.read()
+    opened.run(lambda store: setattr(store, "facts", Facts(frozenset({"b"}), number=1)))
+    assert roads.read().version.fact == 1 != known.version.fact
+
+
+@pytest.fixture
+def slow(repaired, monkeypatch):
+    """Answers whose roads are made beside them, and an event until which the next ones are in the making."""
+    opened, _ = repaired
+    monkeypatch.setattr(road_maps, "EVERY_S", 0.01)
+    answers, may_end, began = answers_of(opened), threading.Event(), threading.Event()
+    answers._roads.read()
+    whole = road_maps.network
+
+    def slowly(skeleton):
+        began.set()
+        assert may_end.wait(WAIT_S)
+        return whole(skeleton)
+
+    monkeypatch.setattr(road_maps, "network", slowly)
+    answers.start()
+    yield opened, answers, began, may_end
+    may_end.set()
+    answers.close()
+
+
+def test_roads_in_the_making_hold_up_no_route(slow):
+    opened, answers, began, may_end = slow
+    line = ((15.0, 10.0), (205.0, 10.0))
+    known = answers._routes.route(RouteQuery(line))
+    come(opened)
+    assert began.wait(WAIT_S)
+    meanwhile = answers._routes.route(RouteQuery(line))
+    assert meanwhile.version.row == known.version.row == 4
+    assert meanwhile.totals == known.totals
+    assert answers._routes.route(RouteQuery(line, repairs=False)).version.row == 5
+    may_end.set()
+    wait_for(lambda: answers._routes.route(RouteQuery(line)).version.row == 5)
+
+
+def test_who_waits_for_roads_takes_those_that_were_begun_in_time(slow):
+    """However long they take: whoever waits would make the next ones otherwise, one after the other."""
+    opened, answers, began, may_end = slow
+    come(opened)
+    assert began.wait(WAIT_S)
+    with ThreadPoolExecutor(4) as pool:
+        waiting = [pool.submit(answers._roads.reach, 5) for _ in range(4)]
+        may_end.set()
+        for one in waiting:
+            one.result(WAIT_S)
+    assert answers._roads.read().version.row == 5
+
+
+def test_roads_are_made_beside_while_somebody_asks(repaired):
+    opened, _ = repaired
+    clock = Clock()
+    roads = RoadMaps(answers_of(opened)._source, clock)
+    roads.renew()
+    clock.now_s += ASKED_S
+    come(opened)
+    roads.renew()
+    assert roads._newest.roads.version.row == 4, "nobody asked for long"
+    assert roads.read().version.row == 5
+    come(opened, "d")
+    roads.renew()
+    assert roads.read().version.row == 6, "and now somebody does"
+
+
+def test_the_end_of_a_server_ends_the_making_of_roads(repaired):
+    answers = answers_of(repaired[0])
+    answers.close()  # never begun
+    answers.start()
+    thread = answers._roads._thread
+    answers.close()
+    assert not thread.is_alive()
+
+
+def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
+    opened, _ = repaired
+    monkeypatch.setattr(road_maps, "EVERY_S", 0.01)
+    roads, failing = answers_of(opened)._roads, threading.Event()
+    follow = roads._follow
+
+    def fails(*args):
+        if failing.is_set():
+            return follow(*args)
+        failing.set()
+        raise StoreError("the disk is gone")
+
+    monkeypatch.setattr(roads, "_follow", fails)
+    roads.start()
+    wait_for(lambda: roads._newest)
+    roads.close()
 
 
 def test_where_nothing_changed_cells_are_as_they_are(writer):
