@@ -151,8 +151,11 @@ class BlockLayers:
         turns = _spread(turns, self._reach)
         cell_turns: dict[Block, int] = dict(zip(blocks, turns[at].astype(int).tolist(), strict=True))
         area_turns = _by_square(_spread(turns, margin), wide, squares) if squares else {}
-        cell_states = _states(cell_turns, ages, lambda block: [block])
-        area_states = _states(area_turns, ages, lambda square: self._around([square], area_names))
+        if isinstance(state, StillMap) and ages:
+            cell_states = _marked(cell_turns, state, None, lambda block: [block])
+            area_states = _marked(area_turns, state, margin, lambda square: self._around([square], area_names))
+        else:
+            cell_states, area_states = _unmarked(cell_turns), _unmarked(area_turns)
         with self._lock:
             if self._grid is None or self._grid() is not owner():  # a fact, or rows that are gone, bring another one
                 self._cells.clear()
@@ -348,11 +351,21 @@ def _at(layers: Layers, name: str, now_ns: int) -> Floats | Floats32:
     return layers[name]
 
 
-def _states(turns: Mapping[Block, int], ages: Ages, near: Callable[[Block], Iterable[Block]]) -> dict[Block, State]:
-    """States of blocks or squares. near: the blocks whose ages they depend on."""
-    if not ages:
-        return {one: (turn, NO_AGES) for one, turn in turns.items()}
-    return {one: (turn, _digest(sorted(ages.keys() & near(one)), ages)) for one, turn in turns.items()}
+def _unmarked(turns: Mapping[Block, int]) -> dict[Block, State]:
+    """States of blocks or squares of a map without ages."""
+    return {one: (turn, NO_AGES) for one, turn in turns.items()}
+
+
+def _marked(
+    turns: Mapping[Block, int], still: StillMap, margin: int | None, near: Callable[[Block], Iterable[Block]]
+) -> dict[Block, State]:
+    """States of blocks, or of squares with this margin. near: the blocks whose ages they depend on."""
+    out, ages, marks = dict[Block, State](), still.ages, still.marks
+    for one, turn in turns.items():
+        if (mark := marks.get((margin, one))) is None:
+            mark = marks[margin, one] = _digest(sorted(ages.keys() & near(one)), ages)
+        out[one] = turn, mark
+    return out
 
 
 def _digest(blocks: Sequence[Block], ages: Ages) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence, Set
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from mapserver.query.source import MapSource
 from mapserver.routes.ground import Squares, squares_at
 from mapserver.routes.least_cost import Cell, Terrain, cost_of, least_cost_line, reaches
 from mapserver.routes.line import steps
-from mapserver.routes.prices import PRICED, around, bare, priced
+from mapserver.routes.prices import PRICED, Prices, around, bare
 from mapserver.routes.route import LAYERS, STEP_M, route
 from protocol.arrays import Bools, Floats, Floats32, Ints
 from protocol.errors import QueryError, Refusal
@@ -51,11 +52,11 @@ class Routes:
         touched = squares_at(places, self._site.cell_m, SQUARE_CELLS)
 
         def unpriced(read: Squares) -> set[Block]:
-            nobody = ~np.isfinite(read.at(places)["visits"])
+            nobody = ~np.isfinite(read.at(places, ("visits",))["visits"])
             return squares_at(places[nobody], self._site.cell_m, SQUARE_CELLS) if nobody.any() else set()
 
         look, read = self._read(touched, query, unpriced)
-        return self._answer(query, machine, line, look, read)
+        return self._answer(query, machine, line, look, read, Prices(read, _given(query)))
 
     def way(self, query: WayQuery) -> RouteAnswer:
         """The line that costs least, and what it costs."""
@@ -64,7 +65,8 @@ class Routes:
         machine, window = self._machines.resolve(query.machine, query.as_of_ns), self._window(query)
         touched = squares_of(window)
         look, read = self._read(touched, query, lambda read: bare(read, touched))
-        terrain, known = self._terrain(query, machine, window, read)
+        prices = Prices(read, _given(query))
+        terrain, known = self._terrain(query, machine, window, read, prices)
         ends = start, end = self._cell(query.start, window), self._cell(query.end, window)
         terrain = replace(terrain, is_open=_open(terrain, known, query, window, self._site.cell_m))
         lines = [self._line(query, terrain, known, start, end)]
@@ -74,19 +76,19 @@ class Routes:
         places = [np.asarray((line[:, ::-1] + 0.5 + corner) * self._site.cell_m, np.float64) for line in lines]
         for line in places:
             line[0], line[-1] = query.start, query.end
-        return self._cheapest(query, machine, look, read, places)
+        return self._cheapest(query, places, partial(self._answer, query, machine, look=look, read=read, prices=prices))
 
     def _cheapest(
-        self, query: WayQuery, machine: RouteMachine, look: Look, read: Squares, lines: Sequence[Floats]
+        self, query: WayQuery, lines: Sequence[Floats], driven: Callable[[Floats], RouteAnswer]
     ) -> RouteAnswer:
         """The line that the drive costs least over, which stops and takes curves: cells know nothing of either.
 
-        QueryError as of the first, where no drive is possible over any.
+        driven: over a line. QueryError as of the first, where no drive is possible over any.
         """
         answers, problems = [], []
         for line in lines:
             try:
-                answers.append(self._answer(query, machine, line, look, read))
+                answers.append(driven(line))
             except QueryError as problem:
                 problems.append(problem)
         if not answers:
@@ -125,7 +127,13 @@ class Routes:
         return "`max_grade` and `unknown` together leave none"
 
     def _answer(
-        self, query: RouteQuery | WayQuery, machine: RouteMachine, line: Floats, look: Look, read: Squares
+        self,
+        query: RouteQuery | WayQuery,
+        machine: RouteMachine,
+        line: Floats,
+        look: Look,
+        read: Squares,
+        prices: Prices,
     ) -> RouteAnswer:
         steps, totals = route(
             line,
@@ -133,7 +141,7 @@ class Routes:
             machine,
             stops=query.stops,
             step_m=query.step_m,
-            unknown_resistance=_given(query),
+            prices=prices,
             refuse_unknown=query.unknown == REFUSE,
         )
         return RouteAnswer(look.version, look.stamp_ns, line, totals, steps, machine)
@@ -160,17 +168,16 @@ class Routes:
         return look, Squares.stacked(self._site.cell_m, SQUARE_CELLS, layers or nothing)
 
     def _terrain(
-        self, query: WayQuery, machine: RouteMachine, window: CellWindow, read: Squares
+        self, query: WayQuery, machine: RouteMachine, window: CellWindow, read: Squares, prices: Prices
     ) -> tuple[Terrain, Bools]:
         """Ground of a window, open everywhere, and which cells of it are known."""
         resistance, east, north, visits = (_in_window(read, name, window) for name in GROUND)
         known = np.isfinite(resistance) | np.isfinite(visits)
-        given = _given(query)
-        if given is None and not known.any():
+        if prices.given is None and not known.any():
             raise _refusal("nobody has driven near these places yet: give `unknown` a resistance")
         if to_price := bare(read, squares_of(window)):
-            prices = priced(read, to_price, given)
-            price, price_east, price_north = (_in_window(prices, name, window) for name in PRICED)
+            of_bare = prices.of(to_price)
+            price, price_east, price_north = (_in_window(of_bare, name, window) for name in PRICED)
             resistance = np.where(np.isfinite(price), price, resistance)
             east, north = np.where(np.isfinite(price_east), (price_east, price_north), (east, north))
         east_m, north_m = (np.nan_to_num(grade).astype(np.float64) for grade in (east, north))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import product
 from weakref import ReferenceType
 
@@ -24,7 +25,7 @@ from mapserver.layers import cell_layers
 from mapserver.past.cell_history import CellHistory, cell_history
 from mapserver.past.past import Past
 from mapserver.query.source import MapState
-from protocol.arrays import AnyArray, Floats32
+from protocol.arrays import AnyArray, Floats32, Ints
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -54,12 +55,18 @@ class StillGrid:
 
     def blocks_in(self, window: CellWindow) -> list[Block]:
         """As `Grid.blocks_in`."""
-        n = BLOCK_CELLS
+        n, (x, y) = BLOCK_CELLS, self._places.T
         columns = range(window.column // n, (window.column + window.columns - 1) // n + 1)
         rows = range(window.row // n, (window.row + window.rows - 1) // n + 1)
         if len(columns) * len(rows) > len(self.all_pages):
-            return sorted((x, y) for x, y in self.all_pages if x in columns and y in rows)
+            inside = (x >= columns.start) & (x < columns.stop) & (y >= rows.start) & (y < rows.stop)
+            return list(map(tuple, self._places[inside].tolist()))
         return [block for block in product(columns, rows) if block in self.all_pages]
+
+    @cached_property
+    def _places(self) -> Ints:
+        """All blocks (n, 2), sorted."""
+        return np.array(sorted(self.all_pages), np.int64).reshape(-1, 2)
 
     def last_turns(self, blocks: Iterable[Block]) -> list[int]:
         """As `Grid.last_turns`."""
@@ -72,12 +79,16 @@ class StillGrid:
 
 @dataclass(frozen=True)
 class StillMap:
-    """A version of the map as it was, with the ages that changes of roads give. newest_ns: as in MapState."""
+    """A version of the map as it was, with the ages that changes of roads give. newest_ns: as in MapState.
+
+    marks: what stands for the ages in and near a block or square, kept by who reads it.
+    """
 
     grid: StillGrid
     version: MapVersion
     newest_ns: int
     ages: Ages
+    marks: dict[object, bytes] = field(default_factory=dict, compare=False)
 
 
 @dataclass(frozen=True)

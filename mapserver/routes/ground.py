@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numba
 import numpy as np
 
 from protocol.arrays import AnyArray, Floats, Ints
@@ -33,20 +35,17 @@ class Squares:
         layers = {name: np.stack([squares[place][name] for place in places]) for name in names}
         return cls(cell_m, edge, np.array(places), layers)
 
-    def at(self, position_m: Floats) -> dict[str, Floats]:
-        """Layers (n,) at places (n, 2): bilinear over the known of the four cells around; NaN where none is."""
+    def at(self, position_m: Floats, names: Sequence[str] = ()) -> dict[str, Floats]:
+        """Layers (n,) at places (n, 2), all or some: bilinear over the known of the four cells around; NaN of none."""
         column, row = (position_m / self.cell_m - 0.5).T
-        out = {name: (np.zeros(len(position_m)), np.zeros(len(position_m))) for name in self.layers}
+        out = {name: np.zeros((2, len(position_m))) for name in names or self.layers}
         for right in (0, 1):
             for up in (0, 1):
-                x, y = np.floor(column).astype(int) + right, np.floor(row).astype(int) + up
+                x, y = np.floor(column).astype(np.int64) + right, np.floor(row).astype(np.int64) + up
                 share = np.maximum(1 - np.abs(column - x), 0) * np.maximum(1 - np.abs(row - y), 0)
-                at, inside = self._find(x // self.edge, y // self.edge)
-                for name, (total, weight) in out.items():
-                    value = self.layers[name][at, y % self.edge, x % self.edge].astype(float)
-                    known = inside & np.isfinite(value)
-                    total += np.where(known, share * np.where(known, value, 0.0), 0.0)
-                    weight += np.where(known, share, 0.0)
+                at, inside = self._find(x // self.edge, y // self.edge), (y % self.edge, x % self.edge)
+                for name, sums in out.items():
+                    _add_known(self.layers[name], at, *inside, share, sums)
         return {
             name: np.where(weight > LEAST_SHARE, total / np.maximum(weight, LEAST_SHARE), np.nan)
             for name, (total, weight) in out.items()
@@ -56,19 +55,31 @@ class Squares:
         """Index of each square by its column and row."""
         return {(x, y): i for i, (x, y) in enumerate(self.places.tolist())}
 
-    def _find(self, x: Ints, y: Ints) -> tuple[Ints, AnyArray]:
-        """Index (n,) of the squares at these places, and whether they are there."""
+    def _find(self, x: Ints, y: Ints) -> Ints:
+        """Index (n,) of the squares at these places, -1 where there is none."""
         keys, wanted = _key(*self.places.T), _key(x, y)
         order = np.argsort(keys)
         at = np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)
-        return order[at], keys[order[at]] == wanted
+        return np.where(keys[order[at]] == wanted, order[at], -1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_known(layer: Any, at: Any, y: Any, x: Any, share: Any, sums: Any) -> None:
+    """Add shares (n,) of the known of these cells of squares, and of their values, to sums (2, n): values, shares."""
+    for i in range(len(at)):
+        if at[i] >= 0:
+            value = np.float64(layer[at[i], y[i], x[i]])
+            if np.isfinite(value):
+                sums[0, i] += share[i] * value
+                sums[1, i] += share[i]
 
 
 def squares_at(position_m: Floats, cell_m: float, edge: int) -> set[tuple[int, int]]:
     """Columns and rows of the squares, edge cells to a side, that the four cells around places (n, 2) lie in."""
-    first = np.floor(position_m / cell_m - 0.5).astype(int)
-    corners = [first + np.array([x, y]) for x in (0, 1) for y in (0, 1)]
-    return set(map(tuple, np.unique(np.concatenate(corners) // edge, axis=0).tolist()))
+    first = np.floor(position_m / cell_m - 0.5).astype(np.int64)
+    corners = [(first + np.array([x, y])) // edge for x in (0, 1) for y in (0, 1)]
+    keys = np.unique(np.concatenate([_key(*corner.T) for corner in corners]))
+    return set(zip((keys // (2 * HALF) - HALF).tolist(), (keys % (2 * HALF) - HALF).tolist(), strict=True))
 
 
 def _key(x: Ints, y: Ints) -> Ints:

@@ -9,6 +9,7 @@ deviation is of the one that filling begins with.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Set
+from functools import cached_property
 from itertools import product
 
 import cv2
@@ -38,45 +39,75 @@ def bare(squares: Squares, among: Iterable[Square]) -> set[Square]:
     return set(among) - {place for place, at in squares.by_place().items() if whole[at].all()}
 
 
-def priced(squares: Squares, wanted: Set[Square], given: float | None) -> Squares:
-    """PRICED of wanted squares: resistance, slopes to the east and north; NaN where machines were and measured them.
+class Prices:
+    """What bare ground costs, square by square, each reckoned once: a way reads them for its search and for its drives.
 
-    squares: NEEDS, of all `around` the wanted. given: what unknown ground resists, None: by the rule. Where machines
-    were and measured no resistance, it is that of the nearest place where they did.
+    squares: NEEDS, of all `around` those that are wanted. given: what unknown ground resists, None: by the rule. For
+    one thread at a time.
     """
-    edge = squares.edge
-    resistance, std, east, north, visits = (squares.layers[name] for name in NEEDS)
-    driven = np.isfinite(visits)
-    known, sloped = driven & np.isfinite(resistance), driven & np.isfinite(east)
-    counts = _counts(resistance + np.nan_to_num(np.hypot(east, north)), known)
-    rises = Rises.of_slopes(east, north, sloped)
-    index = squares.by_place()
-    out = {}
-    for square in wanted:
-        near = [[index.get((square[0] + x, square[1] + y)) for x in (-1, 0, 1)] for y in (-1, 0, 1)]
+
+    def __init__(self, squares: Squares, given: float | None = None) -> None:
+        self.given, self._squares, self._index = given, squares, squares.by_place()
+        self._known: dict[Square, dict[str, Floats]] = {}
+
+    def of(self, wanted: Set[Square]) -> Squares:
+        """PRICED of wanted squares: resistance, slopes to the east and north; NaN where machines measured them.
+
+        Where machines were and measured no resistance, it is that of the nearest place where they did.
+        """
+        for square in wanted - self._known.keys():
+            self._known[square] = self._priced(square)
+        return Squares.stacked(
+            self._squares.cell_m, self._squares.edge, {square: self._known[square] for square in wanted}
+        )
+
+    @cached_property
+    def _layers(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
+        """Resistance and its deviation, where machines were, and where they measured slopes (k, n, n)."""
+        resistance, std, east, _, visits = (self._squares.layers[name] for name in NEEDS)
+        driven = np.isfinite(visits)
+        return resistance, std, driven, driven & np.isfinite(east)
+
+    @cached_property
+    def _counted(self) -> Ints:
+        """How many known cells of each square are so dear."""
+        resistance, _, driven, _ = self._layers
+        east, north = (self._squares.layers[name] for name in NEEDS[2:4])
+        steep = np.hypot(east, north)
+        return _counts(resistance + np.where(np.isfinite(steep), steep, 0), driven & np.isfinite(resistance))
+
+    @cached_property
+    def _rises(self) -> Rises:
+        east, north = (self._squares.layers[name] for name in NEEDS[2:4])
+        return Rises.of_slopes(east, north, self._layers[3])
+
+    def _priced(self, square: Square) -> dict[str, Floats]:
+        edge, (resistance, std, driven, sloped) = self._squares.edge, self._layers
+        near = [[self._index.get((square[0] + x, square[1] + y)) for x in (-1, 0, 1)] for y in (-1, 0, 1)]
         own, doubt, is_driven, is_sloped = np.full((edge, edge), np.nan), 0.0, False, False
         if (at := near[1][1]) is not None:
             own, is_driven, is_sloped = resistance[at].astype(np.float64), driven[at], sloped[at]
             doubt = np.clip(std[at] / own / RESISTANCE_PRIOR_STD, 0.0, 1.0)
         dear = (
-            given
-            if given is not None
-            else _dearest(counts[[at for row in near for at in row if at is not None]].sum(axis=0))
+            self.given
+            if self.given is not None
+            else _dearest(self._counted[[at for row in near for at in row if at is not None]].sum(axis=0))
         )
-        price = np.where(np.isfinite(own), own + doubt * np.maximum(dear - own, 0.0), dear)
-        if (unmeasured := is_driven & ~np.isfinite(own)).any():
-            price = np.where(unmeasured, _nearest(_joined(resistance, near), _joined(known, near) > 0, dear), price)
-        height = heights(Rises(*(np.nan_to_num(_joined(part, near)) for part in vars(rises).values())))
+        measured = np.isfinite(own)
+        price = np.where(measured, own + doubt * np.maximum(dear - own, 0.0), dear)
+        if (unmeasured := is_driven & ~measured).any():
+            known = _joined(driven & np.isfinite(resistance), near, 0.0) > 0
+            price = np.where(unmeasured, _nearest(_joined(resistance, near, np.nan), known, dear), price)
+        height = heights(Rises(*(_joined(part, near, 0.0) for part in vars(self._rises).values())))
         m = len(height) // 3
         even = slopes(height[m - 1 : 2 * m + 1, m - 1 : 2 * m + 1])
-        out[square] = {
-            RESISTANCE: np.where(is_driven & np.isfinite(own), np.nan, price),
+        return {
+            RESISTANCE: np.where(is_driven & measured, np.nan, price),
             **{
                 name: np.where(is_sloped, np.nan, part[:edge, :edge])
                 for name, part in zip((EAST, NORTH), even, strict=True)
             },
         }
-    return Squares.stacked(squares.cell_m, edge, out)
 
 
 def _counts(values: AnyArray, known: Bools) -> Ints:
@@ -96,10 +127,10 @@ def _dearest(counts: Ints) -> float:
     return float(BINS[bin_] * (BINS[bin_ + 1] / BINS[bin_]) ** share)
 
 
-def _joined(values: AnyArray, near: Sequence[Sequence[int | None]]) -> Floats:
-    """Values (k, n, n) of three by three squares in one array (3 n, 3 n); NaN of those that are not there."""
+def _joined(values: AnyArray, near: Sequence[Sequence[int | None]], otherwise: float) -> Floats:
+    """Values (k, n, n) of three by three squares in one array (3 n, 3 n); otherwise: of those that are not there."""
     n = values.shape[-1]
-    out = np.full((3 * n, 3 * n), np.nan)
+    out = np.full((3 * n, 3 * n), otherwise)
     for y, row in enumerate(near):
         for x, at in enumerate(row):
             if at is not None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
+import numba
 import numpy as np
 
 from mapserver.routes.drive import Drive, drive, smoothed
 from mapserver.routes.ground import Squares, squares_at
 from mapserver.routes.line import Steps, limits, steps
-from mapserver.routes.prices import EAST, NORTH, RESISTANCE, priced
+from mapserver.routes.prices import EAST, NORTH, RESISTANCE, Prices
 from protocol.arrays import Bools, Floats
 from protocol.errors import QueryError, Refusal
 from protocol.queries.routing import RouteMachine, RouteSteps, RouteTotals
@@ -59,8 +61,8 @@ class Ground:
     unmeasured: Bools
 
 
-def ground_along(squares: Squares, cut: Steps, unknown_resistance: float | None) -> Ground:
-    """The ground along a line; what is unknown has this resistance, None: its price.
+def ground_along(squares: Squares, cut: Steps, prices: Prices) -> Ground:
+    """The ground along a line; what is unknown has its price.
 
     What was driven on and not measured lies between what was measured before and behind it, and so does its resistance.
     QueryError where all is unknown and nothing says what that is to cost.
@@ -78,11 +80,11 @@ def ground_along(squares: Squares, cut: Steps, unknown_resistance: float | None)
         resistance = np.where(unmeasured, between, resistance)
         std = np.where(unmeasured, np.hypot(UNMEASURED_STD * between, differs / 2), std)
     if (bare := unknown | ~driven).any():
-        if unknown_resistance is None and unknown.all() and not np.isfinite(squares.layers["resistance_filled"]).any():
+        if prices.given is None and unknown.all() and not np.isfinite(squares.layers["resistance_filled"]).any():
             raise QueryError(Refusal.OUT_OF_RANGE, "nobody has driven near this line yet: say what `unknown` ground is")
         wanted = squares_at(cut.position_m[bare], squares.cell_m, squares.edge)
-        prices = priced(squares, wanted, unknown_resistance).at(cut.position_m)
-        price, even = prices[RESISTANCE], prices[EAST] * east + prices[NORTH] * north
+        of_bare = prices.of(wanted).at(cut.position_m)
+        price, even = of_bare[RESISTANCE], of_bare[EAST] * east + of_bare[NORTH] * north
         std = np.where(unknown, UNKNOWN_STD * price, np.where(bare, np.hypot(std, price - resistance), std))
         resistance, slope = np.where(bare, price, resistance), np.where(bare & np.isfinite(even), even, slope)
     slope_std = np.where(flat, UNKNOWN_SLOPE_STD, along["grade_filled_std"])
@@ -116,12 +118,17 @@ def mean_std(std: Floats, length_m: Floats) -> float:
     """
     distance_m = float(length_m.sum())
     weighted = std * length_m / distance_m
-    fade = np.exp(-length_m / ALIKE_M)
+    return math.sqrt(_correlated(weighted, np.exp(-length_m / ALIKE_M)) + COMMON_STD**2)
+
+
+@numba.njit(cache=True, nogil=True)
+def _correlated(std: Any, fade: Any) -> float:
+    """Variance of the sum of values with deviations (n,), each of which correlates by its fade with what is before."""
     total, carried = 0.0, 0.0
-    for value, kept in zip(weighted.tolist(), fade.tolist(), strict=True):
-        total += value * value + 2 * value * carried
-        carried = (carried + value) * kept
-    return float(np.sqrt(total + COMMON_STD**2))
+    for i in range(len(std)):
+        total += std[i] * std[i] + 2 * std[i] * carried
+        carried = (carried + std[i]) * fade[i]
+    return total
 
 
 def route(
@@ -131,15 +138,16 @@ def route(
     *,
     stops: tuple[bool, bool] = (True, True),
     step_m: float = 25.0,
-    unknown_resistance: float | None = None,
+    prices: Prices | None = None,
     refuse_unknown: bool = False,
 ) -> tuple[RouteSteps, RouteTotals]:
     """What a drive along a line (k, 2) costs. squares: LAYERS, around all of it. stops: at its begin and its end.
 
-    step_m: of the steps that are answered. QueryError where the machine's power does not do it, or nothing is known.
+    step_m: of the steps that are answered. prices: of these squares. QueryError where the machine's power does not do
+    it, or nothing is known.
     """
     cut = steps(line_m, STEP_M)
-    ground = ground_along(squares, cut, unknown_resistance)
+    ground = ground_along(squares, cut, prices or Prices(squares))
     if refuse_unknown and ground.unknown.any():
         x, y = cut.position_m[int(ground.unknown.argmax())]
         raise QueryError(

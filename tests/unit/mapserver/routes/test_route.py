@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapserver.routes.ground import Squares
+from mapserver.routes.prices import Prices
 from mapserver.routes.route import LAYERS, STEP_M, mean_std, route
 from protocol.arrays import Floats
 from protocol.errors import QueryError
@@ -114,7 +115,7 @@ def test_unknown_ground_counts_as_the_dearest_and_is_said() -> None:
     assert (totals.unknown, totals.unmeasured) == (pytest.approx(40 / 130, abs=0.02), 0.0)
     assert steps.resistance[8] == totals.unknown_resistance == pytest.approx(0.08, rel=0.02)
     assert np.isnan(steps.confidence[8])
-    _, given = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, unknown_resistance=0.02)
+    _, given = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, prices=Prices(layers, 0.02))
     assert given.energy_j == pytest.approx(WEIGHT_N * 0.02 * 130, rel=0.01)
     assert totals.energy_high_j - totals.energy_low_j > given.energy_high_j - given.energy_low_j
 
@@ -142,7 +143,7 @@ def test_where_nothing_is_known_a_route_has_no_cost_unless_it_is_said() -> None:
     layers = fields(math.nan)
     with pytest.raises(QueryError, match="nobody has driven near this line yet"):
         route(line((10, 50), (140, 50)), layers, SLOW)
-    _, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, unknown_resistance=0.05)
+    _, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, prices=Prices(layers, 0.05))
     assert (totals.unknown, totals.energy_j) == pytest.approx((1.0, WEIGHT_N * 0.05 * 130))
 
 
