@@ -17,10 +17,8 @@ LEAST_COST = 0.002
 
 @numba.njit(cache=True, nogil=True)
 def dijkstra(
-    resistance: Any,
-    east: Any,
-    north: Any,
-    is_open: Any,
+    ground: Any,
+    columns: int,
     cell_m: float,
     crawl: float,
     steps: Any,
@@ -33,13 +31,16 @@ def dijkstra(
 ) -> None:
     """Cost of the cheapest line from one cell to others, and the cell before each on it, until the target is reached.
 
-    Cells are numbered row by row. The arrays are as of `least_cost.Terrain`; cells, shares: what steps (k, 2) touch.
-    distance (n,): inf, before (n,): -1, where no line leads or none was looked for.
+    Cells are numbered row by row, with a border of closed ones that no step leads across. ground (n, 3): resistance,
+    inf where closed, and slopes to the east and north, side by side, as each look at a cell takes all of them. cells,
+    shares: what steps (k, 2) touch, by the difference of numbers. distance (n,): inf, before (n,): -1, where no line
+    leads or none was looked for.
     """
-    rows, columns = is_open.shape
     norms = np.sqrt((steps * steps).sum(axis=1).astype(np.float64))
-    heap, place = np.empty(rows * columns, np.int32), np.full(rows * columns, -1, np.int32)  # -2: settled
-    distance[source], heap[0], place[source], size = 0.0, source, 0, 1
+    east, north, onward = steps[:, 1] / norms, steps[:, 0] / norms, steps[:, 0] * columns + steps[:, 1]
+    heap, keys = np.empty(len(ground), np.int32), np.empty(len(ground))
+    place = np.full(len(ground), -1, np.int32)  # -2: settled
+    distance[source], heap[0], keys[0], place[source], size = 0.0, source, 0.0, 0, 1
     while size > 0:
         node = heap[0]
         if node == target:
@@ -47,72 +48,73 @@ def dijkstra(
         size -= 1
         place[node] = -2
         if size > 0:
-            _sift_down(heap, place, distance, heap[size], size)
-        row, column = node // columns, node % columns
+            _sift_down(heap, keys, place, heap[size], keys[size], size)
         for k in range(len(steps)):
-            to_row, to_column = row + steps[k, 0], column + steps[k, 1]
-            if not (0 <= to_row < rows and 0 <= to_column < columns):
+            to = node + onward[k]
+            if place[to] == -2 or ground[to, 0] == math.inf:
                 continue
-            to = to_row * columns + to_column
-            if place[to] == -2:
-                continue
-            per_m = _per_m(
-                resistance, east, north, is_open, crawl, row, column, cells[k], shares[k],
-                steps[k, 1] / norms[k], steps[k, 0] / norms[k],
+            there = _there(
+                ground, crawl, node, cells[k], shares[k], east[k], north[k], distance[node], norms[k], cell_m,
+                distance[to],
             )  # fmt: skip
-            there = distance[node] + per_m * norms[k] * cell_m
             if there < distance[to]:
                 distance[to], before[to] = there, node
                 if place[to] < 0:
                     place[to] = size
                     size += 1
-                _sift_up(heap, place, distance, to)
+                _sift_up(heap, keys, place, to, there)
 
 
 @numba.njit(cache=True, nogil=True)
-def _sift_up(heap: Any, place: Any, distance: Any, node: int) -> None:
+def _sift_up(heap: Any, keys: Any, place: Any, node: int, key: float) -> None:
     """Bring a node to its place in the heap, which is no later than the one that it has."""
-    at, key = place[node], distance[node]
+    at = place[node]
     while at > 0:
         parent = (at - 1) // 4
-        other = heap[parent]
-        if distance[other] <= key:
+        if keys[parent] <= key:
             break
-        heap[at], place[other] = other, at
+        heap[at], keys[at] = heap[parent], keys[parent]
+        place[heap[at]] = at
         at = parent
-    heap[at], place[node] = node, at
+    heap[at], keys[at], place[node] = node, key, at
 
 
 @numba.njit(cache=True, nogil=True)
-def _sift_down(heap: Any, place: Any, distance: Any, node: int, size: int) -> None:
+def _sift_down(heap: Any, keys: Any, place: Any, node: int, key: float, size: int) -> None:
     """Bring a node from the top of the heap to its place."""
-    at, key = 0, distance[node]
+    at = 0
     while True:
         least, best = -1, key
         for child in range(4 * at + 1, min(4 * at + 5, size)):
-            if distance[heap[child]] < best:
-                least, best = child, distance[heap[child]]
+            if keys[child] < best:
+                least, best = child, keys[child]
         if least < 0:
             break
-        other = heap[least]
-        heap[at], place[other] = other, at
+        heap[at], keys[at] = heap[least], best
+        place[heap[at]] = at
         at = least
-    heap[at], place[node] = node, at
+    heap[at], keys[at], place[node] = node, key, at
 
 
 @numba.njit(cache=True, nogil=True)
-def _per_m(
-    resistance: Any, east: Any, north: Any, is_open: Any, crawl: float, row: int, column: int, cells: Any, shares: Any,
-    x: float, y: float,
+def _there(
+    ground: Any, crawl: float, node: int, cells: Any, shares: Any, x: float, y: float, here: float, norm: float,
+    cell_m: float, known: float,
 ) -> float:  # fmt: skip
-    """Mean cost per metre in direction x, y over the cells that a step from here touches; inf where one is not open."""
-    total = 0.0
+    """Cost of a line by way of here, one step further in direction x, y: the mean per metre of the cells it touches.
+
+    inf where one of these is closed, or the cost at least what is known: what they cost only adds up.
+    """
+    total, there = 0.0, here
     for i in range(len(shares)):
         if shares[i] < 0.0:
             break
-        r, c = row + cells[i, 0], column + cells[i, 1]
-        if not is_open[r, c]:
+        cell = node + cells[i]
+        if ground[cell, 0] == math.inf:
             return math.inf
-        climbs = resistance[r, c] + east[r, c] * x + north[r, c] * y
+        climbs = ground[cell, 0] + ground[cell, 1] * x + ground[cell, 2] * y
         total += shares[i] * (max(climbs, LEAST_COST) if crawl == math.inf else max(climbs / crawl, 1.0))
-    return total
+        there = here + total * norm * cell_m
+        if there >= known:
+            return math.inf
+    return there

@@ -59,16 +59,30 @@ def least_cost_line(terrain: Terrain, start: Cell, end: Cell) -> tuple[Ints, flo
 
 def _search(terrain: Terrain, start: Cell, end: Cell, steps: Ints) -> Ints | None:
     """Cells (n, 2) of the cheapest line in steps (k, 2)."""
-    columns, cells = terrain.is_open.shape[1], terrain.is_open.size
-    source, target = start[0] * columns + start[1], end[0] * columns + end[1]
-    distance, before = np.full(cells, math.inf), np.full(cells, -1, np.int32)
-    dijkstra(*_arrays(terrain), steps, *_touched(steps), source, target, distance, before)
+    border = int(np.abs(steps).max())
+    columns = terrain.is_open.shape[1] + 2 * border
+    ground, (cells, shares) = _bordered(terrain, border), _touched(steps)
+    source, target = ((row + border) * columns + column + border for row, column in (start, end))
+    distance, before = np.full(len(ground), math.inf), np.full(len(ground), -1, np.int32)
+    onward = cells @ np.array([columns, 1])
+    dijkstra(ground, columns, terrain.cell_m, terrain.crawl, steps, onward, shares, source, target, distance, before)
     if not math.isfinite(distance[target]):
         return None
     places = [target]
     while places[-1] != source:
         places.append(int(before[places[-1]]))
-    return np.stack(np.divmod(np.array(places[::-1]), columns), axis=1)
+    return np.stack(np.divmod(np.array(places[::-1]), columns), axis=1) - border
+
+
+def _bordered(terrain: Terrain, border: int) -> Floats:
+    """Resistance and slopes (n, 3) of cells, row by row, with so many closed ones around; inf where closed."""
+    rows, columns = terrain.is_open.shape
+    out = np.zeros((rows + 2 * border, columns + 2 * border, 3))
+    out[..., 0] = math.inf
+    inner = out[border : border + rows, border : border + columns]
+    inner[..., 0] = np.where(terrain.is_open, terrain.resistance, math.inf)
+    inner[..., 1], inner[..., 2] = terrain.grade_east, terrain.grade_north
+    return out.reshape(-1, 3)
 
 
 def _band(shape: tuple[int, int], line: Ints) -> Bools:
