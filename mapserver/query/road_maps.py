@@ -45,9 +45,9 @@ log = logging.getLogger("mapserver.query.road_maps")
 # How much older than a question its roads may be: a repair is seen after two or three passes, which take minutes, and a
 # road is planned on for minutes more. A new map each second costs whoever asks, and those who wait for him, 0.1 s.
 FRESH_S = 10.0
-EVERY_S = FRESH_S / 2  # between two makings: one that takes as long still ends in time
+SPARE = 3  # times the last making: so long before roads are too old the next one begins, its own time twice with it
 ASKED_S = 600.0  # so long after the last question roads are still made for the next one
-PATIENCE_S = 2.0  # how long a picture waits for roads before it goes without newer ones
+PATIENCE_S = 2.0  # how long a picture waits for the first roads before it goes without
 END_S = 1.0  # at the end, what is being made may take so long; nobody waits for it
 LOOK_BACK_NS = 30 * 24 * HOUR_NS  # before the site's now, of traffic: older journals are not read for it
 
@@ -187,10 +187,15 @@ class RoadMaps:
                 self._now()
 
     def lately(self) -> Ages:
-        """Ages of cells as of some seconds ago, for pictures; none while the journal is read for the first time."""
+        """Ages of cells as of some seconds ago, for pictures, which wait for none that others make but the first."""
         try:
             with _journal_read():
-                self._lately(PATIENCE_S)
+                asked_s = self._ask()
+                if not self._fresh(asked_s) and self._lock.acquire(timeout=0.0 if self._newest else PATIENCE_S):
+                    try:
+                        self._now()
+                    finally:
+                        self._lock.release()
         except QueryError as error:  # asked again with the next picture
             log.warning("no road map reason=%s problem=%r", error.reason, str(error))
         return self._newest.roads.ages if self._newest else {}
@@ -202,30 +207,31 @@ class RoadMaps:
                 self._now()
 
     def _run(self) -> None:
-        while True:
+        wait_s = 0.0
+        while not self._ended.wait(wait_s):
+            began_s = self._clock()
             try:
                 self.renew()
             except QueryError as error:  # who asks is answered so, too
                 log.info("no road map reason=%s problem=%r", error.reason, str(error))
             except Exception:  # a bug must not end the thread
                 log.exception("no road map")
-            if self._ended.wait(EVERY_S):
-                return
+            took_s = self._clock() - began_s
+            # as seldom as may be, since all layers near a new sample are derived again; and half of the time at most
+            wait_s = max(FRESH_S - SPARE * took_s, took_s)
 
-    def _lately(self, patience_s: float = -1.0) -> RoadMap:
-        """The newest roads, none older than FRESH_S: who waits for those in the making takes them, however long it was.
-
-        patience_s: how long to wait for whoever makes some; beyond, and QueryError. Negative: for as long as it takes.
-        """
-        asked_s = self._asked_s = self._clock()
+    def _lately(self) -> RoadMap:
+        """The newest roads, none older than FRESH_S: who waits for those in the making takes them, if begun in time."""
+        asked_s = self._ask()
         if roads := self._fresh(asked_s):
             return roads
-        if not self._lock.acquire(timeout=patience_s):
-            raise QueryError(Refusal.OVERLOADED, "roads are still being made")
-        try:
+        with self._lock:
             return self._fresh(asked_s) or self._now()
-        finally:
-            self._lock.release()
+
+    def _ask(self) -> float:
+        """Note that somebody asks, and when."""
+        self._asked_s = self._clock()
+        return self._asked_s
 
     def _fresh(self, asked_s: float) -> RoadMap | None:
         """Roads that a question of this time may be answered from: of the map's facts, and of its last seconds."""

@@ -456,9 +456,8 @@ def test_roads_of_another_fact_are_of_no_use(repaired):
 
 @pytest.fixture
 def slow(repaired, monkeypatch):
-    """Answers whose roads are made beside them, and an event until which the next ones are in the making."""
+    """Answers to which newer roads are in the making beside, once `come` was called, until an event is set."""
     opened, _ = repaired
-    monkeypatch.setattr(road_maps, "EVERY_S", 0.01)
     answers, may_end, began = answers_of(opened), threading.Event(), threading.Event()
     answers._roads.read()
     whole = road_maps.network
@@ -469,37 +468,40 @@ def slow(repaired, monkeypatch):
         return whole(skeleton)
 
     monkeypatch.setattr(road_maps, "network", slowly)
-    answers.start()
-    yield opened, answers, began, may_end
+    come(opened)
+    making = threading.Thread(target=answers._roads.renew)
+    making.start()
+    assert began.wait(WAIT_S)
+    yield answers, may_end
     may_end.set()
-    answers.close()
+    making.join()
 
 
 def test_roads_in_the_making_hold_up_no_route(slow):
-    opened, answers, began, may_end = slow
+    answers, may_end = slow
     line = ((15.0, 10.0), (205.0, 10.0))
-    known = answers._routes.route(RouteQuery(line))
-    come(opened)
-    assert began.wait(WAIT_S)
     meanwhile = answers._routes.route(RouteQuery(line))
-    assert meanwhile.version.row == known.version.row == 4
-    assert meanwhile.totals == known.totals
+    assert meanwhile.version.row == answers._routes.route(RouteQuery(line)).version.row == 4
     assert answers._routes.route(RouteQuery(line, repairs=False)).version.row == 5
     may_end.set()
     wait_for(lambda: answers._routes.route(RouteQuery(line)).version.row == 5)
 
 
-def test_who_waits_for_roads_takes_those_that_were_begun_in_time(slow):
-    """However long they take: whoever waits would make the next ones otherwise, one after the other."""
-    opened, answers, began, may_end = slow
-    come(opened)
-    assert began.wait(WAIT_S)
+def test_who_waits_for_roads_takes_those_in_the_making(slow):
+    answers, may_end = slow
     with ThreadPoolExecutor(4) as pool:
         waiting = [pool.submit(answers._roads.reach, 5) for _ in range(4)]
         may_end.set()
         for one in waiting:
             one.result(WAIT_S)
     assert answers._roads.read().version.row == 5
+
+
+def test_a_picture_goes_without_newer_roads_that_take_long(slow, monkeypatch):
+    answers, _ = slow
+    known = answers._roads.read().ages
+    monkeypatch.setattr(road_maps, "FRESH_S", -1.0)  # too old at once
+    assert answers._roads.lately() is known
 
 
 def test_roads_are_made_beside_while_somebody_asks(repaired):
@@ -528,7 +530,7 @@ def test_the_end_of_a_server_ends_the_making_of_roads(repaired):
 
 def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
     opened, _ = repaired
-    monkeypatch.setattr(road_maps, "EVERY_S", 0.01)
+    monkeypatch.setattr(road_maps, "FRESH_S", 0.0)
     roads, failing = answers_of(opened)._roads, threading.Event()
     follow = roads._follow
 
