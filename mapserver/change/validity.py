@@ -47,8 +47,7 @@ def _since(pages: Sequence[TimedPage], age_ns: Ints) -> Ints:
     Where there is none, of the page that it begins in, which has older evidence as well: better than to know nothing.
     """
     whole, part = np.zeros((2, len(age_ns)), np.int64)
-    for index in range(len(pages) - 1, -1, -1):
-        timed = pages[index]
+    for index, timed in reversed(list(enumerate(pages))):  # packed pages are expanded as a whole, whichever is read
         known = np.zeros(len(age_ns), np.bool_)
         known[timed.page.cells["cell"]] = age_ns[timed.page.cells["cell"]] > 0
         whole[known & (timed.first_ns >= age_ns)] = index
