@@ -122,7 +122,7 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
     queries = _without(counters, _REFUSED_QUERY)
     batches = {k: v for k, v in _without(counters, _REFUSED).items() if not k.startswith("query_")}
     trimmed, past = counters.get("samples_trimmed", 0), info["checkpoints"]
-    answered = counters.get("queries_answered", 0)
+    answered, made = (counters.get(name, 0) for name in ("queries_answered", "roads_made"))
     return [
         _counter("sitegrid_batches_total", "Batches with new samples that were taken.", counters.get("batches", 0)),
         _counter("sitegrid_batches_refused_total", "Batches that were refused.", batches, "reason"),
@@ -131,6 +131,8 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _counter(
             "sitegrid_layers_total", "Blocks and squares whose layers a query needed.", _layers(counters), "source"
         ),
+        _counter("sitegrid_roads_made_total", "Road maps that were made of the map as it is.", made),
+        _counter("sitegrid_roads_made_seconds_total", "Time spent on that.", counters.get("roads_made_ms", 0) / 1e3),
         _counter("sitegrid_samples_trimmed_total", "Samples that came in once more, and do not count.", trimmed),
         _gauge("sitegrid_journal_rows", "The last row of the journal on disk.", info["journalled"]),
         _gauge("sitegrid_merged_rows", "The last row of the journal that is in the map.", info["merged"]),

@@ -57,6 +57,7 @@ SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make 
 WAY_BYTES = 2**23  # as much of the budget as a search for a way takes: four may wait or be in work
 # Counters of `info`: blocks and squares whose layers were kept from an earlier query, and were derived for one.
 LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
+ROADS_MADE, ROADS_MADE_MS = "roads_made", "roads_made_ms"  # road maps of now, and how long that took
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
 WITHOUT_MEAN = ("heading", "resistance_class", "slope_class", "resistance_class_filled")
 
@@ -157,7 +158,8 @@ class Answers:
         names = {"layers": [*cell_layers.LAYERS, *AREA_LAYERS], "boundaries": list(self._config.read.boundaries)}
         info = self._source.info()
         layers = Counter({LAYERS_KEPT: self._layers.used, LAYERS_DERIVED: self._layers.derived})
-        counters = {**info["counters"], **+layers}
+        made = Counter({ROADS_MADE: self._roads.made, ROADS_MADE_MS: round(1e3 * self._roads.made_s)})
+        counters = {**info["counters"], **+layers, **+made}
         return {**info, "counters": counters, "checkpoints": self._source.past.checkpoints.state, **names}
 
     def point(self, query: PointQuery) -> PointAnswer:

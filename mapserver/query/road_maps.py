@@ -141,7 +141,10 @@ def _journal_read() -> Iterator[None]:
 
 
 class RoadMaps:
-    """Makes road maps of one source. For any thread; one at a time makes those of now."""
+    """Makes road maps of one source. For any thread; one at a time makes those of now.
+
+    made, made_s: how many of these, and how long it took.
+    """
 
     def __init__(self, source: MapSource, clock: Callable[[], float] = time.monotonic) -> None:
         """clock: steady, in seconds."""
@@ -150,6 +153,7 @@ class RoadMaps:
         self._lock = threading.Lock()
         self._skeletons = Skeletons(self._cell_m)
         self._newest: _Newest | None = None
+        self.made, self.made_s = 0, 0.0
         self._asked_s = clock()
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
@@ -270,6 +274,7 @@ class RoadMaps:
         roads = replace(made, grid=grid)
         _ = roads.still  # with the ages, here and not in the first question
         self._newest = _Newest(roads, looked_s)
+        self.made, self.made_s = self.made + 1, self.made_s + self._clock() - looked_s
         return roads
 
     def _as_of(self, as_of_ns: int, machine: str) -> RoadMap:

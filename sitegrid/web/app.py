@@ -24,12 +24,13 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from protocol.errors import Refusal
-from protocol.queries.answers import MapInfo
+from protocol.queries.answers import MapInfo, MapVersion
 from protocol.site.geometry import Bounds
 from sitegrid.web import live, mercator, values
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
 from sitegrid.web.problems import Problem, bad, problem_response
+from sitegrid.web.resource import tag_of
 from sitegrid.web.resources import RESOURCES, follows_now
 from sitegrid.web.site import SiteFeed
 
@@ -91,14 +92,16 @@ class WebApp:
         try:
             feed = self._feed(request)
             values.check_known(parameters, tuple(resource.parameters))
-            tag = _tag(await feed.info(FRESH_S), with_now=follows_now(resource, parameters))
+            info = await feed.info(FRESH_S)
+            tag = _tag(info, with_now=follows_now(resource, parameters))
             headers = {"ETag": tag, "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
             if request.headers.get("if-none-match") == tag:
                 return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
             response = await resource.answer(feed, parameters)
         except Exception as error:  # whatever it was: one answer, as a problem
             return _failed(request, error)
-        response.headers.update(headers)
+        own = response.headers.get("etag")
+        response.headers.update(headers if own in (None, _tag(info, with_now=False)) else {**headers, "ETag": str(own)})
         return response
 
     async def _live(self, socket: WebSocket) -> None:
@@ -220,8 +223,8 @@ def _parameters(request: Request) -> dict[str, str]:
 
 def _tag(info: MapInfo, *, with_now: bool) -> str:
     """Which map an answer is of: its store and version, and the site's now where ages depend on it."""
-    now = f"-{info.stamp_ns}-{info.journalled}" if with_now else ""
-    return f'"{info.store}-{info.merged}-{info.fact}{now}"'
+    tag = tag_of(MapVersion(info.store, info.merged, info.fact))
+    return f'{tag[:-1]}-{info.stamp_ns}-{info.journalled}"' if with_now else tag
 
 
 def _json(value: Any, headers: dict[str, str] | None = None) -> Response:

@@ -48,6 +48,17 @@ def as_geojson(value: Any) -> Response:
     return Response(json.dumps(value, allow_nan=False), media_type=GEOJSON[0])
 
 
+def of_version(response: Response, version: MapVersion) -> Response:
+    """Name the map that an answer is of: roads may be of some seconds ago, and a copy of them is none of the newest."""
+    response.headers["ETag"] = tag_of(version)
+    return response
+
+
+def tag_of(version: MapVersion) -> str:
+    """ETag of what follows from the map alone."""
+    return f'"{version.store}-{version.row}-{version.fact}"'
+
+
 def version_of(version: MapVersion) -> dict[str, Any]:
     """The map that an answer is of, as all answers name it."""
     return {"store": version.store, "merged": version.row, "fact": version.fact}

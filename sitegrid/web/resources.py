@@ -24,6 +24,7 @@ from sitegrid.web.resource import (
     Resource,
     as_geojson,
     as_json,
+    of_version,
     parsed,
     version_of,
 )
@@ -45,7 +46,8 @@ async def point(feed: SiteFeed, parameters: Parameters) -> Response:
     answer = await feed.ask(feed.client.point, query.x_m, query.y_m, query.layers, **vars(query.when))
     lat_deg, lon_deg, _ = (await feed.projection()).to_geodetic(answer.x_m, answer.y_m)
     place = {"x_m": answer.x_m, "y_m": answer.y_m, "lat_deg": lat_deg, "lon_deg": lon_deg}
-    return as_json({**place, "values": answer.values, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
+    table = {**place, "values": answer.values, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
+    return of_version(as_json(table), answer.version)
 
 
 async def points(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -54,7 +56,8 @@ async def points(feed: SiteFeed, parameters: Parameters) -> Response:
     assert isinstance(query, PointsQuery)
     answer = await feed.ask(feed.client.points, query.places, query.layers, **vars(query.when))
     columns = {"x_m": answer.x_m, "y_m": answer.y_m, "layers": answer.layers}
-    return as_json({**columns, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
+    table = {**columns, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
+    return of_version(as_json(table), answer.version)
 
 
 async def why(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -89,9 +92,10 @@ async def region(feed: SiteFeed, parameters: Parameters) -> Response:
         file = io.BytesIO()
         version = np.array([answer.version.row, answer.version.fact])
         np.savez_compressed(file, x_m=answer.x_m, y_m=answer.y_m, version=version, **layers)  # type: ignore[arg-type]
-        return Response(file.getvalue(), media_type="application/x-npz")
+        return of_version(Response(file.getvalue(), media_type="application/x-npz"), answer.version)
     axes = {"x_m": answer.x_m, "y_m": answer.y_m, "cell_m": answer.cell_m}
-    return as_json({**axes, "layers": layers, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
+    table = {**axes, "layers": layers, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
+    return of_version(as_json(table), answer.version)
 
 
 async def history(feed: SiteFeed, parameters: Parameters) -> Response:

@@ -11,12 +11,13 @@ from typing import Any
 
 from starlette.responses import Response
 
+from protocol.queries.answers import MapVersion
 from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
 from protocol.queries.roads import Segments, Worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
 from sitegrid.web import features
-from sitegrid.web.resource import AS_OF, BOUNDS, GEOJSON, Resource, as_geojson, as_json, parsed, version_of
+from sitegrid.web.resource import AS_OF, BOUNDS, GEOJSON, Resource, as_geojson, as_json, of_version, parsed, version_of
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters
 
@@ -59,30 +60,35 @@ CHEAPEST = {
 
 async def segments(feed: SiteFeed, parameters: Parameters) -> Response:
     """Roads, segment by segment."""
-    return as_json(await _segments(feed, parameters))
+    answer = await _segments(feed, parameters)
+    return _of_map(as_json(answer), answer)
 
 
 async def segment_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Roads as lines."""
     answer = await _segments(feed, parameters)
-    return as_geojson(features.segments(answer.segments, await feed.projection()))
+    found = features.segments(answer.segments, await feed.projection())
+    return _of_map(as_geojson(found), answer)
 
 
 async def worklist(feed: SiteFeed, parameters: Parameters) -> Response:
     """Stretches where work pays."""
-    return as_json(await _worklist(feed, parameters))
+    answer = await _worklist(feed, parameters)
+    return _of_map(as_json(answer), answer)
 
 
 async def worklist_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Stretches where work pays, as lines."""
     answer = await _worklist(feed, parameters)
-    return as_geojson(features.worklist(answer.rows, await feed.projection()))
+    found = features.worklist(answer.rows, await feed.projection())
+    return _of_map(as_geojson(found), answer)
 
 
 async def repair_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Stretches whose ground changed, as lines."""
     answer = await _worklist(feed, parameters)
-    return as_geojson(features.repairs(answer.changes, await feed.projection()))
+    found = features.repairs(answer.changes, await feed.projection())
+    return _of_map(as_geojson(found), answer)
 
 
 async def route(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -130,7 +136,12 @@ async def _drive(feed: SiteFeed, name: str, parameters: Parameters, places: Sequ
     answer = await feed.ask(feed.client.drive, query)
     totals = {**asdict(answer.totals), "litres": answer.totals.litres}
     ground = {"line": answer.line_m, "totals": totals, "steps": vars(answer.steps), "machine": asdict(answer.machine)}
-    return as_json({**ground, **version_of(answer.version), "stamp_ns": answer.stamp_ns})
+    table = {**ground, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
+    return of_version(as_json(table), answer.version)
+
+
+def _of_map(response: Response, answer: Segments | Worklist) -> Response:
+    return of_version(response, MapVersion(answer.store, answer.merged, answer.fact))
 
 
 def _named(query: SegmentsQuery | WorklistQuery) -> dict[str, Any]:

@@ -59,4 +59,5 @@ def hauling_site(folder: Path, children: Children) -> WebSite:
     site = WebSite(folder, children)
     site.machines = haulers()  # type: ignore[assignment]
     site.drive(DAYS * BATCH_S)
+    site.client.worklist(after=site.client.info().merged)  # roads are of all that they drove from here on
     return site
