@@ -176,7 +176,7 @@ class Routes:
         if prices.given is None and not known.any():
             raise _refusal("nobody has driven near these places yet: give `unknown` a resistance")
         if to_price := bare(read, squares_of(window)):
-            of_bare = prices.of(to_price)
+            of_bare = prices.squares(to_price)
             price, price_east, price_north = (_in_window(of_bare, name, window) for name in PRICED)
             resistance = np.where(np.isfinite(price), price, resistance)
             east, north = np.where(np.isfinite(price_east), (price_east, price_north), (east, north))

@@ -50,7 +50,7 @@ class Prices:
         self.given, self._squares, self._index = given, squares, squares.by_place()
         self._known: dict[Square, dict[str, Floats]] = {}
 
-    def of(self, wanted: Set[Square]) -> Squares:
+    def squares(self, wanted: Set[Square]) -> Squares:
         """PRICED of wanted squares: resistance, slopes to the east and north; NaN where machines measured them.
 
         Where machines were and measured no resistance, it is that of the nearest place where they did.

@@ -83,7 +83,7 @@ def ground_along(squares: Squares, cut: Steps, prices: Prices) -> Ground:
         if prices.given is None and unknown.all() and not np.isfinite(squares.layers["resistance_filled"]).any():
             raise QueryError(Refusal.OUT_OF_RANGE, "nobody has driven near this line yet: say what `unknown` ground is")
         wanted = squares_at(cut.position_m[bare], squares.cell_m, squares.edge)
-        of_bare = prices.of(wanted).at(cut.position_m)
+        of_bare = prices.squares(wanted).at(cut.position_m)
         price, even = of_bare[RESISTANCE], of_bare[EAST] * east + of_bare[NORTH] * north
         std = np.where(unknown, UNKNOWN_STD * price, np.where(bare, np.hypot(std, price - resistance), std))
         resistance, slope = np.where(bare, price, resistance), np.where(bare & np.isfinite(even), even, slope)

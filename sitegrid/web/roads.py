@@ -67,8 +67,8 @@ async def segments(feed: SiteFeed, parameters: Parameters) -> Response:
 async def segment_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Roads as lines."""
     answer = await _segments(feed, parameters)
-    found = features.segments(answer.segments, await feed.projection())
-    return _of_map(as_geojson(found), answer)
+    lines = features.segments(answer.segments, await feed.projection())
+    return _of_map(as_geojson(lines), answer)
 
 
 async def worklist(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -80,15 +80,15 @@ async def worklist(feed: SiteFeed, parameters: Parameters) -> Response:
 async def worklist_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Stretches where work pays, as lines."""
     answer = await _worklist(feed, parameters)
-    found = features.worklist(answer.rows, await feed.projection())
-    return _of_map(as_geojson(found), answer)
+    lines = features.worklist(answer.rows, await feed.projection())
+    return _of_map(as_geojson(lines), answer)
 
 
 async def repair_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Stretches whose ground changed, as lines."""
     answer = await _worklist(feed, parameters)
-    found = features.repairs(answer.changes, await feed.projection())
-    return _of_map(as_geojson(found), answer)
+    lines = features.repairs(answer.changes, await feed.projection())
+    return _of_map(as_geojson(lines), answer)
 
 
 async def route(feed: SiteFeed, parameters: Parameters) -> Response:

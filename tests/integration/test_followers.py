@@ -106,8 +106,9 @@ def region(sender: Sender, run: Followed, follower: str, row: int) -> bytes:
     return sender.ask(keys.follower_query(run.site, follower, "region"), ask).payload.to_bytes()
 
 
-def roads(sender: Sender, run: Followed, follower: str, query: str) -> bytes:
+def roads(sender: Sender, run: Followed, follower: str, query: str, row: int) -> bytes:
     name, _, parameters = query.partition("?")
+    parameters = f"{parameters};after={row}"  # others may be of some seconds ago
     key = keys.follower_query(run.site, follower, name) if follower else keys.map_query(run.site, name)
     return sender.ask(key, parameters).payload.to_bytes()
 
@@ -149,7 +150,7 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
                 "worklist",
                 *lines,
             ):  # of a server that followed, and of processes that read it all
-                answers = [roads(sender, run, name, query) for name in ("", "near", "far")]
+                answers = [roads(sender, run, name, query, row) for name in ("", "near", "far")]
                 assert answers[0] == answers[1] == answers[2], (query, pids)
             drawn = [tiles(sender, run, name) for name in ("", "near", "far")]
             assert drawn[0] == drawn[1] == drawn[2], pids
