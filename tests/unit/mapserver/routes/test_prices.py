@@ -31,12 +31,12 @@ def half(known: float, beyond: float = np.nan) -> np.ndarray:
 def test_unknown_ground_is_as_dear_as_the_dearest_tenth_around_uphill() -> None:
     gravel, slope = half(0.03), half(0.04)
     one = squares({(0, 0): {"resistance": gravel, "grade": slope, "driven": np.isfinite(gravel)}})
-    price = Prices(one).of(HERE).layers[RESISTANCE][0]
+    price = Prices(one).squares(HERE).layers[RESISTANCE][0]
     assert np.isnan(price[:, : EDGE // 2]).all()
     assert price[:, EDGE // 2 :] == pytest.approx(0.07, rel=0.02)
     dear = squares({(0, 0): {"resistance": gravel, "driven": np.isfinite(gravel)}, (0, 1): {"resistance": 0.12}})
-    assert Prices(dear).of(HERE).layers[RESISTANCE][0][0, -1] == pytest.approx(0.12, rel=0.02)
-    assert Prices(dear, 0.05).of(HERE).layers[RESISTANCE][0][0, -1] == pytest.approx(0.05)
+    assert Prices(dear).squares(HERE).layers[RESISTANCE][0][0, -1] == pytest.approx(0.12, rel=0.02)
+    assert Prices(dear, 0.05).squares(HERE).layers[RESISTANCE][0][0, -1] == pytest.approx(0.05)
 
 
 def test_what_is_filled_in_costs_more_the_less_sure_it_is() -> None:
@@ -45,7 +45,7 @@ def test_what_is_filled_in_costs_more_the_less_sure_it_is() -> None:
     std = np.where(driven, 0.001, 0.03 * np.linspace(0.0, 1.3, EDGE)) + np.zeros((EDGE, 1))
     beside = {"resistance": road, "std": std, "driven": driven & np.ones((EDGE, 1), bool)}
     one = squares({(0, 0): beside, (1, 0): {"resistance": 0.13}})
-    price = Prices(one).of(HERE).layers[RESISTANCE][0][5, EDGE // 2 :]
+    price = Prices(one).squares(HERE).layers[RESISTANCE][0][5, EDGE // 2 :]
     assert (np.diff(price) > 0).all()
     assert price[-1] == pytest.approx(0.13, rel=0.02)
     assert 0.03 < price[0] < 0.09
@@ -59,20 +59,20 @@ def test_a_price_is_the_same_whatever_else_was_read() -> None:
             values = np.exp(draw.normal(-3.5, 0.5, (EDGE, EDGE)))
             made[x, y] = {"resistance": values, "grade": draw.normal(0, 0.1), "driven": draw.random((EDGE, EDGE)) < 0.3}
     everything, near = squares(made), squares({place: made[place] for place in around(HERE)})
-    few = Prices(near).of(HERE).layers[RESISTANCE][0]
-    many = Prices(everything).of({(1, 1), (0, 0), (0, 1)})
+    few = Prices(near).squares(HERE).layers[RESISTANCE][0]
+    many = Prices(everything).squares({(1, 1), (0, 0), (0, 1)})
     assert np.array_equal(few, many.layers[RESISTANCE][many.by_place()[0, 0]], equal_nan=True)
 
 
 def test_far_from_everything_ground_is_as_loose_as_sand_unless_somebody_says_what_it_is() -> None:
     far = squares({(3, 0): {"resistance": 0.03}})
-    assert (Prices(far).of(HERE).layers[RESISTANCE] == LOOSE).all()
-    assert (Prices(far, 0.04).of(HERE).layers[RESISTANCE] == 0.04).all()
+    assert (Prices(far).squares(HERE).layers[RESISTANCE] == LOOSE).all()
+    assert (Prices(far, 0.04).squares(HERE).layers[RESISTANCE] == 0.04).all()
 
 
 def test_what_was_driven_and_not_measured_is_as_the_nearest_that_was() -> None:
     one = squares({(0, 0): {"resistance": half(0.04)}})
-    assert Prices(one).of(HERE).layers[RESISTANCE][0][:, EDGE // 2 :] == pytest.approx(0.04)
+    assert Prices(one).squares(HERE).layers[RESISTANCE][0][:, EDGE // 2 :] == pytest.approx(0.04)
     assert bare(one, HERE) == HERE, "though machines were everywhere"
 
 
