@@ -66,9 +66,8 @@ async def why(feed: SiteFeed, parameters: Parameters) -> Response:
     rest = {name: text for name, text in parameters.items() if name not in PLACE}
     query = parsed("why", {**rest, "x": text_of(x_m), "y": text_of(y_m)}, TIMES)
     assert isinstance(query, WhyQuery)
-    return as_json(
-        await feed.ask(feed.client.why, query.x_m, query.y_m, as_of_ns=query.as_of_ns, repairs=query.repairs)
-    )
+    answer = await feed.ask(feed.client.why, query.x_m, query.y_m, as_of_ns=query.as_of_ns, repairs=query.repairs)
+    return of_version(as_json(answer), answer.version)
 
 
 async def region(feed: SiteFeed, parameters: Parameters) -> Response:
