@@ -67,7 +67,7 @@ async def why(feed: SiteFeed, parameters: Parameters) -> Response:
     query = parsed("why", {**rest, "x": text_of(x_m), "y": text_of(y_m)}, TIMES)
     assert isinstance(query, WhyQuery)
     answer = await feed.ask(feed.client.why, query.x_m, query.y_m, as_of_ns=query.as_of_ns, repairs=query.repairs)
-    return of_version(as_json(answer), answer.version)
+    return of_version(as_json(answer), MapVersion(answer.store, answer.merged, answer.fact))
 
 
 async def region(feed: SiteFeed, parameters: Parameters) -> Response:
