@@ -152,11 +152,13 @@ def traffic_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
     share, right = (each[judged, 0] / each[judged].sum(axis=1) for each in (metres, true.metres))
     measured = judged & np.isfinite(known.c_rr) & np.isfinite(true.c_rr)
     off = (known.c_rr - true.c_rr)[measured]
+    off_ground = (known.c_rr / true.ground_c_rr - 1)[measured]
     return {
         "segments": int(judged.sum()),
         "passes_pct": 100.0 * float((np.abs(ratio - 1) < 0.1).mean()),
         "direction_pct": 100.0 * float((np.abs(share - right) < SHARE_OFF).mean()),
         "c_pct": 100.0 * float(np.sqrt(np.mean((off / true.c_rr[measured]) ** 2))),
+        "c_ground_pct": 100.0 * float(np.sqrt(np.mean(off_ground**2))),
         "c_median_pct": 100.0 * float(np.median(np.abs(off / true.c_rr[measured]))),
         "inside_pct": 100.0 * float((np.abs(off) <= SIGMA_90 * known.c_std[measured]).mean()),
         **_list_figures(known, true, judged),

@@ -17,7 +17,10 @@ from sim.recorder import TRACKS_FOLDER
 
 @dataclass(frozen=True)
 class TrueTrack:
-    """One machine's load centre at n instants: place (n, 2), direction of travel, and what the simulator has there."""
+    """One machine's load centre at n instants: place (n, 2), direction of travel, and what the simulator has there.
+
+    c_rr: of the ground below the wheels, by their loads; ground_c_rr: below the load centre itself, as it is in the end.
+    """
 
     stamp_ns: Ints
     place_m: Floats
@@ -26,27 +29,31 @@ class TrueTrack:
     c_rr: Floats
     slope: Floats
     mass_kg: Floats
+    ground_c_rr: Floats
 
 
 @dataclass(frozen=True)
 class TrueTraffic:
-    """Of segments (k,): metres (k, 2) by direction, mean c_rr over places, work lost [J]."""
+    """Of segments (k,): metres (k, 2) by direction, mean c_rr over places, work lost [J]; both c_rr as of a track."""
 
     metres: Floats
     c_rr: Floats
     work_j: Floats
+    ground_c_rr: Floats
 
 
 def true_tracks(drive: FleetDrive, scene: Scene, cache: Path) -> dict[str, TrueTrack]:
     """The tracks of all machines of a recording."""
-    out = {}
+    out, truth = {}, scene.truth
     for name, track in scene.tracks.items():
         path = drive.folder(cache) / "truth" / TRACKS_FOLDER / f"{name}.csv"
         table: Table = np.genfromtxt(path, delimiter=",", names=True)
         heading = track.yaw_rad + np.pi * (table["speed"] < 0)
         slope = table["grade_e"] * np.cos(heading) + table["grade_n"] * np.sin(heading)
         step = np.diff(track.driven_m, prepend=0.0)
-        known = (track.stamp_ns, track.place_m, heading, step, table["c_rr"], slope, table["mass"])
+        column, row = np.floor((track.place_m - (truth.west_m, truth.south_m)) / truth.cell_m).astype(int).T
+        ground = truth.c_rr[row, column]
+        known = (track.stamp_ns, track.place_m, heading, step, table["c_rr"], slope, table["mass"], ground)
         out[name] = TrueTrack(*(np.asarray(column) for column in known))
     return out
 
@@ -57,7 +64,7 @@ def true_traffic(
     """What was driven on segments from a stamp to another."""
     count, ends = len(ledgers.segments.ids), ledgers.slices
     metres, work = np.zeros((count, 2)), np.zeros(count)
-    slices = np.zeros((2, int(ends[-1])))
+    slices = np.zeros((3, int(ends[-1])))
     for track in tracks:
         at = ledgers.place(track.place_m, track.heading_rad)
         own: Bools = (at.segment >= 0) & (track.stamp_ns >= from_ns) & (track.stamp_ns < to_ns)
@@ -68,8 +75,10 @@ def true_traffic(
         np.add.at(work, at.segment[own], lost)
         np.add.at(slices[0], at.slice[own], step)
         np.add.at(slices[1], at.slice[own], step * c_rr)
+        np.add.at(slices[2], at.slice[own], step * track.ground_c_rr[own])
     with np.errstate(invalid="ignore"):
-        return TrueTraffic(metres, mean(slices[1] / slices[0], ends), work)
+        c_rr, ground = (mean(each / slices[0], ends) for each in slices[1:])
+    return TrueTraffic(metres, c_rr, work, ground)
 
 
 def true_passes(track: TrueTrack, ledgers: Ledgers, segment: int, from_ns: int) -> Ints:

@@ -45,6 +45,9 @@ log = logging.getLogger("mapserver.query.road_maps")
 # How much older than a question its roads may be: a repair is seen after two or three passes, which take minutes, and a
 # road is planned on for minutes more. A new map each second costs whoever asks, and those who wait for him, 0.1 s.
 FRESH_S = 10.0
+# Where roads are soon made they are newer: no older than so many times what the last took, 1 % of the time for whoever
+# asks. So a small site, or one that has just begun, is answered of what came in a moment ago.
+CHEAP = 100
 SPARE = 3  # times the last making: so long before roads are too old the next one begins, its own time twice with it
 ASKED_S = 600.0  # so long after the last question roads are still made for the next one
 PATIENCE_S = 2.0  # how long a picture waits for the first roads before it goes without
@@ -125,10 +128,14 @@ class Traffic:
 
 @dataclass(frozen=True)
 class _Newest:
-    """The newest roads that are made, and when the map was last looked at that they are of [s of the clock]."""
+    """The newest roads that are made, and when the map was last looked at that they are of [s of the clock].
+
+    took_s: what making them took.
+    """
 
     roads: RoadMap
     looked_s: float
+    took_s: float
 
 
 @contextmanager
@@ -175,7 +182,7 @@ class RoadMaps:
             self._thread.join(END_S)
 
     def read(self, as_of_ns: int | None = None, machine: str = "") -> RoadMap:
-        """The roads as of a time, or of the last FRESH_S; machine: with its traffic alone. Raises QueryError."""
+        """The roads as of a time, or of the last seconds; machine: with its traffic alone. Raises QueryError."""
         if machine and not self._source.run(lambda state: machine in state.machines()):
             raise QueryError(Refusal.UNKNOWN_MACHINE, f"machine `{machine[:40]}` has sent nothing")
         with _journal_read():
@@ -225,7 +232,7 @@ class RoadMaps:
             wait_s = max(FRESH_S - SPARE * took_s, took_s)
 
     def _lately(self) -> RoadMap:
-        """The newest roads, none older than FRESH_S: who waits for those in the making takes them, if begun in time."""
+        """The newest roads, if not too old: who waits for those in the making takes them, if begun in time."""
         asked_s = self._ask()
         if roads := self._fresh(asked_s):
             return roads
@@ -244,7 +251,7 @@ class RoadMaps:
             return None
         own, now = newest.roads.version, self._source.run(lambda state: state.version)
         is_of_map = (own.store, own.fact) == (now.store, now.fact) and own.row <= now.row
-        in_time = own == now or asked_s - newest.looked_s <= FRESH_S
+        in_time = own == now or asked_s - newest.looked_s <= min(FRESH_S, CHEAP * newest.took_s)
         return newest.roads if is_of_map and in_time else None
 
     def view(self, window: CellWindow, reach: int, as_of_ns: int | None) -> View:
@@ -273,8 +280,9 @@ class RoadMaps:
         made = self._map(ledgers, self._traffic, grid.all_pages, facts, version, newest_ns)
         roads = replace(made, grid=grid)
         _ = roads.still  # with the ages, here and not in the first question
-        self._newest = _Newest(roads, looked_s)
-        self.made, self.made_s = self.made + 1, self.made_s + self._clock() - looked_s
+        took_s = self._clock() - looked_s
+        self._newest = _Newest(roads, looked_s, took_s)
+        self.made, self.made_s = self.made + 1, self.made_s + took_s
         return roads
 
     def _as_of(self, as_of_ns: int, machine: str) -> RoadMap:

@@ -38,7 +38,7 @@ def drive(later: int, *, repaired: bool = True) -> Recorded:
         rows[name] = table
         n = len(table)
         place = np.stack([table["x_m"], table["y_m"]], axis=1)
-        true = (table["heading_rad"], np.full(n, 0.5), table["c_rr"], np.zeros(n), np.full(n, 4e4))
+        true = (table["heading_rad"], np.full(n, 0.5), table["c_rr"], np.zeros(n), np.full(n, 4e4), table["c_rr"])
         tracks[name] = TrueTrack(table["stamp_ns"], place, *(np.asarray(each, np.float64) for each in true))
     return Recorded(rows, tracks, START_NS, START_NS + round(2 * HALF_S * 1e9))
 
@@ -87,7 +87,7 @@ def track(*points: tuple[float, float, float]) -> TrueTrack:
     second, x, y = np.array(points).T
     step = np.hypot(np.diff(x, prepend=x[0]), np.diff(y, prepend=y[0]))
     none = np.zeros(len(x))
-    return TrueTrack((second * 1e9).astype(np.int64), np.stack([x, y], axis=1), none, step, none, none, none)
+    return TrueTrack((second * 1e9).astype(np.int64), np.stack([x, y], axis=1), none, step, none, none, none, none)
 
 
 def test_what_a_machine_drives_on_a_cell_within_a_minute_is_one_pass():

@@ -395,6 +395,7 @@ def test_tiles_show_a_repair_with_the_next_row(repaired):
 
 def test_pictures_have_the_ages_of_some_seconds_ago(repaired, monkeypatch):
     opened, _ = repaired
+    monkeypatch.setattr(road_maps, "CHEAP", DEAR)
     roads = answers_of(opened)._roads
     known = roads.lately()
     assert known.keys() == roads.read().ages.keys() != set()
@@ -409,33 +410,50 @@ def come(opened, machine="c"):
     send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine=machine)])
 
 
-class Clock:
-    """Steady seconds, as told."""
+DEAR = 1e9  # times what a making took: as if it had taken long
 
-    def __init__(self) -> None:
-        self.now_s = 100.0
+
+class Clock:
+    """Steady seconds, as told; each look at it takes some."""
+
+    def __init__(self, look_s: float = 0.0) -> None:
+        self.now_s, self._look_s = 100.0, look_s
 
     def __call__(self) -> float:
+        self.now_s += self._look_s
         return self.now_s
 
 
 def test_roads_are_those_of_the_last_seconds_and_say_which(repaired):
     opened, _ = repaired
-    clock = Clock()
+    clock = Clock(look_s=0.5)
     roads = RoadMaps(answers_of(opened)._source, clock)
     first = roads.read()
     come(opened)
-    clock.now_s += FRESH_S
+    clock.now_s += FRESH_S - 2.0
     assert roads.read() is first, "no older than they may be, and the version says which"
-    clock.now_s += 0.1
+    clock.now_s += 2.0
     second = roads.read()
     assert (first.version.row, second.version.row) == (4, 5)
     clock.now_s += 100 * FRESH_S
     assert roads.read() is second, "nothing came in since, however long ago"
 
 
-def test_who_waits_for_a_row_gets_roads_of_it(repaired):
+def test_roads_that_are_soon_made_are_of_a_moment_ago(repaired):
+    opened, _ = repaired
+    clock = Clock(look_s=0.01)
+    roads = RoadMaps(answers_of(opened)._source, clock)
+    first = roads.read()
+    come(opened)
+    clock.now_s += 0.5
+    assert roads.read() is first
+    clock.now_s += 0.5
+    assert roads.read().version.row == 5
+
+
+def test_who_waits_for_a_row_gets_roads_of_it(repaired, monkeypatch):
     opened, then_ns = repaired
+    monkeypatch.setattr(road_maps, "CHEAP", DEAR)
     answers = answers_of(opened)
     asked = encode_query(RouteQuery(((15.0, 10.0), (205.0, 10.0))))
     first = answered(answers, "route", asked)
@@ -468,6 +486,7 @@ def slow(repaired, monkeypatch):
         return whole(skeleton)
 
     monkeypatch.setattr(road_maps, "network", slowly)
+    monkeypatch.setattr(road_maps, "CHEAP", DEAR)
     come(opened)
     making = threading.Thread(target=answers._roads.renew)
     making.start()
