@@ -19,7 +19,7 @@ from sim.recorder import TRACKS_FOLDER
 class TrueTrack:
     """One machine's load centre at n instants: place (n, 2), direction of travel, and what the simulator has there.
 
-    c_rr: of the ground below the wheels, by their loads; ground_c_rr: below the load centre itself, as it is in the end.
+    c_rr: of the ground below the wheels, by their loads; ground_c_rr: below the load centre, as it is in the end.
     """
 
     stamp_ns: Ints
