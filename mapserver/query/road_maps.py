@@ -9,6 +9,7 @@ It is one module because what makes roads and what says which may be read have t
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -161,7 +162,7 @@ class RoadMaps:
         self._skeletons = Skeletons(self._cell_m)
         self._newest: _Newest | None = None
         self.made, self.made_s = 0, 0.0
-        self._asked_s = clock()
+        self._asked_s = -math.inf  # nobody has
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self._begin("", NO_FACTS)

@@ -5,12 +5,12 @@ from contextlib import closing
 from dataclasses import replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 
 from sim.config import SimConfig
 from sim.simulator import Simulator
+from tests.arithmetic import ARITHMETIC, arithmetic
 
 ALL_SENSORS = SimConfig(world="pybullet", seed=3, preset="paper", gps=(1, 2, 3), imu=(1, 2, 3, 4), attitude=(1, 3, 4))
 TRACK = ("stamp_ns", "x", "y", "z", "yaw", "pitch", "roll", "speed", "mass", "c_rr", "grade_e", "grade_n")
@@ -40,17 +40,6 @@ SCENARIOS = {
         ((41.99167244, 281.61370027), (343.14015706, 249.19351529)),
     ),
 }
-ARITHMETIC = "85b39dcb4c8abd5073b917b43955c139a588eb341ad68d0d76a8ef8fbc9e2d8b"
-
-
-def arithmetic() -> str:
-    """Hash of how this processor rounds: numpy and OpenCV pick their kernels by what it offers."""
-    at = np.random.default_rng(1).standard_normal(1001)
-    matrix = at[:900].reshape(100, 3, 3)
-    values = [np.sin(at), np.cos(at), np.tan(at), np.arctan2(at, at[::-1]), np.exp(at), np.tanh(at), np.hypot(at, 1.0)]
-    values += [matrix @ matrix, matrix @ at[:3], at @ at, np.arcsin(np.tanh(at)), np.arctanh(np.tanh(at))]
-    values += [cv2.GaussianBlur(at[:900].reshape(30, 30), (0, 0), 4.8), np.fft.fft(at).real]
-    return hashlib.sha256(b"".join(np.ascontiguousarray(value).tobytes() for value in values)).hexdigest()
 
 
 @pytest.mark.slow

