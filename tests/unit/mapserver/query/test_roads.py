@@ -557,7 +557,7 @@ def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
 
     def fails(*args):
         if next(failures, None):
-            raise StoreError("the disk is gone")
+            raise StoreError("journal", "the disk is gone")
         return follow(*args)
 
     monkeypatch.setattr(roads, "_follow", fails)
