@@ -172,7 +172,12 @@ class RoadMaps:
         self._traffic, self._followed, self._with = Traffic(), 0, (store, facts)
 
     def start(self) -> None:
-        """Make roads beside the questions from here on, until closed; without this, those who ask make them."""
+        """Make roads beside the questions from here on, until closed; without this, those who ask make them.
+
+        Those of a map that is there already are made at once: whoever asks first would wait for its whole journal.
+        """
+        if self._source.run(lambda state: state.version.row):
+            self._ask()
         self._thread = threading.Thread(target=self._run, name="roads", daemon=True)
         self._thread.start()
 

@@ -540,6 +540,19 @@ def test_roads_are_made_beside_while_somebody_asks(repaired):
     assert roads.read().version.row == 6, "and now somebody does"
 
 
+def test_roads_of_a_map_that_is_there_at_the_start_are_made_at_once(repaired, tmp_path):
+    answers = answers_of(repaired[0])
+    answers.start()
+    wait_for(lambda: answers._roads._newest)
+    answers.close()
+    with closing(open_writer(tmp_path / "empty")) as opened:
+        empty = answers_of(opened)._roads
+        empty.start()
+        empty.renew()
+        assert empty._newest is None, "nobody has asked yet"
+        empty.close()
+
+
 def test_the_end_of_a_server_ends_the_making_of_roads(repaired):
     answers = answers_of(repaired[0])
     answers.close()  # never begun
