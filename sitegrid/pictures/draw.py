@@ -109,7 +109,7 @@ def draw_line(client: Client, out: Path, query: RouteQuery | WayQuery, bounds: l
     answer = client.drive(query)
     low, high = answer.line_m.min(axis=0) - AROUND_M, answer.line_m.max(axis=0) + AROUND_M
     chosen = _bounds(client, bounds) if bounds else Bounds(*low.tolist(), *high.tolist())
-    region = client.region(chosen, ("resistance", "resistance_filled"), as_of_ns=query.as_of_ns)
+    region = client.region(chosen, ("resistance", "resistance_filled"), as_of_ns=query.as_of_ns, repairs=query.repairs)
     write_image(out, draw_drive(region, answer))
 
 
