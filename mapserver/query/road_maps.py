@@ -13,7 +13,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from weakref import ref
@@ -176,8 +176,9 @@ class RoadMaps:
 
         Those of a map that is there already are made at once: whoever asks first would wait for its whole journal.
         """
-        if self._source.run(lambda state: state.version.row):
-            self._ask()
+        with suppress(QueryError):  # of a follower, which has no map yet
+            if self._source.run(lambda state: state.version.row):
+                self._ask()
         self._thread = threading.Thread(target=self._run, name="roads", daemon=True)
         self._thread.start()
 

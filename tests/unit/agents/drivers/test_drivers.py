@@ -140,9 +140,7 @@ class Stream:
     def __init__(self, sessions: tuple[Any, Any], name: str) -> None:
         self.driver = ZenohDriver(sessions[1], SITE.name, name)
         self._publisher = sessions[0].declare_publisher(keys.sensors(SITE.name, name))
-        deadline_s = time.monotonic() + 10
-        while not self._publisher.matching_status.matching:
-            assert time.monotonic() < deadline_s, "the router does not know of the subscriber"
+        self._wait(True)
 
     def put(self, payload: bytes) -> None:
         self._publisher.put(payload)
@@ -152,7 +150,13 @@ class Stream:
 
     def close(self) -> None:
         self.driver.close()
+        self._wait(False)  # else the next stream of this name takes this one's subscriber for its own
         self._publisher.undeclare()
+
+    def _wait(self, known: bool) -> None:
+        deadline_s = time.monotonic() + 10
+        while self._publisher.matching_status.matching != known:
+            assert time.monotonic() < deadline_s, f"the router does not know of the subscriber's {known=}"
 
 
 @pytest.fixture
