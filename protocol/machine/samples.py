@@ -56,8 +56,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "grade_e": (-5.0, 5.0),
     "grade_n": (-5.0, 5.0),
     "grade_var": (0.0, 100.0),
-    # No accelerometer or drive train that a machine is driven with is further off: ten times what is expected.
-    "applied_zero": (-0.05, 0.05),
+    # No accelerometer or drive train that a machine is driven with is further off. An IMU that nobody calibrated, under
+    # a frame of a machine, has a zero of 0.03 and stands 0.026 rad (1.5 degrees) askew: five times both together.
+    "applied_zero": (-0.2, 0.2),
     "applied_scale": (-0.5, 0.5),
     "mass_kg": (1.0, 1e6),
 }

@@ -443,6 +443,6 @@ def test_stretches_that_were_excluded_do_not_make_a_tour_right() -> None:
 def test_what_is_applied_can_be_stated_in_a_sample() -> None:
     """A sensor that is worse than any: its samples would be refused."""
     for sign in (1.0, -1.0):
-        beyond = Calibration(sign * 0.08, sign * 0.7, ((1e-6, 0.0), (0.0, 1e-4)))
+        beyond = Calibration(sign * 0.3, sign * 0.7, ((1e-6, 0.0), (0.0, 1e-4)))
         calibration = Calibrator(beyond).calibration
         assert (calibration.zero, calibration.scale) == (sign * LIMITS["applied_zero"][1], sign * 0.5)

@@ -34,7 +34,7 @@ def test_anything_else_is_refused_with_its_path(tmp_path: Path, text: str) -> No
         {"machine": "loader-2"},
         {"zero": "a"},
         {"zero": float("nan")},
-        {"zero": 0.06},
+        {"zero": 0.3},
         {"scale": -0.6},
         {"covariance": [[1e-6, 1.0], [1.0, 1e-4]]},
         {"covariance": [[-1e-6, 0.0], [0.0, 1e-4]]},

@@ -142,7 +142,7 @@ def test_column_of_another_length_is_named(column, change):
         ("grade_n", -6.0, Refusal.OUT_OF_RANGE),
         ("grade_var", np.inf, Refusal.NOT_FINITE),
         ("applied_zero", np.nan, Refusal.NOT_FINITE),
-        ("applied_zero", 0.051, Refusal.OUT_OF_RANGE),
+        ("applied_zero", 0.201, Refusal.OUT_OF_RANGE),
         ("applied_scale", -np.inf, Refusal.NOT_FINITE),
         ("applied_scale", -0.51, Refusal.OUT_OF_RANGE),
         ("mass_kg", np.inf, Refusal.NOT_FINITE),

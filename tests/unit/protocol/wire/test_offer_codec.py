@@ -24,7 +24,7 @@ def test_an_offer_comes_back_from_an_acknowledgement() -> None:
     ("changes", "reason", "field"),
     [
         ({"zero": math.nan}, Refusal.NOT_FINITE, "zero"),
-        ({"zero": 0.051}, Refusal.OUT_OF_RANGE, "zero"),
+        ({"zero": 0.201}, Refusal.OUT_OF_RANGE, "zero"),
         ({"zero": "0"}, Refusal.WRONG_TYPE, "zero"),
         ({"scale": -0.51}, Refusal.OUT_OF_RANGE, "scale"),
         ({"scale": math.inf}, Refusal.NOT_FINITE, "scale"),
