@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums
+from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums, weights
 from mapserver.evidence import cells as ev
 from mapserver.evidence.timeline import TimedPage, packed_votes
 from protocol.arrays import Bools, Floats, Ints
@@ -53,11 +53,14 @@ class Cuts:
     """Where the evidence of a block's cells (256,) is cut.
 
     first: index of the first page that holds for the ground as it is now, 0 where nothing changed. kind: median of the
-    c_rr votes after the cut, in bins; NaN where c_rr did not change.
+    c_rr votes after the cut, in bins; NaN where c_rr did not change. old_ns, new_ns: when the last page before the cut
+    and the first one after it begin that know the cell, between which the ground changed; NaN where it did not.
     """
 
     first: Ints
     kind: Floats
+    old_ns: Floats
+    new_ns: Floats
 
     @property
     def has_change(self) -> bool:
@@ -67,7 +70,7 @@ class Cuts:
 
 def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
     """Find the last change in every cell of a block."""
-    last = Cuts(np.zeros(ev.CELLS, np.int64), np.full(ev.CELLS, np.nan))
+    last = Cuts(np.zeros(ev.CELLS, np.int64), *(np.full(ev.CELLS, np.nan) for _ in range(3)))
     if len(pages) < 2 or not config.detect:
         return last
     votes_of_pages, ends = packed_votes(pages)
@@ -86,39 +89,96 @@ def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
             last.kind[cells[left]] = kind if part == ev.RESISTANCE else np.nan
             if not len(left):
                 break
+    if last.has_change:
+        index, begins_ns = np.arange(len(pages))[:, None], _begins_ns(pages)
+        knows = weights(votes_of_pages, ends, ev.RESISTANCE.start, ev.RESISTANCE.stop) > 0
+        old = np.where(knows & (index < last.first), index, 0).max(axis=0)
+        new = np.where(knows & (index >= last.first), index, len(pages) - 1).min(axis=0)
+        for times_ns, page in ((last.old_ns, old), (last.new_ns, new)):
+            times_ns[:] = np.where(last.first > 0, begins_ns[page], np.nan)
     return last
 
 
-def kinds(pages: Sequence[TimedPage]) -> Floats:
-    """Median (256,) of all c_rr votes of each cell, in bins; NaN where they are too few for both sides of a cut."""
-    packed, _ = packed_votes(pages)
-    votes = sums(packed, ev.RESISTANCE.start, ev.RESISTANCE.stop) / ev.WEIGHT_UNITS_PER_M
-    return np.where(votes.sum(axis=0) >= 2 * WEIGHT_M, medians(votes), np.nan)
+@dataclass(frozen=True)
+class Known:
+    """What the c_rr votes of cells (n,) say, apart from changes.
+
+    kind: median of all, in bins, NaN where they are too few for both sides of a cut. from_ns, until_ns: when the pages
+    begin up to which, and from which on, there are enough for one side; NaN where there never are.
+    """
+
+    kind: Floats
+    from_ns: Floats
+    until_ns: Floats
 
 
-def credible(changed: Bools, kind: Floats, now: Floats, cell_m: float, config: ChangeConfig) -> Bools:
-    """Changed cells (rows, columns) that are no position errors.
+def known(pages: Sequence[TimedPage]) -> Known:
+    """What is known of the cells (256,) of a block."""
+    packed, ends = packed_votes(pages)
+    span = ev.RESISTANCE.start, ev.RESISTANCE.stop
+    weight = weights(packed, ends, *span) / ev.WEIGHT_UNITS_PER_M
+    median = medians(sums(packed, *span) / ev.WEIGHT_UNITS_PER_M)
+    kind = np.where(weight.sum(axis=0) >= 2 * WEIGHT_M, median, np.nan)
+    begins_ns = _begins_ns(pages)
+    return Known(kind, _reached(weight, begins_ns), _reached(weight[::-1], begins_ns[::-1]))
+
+
+def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig) -> Bools:
+    """Changed cells (rows, columns) that are no position errors; all values are images.
 
     A wrong position moves the ground of one side of a border to the other. So a strip of changed cells counts where it
-    is size_m wide and its new kind is not that of the ground around, or twice as wide. Trucks that keep to a lane make
-    a narrower strip known: what is not known beside it speaks neither for the change nor against it, as long as the
-    strip changed over size_m of its length. kind: after the change, as in Cuts; now: `kinds` of all cells.
+    is size_m wide and its new kind is not that of the ground around, or twice as wide. Only ground that was known
+    before the change tells of such a border: at the edge of a lane, cells are driven for the first time after it.
+
+    Trucks that keep to a lane make a narrower strip known: what is not known beside it, before the change and after,
+    speaks neither for the change nor against it, as long as the strip changed over size_m of its length. Where a part
+    of a change is believed, so is the rest of it that lies around: no border moves so far.
     """
     edge = _edge(cell_m, config)
-    ground = np.where(changed, np.nan, now)
+    changed, kind = cuts_of.first > 0, cuts_of.kind
+    whole = np.rint(np.where(changed, kind, np.nan))
+    sorts = np.unique(whole[np.isfinite(whole)])
     near = np.zeros(changed.shape, np.bool_)
-    for one in np.unique(np.rint(kind[changed & np.isfinite(kind)])):
-        alike = (np.abs(ground - one) <= ALIKE_BINS).astype(np.uint8)
-        around = cv2.dilate(alike, np.ones((4 * edge + 1, 4 * edge + 1), np.uint8)) > 0
-        near |= around & (np.rint(kind) == one)
+    for one in sorts:
+        alike = ~changed & (np.abs(cells.kind - one) <= ALIKE_BINS)
+        always_ns = np.where(_opened(alike, edge), -np.inf, cells.from_ns)
+        near |= (whole == one) & (_least(always_ns, alike, 2 * edge) <= cuts_of.old_ns)
     new = changed & np.isfinite(kind) & ~near
-    return _opened(changed, 2 * edge) | _opened(new, edge) | _strips(new, ~changed & np.isnan(now), edge)
+    old_ns, new_ns = -_least(-cuts_of.old_ns, changed, edge), _least(cuts_of.new_ns, changed, edge)
+    against = ~changed & (cells.from_ns <= old_ns) & (cells.until_ns >= new_ns)
+    believed = _opened(changed, 2 * edge) | _opened(new, edge) | _strips(new, ~changed & ~against, edge)
+    beside = cv2.dilate(against.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    for one in np.unique(whole[believed & np.isfinite(whole)]):
+        alike = changed & (np.abs(kind - one) <= ALIKE_BINS) & ~beside
+        count, part = cv2.connectedComponents(alike.astype(np.uint8), connectivity=8)
+        believes = np.zeros(count, np.bool_)
+        believes[part[alike & believed & (whole == one)]] = True
+        believed |= alike & believes[part]
+    return believed
 
 
 def reach_blocks(cell_m: float, config: ChangeConfig) -> int:
     """How many blocks away the cells are that `credible` looks at."""
     edge = _edge(cell_m, config)
     return -(-(4 * edge - 2) // BLOCK_CELLS)  # a square of 2 edge cells that holds a cell, and neighbours in it
+
+
+def _begins_ns(pages: Sequence[TimedPage]) -> Floats:
+    return np.array([float(timed.first_ns) for timed in pages])
+
+
+def _reached(weight: Floats, time_ns: Floats) -> Floats:
+    """Time (cells,) of the page at which a cell's votes (pages, cells), summed up, reach what a cut needs; or NaN."""
+    if not len(weight):
+        return np.full(weight.shape[1], np.nan)
+    enough = np.cumsum(weight, axis=0) >= WEIGHT_M
+    return np.where(enough.any(axis=0), time_ns[enough.argmax(axis=0)], np.nan)
+
+
+def _least(values: Floats, where: Bools, reach: int) -> Floats:
+    """Least value (rows, columns) of the cells that lie so many cells away or nearer; infinite where there is none."""
+    chosen = np.where(where & ~np.isnan(values), values, np.inf)
+    return np.asarray(cv2.erode(chosen, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8), borderValue=np.inf))
 
 
 def _edge(cell_m: float, config: ChangeConfig) -> int:

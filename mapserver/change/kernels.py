@@ -71,6 +71,20 @@ def sums(votes: Any, start: int, stop: int) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
+def weights(votes: Any, ends: Any, start: int, stop: int) -> Any:
+    """Votes (pages, 256) for a value, whose bins are `start` to `stop`; ends (pages,): of each page's votes."""
+    out = np.zeros((len(ends), CELLS))
+    i = 0
+    for page in range(len(ends)):
+        while i < ends[page]:
+            place = int(votes[i] & np.uint64(0xFFFF))
+            if start <= place // CELLS < stop:
+                out[page, place % CELLS] += float(votes[i] >> np.uint64(16))
+            i += 1
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
 def medians(votes: Any) -> Any:
     """Median (cells,) of histograms (bins, cells), in bins, between two where it lies there; NaN without votes."""
     bins, cells = votes.shape

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import TypeVar
 
 import numpy as np
 
-from mapserver.change.detection import ChangeConfig, Cuts, credible, cuts, kinds, reach_blocks
+from mapserver.change.detection import ChangeConfig, Cuts, Known, credible, cuts, known, reach_blocks
 from mapserver.evidence.timeline import Block, TimedPage, TimedPages
-from protocol.arrays import AnyArray, Floats, Ints
+from protocol.arrays import AnyArray, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
 Pages = Mapping[Block, Sequence[TimedPage]]
@@ -30,10 +31,9 @@ def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig, ages: Ages | 
     reach = reach_blocks(cell_m, config)
     for some in clusters(changed, reach):
         near = {block for one in some for block in around(one, reach) if block in pages}
-        image, corner = image_of({block: first[block] > 0 for block in near}, False)
-        kind, _ = image_of({block: last[block].kind for block in near}, np.nan)
-        now, _ = image_of({block: _kinds(pages[block]) for block in near}, np.nan)
-        holds = credible(image, kind, now, cell_m, config)
+        images, corner = _images(Cuts, {block: last[block] for block in near})
+        cells, _ = _images(Known, {block: _known(pages[block]) for block in near})
+        holds = credible(images, cells, cell_m, config)
         for block in some:
             valid[block] = np.where(cells_of(holds, corner, block), first[block], 0)
     for block in (ages or {}).keys() & pages.keys():
@@ -73,9 +73,9 @@ def _cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
     return _derived(pages, config, lambda: cuts(pages, config))
 
 
-def _kinds(pages: Sequence[TimedPage]) -> Floats:
-    """As `kinds`, found once for the same pages."""
-    return _derived(pages, kinds, lambda: kinds(pages))
+def _known(pages: Sequence[TimedPage]) -> Known:
+    """As `known`, found once for the same pages."""
+    return _derived(pages, known, lambda: known(pages))
 
 
 def _derived(pages: Sequence[TimedPage], key: object, derive: Callable[[], T]) -> T:
@@ -92,6 +92,17 @@ def around(block: Block, reach: int) -> list[Block]:
     x, y = block
     steps = range(-reach, reach + 1)
     return [(x + dx, y + dy) for dy in steps for dx in steps]
+
+
+def _images(kind: type[T], blocks: Mapping[Block, T]) -> tuple[T, Block]:
+    """Values of blocks as images, field by field: 0 elsewhere, NaN where they are no integers."""
+    images = {}
+    corner = (0, 0)
+    for field in fields(kind):  # type: ignore[arg-type]
+        values = {block: getattr(each, field.name) for block, each in blocks.items()}
+        nothing = 0 if next(iter(values.values())).dtype.kind == "i" else np.nan
+        images[field.name], corner = image_of(values, nothing)
+    return kind(**images), corner
 
 
 def image_of(blocks: Mapping[Block, AnyArray], nothing: float) -> tuple[AnyArray, Block]:

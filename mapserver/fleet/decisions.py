@@ -25,7 +25,9 @@ from mapserver.fleet.spans import VALUES, paint
 KIND = "calibration"
 VERSION = 1  # of the event; what a newer one means is not known here
 SOLVER, PERSON = "solver", "person"
-EVERY_NS = 600 * 10**9  # the solver decides at most so often: each time, samples are folded again
+# The solver decides at most so often: each time, samples are folded again. In the first minutes of machines, when it
+# learns most and there is little to fold, as soon as they have driven twice as long as at the last decision.
+EVERY_NS = 600 * 10**9
 
 
 class NewerVersionError(ValueError):
@@ -172,10 +174,17 @@ class CalibrationDecisions:
                 self._waiting[machine] = CalibrationDecision(machine, SOLVER, "", now_ns, spans, remembered)
         self.confirm(confirmed)
         self.confirmed = confirmed
-        if not asked and self.decided_ns is not None and self.decided_ns <= now_ns < self.decided_ns + EVERY_NS:
+        if not asked and self.decided_ns is not None and self.decided_ns <= now_ns < self._due_ns(calibration, now_ns):
             return []
         wanted = (each for name, each in sorted(self._waiting.items()) if not self._spans[PERSON].get(name))
         return [replace(each, stamp_ns=now_ns) for each in wanted]
+
+    def _due_ns(self, calibration: Calibration, now_ns: int) -> int:
+        """The site's now from which on the solver may decide again what it says of some machines."""
+        assert self.decided_ns is not None
+        first_ns = min(calibration.begins_ns.values(), default=0)
+        driven_ns = max(0, self.decided_ns - first_ns) if first_ns <= now_ns else EVERY_NS  # else a clock is ahead
+        return self.decided_ns + min(driven_ns, EVERY_NS)
 
     def _of(self, machine: str) -> list[Correction]:
         """Those of one machine: people's above the solver's."""

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.change.detection import BINS, VARIATION, WEIGHT_M, ChangeConfig, credible, cuts, kinds
+from mapserver.change.detection import BINS, VARIATION, WEIGHT_M, ChangeConfig, Cuts, Known, credible, cuts, known
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
@@ -99,9 +99,32 @@ def test_the_kind_of_a_change_is_the_ground_after_it():
 
 
 def test_the_kind_of_a_cell_is_the_median_of_all_its_votes():
-    assert np.allclose(kinds(passes(0.04, 0.04, 0.2)), bin_of(0.04), atol=0.6)
-    assert np.isnan(kinds([])).all()
-    assert np.isnan(kinds(passes(0.1, column="grade_e")[:0])).all()
+    assert np.allclose(known(passes(0.04, 0.04, 0.2)).kind, bin_of(0.04), atol=0.6)
+    assert np.isnan(known([]).kind).all()
+    assert np.isnan(known(passes(0.1, column="grade_e")[:0]).kind).all()
+
+
+def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for_a_cut():
+    enough, little = {0.04: WEIGHT_M + 0.02}, {0.04: 0.6 * WEIGHT_M}
+    for grounds, first, last in (
+        ((enough, enough, enough), 0, 2),
+        ((little, enough, little), 1, 1),
+        ((little, little, little, little), 1, 2),
+        ((enough,), 0, 0),
+        ((little,), np.nan, np.nan),
+    ):
+        cells, pages = known(two_passes(*grounds)), two_passes(*grounds)
+        begins = np.array([timed.first_ns for timed in pages], float)
+        for value, index in ((cells.from_ns, first), (cells.until_ns, last)):
+            assert np.array_equal(value, np.full(256, begins[index] if index == index else np.nan), equal_nan=True)
+    assert np.isnan(known([]).from_ns).all()
+
+
+def test_a_cut_lies_between_the_pages_that_knew_the_ground_before_and_after():
+    pages = passes(0.04, 0.04, 0.2)
+    found, nothing = cuts(pages, CONFIG), cuts(passes(0.04, 0.04), CONFIG)
+    assert (set(found.old_ns), set(found.new_ns)) == ({pages[1].first_ns}, {pages[2].first_ns})
+    assert np.isnan([nothing.old_ns, nothing.new_ns]).all()
 
 
 # --- limits ----------------------------------------------------------------------------------------------------------
@@ -142,8 +165,16 @@ def test_less_evidence_than_weight_on_either_side_is_no_change(old_is_less):
 
 # --- areas -----------------------------------------------------------------------------------------------------------
 
-# Ground of bin 10 in 80 x 80 cells, of which some are changed to bin 15.
-OLD, NEW = 10.0, 15.0
+# Ground of bin 10 in 80 x 80 cells, of which some are changed to bin 15 from a time on.
+OLD, NEW, NEW_NS = 10.0, 15.0, 300e9
+
+
+def believed(changed: Bools, kind: Floats, now: Floats, fresh: Bools | None = None, config: ChangeConfig = CONFIG,
+             cell_m: float = 1.0) -> Bools:  # fmt: skip
+    """What is credible of changed cells; fresh: cells that were not driven before the change."""
+    cut = Cuts(changed.astype(np.int64), kind, np.where(changed, 0.0, np.nan), np.where(changed, NEW_NS, np.nan))
+    from_ns = np.where(np.isnan(now), np.nan, 0.0 if fresh is None else np.where(fresh, NEW_NS, 0.0))
+    return credible(cut, Known(now, from_ns, np.where(np.isnan(now), np.nan, 2 * NEW_NS)), cell_m, config)
 
 
 def square(width: int, height: int | None = None, column: int = 32, row: int = 30) -> Bools:
@@ -157,7 +188,7 @@ def counts(changed: Bools, kind: float = NEW, beside: Bools | None = None, cell_
     now: Floats = np.full(changed.shape, OLD)
     now[changed if beside is None else changed | beside] = NEW
     kinds = np.where(changed, kind, np.nan)
-    return credible(changed, kinds, now, cell_m, replace(CONFIG, size_m=size_m))
+    return believed(changed, kinds, now, config=replace(CONFIG, size_m=size_m), cell_m=cell_m)
 
 
 @pytest.mark.parametrize("edge", [1, 2, 3, 4, 5, 10])
@@ -212,7 +243,7 @@ def lane(changed: Bools, known: Bools | None = None):
     now: Floats = np.full(changed.shape, np.nan)
     now[changed] = NEW
     now[np.zeros_like(changed) if known is None else known & ~changed] = OLD
-    return credible(changed, np.where(changed, NEW, np.nan), now, 1.0, CONFIG)
+    return believed(changed, np.where(changed, NEW, np.nan), now)
 
 
 @pytest.mark.parametrize("turn", [False, True])
@@ -237,4 +268,48 @@ def test_a_lane_that_moved_beside_ground_as_it_was_is_not_believed():
 
 def test_nothing_changed_and_nothing_known_is_nothing():
     nothing, unknown = square(0), np.full((80, 80), np.nan)
-    assert not credible(nothing, unknown, unknown, 1.0, CONFIG).any()
+    assert not believed(nothing, unknown, unknown).any()
+
+
+def fringed(kind_beside: float, *, is_fresh: bool, wide: int = 1) -> tuple[Bools, Bools]:
+    """A lane of 5 cells that changed, with some cells beside it that did not; and what is credible of it."""
+    strip, beside = square(5, 40, 32, 20), square(wide, 40, 37, 20)
+    now = np.full(strip.shape, np.nan)
+    now[strip], now[beside] = NEW, kind_beside
+    return strip, believed(strip, np.where(strip, NEW, np.nan), now, beside if is_fresh else None)
+
+
+def test_cells_at_a_lanes_edge_that_were_first_driven_after_the_change_are_no_border_that_moved():
+    strip, seen = fringed(NEW, is_fresh=True)
+    assert np.array_equal(seen, strip)
+    _, seen = fringed(NEW, is_fresh=False)
+    assert not seen.any(), "this ground was there before, and may have moved"
+
+
+def test_wide_ground_of_the_new_kind_tells_of_a_border_even_if_it_was_driven_later():
+    _, seen = fringed(NEW, is_fresh=True, wide=5)
+    assert not seen.any()
+
+
+@pytest.mark.parametrize(("is_fresh", "share"), [(True, 1.0), (False, 0.0)])
+def test_a_narrow_lane_is_believed_unless_cells_beside_it_stayed_as_they_were_before_and_after(is_fresh, share):
+    strip, beside = square(3, 40, 32, 20), square(1, 40, 31, 20) | square(1, 40, 35, 20)
+    now = np.full(strip.shape, np.nan)
+    now[strip], now[beside] = NEW, OLD
+    seen = believed(strip, np.where(strip, NEW, np.nan), now, beside if is_fresh else None)
+    assert seen[strip].mean() == share
+
+
+def test_the_rest_of_a_change_that_is_believed_is_believed_with_it_but_not_beside_ground_that_stayed():
+    area, tail = square(6, 6, 20, 20), square(2, 20, 23, 26)
+    unknown = np.full(area.shape, np.nan)
+    both = area | tail
+    now = np.where(both, NEW, unknown)
+    assert np.array_equal(believed(both, np.where(both, NEW, np.nan), now), both)
+    now[30:, 21:27] = np.where(both, NEW, OLD)[30:, 21:27]
+    seen = believed(both, np.where(both, NEW, np.nan), now)
+    assert seen[area].all()
+    assert seen[tail].any()
+    assert not seen[30:].any()
+    other = np.where(tail, NEW + 4, np.where(area, NEW, np.nan))
+    assert not believed(both, other, now)[30:].any(), "another kind of ground is another change"

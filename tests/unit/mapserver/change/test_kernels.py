@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums
+from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums, weights
 from mapserver.evidence import cells as ev
 
 PARTS = [ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH]
@@ -81,6 +81,13 @@ def median(votes: np.ndarray) -> np.ndarray:
     """Where half of the votes (bins, cells) lie below, each bin's spread evenly around it."""
     until = np.vstack([np.zeros(votes.shape[1]), (votes / votes.sum(axis=0)).cumsum(axis=0)])
     return np.array([np.interp(0.5, column, np.arange(len(column)) - 0.5) for column in until.T])
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_weights_are_the_sums_of_all_bins_page_by_page(part):
+    votes, ends, counts = made_up(7)
+    assert np.array_equal(weights(votes, ends, part.start, part.stop), counts[:, part].sum(axis=1))
+    assert weights(votes[:0], ends[:0], part.start, part.stop).shape == (0, ev.CELLS)
 
 
 def test_all_pages_together_have_their_sums_and_medians():

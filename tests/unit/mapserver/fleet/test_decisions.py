@@ -43,9 +43,9 @@ def one(
     return Correction(machine, epoch * EPOCH_NS, to_ns, zero, scale, across, rows, **more)
 
 
-def solved(*corrections: Correction) -> Calibration:
-    begins_ns = {one.machine: LAST_NS for one in corrections}
-    return Calibration(corrections, {}, CommonScale(True, 0.005, ""), begins_ns=begins_ns)
+def solved(*corrections: Correction, begins_ns: int = LAST_NS) -> Calibration:
+    begins_ns_of = {one.machine: begins_ns for one in corrections}
+    return Calibration(corrections, {}, CommonScale(True, 0.005, ""), begins_ns=begins_ns_of)
 
 
 class Solver:
@@ -55,9 +55,11 @@ class Solver:
         self.decisions = CalibrationDecisions(decisions)
         self.now_ns = NOW_NS
 
-    def hears(self, *corrections: Correction, asked: bool = False, after_ns: int = 60 * 10**9) -> int:
+    def hears(
+        self, *corrections: Correction, asked: bool = False, after_ns: int = 60 * 10**9, begins_ns: int = LAST_NS
+    ) -> int:
         """How many corrections are decided."""
-        made = self.decisions.judge(solved(*corrections), self.now_ns, asked=asked)
+        made = self.decisions.judge(solved(*corrections, begins_ns=begins_ns), self.now_ns, asked=asked)
         for decision in made:
             self.decisions.add(CalibrationDecision.from_body(json.loads(json.dumps(decision.body()))))
         self.now_ns += after_ns
@@ -117,6 +119,22 @@ def test_the_solver_decides_at_most_once_in_ten_minutes_of_site_time_unless_it_i
     started_anew = Solver(*[CalibrationDecision("a", SOLVER, "", solver.now_ns, (one(0.1),))])
     started_anew.now_ns = solver.now_ns
     assert [started_anew.hears(one(0.2)) for _ in range(11)] == [0] * 10 + [1], "its last decision is on disk"
+
+
+@pytest.mark.parametrize(
+    ("begun_min", "decided"),
+    [
+        (0, [1, 3, 7, 15, 25]),  # 2, 4, 8, 16 minutes after the first sample; from then on every 10
+        (-60, [1, 11, 21]),
+        (2, [1, 3, 5, 9, 17, 27]),  # the first sample came with the first decision
+        (10**6, [1, 11, 21]),  # a clock is ahead
+    ],
+)
+def test_in_the_first_minutes_of_machines_it_decides_again_when_twice_the_time_has_passed(begun_min, decided):
+    solver = Solver()
+    begins_ns = NOW_NS - 60 * 10**9 * (1 - begun_min)
+    counts = [solver.hears(one(0.002 + 0.002 * (minute // 2)), begins_ns=begins_ns) for minute in range(30)]
+    assert np.flatnonzero(counts).tolist() == decided
 
 
 def test_the_limit_holds_after_a_clock_was_ahead():

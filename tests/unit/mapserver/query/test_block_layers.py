@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 
 import numpy as np
@@ -159,7 +160,7 @@ def test_a_block_is_derived_again_where_what_came_in_beside_it_shows_that_its_gr
     names, window = ("resistance", "resistance_filled"), CellWindow(0, 0, 32, 16)
     kept, sent = fresh(), 0
 
-    def drive(writer: Writer, columns: range, c_rr: float, after_s: float) -> float:
+    def drive(writer: Writer, columns: Sequence[int], c_rr: float, after_s: float) -> float:
         nonlocal sent
         x, y = (grid.ravel() + 0.5 for grid in np.meshgrid(np.array(columns), np.arange(16)))
         rows = samples(len(x), x_m=x, y_m=y, distance_m=4.0, c_rr=c_rr, cov_xx_m2=1e-4, cov_yy_m2=1e-4)
@@ -171,9 +172,10 @@ def test_a_block_is_derived_again_where_what_came_in_beside_it_shows_that_its_gr
         return float(now["resistance"][8, 14])
 
     with closing(open_writer(tmp_path)) as writer:
-        drive(writer, range(32), 0.02, 0.0)
-        narrow = drive(writer, range(13, 16), 0.2, 3600.0)
-        wide = drive(writer, range(16, 19), 0.2, 7200.0)
+        drive(writer, [*range(32)], 0.02, 0.0)
+        drive(writer, [*range(13), *range(16, 32)], 0.02, 3600.0)
+        narrow = drive(writer, [13, 14, 15], 0.2, 3600.0)
+        wide = drive(writer, [16, 17, 18], 0.2, 7200.0)
         assert wide == pytest.approx(0.2, rel=0.1)
         assert narrow < wide / 2
 
