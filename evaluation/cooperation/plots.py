@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
@@ -22,7 +21,6 @@ MACHINES = {"one": VERMILION, "two": ORANGE, "four": BLUE, "eight": GREEN}
 LINKS = {CENTRAL: GREEN, "four": BLUE, "slow": ORANGE, "lost": VERMILION}
 TITLES = {CENTRAL: "one process, perfect link", "four": "link always there", "slow": "300 kbit/s",
           "lost": "lost one minute in five", "mixed": "loaders and dump trucks"}  # fmt: skip
-Place = Literal["lower right", "upper left"]  # of a legend
 MINUTES, COVERED = "minutes of site time", "network known and right [%]"
 
 
@@ -70,7 +68,7 @@ def draw_links(rows: Sequence[Row]) -> Figure:
         for row in rows:
             title_of = TITLES[row["arm"]]
             _covered(panel, row, name, LINKS[row["arm"]], title_of, "--" if row["arm"] == CENTRAL else "-")
-        _frame(panel, title, "upper left")
+        _frame(panel, title)
     return figure
 
 
@@ -80,8 +78,8 @@ def _covered(axes: Axes, row: Row, name: str, colour: str, label: str, style: st
     axes.plot(times, [0.0, *(step[name] for step in steps)], style, color=colour, label=label)
 
 
-def _frame(axes: Axes, title: str, legend: Place = "lower right") -> None:
+def _frame(axes: Axes, title: str) -> None:
     head(axes, title)
     axes.axhline(SHARE_PCT, color="0.6", lw=0.8)
     axes.set(xlabel=MINUTES, ylabel=COVERED, ylim=(0, 102), xlim=(0, None))
-    axes.legend(loc=legend)
+    axes.legend(loc="lower right")

@@ -26,11 +26,17 @@ VARIATION = 0.6  # total variation of two histograms, 0 to 1, above which they c
 BINS = (
     1.5  # least difference of their medians, in bins (22 % of c_rr, 0.031 of gradient): medians are no finer than one
 )
+LEAST_C_RR = 0.005  # likewise: three times what zeros of two calibrated machines differ by, 22 % of c_rr from 0.023 on
 WEIGHT_M = 0.3  # least evidence on either side of a cut: a sample's vote in a cell beside its own is no pass
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
 LEAST_SHARE = 0.5  # of a square of size_m that changed, where all else in it is not known
 ALIKE_BINS = 1.0  # kinds of ground nearer to each other are the same; cells whose pages are nearer did not change
-_PARTS = (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH)
+# Bins of each value that is looked at, their centres, and the least difference of two medians.
+_PARTS = (
+    (ev.RESISTANCE, ev.RESISTANCE_CENTRES, LEAST_C_RR),
+    (ev.GRADE_EAST, ev.GRADE_CENTRES, 0.0),
+    (ev.GRADE_NORTH, ev.GRADE_CENTRES, 0.0),
+)
 
 
 @dataclass(frozen=True)
@@ -75,14 +81,14 @@ def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
         return last
     votes_of_pages, ends = packed_votes(pages)
     least, most = 0.1 * WEIGHT_M * ev.WEIGHT_UNITS_PER_M, min(ALIKE_BINS, BINS / 2)
-    for part in _PARTS:
+    for part, centres, least_step in _PARTS:
         cells = np.flatnonzero(differ(votes_of_pages, ends, part.start, part.stop, least, most))
         if not len(cells):
             continue
         votes = _histograms(votes_of_pages, ends, part, cells)
         left = np.arange(len(cells))
         for _ in range(MOST_CHANGES):
-            cut, kind = _best_cut(votes[:, :, left], last.first[cells[left]])
+            cut, kind = _best_cut(votes[:, :, left], last.first[cells[left]], centres, least_step)
             changed = cut > last.first[cells[left]]
             left, cut, kind = left[changed], cut[changed], kind[changed]
             last.first[cells[left]] = cut
@@ -137,17 +143,17 @@ def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig) -
     edge = _edge(cell_m, config)
     changed, kind = cuts_of.first > 0, cuts_of.kind
     whole = np.rint(np.where(changed, kind, np.nan))
-    sorts = np.unique(whole[np.isfinite(whole)])
-    near = np.zeros(changed.shape, np.bool_)
-    for one in sorts:
+    near, agrees = np.zeros((2, *changed.shape), np.bool_)
+    for one in np.unique(whole[np.isfinite(whole)]):
         alike = ~changed & (np.abs(cells.kind - one) <= ALIKE_BINS)
-        always_ns = np.where(_opened(alike, edge), -np.inf, cells.from_ns)
-        near |= (whole == one) & (_least(always_ns, alike, 2 * edge) <= cuts_of.old_ns)
+        beside_ns = np.where(_opened(alike, edge), -np.inf, cells.from_ns)
+        near |= (whole == one) & (_least(beside_ns, _opened(alike, -(-edge // 2)), 2 * edge) <= cuts_of.old_ns)
+        agrees |= alike & _grown(whole == one, edge)
     new = changed & np.isfinite(kind) & ~near
     old_ns, new_ns = -_least(-cuts_of.old_ns, changed, edge), _least(cuts_of.new_ns, changed, edge)
-    against = ~changed & (cells.from_ns <= old_ns) & (cells.until_ns >= new_ns)
+    against = ~changed & ~agrees & (cells.from_ns <= old_ns) & (cells.until_ns >= new_ns)
     believed = _opened(changed, 2 * edge) | _opened(new, edge) | _strips(new, ~changed & ~against, edge)
-    beside = cv2.dilate(against.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    beside = _grown(against, 1)
     for one in np.unique(whole[believed & np.isfinite(whole)]):
         alike = changed & (np.abs(kind - one) <= ALIKE_BINS) & ~beside
         count, part = cv2.connectedComponents(alike.astype(np.uint8), connectivity=8)
@@ -173,6 +179,12 @@ def _reached(weight: Floats, time_ns: Floats) -> Floats:
         return np.full(weight.shape[1], np.nan)
     enough = np.cumsum(weight, axis=0) >= WEIGHT_M
     return np.where(enough.any(axis=0), time_ns[enough.argmax(axis=0)], np.nan)
+
+
+def _grown(cells: Bools, reach: int) -> Bools:
+    """Cells (rows, columns) that are, or lie so many cells from one that is, or nearer."""
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), square, borderValue=0) > 0)
 
 
 def _least(values: Floats, where: Bools, reach: int) -> Floats:
@@ -222,11 +234,14 @@ def _histograms(votes: NDArray[np.uint64], ends: Ints, part: slice, cells: Ints)
     return metres
 
 
-def _best_cut(votes: Floats, first: Ints) -> tuple[Ints, Floats]:
+def _best_cut(votes: Floats, first: Ints, centres: Floats, least_step: float) -> tuple[Ints, Floats]:
     """Index of the page (cells,) at which the ground changed, the given first page where it did not.
 
-    votes: (pages, bins, cells); pages before `first` do not count. Also returns the median (cells,) after it.
+    votes: (pages, bins, cells); pages before `first` do not count. centres (bins,): their values; medians differ by
+    least_step or more. Also returns the median (cells,) after it, in bins.
     """
     best, variation, before, after = likeliest_cuts(votes, first, WEIGHT_M)
-    changed = (best > 0) & (variation > VARIATION) & (np.abs(before - after) >= BINS)
+    values_before, values_after = (np.interp(median, np.arange(len(centres)), centres) for median in (before, after))
+    apart = (np.abs(before - after) >= BINS) & (np.abs(values_before - values_after) >= least_step)
+    changed = (best > 0) & (variation > VARIATION) & apart
     return np.where(changed, best, first), after

@@ -122,8 +122,8 @@ def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for
 
 def test_a_cut_lies_between_the_pages_that_knew_the_ground_before_and_after():
     pages = passes(0.04, 0.04, 0.2)
-    found, nothing = cuts(pages, CONFIG), cuts(passes(0.04, 0.04), CONFIG)
-    assert (set(found.old_ns), set(found.new_ns)) == ({pages[1].first_ns}, {pages[2].first_ns})
+    one_cut, nothing = cuts(pages, CONFIG), cuts(passes(0.04, 0.04), CONFIG)
+    assert (set(one_cut.old_ns), set(one_cut.new_ns)) == ({pages[1].first_ns}, {pages[2].first_ns})
     assert np.isnan([nothing.old_ns, nothing.new_ns]).all()
 
 
@@ -134,6 +134,13 @@ def test_medians_nearer_than_bins_are_no_change():
     old = float(ev.RESISTANCE_CENTRES[8])
     assert firsts(passes(old, old * np.exp((BINS + 0.1) * BIN))) == [1]
     assert firsts(passes(old, old * np.exp((BINS - 0.1) * BIN))) == [0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "change"), [(0.005, 0.0098, 0), (0.0098, 0.005, 0), (0.006, 0.0115, 1), (0.02, 0.008, 1)]
+)
+def test_concrete_does_not_change_by_what_zeros_of_machines_differ(old, new, change):
+    assert firsts(passes(old, new)) == [change]
 
 
 def two_passes(*grounds: dict[float, float]) -> list[TimedPage]:
@@ -280,10 +287,12 @@ def fringed(kind_beside: float, *, is_fresh: bool, wide: int = 1) -> tuple[Bools
 
 
 def test_cells_at_a_lanes_edge_that_were_first_driven_after_the_change_are_no_border_that_moved():
-    strip, seen = fringed(NEW, is_fresh=True)
+    strip, seen = fringed(NEW, is_fresh=True, wide=3)
     assert np.array_equal(seen, strip)
-    _, seen = fringed(NEW, is_fresh=False)
+    _, seen = fringed(NEW, is_fresh=False, wide=3)
     assert not seen.any(), "this ground was there before, and may have moved"
+    strip, seen = fringed(NEW, is_fresh=False, wide=2)
+    assert np.array_equal(seen, strip), "an edge that was driven late in the bucket in which the ground changed"
 
 
 def test_wide_ground_of_the_new_kind_tells_of_a_border_even_if_it_was_driven_later():
