@@ -138,7 +138,7 @@ def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig) -
 
     Trucks that keep to a lane make a narrower strip known: what is not known beside it, before the change and after,
     speaks neither for the change nor against it, as long as the strip changed over size_m of its length. Where a part
-    of a change is believed, so is the rest of it that lies around: no border moves so far.
+    of a change is believed, so are cells of its kind that hang together with it, but not beside those that say no.
     """
     edge = _edge(cell_m, config)
     changed, kind = cuts_of.first > 0, cuts_of.kind
@@ -153,20 +153,21 @@ def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig) -
     old_ns, new_ns = -_least(-cuts_of.old_ns, changed, edge), _least(cuts_of.new_ns, changed, edge)
     against = ~changed & ~agrees & (cells.from_ns <= old_ns) & (cells.until_ns >= new_ns)
     believed = _opened(changed, 2 * edge) | _opened(new, edge) | _strips(new, ~changed & ~against, edge)
-    beside = _grown(against, 1)
+    out, untouched = believed.copy(), changed & ~_grown(against, 1)
     for one in np.unique(whole[believed & np.isfinite(whole)]):
-        alike = changed & (np.abs(kind - one) <= ALIKE_BINS) & ~beside
-        count, part = cv2.connectedComponents(alike.astype(np.uint8), connectivity=8)
-        believes = np.zeros(count, np.bool_)
-        believes[part[alike & believed & (whole == one)]] = True
-        believed |= alike & believes[part]
-    return believed
+        alike = untouched & (np.abs(kind - one) <= ALIKE_BINS)
+        part = alike & believed & (whole == one)
+        for _ in range(2 * edge):  # not further: what a cell shows is to depend on blocks near it alone
+            part = alike & _grown(part, 1)
+        out |= part
+    return out
 
 
 def reach_blocks(cell_m: float, config: ChangeConfig) -> int:
     """How many blocks away the cells are that `credible` looks at."""
     edge = _edge(cell_m, config)
-    return -(-(4 * edge - 2) // BLOCK_CELLS)  # a square of 2 edge cells that holds a cell, and neighbours in it
+    # Along what is believed, through a square that is, to ground beside, and through the square that makes it ground.
+    return -(-(2 * edge + (edge - 1) + 2 * edge + (edge - 1)) // BLOCK_CELLS)
 
 
 def _begins_ns(pages: Sequence[TimedPage]) -> Floats:

@@ -1,14 +1,27 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
+import cv2
 import numpy as np
 import pytest
 
-from mapserver.change.detection import BINS, VARIATION, WEIGHT_M, ChangeConfig, Cuts, Known, credible, cuts, known
+from mapserver.change.detection import (
+    BINS,
+    VARIATION,
+    WEIGHT_M,
+    ChangeConfig,
+    Cuts,
+    Known,
+    credible,
+    cuts,
+    known,
+    reach_blocks,
+)
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import TimedPage
 from protocol.arrays import Bools, Floats, Ints
+from protocol.site.geometry import BLOCK_CELLS
 from tests.unit.mapserver.data import NOW_NS, samples
 
 CONFIG = ChangeConfig()
@@ -273,6 +286,32 @@ def test_a_lane_that_moved_beside_ground_as_it_was_is_not_believed():
     assert not lane(square(40, 2)).any(), "half of the least width"
 
 
+def crop(images: Cuts | Known, part: slice):
+    return type(images)(*(getattr(images, field.name)[part, part] for field in fields(images)))
+
+
+@pytest.mark.parametrize("size_m", [1.0, 5.0, 6.0])
+@pytest.mark.parametrize("seed", range(12))
+def test_what_a_cell_shows_depends_on_the_blocks_near_it_alone(seed, size_m):
+    """Queries of a point and of the whole map see other images, and have to say the same."""
+    rng, n = np.random.default_rng(seed), 9 * BLOCK_CELLS
+    config = replace(CONFIG, size_m=size_m)
+    patches = [cv2.resize(rng.random((n // edge, n // edge)), (n, n)) for edge in (3, 6, 16)]
+    lanes = cv2.resize(rng.random((n // 8, 1)), (n, n)) > 0.4
+    changed: Bools = np.asarray((patches[0] + patches[1] > 0.7 + 0.5 * rng.random()) & lanes)
+    driven = patches[2] > 0.2
+    changed &= driven
+    kind = np.where(changed, 2.0 + np.rint(6 * patches[2]), np.nan)
+    pages = [np.where(driven, 1e9 * np.rint(each * 3), np.nan) for each in (patches[0], 1 + patches[1])]
+    seen = Known(np.where(driven & ~changed, np.rint(9 * patches[1]), np.nan), *pages)
+    cut = Cuts(changed.astype(np.int64), kind, *(np.where(changed, time_ns, np.nan) for time_ns in (1e9, 2e9)))
+    whole, reach = credible(cut, seen, 1.0, config), reach_blocks(1.0, config)
+    middle = slice((4 - reach) * BLOCK_CELLS, (5 + reach) * BLOCK_CELLS)
+    inner = slice(reach * BLOCK_CELLS, (reach + 1) * BLOCK_CELLS)
+    alone = credible(crop(cut, middle), crop(seen, middle), 1.0, config)[inner, inner]
+    assert np.array_equal(alone, whole[4 * BLOCK_CELLS : 5 * BLOCK_CELLS, 4 * BLOCK_CELLS : 5 * BLOCK_CELLS])
+
+
 def test_nothing_changed_and_nothing_known_is_nothing():
     nothing, unknown = square(0), np.full((80, 80), np.nan)
     assert not believed(nothing, unknown, unknown).any()
@@ -310,11 +349,16 @@ def test_a_narrow_lane_is_believed_unless_cells_beside_it_stayed_as_they_were_be
 
 
 def test_the_rest_of_a_change_that_is_believed_is_believed_with_it_but_not_beside_ground_that_stayed():
-    area, tail = square(6, 6, 20, 20), square(2, 20, 23, 26)
+    area, tail = square(6, 6, 20, 20), square(2, 9, 23, 26)
     unknown = np.full(area.shape, np.nan)
     both = area | tail
     now = np.where(both, NEW, unknown)
     assert np.array_equal(believed(both, np.where(both, NEW, np.nan), now), both)
+    longer = area | square(2, 30, 23, 26)
+    seen = believed(longer, np.where(longer, NEW, np.nan), np.where(longer, NEW, unknown))
+    assert np.flatnonzero(seen.any(axis=1)).tolist() == list(range(20, 40)), (
+        "a strip to row 29, and twice the least size"
+    )
     now[30:, 21:27] = np.where(both, NEW, OLD)[30:, 21:27]
     seen = believed(both, np.where(both, NEW, np.nan), now)
     assert seen[area].all()
