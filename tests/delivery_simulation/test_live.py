@@ -280,6 +280,7 @@ def server_at(endpoint: str, folder: Path) -> Iterator[None]:
     session.close()
 
 
+@pytest.mark.slow
 def test_machine_catches_up_at_the_speed_of_the_server(endpoint: str, opened: Opened, tmp_path: Path) -> None:
     n = 60_000
     with server_at(endpoint, tmp_path / "store"), uplink_of(opened(), tmp_path / "spool.db", n) as spool:
