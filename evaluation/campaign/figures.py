@@ -68,18 +68,23 @@ class Goal:
 
 
 def judge(goals: Sequence[Goal], rows: Sequence[Row]) -> list[Row]:
-    """Compare rows with the goals that concern them; `row`: the values that choose it, `name`: of the figure."""
-    return [
-        {
-            "row": " ".join(map(str, goal.row.values())),
-            "name": goal.figure,
-            "goal": f"{goal.relation} {goal.limit:g}",
-            "value": row[goal.figure],
-            "met": goal.is_met(row[goal.figure]),
-        }
-        for goal in goals
-        for row in select(rows, goal.row)
-    ]
+    """Compare rows with the goals that concern them; `name`: of the figure.
+
+    `row`: the values that choose it, and the names by which it differs from others that they choose.
+    """
+    out = []
+    for goal in goals:
+        chosen = select(rows, goal.row)
+        apart = [key for key, value in chosen[0].items() if isinstance(value, str)] if len(chosen) > 1 else []
+        apart = [key for key in apart if len({row[key] for row in chosen}) > 1]
+        for row in chosen:
+            named = (*goal.row.values(), *(row[key] for key in apart))
+            value, limit = row[goal.figure], f"{goal.relation} {goal.limit:g}"
+            met = goal.is_met(value)
+            out.append(
+                {"row": " ".join(map(str, named)), "name": goal.figure, "goal": limit, "value": value, "met": met}
+            )
+    return out
 
 
 def select(rows: Iterable[Row], values: Mapping[str, Any]) -> list[Row]:

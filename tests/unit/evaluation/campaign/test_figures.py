@@ -45,6 +45,6 @@ def test_goals_concern_the_rows_that_have_their_values():
     shared = {"name": "wrong_pct", "goal": "<= 0.4"}
     assert results == [
         {"row": "mean 2", **shared, "value": 0.5, "met": False},
-        {"row": "1", **shared, "value": 0.2, "met": True},
-        {"row": "1", **shared, "value": None, "met": False},
+        {"row": "1 mean", **shared, "value": 0.2, "met": True},
+        {"row": "1 median", **shared, "value": None, "met": False},
     ]
