@@ -26,7 +26,7 @@ VARIATION = 0.6  # total variation of two histograms, 0 to 1, above which they c
 BINS = (
     1.5  # least difference of their medians, in bins (22 % of c_rr, 0.031 of gradient): medians are no finer than one
 )
-LEAST_C_RR = 0.005  # likewise: three times what zeros of two calibrated machines differ by, 22 % of c_rr from 0.023 on
+LEAST_C_RR = 0.005  # likewise, on concrete, by what machines' zeros are off by; from 0.023 on bins ask for more
 WEIGHT_M = 0.3  # least evidence on either side of a cut: a sample's vote in a cell beside its own is no pass
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
 LEAST_SHARE = 0.5  # of a square of size_m that changed, where all else in it is not known
@@ -133,8 +133,9 @@ def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig) -
     """Changed cells (rows, columns) that are no position errors; all values are images.
 
     A wrong position moves the ground of one side of a border to the other. So a strip of changed cells counts where it
-    is size_m wide and its new kind is not that of the ground around, or twice as wide. Only ground that was known
-    before the change tells of such a border: at the edge of a lane, cells are driven for the first time after it.
+    is size_m wide and its new kind is not that of the ground around, or twice as wide. Ground tells of such a border
+    that is half as wide and was known before the change, or is as wide: at the edge of a lane, cells are driven for
+    the first time after it.
 
     Trucks that keep to a lane make a narrower strip known: what is not known beside it, before the change and after,
     speaks neither for the change nor against it, as long as the strip changed over size_m of its length. Where a part

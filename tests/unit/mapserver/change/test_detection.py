@@ -317,25 +317,25 @@ def test_nothing_changed_and_nothing_known_is_nothing():
     assert not believed(nothing, unknown, unknown).any()
 
 
-def fringed(kind_beside: float, *, is_fresh: bool, wide: int = 1) -> tuple[Bools, Bools]:
-    """A lane of 5 cells that changed, with some cells beside it that did not; and what is credible of it."""
+def fringed(wide: int, *, is_fresh: bool) -> tuple[Bools, Bools]:
+    """A lane of 5 cells that changed, beside some cells of its new kind that did not; and what is credible of it."""
     strip, beside = square(5, 40, 32, 20), square(wide, 40, 37, 20)
     now = np.full(strip.shape, np.nan)
-    now[strip], now[beside] = NEW, kind_beside
+    now[strip | beside] = NEW
     return strip, believed(strip, np.where(strip, NEW, np.nan), now, beside if is_fresh else None)
 
 
 def test_cells_at_a_lanes_edge_that_were_first_driven_after_the_change_are_no_border_that_moved():
-    strip, seen = fringed(NEW, is_fresh=True, wide=3)
+    strip, seen = fringed(3, is_fresh=True)
     assert np.array_equal(seen, strip)
-    _, seen = fringed(NEW, is_fresh=False, wide=3)
+    _, seen = fringed(3, is_fresh=False)
     assert not seen.any(), "this ground was there before, and may have moved"
-    strip, seen = fringed(NEW, is_fresh=False, wide=2)
+    strip, seen = fringed(2, is_fresh=False)
     assert np.array_equal(seen, strip), "an edge that was driven late in the bucket in which the ground changed"
 
 
 def test_wide_ground_of_the_new_kind_tells_of_a_border_even_if_it_was_driven_later():
-    _, seen = fringed(NEW, is_fresh=True, wide=5)
+    _, seen = fringed(5, is_fresh=True)
     assert not seen.any()
 
 
