@@ -80,10 +80,9 @@ def test_of_two_servers_at_a_promoted_replica_and_at_the_old_primary_the_old_one
             site.start()
             site.wait_for_acknowledgements(5)
             row = site.acknowledged()[-1].row
-            there = Database(replica, database.name)
-            wait_until(
-                lambda: there.sql("SELECT last_row FROM sitegrid.head")[0][0] >= row, 30.0, "the replica follows"
-            )
+            wait_until(lambda: replica.shows_all_of(primary), 30.0, "the replica follows")
+            last_row = Database(replica, database.name).sql("SELECT last_row FROM sitegrid.head")[0][0]
+            assert last_row >= row
             for sender in site.senders:
                 sender.end()
             assert site.standby

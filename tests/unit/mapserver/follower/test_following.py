@@ -510,8 +510,7 @@ def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_
 
             deliver(1)
             url = replica.url(database.name)
-            known = f"SELECT 1 FROM pg_database WHERE datname = '{database.name}'"
-            wait_for(lambda: replica.sql(known) and JournalLocation(tmp_path, url).exists())
+            wait_for(lambda: replica.shows_all_of(primary))
             of_one = Following(JournalLocation(tmp_path / "one", url), SITE, CONFIG)
             ports = f"127.0.0.1:{primary.port},127.0.0.1:{replica.port}"
             pool = f"postgresql://postgres@{ports}/{database.name}?load_balance_hosts=random"

@@ -661,8 +661,7 @@ def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_ac
     first = Store(JournalLocation(tmp_path / "one", database.url), SITE, CONFIG, now_ns)
     assert first.info()["replica"] == "synchronous"
     acknowledged = [send(first, k).watermark for k in (1, 6, 11)]
-    known = f"SELECT 1 FROM pg_database WHERE datname = '{database.name}'"
-    wait_for(lambda: replica.sql(known) and JournalLocation(tmp_path, replica.url(database.name)).exists())
+    wait_for(lambda: replica.shows_all_of(primary))
     with JournalLocation(tmp_path / "two", replica.url(database.name)).reader() as follower:
         wait_for(lambda: follower.last_row == 3)
         assert follower.follow(follower.state(), 0.1).row == 3, "a replica has no notifications"

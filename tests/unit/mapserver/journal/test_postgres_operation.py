@@ -139,9 +139,8 @@ def test_a_commit_that_an_operator_stops_from_waiting_for_its_replica_is_not_ack
                 assert not any(isinstance(answer, Ack) for answer in answers)
             again.join(20.0)
             wait_for(lambda: isinstance(send(store, 6), Ack))
-            known = f"SELECT 1 FROM pg_database WHERE datname = '{database.name}'"
-            wait_for(lambda: bool(replica.sql(known)))  # it has all on its disk, and shows it a little later
-            wait_for(lambda: Database(replica, database.name).sql(count) == [(2,)])
+            wait_for(lambda: replica.shows_all_of(primary))
+            assert Database(replica, database.name).sql(count) == [(2,)]
             assert store.journal.watermark("a", 7).seq == 10
             assert same(store.grid, folded_by(store))
 
