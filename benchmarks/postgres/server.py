@@ -130,7 +130,7 @@ class Cluster:
     def shows_all_of(self, primary: Cluster) -> bool:
         """Whether a replica's sessions see all that its primary has written: having it on disk comes before that."""
         written = primary.sql("SELECT pg_current_wal_lsn()")[0][0]
-        return bool(self.sql(f"SELECT pg_last_wal_replay_lsn() >= '{written}'::pg_lsn")[0][0]) 
+        return bool(self.sql(f"SELECT pg_last_wal_replay_lsn() >= '{written}'::pg_lsn")[0][0])
 
     def url(self, database: str = "postgres") -> str:
         """Of a database, over TCP."""
