@@ -25,8 +25,8 @@ def test_filter_prints_one_json_object_with_every_step_of_every_filter(monkeypat
     assert all(set(row) == {"filter", "step", "us", "x_stock", "x_stock_angles"} for row in rows)
     assert all(math.isfinite(value) for row in rows for value in row.values() if not isinstance(value, str))
     assert [(row["filter"], row["lag_s"]) for row in result["smoother"]] == [("ekf", 90.0), ("ukf", 90.0)]
-    # A difference of two timings, which comes out below zero where other work gets in between; never above both.
-    assert all(row["smoother_percent"] < row["cpu_percent"] for row in result["smoother"])
+    # A difference of two timings: below zero where other work gets in between, but not by a whole pipeline.
+    assert all(abs(row["smoother_percent"]) < row["cpu_percent"] for row in result["smoother"])
     (whole,) = result["agent"]
     assert whole["seconds"] == 20
     assert whole["cpu_percent"] > 0
