@@ -61,12 +61,12 @@ def _medians(runs: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _row(load: str, alone: dict[str, float], asked: dict[str, float]) -> Report:
-    loss = 1 - asked["samples_per_s"] / alone["samples_per_s"]
+    loss = round(1 - asked["samples_per_s"] / alone["samples_per_s"], 3)
     return {
         "load": load,
         **{f"alone_{key}": round(value, 3) for key, value in alone.items()},
         **{f"asked_{key}": round(value, 3) for key, value in asked.items()},
-        "loss": round(loss, 3),
+        "loss": loss,
         "goal": f"loss <= {GOAL:g}",
         "met": loss <= GOAL,
     }
