@@ -1,83 +1,138 @@
-"""Slope along and across the machine: where the vertical points in the body's axes, by gyros and accelerometer.
+"""Slope along and across the machine: where the vertical points in the body's axes, by gyros, accelerometer and wheels.
 
-With u the vertical in the body's axes (ahead, left, up), omega the rates of the gyros, f the specific force and a the
-acceleration of the machine itself, along its track and towards the centre of a bend,
+With u the vertical in the body's axes (ahead, left, up), omega the rates of the gyros, f the specific force that the
+accelerometer measures with its zero z, and v the velocity of the place where it sits,
 
-    du/dt = -omega x u          f = g u + a
+    du/dt = -omega x u          dv/dt = f - g (u + z) - omega x v
 
-The gyros predict u, the accelerometer corrects it. The parts of u ahead and to the left are the sines of the two
-slopes, positive uphill.
+The gyros turn u; the forces are summed up to a velocity, and the wheels say what it should be: their speed ahead, none
+aside, and what turning adds at the sensor. Wheel travel is not differentiated twice: an acceleration that comes late is
+a slope that is not there. A machine that turns tells a zero, which turns with it, from a slope, which stays.
+The parts of u ahead and to the left are the sines of the two slopes, positive uphill.
 """
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
+
+from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 
 MAX_SINE = 0.7  # steeper than any machine stands
 FIRST_STD = 0.05  # of the sine, after the first reading
-# Noise of the specific force over NOISE_S, vibration included. It is taken as white: the variance of a reading grows as
-# readings come faster.
-FORCE_STD_MPS2 = 0.35
-NOISE_S = 0.02
-RATE_WALK = 1.5e-3  # random walk of the angle that the gyros do not see [rad/sqrt(s)]
+FIRST_SPEED_STD_MPS = 5.0  # of a machine whose wheels have said nothing yet
+RATE_WALK = 3e-4  # random walk of the angle that the gyros do not see [rad/sqrt(s)]: a cheap gyro, 0.17 deg/s at 100 Hz
 BIAS_STD_RADPS = 2e-3  # of the gyro bias at start: 0.1 deg/s
 BIAS_WALK = 3.5e-5  # random walk of the gyro bias [rad/s/sqrt(s)]: another 0.1 deg/s in an hour
+ZERO_STD = 0.01  # of the accelerometer's zero at start, over g: an uncalibrated one
+ZERO_WALK = 1e-4  # random walk of that zero [1/sqrt(s)]: most of it again in an hour
+FORCE_WALK = 0.05  # of the summed forces [m/s/sqrt(s)]: vibration of 0.35 m/s2, white over 20 ms
+SPEED_WALK = 0.027  # noise of the wheels' speed [m/s sqrt(s)]: 0.05 m/s, shared by readings over 0.3 s
+# Wheels that jump by more than this against the forces slip, or grip again: that says nothing about the slope. One
+# sigma is rare: noise is shared by readings that are counted as if it were each one's own.
+JUMP_SIGMA = 1.0
+SINES, BIASES, ZEROS, SPEEDS = (slice(i, i + 2) for i in (0, 2, 4, 6))  # of the state, each ahead and to the left
 
 
 class SlopeFilter:
-    """Sines of the slopes ahead and to the left, each with a Kalman filter.
+    """Sines of the slopes ahead and to the left by a Kalman filter, of one IMU.
 
-    A machine that turns on a slope exchanges the slope ahead for the one across: du/dt couples the two.
+    State: both sines, biases of the rates at which these change [rad/s], zeros of the accelerometer over g, and speeds
+    [m/s]. Turning couples the directions: the slope ahead becomes the one across.
     """
 
     def __init__(self) -> None:
-        self.ahead, self.left = _Sine(), _Sine()
-        self._started = False
-
-    def update(self, dt_s: float, rates_radps: tuple[float, float, float], force_mps2: tuple[float, float]) -> None:
-        """Predict with the rates, correct with the specific force without the machine's own acceleration.
-
-        rates_radps: about the axes ahead, left and up. force_mps2: ahead and to the left.
-        """
-        measured = [max(-MAX_SINE, min(MAX_SINE, force / GRAVITY_MPS2)) for force in force_mps2]
-        if not self._started:
-            self.ahead.sine, self.left.sine = measured
-            self._started = True
-            return
-        x, y = self.ahead.sine, self.left.sine
-        up = math.sqrt(max(1 - x * x - y * y, MAX_SINE**2))
-        about_x, about_y, about_z = rates_radps
-        self.ahead.update(dt_s, about_z * y - about_y * up, measured[0])
-        self.left.update(dt_s, about_x * up - about_z * x, measured[1])
-
-
-class _Sine:
-    """Kalman filter over the sine of one slope and the bias of the rate that changes it [rad/s]."""
-
-    def __init__(self) -> None:
-        self.sine = 0.0
-        self._bias = 0.0
-        self._p00, self._p01, self._p11 = FIRST_STD**2, 0.0, BIAS_STD_RADPS**2
+        self._x: Floats = np.zeros(8)
+        self._covariance: Floats = np.diag(
+            np.repeat([FIRST_STD, BIAS_STD_RADPS, ZERO_STD, FIRST_SPEED_STD_MPS], 2) ** 2
+        )
+        self._is_started = False
 
     @property
-    def angle_rad(self) -> float:
-        """The slope, positive uphill."""
-        return math.asin(max(-1.0, min(1.0, self.sine)))
+    def ahead(self) -> float:
+        """Sine of the slope ahead."""
+        return _bounded(self._x[0])
+
+    @property
+    def left(self) -> float:
+        """Sine of the slope to the left."""
+        return _bounded(self._x[1])
+
+    @property
+    def shown_ahead(self) -> float:
+        """Sine of the slope ahead as the accelerometer shows it: its zero, which calibration knows, is in it."""
+        return _bounded(self._x[0] + self._x[4])
 
     @property
     def variance(self) -> float:
-        """Variance of the sine."""
-        return self._p00
+        """Variance of `shown_ahead`."""
+        P = self._covariance
+        return float(P[0, 0] + 2 * P[0, 4] + P[4, 4])
 
-    def update(self, dt_s: float, change_per_s: float, measured: float) -> None:
-        self.sine += dt_s * (change_per_s - self._bias)
-        p00, p01, p11 = self._p00, self._p01, self._p11
-        p00 += dt_s * (dt_s * p11 - 2 * p01) + RATE_WALK**2 * dt_s
-        p01 -= dt_s * p11
-        p11 += BIAS_WALK**2 * dt_s
-        noise = (FORCE_STD_MPS2 / GRAVITY_MPS2) ** 2 * NOISE_S / max(dt_s, 1e-3)
-        innovation, total = measured - self.sine, p00 + noise
-        gain, bias_gain = p00 / total, p01 / total
-        self.sine += gain * innovation
-        self._bias += bias_gain * innovation
-        self._p00, self._p01, self._p11 = (1 - gain) * p00, (1 - gain) * p01, p11 - bias_gain * p01
+    def restart(self) -> None:
+        """After a pause: slopes and speeds are of another place; biases and zeros are not."""
+        self._is_started = False
+
+    def update(
+        self,
+        dt_s: float,
+        rates_radps: Sequence[float],
+        force_mps2: Sequence[float],
+        speed_mps: Sequence[float] | None,
+    ) -> None:
+        """Predict with means over dt_s, correct with the speed at its end; None: it is not known.
+
+        rates_radps: about the axes ahead, left and up. force_mps2: ahead and to the left, what changes the speeds and
+        gravity's share, without omega x v. speed_mps: ahead and to the left, at the sensor.
+        """
+        if not self._is_started:
+            self._start(force_mps2)
+        else:
+            self._predict(dt_s, rates_radps, force_mps2)
+        if speed_mps is not None:
+            self._correct(speed_mps, SPEED_WALK**2 / dt_s)
+
+    def _start(self, force_mps2: Sequence[float]) -> None:
+        """Believe the accelerometer."""
+        P = self._covariance
+        for i, first in ((SINES, FIRST_STD), (SPEEDS, FIRST_SPEED_STD_MPS)):
+            P[i], P[:, i] = 0.0, 0.0
+            P[i, i] = np.diag([first**2] * 2)
+        self._x[SINES] = np.clip(np.array(force_mps2) / GRAVITY_MPS2 - self._x[ZEROS], -MAX_SINE, MAX_SINE)
+        self._x[SPEEDS] = 0.0
+        self._is_started = True
+
+    def _predict(self, dt_s: float, rates_radps: Sequence[float], force_mps2: Sequence[float]) -> None:
+        ahead, left, bias_ahead, bias_left, zero_ahead, zero_left, *_ = self._x.tolist()
+        about_x, about_y, about_z = rates_radps
+        up = math.sqrt(max(1 - ahead**2 - left**2, MAX_SINE**2))
+        c, s, fall_mps = math.cos(about_z * dt_s), math.sin(about_z * dt_s), GRAVITY_MPS2 * dt_s
+        next_ahead = c * ahead + s * left - dt_s * (about_y * up + bias_ahead)
+        next_left = c * left - s * ahead + dt_s * (about_x * up - bias_left)
+        self._x[SINES] = next_ahead, next_left
+        self._x[6] += dt_s * force_mps2[0] - fall_mps * (0.5 * (ahead + next_ahead) + zero_ahead)
+        self._x[7] += dt_s * force_mps2[1] - fall_mps * (0.5 * (left + next_left) + zero_left)
+        F = np.eye(8)
+        F[SINES, SINES] = (c, s), (-s, c)
+        F[0, 2] = F[1, 3] = -dt_s
+        F[6, 0] = F[6, 4] = F[7, 1] = F[7, 5] = -fall_mps
+        P = F @ self._covariance @ F.T
+        P.flat[::9] += dt_s * _WALKS**2
+        self._covariance = 0.5 * (P + P.T)  # rounding does not add up over hours
+
+    def _correct(self, speed_mps: Sequence[float], noise: float) -> None:
+        P = self._covariance
+        for i, speed in zip((6, 7), speed_mps, strict=True):
+            innovation = speed - float(self._x[i])
+            P[i, i] += max(0.0, innovation**2 - JUMP_SIGMA**2 * (P[i, i] + noise))
+            gain = P[:, i] / (P[i, i] + noise)
+            self._x += gain * innovation
+            P -= np.outer(gain, P[i])
+
+
+_WALKS: Floats = np.repeat([RATE_WALK, BIAS_WALK, ZERO_WALK, FORCE_WALK], 2)
+
+
+def _bounded(sine: float) -> float:
+    return max(-1.0, min(1.0, float(sine)))

@@ -14,6 +14,7 @@ nose rises by (N_r - N_f) / (k L). The empty machine stands level: its own pitch
 
 import math
 from dataclasses import dataclass
+from operator import add
 
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import SlopeFilter
@@ -25,7 +26,7 @@ from protocol.units import GRAVITY_MPS2
 STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
 MAX_PAUSE_S = 1.0  # of the IMU, or of the wheels' readings, before their last values no longer count
 SLOW_MPS = 2.0  # a slower machine pitches by its own forces rather than by the ground
-NO_SUMS = (0.0,) * 4
+NO_SUMS = (0.0,) * 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,9 @@ class Balancer:
         self._rotation: dict[str, Floats] = {}
         self._sensor: str | None = None
         self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = 0
-        self._force_sums = NO_SUMS  # count; force ahead at base_link, norm, rate of nose up, a negative turn about y
+        # Count; force ahead at base_link, norm; rates about x, y, z; forces ahead and left that change the speed.
+        self._imu_sums = NO_SUMS
+        self._speed_mps: tuple[float, float] | None = None  # ahead and left at the IMU, by the wheels
         self._torque_nm, self._torque_sums = 0.0, (0, 0.0)
 
     @property
@@ -136,25 +139,31 @@ class Balancer:
             return None
         dt_s, self._imu_ns = (imu.stamp_ns - self._imu_ns) * 1e-9, imu.stamp_ns
         if not 0 < dt_s < MAX_PAUSE_S:  # start from here
-            self._begin_ns, self._force_sums, self._torque_sums = imu.stamp_ns, NO_SUMS, (0, 0.0)
+            self._begin_ns, self._imu_sums, self._torque_sums = imu.stamp_ns, NO_SUMS, (0, 0.0)
+            self._slope.restart()
             return None
-        rotation, wheels = self._rotation[imu.sensor], dead_reckoning.wheels
-        gyro = rotation.dot((imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)).tolist()
+        rotation, wheels, (x_m, y_m, z_m) = self._rotation[imu.sensor], dead_reckoning.wheels, sensor.mount.xyz_m
+        wx, wy, wz = rotation.dot((imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)).tolist()
         ahead, left, up = rotation.dot((imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)).tolist()
-        ahead += (gyro[1] ** 2 + gyro[2] ** 2) * sensor.mount.xyz_m[0]  # what turning adds at the sensor's place
         shows_speed = wheels.is_known and self._wheels_s() < MAX_PAUSE_S
         accel, speed = (wheels.accel_mps2, wheels.speed_mps) if shows_speed else (0.0, 0.0)
-        self._slope.update(dt_s, (gyro[0], gyro[1], gyro[2]), (ahead - accel, left - speed * gyro[2]))
-        n, force, norm, rate = self._force_sums
-        self._force_sums = n + 1, force + ahead, norm + math.hypot(ahead, left, up), rate - gyro[1]
+        at_base = ahead + (wy**2 + wz**2) * x_m  # without what turning adds at the sensor's place
+        vx, vy, vz = speed + wy * z_m - wz * y_m, wz * x_m - wx * z_m, wx * y_m - wy * x_m
+        self._speed_mps = (vx, vy) if shows_speed else None
+        norm, turned = math.hypot(ahead, left, up), (ahead - wy * vz + wz * vy, left - wz * vx + wx * vz)
+        self._imu_sums = tuple(map(add, self._imu_sums, (1, at_base, norm, wx, wy, wz, *turned)))
         if imu.stamp_ns - self._begin_ns < STEP_NS:
             return None
         return self._balance(dead_reckoning, speed, accel)
 
     def _balance(self, dead_reckoning: DeadReckoning, speed: float, accel: float) -> Balance:
         machine, g = self._machine, GRAVITY_MPS2
-        (n, *sums), (torques, torque_nm) = self._force_sums, self._torque_sums
-        force, norm, rate = (value / n for value in sums)
+        (n, *sums), (torques, torque_nm) = self._imu_sums, self._torque_sums
+        force, norm, about_x, about_y, about_z, *turned = (value / n for value in sums)
+        rate = -about_y  # the nose rises
+        dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
+        self._imu_sums, self._torque_sums = NO_SUMS, (0, 0.0)
+        self._slope.update(dt_s, (about_x, about_y, about_z), turned, self._speed_mps)
         drive_n = (torque_nm / torques if torques else self._torque_nm) / machine.wheel_radius_m
         share = drive_n / (self.mass_kg * g)
         on_front = front_share(machine, self.payload_kg, force)
@@ -163,8 +172,6 @@ class Balancer:
         rotating = (machine.rotating_mass_factor - 1) * machine.mass_kg / self.mass_kg
         curve = self._climb_of_curve(on_front, rate, speed)
         unbalanced = share - force / g + squat - bend - curve - rotating * accel / g
-        dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
-        self._force_sums, self._torque_sums = NO_SUMS, (0, 0.0)
         return Balance(
             stamp_ns=self._imu_ns,
             dt_s=dt_s,
@@ -173,14 +180,14 @@ class Balancer:
             distance_m=dead_reckoning.distance_m,
             unbalanced=unbalanced,
             share=share,
-            slope_x=self._slope.ahead.angle_rad - squat,
-            slope_y=self._slope.left.angle_rad,
-            slope_var=self._slope.ahead.variance,
+            slope_x=math.asin(self._slope.shown_ahead) - squat,
+            slope_y=math.asin(self._slope.left),
+            slope_var=self._slope.variance,
             sine_x=(force - accel) / g - squat,
             pitch_radps=rate,
             norm_mps2=norm,
             on_front=on_front,
-            body_mps2=force - g * self._slope.ahead.sine,
+            body_mps2=force - g * self._slope.shown_ahead,
             torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
             wheels_s=self._wheels_s() if dead_reckoning.wheels.is_known else math.inf,
             mass_kg=self.mass_kg,
@@ -192,7 +199,7 @@ class Balancer:
         Gravity acts on each axle's load along that axle's own direction; the accelerometer measures the rear one's.
         """
         c, s = math.cos(self._bend_rad), math.sin(self._bend_rad)
-        return on_front * ((self._slope.ahead.sine - squat) * (c - 1) + self._slope.left.sine * s)
+        return on_front * ((self._slope.ahead - squat) * (c - 1) + self._slope.left * s)
 
     def _climb_of_curve(self, on_front: float, pitch_radps: float, speed_mps: float) -> float:
         """Sine of the slope under both axles, by their loads, less that of the line from one to the other [-].
