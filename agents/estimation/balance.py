@@ -104,7 +104,8 @@ class Balancer:
         self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = 0
         # Count; force ahead at base_link, norm; rates about x, y, z; forces ahead and left that change the speed.
         self._imu_sums = NO_SUMS
-        self._speed_mps: tuple[float, float] | None = None  # ahead and left at the IMU, by the wheels
+        # Ahead and left at the IMU, by the wheels; None where they said nothing in this step.
+        self._speed_mps: tuple[float, float] | None = None
         self._torque_nm, self._torque_sums = 0.0, (0, 0.0)
 
     @property
@@ -149,7 +150,7 @@ class Balancer:
         accel, speed = (wheels.accel_mps2, wheels.speed_mps) if shows_speed else (0.0, 0.0)
         at_base = ahead + (wy**2 + wz**2) * x_m  # without what turning adds at the sensor's place
         vx, vy, vz = speed + wy * z_m - wz * y_m, wz * x_m - wx * z_m, wx * y_m - wy * x_m
-        self._speed_mps = (vx, vy) if shows_speed else None
+        self._speed_mps = (vx, vy) if shows_speed and self._wheels_ns > self._begin_ns else None
         norm, turned = math.hypot(ahead, left, up), (ahead - wy * vz + wz * vy, left - wz * vx + wx * vz)
         self._imu_sums = tuple(map(add, self._imu_sums, (1, at_base, norm, wx, wy, wz, *turned)))
         if imu.stamp_ns - self._begin_ns < STEP_NS:

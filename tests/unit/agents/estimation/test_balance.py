@@ -89,6 +89,15 @@ def test_lever_arm_of_the_accelerometer_in_a_bend_is_taken_off() -> None:
     assert moved.unbalanced == pytest.approx(0.04 + 0.4 / GRAVITY_MPS2, abs=1e-3)
 
 
+@pytest.mark.parametrize(("every", "worst"), [(1, 5e-3), (20, 0.01)], ids=["20 Hz", "1 Hz"])
+def test_starting_and_stopping_is_no_slope_however_seldom_the_wheels_report(every: int, worst: float) -> None:
+    made = drive([Leg(5), Leg(3, 1.0), Leg(5), Leg(3, -1.0), Leg(5, 0.0)], VEHICLE).readings
+    wheels = [r for r in made if isinstance(r, Encoder)]
+    left = [r for r in made if not isinstance(r, Encoder) or wheels.index(r) % every == 0]
+    steps = balances(VEHICLE, left)
+    assert max(abs(b.slope_x) for b in steps) < worst
+
+
 def test_centripetal_acceleration_of_a_bend_is_no_slope() -> None:
     last = balances(VEHICLE, drive([Leg(2), Leg(4, 0.5), Leg(10, 0.0, 0.3)], VEHICLE).readings)[-1]
     assert last.slope_y == pytest.approx(0.0, abs=2e-3)
