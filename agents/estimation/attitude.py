@@ -32,6 +32,9 @@ SPEED_WALK = 0.027  # noise of the wheels' speed [m/s sqrt(s)]: 0.05 m/s, shared
 # Wheels that jump by more than this against the forces slip, or grip again: that says nothing about the slope. One
 # sigma is rare: noise is shared by readings that are counted as if it were each one's own.
 JUMP_SIGMA = 1.0
+MAX_JUMPS_S = (
+    3.0  # wheels that slip do not jump at every step for as long: the slope is wrong, after a knock or a fault
+)
 SINES, BIASES, ZEROS, SPEEDS = (slice(i, i + 2) for i in (0, 2, 4, 6))  # of the state, each ahead and to the left
 
 
@@ -48,6 +51,7 @@ class SlopeFilter:
             np.repeat([FIRST_STD, BIAS_STD_RADPS, ZERO_STD, FIRST_SPEED_STD_MPS], 2) ** 2
         )
         self._is_started = False
+        self._jumps_s = 0.0  # for so long at every step
 
     @property
     def ahead(self) -> float:
@@ -71,7 +75,7 @@ class SlopeFilter:
         return float(P[0, 0] + 2 * P[0, 4] + P[4, 4])
 
     def restart(self) -> None:
-        """After a pause: slopes and speeds are of another place; biases and zeros are not."""
+        """After a pause or a knock: slopes and speeds are others; biases and zeros are not."""
         self._is_started = False
 
     def update(
@@ -91,7 +95,9 @@ class SlopeFilter:
         else:
             self._predict(dt_s, rates_radps, force_mps2)
         if speed_mps is not None:
-            self._correct(speed_mps, SPEED_WALK**2 / dt_s)
+            self._jumps_s = self._jumps_s + dt_s if self._correct(speed_mps, SPEED_WALK**2 / dt_s) else 0.0
+            if self._jumps_s > MAX_JUMPS_S:
+                self.restart()
 
     def _start(self, force_mps2: Sequence[float]) -> None:
         """Believe the accelerometer."""
@@ -100,7 +106,7 @@ class SlopeFilter:
             P[i], P[:, i] = 0.0, 0.0
             P[i, i] = np.diag([first**2] * 2)
         self._x[SINES] = np.clip(np.array(force_mps2) / GRAVITY_MPS2 - self._x[ZEROS], -MAX_SINE, MAX_SINE)
-        self._x[SPEEDS] = 0.0
+        self._x[SPEEDS], self._jumps_s = 0.0, 0.0
         self._is_started = True
 
     def _predict(self, dt_s: float, rates_radps: Sequence[float], force_mps2: Sequence[float]) -> None:
@@ -121,14 +127,18 @@ class SlopeFilter:
         P.flat[::9] += dt_s * _WALKS**2
         self._covariance = 0.5 * (P + P.T)  # rounding does not add up over hours
 
-    def _correct(self, speed_mps: Sequence[float], noise: float) -> None:
-        P = self._covariance
+    def _correct(self, speed_mps: Sequence[float], noise: float) -> bool:
+        """Correct both speeds; returns whether one of them jumped."""
+        P, jumped = self._covariance, False
         for i, speed in zip((6, 7), speed_mps, strict=True):
             innovation = speed - float(self._x[i])
-            P[i, i] += max(0.0, innovation**2 - JUMP_SIGMA**2 * (P[i, i] + noise))
+            beyond = innovation**2 - JUMP_SIGMA**2 * (P[i, i] + noise)
+            if beyond > 0:
+                jumped, P[i, i] = True, P[i, i] + beyond
             gain = P[:, i] / (P[i, i] + noise)
             self._x += gain * innovation
             P -= np.outer(gain, P[i])
+        return jumped
 
 
 _WALKS: Floats = np.repeat([RATE_WALK, BIAS_WALK, ZERO_WALK, FORCE_WALK], 2)

@@ -139,6 +139,19 @@ def test_wheels_that_slip_and_grip_again_are_no_slope(jump_mps: float) -> None:
     assert worst < 4e-3
 
 
+@pytest.mark.parametrize("knock", [0.02, 0.1, 0.5])
+def test_a_knock_to_the_gyros_is_soon_no_slope(knock: float) -> None:
+    """One reading of up to 50 rad/s: the wheels, which never slip for long, then speak against the slope."""
+    slope = started()
+    for _ in range(400):
+        slope.update(STEP_S, STRAIGHT, LEVEL, (2.5, 0.0))
+    slope.update(STEP_S, (0.0, -knock / STEP_S, 0.0), LEVEL, (2.5, 0.0))
+    assert slope.ahead == pytest.approx(knock, rel=0.1)
+    for _ in range(100):
+        slope.update(STEP_S, STRAIGHT, LEVEL, (2.5, 0.0))
+    assert slope.ahead == pytest.approx(0.0, abs=0.012)
+
+
 def test_after_a_pause_the_slope_is_another_and_the_zero_is_not() -> None:
     slope = SlopeFilter()
     circle(slope, 200, zero=(0.006, 0.0), tilt=0.0)
