@@ -32,9 +32,7 @@ SPEED_WALK = 0.027  # noise of the wheels' speed [m/s sqrt(s)]: 0.05 m/s, shared
 # Wheels that jump by more than this against the forces slip, or grip again: that says nothing about the slope. One
 # sigma is rare: noise is shared by readings that are counted as if it were each one's own.
 JUMP_SIGMA = 1.0
-MAX_JUMPS_S = (
-    3.0  # wheels that slip do not jump at every step for as long: the slope is wrong, after a knock or a fault
-)
+MAX_JUMPS_S = 3.0  # at every step: wheels do not slip like that, the slope is wrong, after a knock or a fault
 SINES, BIASES, ZEROS, SPEEDS = (slice(i, i + 2) for i in (0, 2, 4, 6))  # of the state, each ahead and to the left
 
 
