@@ -149,7 +149,7 @@ class Balancer:
         shows_speed = wheels.is_known and self._wheels_s() < MAX_PAUSE_S
         accel, speed = (wheels.accel_mps2, wheels.speed_mps) if shows_speed else (0.0, 0.0)
         at_base = ahead + (wy**2 + wz**2) * x_m  # without what turning adds at the sensor's place
-        vx, vy, vz = speed + wy * z_m - wz * y_m, wz * x_m - wx * z_m, wx * y_m - wy * x_m
+        vx, vy, vz = speed + wz * (wheels.offset_m - y_m) + wy * z_m, wz * x_m - wx * z_m, wx * y_m - wy * x_m
         self._speed_mps = (vx, vy) if shows_speed and self._wheels_ns > self._begin_ns else None
         norm, turned = math.hypot(ahead, left, up), (ahead - wy * vz + wz * vy, left - wz * vx + wx * vz)
         self._imu_sums = tuple(map(add, self._imu_sums, (1, at_base, norm, wx, wy, wz, *turned)))

@@ -98,6 +98,21 @@ def test_starting_and_stopping_is_no_slope_however_seldom_the_wheels_report(ever
     assert max(abs(b.slope_x) for b in steps) < worst
 
 
+def test_a_wheel_beside_the_middle_is_no_slope_in_a_bend() -> None:
+    """One encoder 1 m to the left rolls 0.3 m/s less in a bend to the left of 0.3 rad/s."""
+    vehicle = changed_sensor(VEHICLE, "wheels", mount=Mount((0.0, 1.0, 0.0)))
+    made = drive([Leg(2), Leg(4, 0.5), Leg(6), Leg(6, 0.0, 0.3), Leg(6)], VEHICLE)
+    heading = dict(zip(made.stamps_ns, (made.heading_rad - made.heading_rad[0]).tolist(), strict=True))
+    ticks_per_m = VEHICLE.sensors[2].ticks_per_rev / (math.tau * VEHICLE.wheel_radius_m)
+
+    def beside(encoder: Encoder) -> Encoder:
+        ticks = encoder.left_ticks - round(heading[encoder.stamp_ns] * ticks_per_m)
+        return replace(encoder, left_ticks=ticks, right_ticks=ticks)
+
+    readings = [beside(r) if isinstance(r, Encoder) else r for r in made.readings]
+    assert max(abs(b.slope_x) for b in balances(vehicle, readings)[100:]) < 6e-3
+
+
 def test_centripetal_acceleration_of_a_bend_is_no_slope() -> None:
     last = balances(VEHICLE, drive([Leg(2), Leg(4, 0.5), Leg(10, 0.0, 0.3)], VEHICLE).readings)[-1]
     assert last.slope_y == pytest.approx(0.0, abs=2e-3)
