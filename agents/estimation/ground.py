@@ -194,7 +194,7 @@ class GroundEstimator:
             variance = resistance[1] + applied.variance(balance.share) / cosine**2 + MODEL_STD**2
         reason = judged.reason or ("" if resistance else "settling")
         slope_x = math.tan(judged.slope_x + applied.zero)  # the accelerometer's zero is an error of the slope too
-        # The mean of both directions: work shows the zero ahead, and nothing shows the one across.
+        # The mean of both directions: work shows the zero ahead; across, nothing shows how the sensor is mounted.
         slope_var = balance.slope_var + (applied.covariance[0][0] + ZERO_STD**2) / 2
         slope_y, calibration = math.tan(balance.slope_y), (applied.zero, applied.scale)
         mass_kg = self._known_mass(balance.mass_kg)
