@@ -6,8 +6,14 @@ accelerometer measures with its zero z, and v the velocity of the place where it
     du/dt = -omega x u          dv/dt = f - g (u + z) - omega x v
 
 The gyros turn u; the forces are summed up to a velocity, and the wheels say what it should be: their speed ahead, none
-aside, and what turning adds at the sensor. Wheel travel is not differentiated twice: an acceleration that comes late is
-a slope that is not there. A machine that turns tells a zero, which turns with it, from a slope, which stays.
+to the side, but for what turning adds at the sensor and for tyres, which slip outwards in a bend. Wheel travel is not
+differentiated twice: an acceleration that comes late is a slope that is not there. A machine that turns tells a zero,
+which turns with it, from a slope, which stays, and the slip of its tyres from both: it comes and goes with the bend.
+
+By the linear tyre model the angle of slip goes with the sideways acceleration a = omega_z v_x, by k,
+
+    v_y = -k a |v_x|            dv_x/dt = ... - k a^2 sign(v_x)
+
 The parts of u ahead and to the left are the sines of the two slopes, positive uphill.
 """
 
@@ -33,20 +39,25 @@ SPEED_WALK = 0.027  # noise of the wheels' speed [m/s sqrt(s)]: 0.05 m/s, shared
 # sigma is rare: noise is shared by readings that are counted as if it were each one's own.
 JUMP_SIGMA = 1.0
 MAX_JUMPS_S = 3.0  # at every step: wheels do not slip like that, the slope is wrong, after a knock or a fault
+SLIP_STD = 0.03  # of the tyres' angle of slip per sideways acceleration at start [rad s2/m]: 0.01 firm, 0.03 on sand
+SLIP_WALK = 1e-3  # random walk of that [rad s2/m/sqrt(s)]: another ground in a quarter of an hour
+MAX_ASIDE_MPS2 = 5.0  # of sideways acceleration: tyres hold no more
 SINES, BIASES, ZEROS, SPEEDS = (slice(i, i + 2) for i in (0, 2, 4, 6))  # of the state, each ahead and to the left
+SLIP = 8
 
 
 class SlopeFilter:
     """Sines of the slopes ahead and to the left by a Kalman filter, of one IMU.
 
-    State: both sines, biases of the rates at which these change [rad/s], zeros of the accelerometer over g, and speeds
-    [m/s]. Turning couples the directions: the slope ahead becomes the one across.
+    State: both sines, biases of the rates at which these change [rad/s], zeros of the accelerometer over g, speeds
+    [m/s], and the angle at which tyres slip per sideways acceleration [rad s2/m]. Turning couples the directions: the
+    slope ahead becomes the one across.
     """
 
     def __init__(self) -> None:
-        self._x: Floats = np.zeros(8)
+        self._x: Floats = np.zeros(9)
         self._covariance: Floats = np.diag(
-            np.repeat([FIRST_STD, BIAS_STD_RADPS, ZERO_STD, FIRST_SPEED_STD_MPS], 2) ** 2
+            np.repeat([FIRST_STD, BIAS_STD_RADPS, ZERO_STD, FIRST_SPEED_STD_MPS, SLIP_STD], 2)[:9] ** 2
         )
         self._is_started = False
         self._jumps_s = 0.0  # for so long at every step
@@ -93,7 +104,8 @@ class SlopeFilter:
         else:
             self._predict(dt_s, rates_radps, force_mps2)
         if speed_mps is not None:
-            self._jumps_s = self._jumps_s + dt_s if self._correct(speed_mps, SPEED_WALK**2 / dt_s) else 0.0
+            jumped = self._correct(self._aside(rates_radps[2]), speed_mps, SPEED_WALK**2 / dt_s)
+            self._jumps_s = self._jumps_s + dt_s if jumped else 0.0
             if self._jumps_s > MAX_JUMPS_S:
                 self.restart()
 
@@ -108,38 +120,50 @@ class SlopeFilter:
         self._is_started = True
 
     def _predict(self, dt_s: float, rates_radps: Sequence[float], force_mps2: Sequence[float]) -> None:
-        ahead, left, bias_ahead, bias_left, zero_ahead, zero_left, *_ = self._x.tolist()
+        ahead, left, bias_ahead, bias_left, zero_ahead, zero_left, speed, _, slip = self._x.tolist()
         about_x, about_y, about_z = rates_radps
         up = math.sqrt(max(1 - ahead**2 - left**2, MAX_SINE**2))
         c, s, fall_mps = math.cos(about_z * dt_s), math.sin(about_z * dt_s), GRAVITY_MPS2 * dt_s
         next_ahead = c * ahead + s * left - dt_s * (about_y * up + bias_ahead)
         next_left = c * left - s * ahead + dt_s * (about_x * up - bias_left)
         self._x[SINES] = next_ahead, next_left
-        self._x[6] += dt_s * force_mps2[0] - fall_mps * (0.5 * (ahead + next_ahead) + zero_ahead)
+        bend_mps = dt_s * math.copysign(self._aside(about_z) ** 2, speed)
+        self._x[6] += dt_s * force_mps2[0] - fall_mps * (0.5 * (ahead + next_ahead) + zero_ahead) - bend_mps * slip
         self._x[7] += dt_s * force_mps2[1] - fall_mps * (0.5 * (left + next_left) + zero_left)
-        F = np.eye(8)
+        F = np.eye(9)
         F[SINES, SINES] = (c, s), (-s, c)
         F[0, 2] = F[1, 3] = -dt_s
         F[6, 0] = F[6, 4] = F[7, 1] = F[7, 5] = -fall_mps
+        F[6, SLIP] = -bend_mps
         P = F @ self._covariance @ F.T
-        P.flat[::9] += dt_s * _WALKS**2
+        P.flat[::10] += dt_s * _WALKS**2
         self._covariance = 0.5 * (P + P.T)  # rounding does not add up over hours
 
-    def _correct(self, speed_mps: Sequence[float], noise: float) -> bool:
+    def _correct(self, aside_mps2: float, speed_mps: Sequence[float], noise: float) -> bool:
         """Correct both speeds; returns whether one of them jumped."""
         P, jumped = self._covariance, False
-        for i, speed in zip((6, 7), speed_mps, strict=True):
-            innovation = speed - float(self._x[i])
-            beyond = innovation**2 - JUMP_SIGMA**2 * (P[i, i] + noise)
+        slips_mps = -aside_mps2 * abs(speed_mps[0])  # per state of slip: to the left, which the wheels do not show
+        for i, speed, shown in zip((6, 7), speed_mps, (0.0, -slips_mps), strict=True):
+            seen = P[:, i] + shown * P[:, SLIP]  # covariance with what they show
+            variance = float(seen[i] + shown * seen[SLIP])
+            innovation = speed - float(self._x[i] + shown * self._x[SLIP])
+            beyond = innovation**2 - JUMP_SIGMA**2 * (variance + noise)
             if beyond > 0:
-                jumped, P[i, i] = True, P[i, i] + beyond
-            gain = P[:, i] / (P[i, i] + noise)
+                jumped = True
+                P[i, i] += beyond
+                seen[i] += beyond
+                variance += beyond
+            gain = seen / (variance + noise)
             self._x += gain * innovation
-            P -= np.outer(gain, P[i])
+            P -= np.outer(gain, seen)
         return jumped
 
+    def _aside(self, about_z_radps: float) -> float:
+        """Sideways acceleration, to the left [m/s2]."""
+        return max(-MAX_ASIDE_MPS2, min(MAX_ASIDE_MPS2, about_z_radps * float(self._x[6])))
 
-_WALKS: Floats = np.repeat([RATE_WALK, BIAS_WALK, ZERO_WALK, FORCE_WALK], 2)
+
+_WALKS: Floats = np.repeat([RATE_WALK, BIAS_WALK, ZERO_WALK, FORCE_WALK, SLIP_WALK], 2)[:9]
 
 
 def _bounded(sine: float) -> float:
