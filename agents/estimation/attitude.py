@@ -41,7 +41,7 @@ JUMP_SIGMA = 1.0
 MAX_JUMPS_S = 3.0  # at every step: wheels do not slip like that, the slope is wrong, after a knock or a fault
 SLIP_STD = 0.03  # of the tyres' angle of slip per sideways acceleration at start [rad s2/m]: 0.01 firm, 0.03 on sand
 SLIP_WALK = 1e-3  # random walk of that [rad s2/m/sqrt(s)]: another ground in a quarter of an hour
-MAX_ASIDE_MPS2 = 5.0  # of sideways acceleration: tyres hold no more
+MAX_LATERAL_MPS2 = 5.0  # of sideways acceleration: tyres hold no more
 SINES, BIASES, ZEROS, SPEEDS = (slice(i, i + 2) for i in (0, 2, 4, 6))  # of the state, each ahead and to the left
 SLIP = 8
 
@@ -57,7 +57,7 @@ class SlopeFilter:
     def __init__(self) -> None:
         self._x: Floats = np.zeros(9)
         self._covariance: Floats = np.diag(
-            np.repeat([FIRST_STD, BIAS_STD_RADPS, ZERO_STD, FIRST_SPEED_STD_MPS, SLIP_STD], 2)[:9] ** 2
+            _state([FIRST_STD, BIAS_STD_RADPS, ZERO_STD, FIRST_SPEED_STD_MPS], SLIP_STD) ** 2
         )
         self._is_started = False
         self._jumps_s = 0.0  # for so long at every step
@@ -104,7 +104,7 @@ class SlopeFilter:
         else:
             self._predict(dt_s, rates_radps, force_mps2)
         if speed_mps is not None:
-            jumped = self._correct(self._aside(rates_radps[2]), speed_mps, SPEED_WALK**2 / dt_s)
+            jumped = self._correct(self._lateral_mps2(rates_radps[2]), speed_mps, SPEED_WALK**2 / dt_s)
             self._jumps_s = self._jumps_s + dt_s if jumped else 0.0
             if self._jumps_s > MAX_JUMPS_S:
                 self.restart()
@@ -127,7 +127,7 @@ class SlopeFilter:
         next_ahead = c * ahead + s * left - dt_s * (about_y * up + bias_ahead)
         next_left = c * left - s * ahead + dt_s * (about_x * up - bias_left)
         self._x[SINES] = next_ahead, next_left
-        bend_mps = dt_s * math.copysign(self._aside(about_z) ** 2, speed)
+        bend_mps = dt_s * math.copysign(self._lateral_mps2(about_z) ** 2, speed)
         self._x[6] += dt_s * force_mps2[0] - fall_mps * (0.5 * (ahead + next_ahead) + zero_ahead) - bend_mps * slip
         self._x[7] += dt_s * force_mps2[1] - fall_mps * (0.5 * (left + next_left) + zero_left)
         F = np.eye(9)
@@ -139,10 +139,10 @@ class SlopeFilter:
         P.flat[::10] += dt_s * _WALKS**2
         self._covariance = 0.5 * (P + P.T)  # rounding does not add up over hours
 
-    def _correct(self, aside_mps2: float, speed_mps: Sequence[float], noise: float) -> bool:
+    def _correct(self, lateral_mps2: float, speed_mps: Sequence[float], noise: float) -> bool:
         """Correct both speeds; returns whether one of them jumped."""
         P, jumped = self._covariance, False
-        slips_mps = -aside_mps2 * abs(speed_mps[0])  # per state of slip: to the left, which the wheels do not show
+        slips_mps = -lateral_mps2 * abs(speed_mps[0])  # per state of slip: to the left, which the wheels do not show
         for i, speed, shown in zip((6, 7), speed_mps, (0.0, -slips_mps), strict=True):
             seen = P[:, i] + shown * P[:, SLIP]  # covariance with what they show
             variance = float(seen[i] + shown * seen[SLIP])
@@ -158,12 +158,17 @@ class SlopeFilter:
             P -= np.outer(gain, seen)
         return jumped
 
-    def _aside(self, about_z_radps: float) -> float:
+    def _lateral_mps2(self, about_z_radps: float) -> float:
         """Sideways acceleration, to the left [m/s2]."""
-        return max(-MAX_ASIDE_MPS2, min(MAX_ASIDE_MPS2, about_z_radps * float(self._x[6])))
+        return max(-MAX_LATERAL_MPS2, min(MAX_LATERAL_MPS2, about_z_radps * float(self._x[6])))
 
 
-_WALKS: Floats = np.repeat([RATE_WALK, BIAS_WALK, ZERO_WALK, FORCE_WALK, SLIP_WALK], 2)[:9]
+def _state(of_both: Sequence[float], of_slip: float) -> Floats:
+    """A number per part of the state, the same ahead and to the left, (9,)."""
+    return np.append(np.repeat(of_both, 2), of_slip)
+
+
+_WALKS = _state([RATE_WALK, BIAS_WALK, ZERO_WALK, FORCE_WALK], SLIP_WALK)
 
 
 def _bounded(sine: float) -> float:
