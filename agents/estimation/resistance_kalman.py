@@ -1,4 +1,4 @@
-"""Rolling resistance by a Kalman filter with a random walk, a test for borders, and a smoother that looks ahead.
+"""Rolling resistance by a Kalman filter with a random walk that stops at borders, and a smoother that looks ahead.
 
 State x = (c_lead, c_trail, e): c_rr under the leading and under the trailing axle, and the scale error of drive force
 over mass, where the mass is estimated. With w the leading axle's share of the load, a step of the balance measures
@@ -16,25 +16,25 @@ a metre. With x, P before and x0, P0, x1, P1 at the present step, and T for the 
 (Rauch, Tung and Striebel 1965). A is the identity on one ground; at a border it forgets what was known under the
 leading axle, and at the end of a crossing the trailing axle takes over what is known under the leading one.
 
-A border is a jump. At every step, each of the last steps is tried as the place of one: the jump of c_rr there, seen
-first by the leading axle, that explains the steps behind it best (a generalised likelihood ratio: Basseville and
-Nikiforov 1993, chapter 2). The likeliest jump is accepted if it is large enough; then the filter runs again from there,
-so that a border lies where it is and not where it was noticed. The smoother never crosses a border.
+Where borders are is another's question (`borders`), which is asked again at every step: where the answer has changed,
+the filter runs again from there, so that a border lies where it is and not where it was noticed. The smoother never
+crosses a border.
 """
 
 import math
 from bisect import bisect_left
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from agents.estimation.balance import BalanceStep
+from agents.estimation.borders import FIRST_C_RR, FIRST_STD, JUMP_STD, BorderSearch
 from protocol.arrays import Floats
 
 LEAD, TRAIL, SCALE = 0, 1, 2
-KEPT = 100  # steps: 5 s, more than a sample waits for what comes after it
-FIRST_C_RR, FIRST_STD = 0.03, 0.1
+KEPT = 160  # steps: 8 s, more than a sample waits for what comes after it
 NEAR_NS = 150_000_000  # a stamp this far from a usable step has no estimate
 NOISE = 0.004  # least density of the noise of raw c_rr [1/sqrt(Hz)]; larger noise is measured
 NOISE_S = 20.0  # over which noise is measured
@@ -42,13 +42,7 @@ OUTLIER = 16.0  # squares beyond so many times the mean are no noise, but a bord
 WALK = 0.002  # random walk of c_rr [1/sqrt(m)]: ground of one kind is never quite even
 SCALE_WALK = 1e-3  # random walk of the scale error [1/sqrt(s)]
 SCALE_STD = 0.2  # standard deviation of the scale error at first, and when the load has changed: 3.5 t of 17.5 t
-# A jump is a border from so many standard deviations on: five minutes on one ground show none. It is also at least JUMP
-# large: smaller differences occur within one kind of ground. c_rr is then as unknown as at first.
-JUMP_SIGMA, JUMP, JUMP_STD = 5.5, 0.006, 0.1
-LEAST_BEHIND = 4  # steps before and behind a border: fewer may be an outlier of the noise
-SEARCHED = 40  # steps that are searched for a border: 2 s
 
-BEHIND = np.triu(np.ones((SEARCHED, SEARCHED)))  # row i: the steps from i on
 IDENTITY = np.eye(3)
 TRAIL_IS_LEAD = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 LEAD_UNKNOWN = np.diag([0.0, 1.0, 1.0])
@@ -70,7 +64,6 @@ class _Filtered(NamedTuple):
 
     border: whether the leading axle crossed one before it. crossing_m: distance at which the crossing under way began,
     NaN if none is. A: transition from the step before (3, 3); x0, P0: belief before the measurement; x, P: after it.
-    judged: what a jump before or behind it is judged by, as plain numbers, since each is judged some forty times.
     """
 
     measured: _Measured
@@ -81,7 +74,6 @@ class _Filtered(NamedTuple):
     P0: Floats
     x: Floats
     P: Floats
-    judged: tuple[float, ...]
 
     @property
     def is_crossing(self) -> bool:
@@ -102,6 +94,8 @@ class KalmanResistance:
         self._steps: list[_Filtered] = []
         self._first = _start(SCALE_STD**2 if estimates_mass else 0.0)  # the last step that is not kept
         self._noise = _Noise()
+        self._search = BorderSearch(2 * KEPT)
+        self._count = 0  # of all steps
         self._load_has_changed = False  # since the last step
 
     def update(self, step: BalanceStep) -> None:
@@ -116,7 +110,9 @@ class KalmanResistance:
         distance_m = before.measured.distance_m + step.distance_m
         measured = _Measured(step, distance_m, h, self._noise.density / step.dt_s, scale_var)
         self._steps.append(_filtered(before, measured, border=False))
-        self._search_border()
+        self._count += 1
+        raw = step.raw - share * float(before.x[SCALE])
+        self._set_borders(self._search.update(self._count, step, raw, measured.r))
         if len(self._steps) > 2 * KEPT:
             self._first = self._steps[KEPT - 1]
             del self._steps[:KEPT]
@@ -130,10 +126,10 @@ class KalmanResistance:
 
         So the ground does not seem to change where the calibration does.
         """
-        first = self._first.measured.step
-        shift = (zero + scale * first.share) / first.regressor
+        self._search.shift(-_shift(self._before(len(self._steps)), zero, scale))
+        shift = _shift(self._first, zero, scale)
         x = self._first.x - shift * np.array([1.0, 1.0, 0.0])
-        self._first = self._first._replace(x=x, judged=_judged(self._first.measured, x, self._first.P))
+        self._first = self._first._replace(x=x)
         self._noise.interrupt()
         for i, old in enumerate(self._steps):
             step = old.measured.step
@@ -159,32 +155,18 @@ class KalmanResistance:
     def _before(self, index: int) -> _Filtered:
         return self._steps[index - 1] if index else self._first
 
-    def _search_border(self) -> None:
-        """Try a jump at each of the last steps, and filter again from the likeliest one if it is a border."""
-        n = len(self._steps)
-        self._withdraw_border(n - 2 * LEAST_BEHIND)
-        last = next((i for i in range(n - 1, max(n - SEARCHED, 0) - 1, -1) if self._is_at_border(i)), None)
-        first = LEAST_BEHIND + (max(n - SEARCHED, 0) if last is None else last + 1)  # something is known before it
-        if n - first < LEAST_BEHIND:
-            return
-        best, sigma = _likeliest_jump(self._steps[first - 1 :])
-        if sigma > JUMP_SIGMA:
-            self._set_border(first + best, border=True)
+    def _set_borders(self, numbers: Collection[int]) -> None:
+        """Have borders before these steps, by their numbers; filter again from the first that changes."""
+        first = self._count - len(self._steps) + 1
+        for index, filtered in enumerate(self._steps):
+            if filtered.border != (first + index in numbers):
+                self._filter_again(index, [first + i in numbers for i in range(len(self._steps))])
+                return
 
-    def _is_at_border(self, index: int) -> bool:
-        return self._steps[index].border or self._steps[index].is_crossing
-
-    def _withdraw_border(self, since: int) -> None:
-        """Withdraw a border that is younger than a step: with more steps behind it, it may lie elsewhere."""
-        for i in range(len(self._steps) - 1, max(since, 0) - 1, -1):
-            if self._steps[i].border:
-                self._set_border(i, border=False)
-
-    def _set_border(self, index: int, *, border: bool) -> None:
-        """Filter again from a step on, with or without a border before it."""
+    def _filter_again(self, index: int, borders: Sequence[bool]) -> None:
+        """Filter all steps from one on; borders: before each of all that are kept."""
         for i in range(index, len(self._steps)):
-            old = self._steps[i]
-            self._steps[i] = _filtered(self._before(i), old.measured, border=border if i == index else old.border)
+            self._steps[i] = _filtered(self._before(i), self._steps[i].measured, border=borders[i])
 
     def _smoothed(self, index: int) -> tuple[Floats, Floats]:
         newest = self._steps[-1]
@@ -229,13 +211,14 @@ def _start(scale_var: float) -> _Filtered:
     x, P = np.array([FIRST_C_RR, FIRST_C_RR, 0.0]), _same_ground(FIRST_STD**2)
     P[SCALE, SCALE] = scale_var
     measured = _Measured(BalanceStep(0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, np.zeros(3), 1.0, 0.0)
-    return _Filtered(measured, False, math.nan, IDENTITY, x, P, x, P, _judged(measured, x, P))
+    return _Filtered(measured, False, math.nan, IDENTITY, x, P, x, P)
 
 
 def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filtered:
     """Predict from the step before, and correct by the measurement."""
     step = measured.step
-    crossing_m = measured.distance_m if border else before.crossing_m
+    middle_m = measured.distance_m - step.distance_m / 2  # a step counts at its end, and shows the ground at its middle
+    crossing_m = middle_m if border else before.crossing_m
     A, free = IDENTITY, 0.0
     if not math.isnan(crossing_m) and before.measured.step.regressor * step.regressor < 0:
         # Back across a border that only one axle had crossed: the axle that led is the trailing one now.
@@ -253,34 +236,13 @@ def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filte
     Ph = P0 @ measured.h
     K = Ph / (measured.h @ Ph + measured.r)
     x, P = x0 + K * (step.raw - measured.h @ x0), P0 - K[:, None] * Ph
-    return _Filtered(measured, border, crossing_m, A, x0, P0, x, P, _judged(measured, x, P))
+    return _Filtered(measured, border, crossing_m, A, x0, P0, x, P)
 
 
-def _likeliest_jump(steps: list[_Filtered]) -> tuple[int, float]:
-    """Index of the step before which c_rr most likely jumped, and how many standard deviations that jump is large.
-
-    steps: those that are tried, and the one before them; a jump starts from the belief of the step before it. At least
-    LEAST_BEHIND steps lie behind a jump; one below JUMP counts as none.
-    """
-    rows, n = np.array([filtered.judged for filtered in steps]), len(steps) - 1
-    z, h, r, distance, lead, base = rows[1:, :6].T
-    x, P = rows[:-1, 6:].T
-    # Row i: a jump before step i, and the share of it that each step would show.
-    shows = np.where(distance - distance[:, None] < base, lead, 1.0) * BEHIND[:n, :n] * h
-    weight = shows / r
-    total = (weight * shows).sum(axis=1)
-    jump = (weight @ z - (weight @ h) * x) / total
-    sigma = np.sqrt(1 / total + P * (weight @ h / total) ** 2)
-    likely = np.where(np.abs(jump) > JUMP, np.abs(jump) / sigma, 0.0)[: n - LEAST_BEHIND + 1]
-    best = int(likely.argmax())
-    return best, float(likely[best])
-
-
-def _judged(m: _Measured, x: Floats, P: Floats) -> tuple[float, ...]:
-    """Raw c_rr without the scale error, regressor, variance, distance, the axles; c_rr as believed, its variance."""
-    raw = m.step.raw - m.h[SCALE] * x[SCALE]
-    of_step = float(raw), m.step.regressor, m.r, m.distance_m, m.step.lead_share, m.step.wheelbase_m
-    return *of_step, float(x[LEAD]), float(P[LEAD, LEAD])
+def _shift(filtered: _Filtered, zero: float, scale: float) -> float:
+    """By how much c_rr is less at a step if zero and scale are taken off."""
+    step = filtered.measured.step
+    return (zero + scale * step.share) / step.regressor
 
 
 def _same_ground(variance: float) -> Floats:

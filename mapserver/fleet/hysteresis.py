@@ -1,6 +1,8 @@
 """When what the solver says replaces what counts: where it is off by more than it is unsure, twice in a row.
 
-What the solver says changes with every sample, and old maps are to stay as people know them. All times are site time.
+What the solver says changes with every sample, and old maps are to stay as people know them. Of a machine of which
+nothing counts yet, once is enough: nobody knows a map of it, and what it says of itself is the least sure of all. All
+times are site time.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from mapserver.fleet.correction import ANY_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS, NOTHING_STATED, Stated
 from mapserver.fleet.spans import at, values
 
-IN_A_ROW = 2  # solves that have to differ from what counts
+IN_A_ROW = 2  # solves that have to differ from what counts, if anything does
 LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better
 FROZEN_NS = 4 * 3600 * 10**9  # so long after it was first seen, an epoch keeps its zero
 MOST_STEP_NS = 600 * 10**9  # of site time between two judgements: more is a jump, of a wrong clock or at night
@@ -62,13 +64,14 @@ class Hysteresis:
             or _Epoch(self._watched_ns - (newest_ns - one.from_ns if begins else 0))
             for one in proposed
         }
+        needed = IN_A_ROW if counts else 1
         out = []
         for one in proposed:
             epoch, now = own[one.from_ns], at(counts, one.from_ns)
             applied = stated.get(one.from_ns // EPOCH_NS, NOTHING_STATED)
             epoch.differs = epoch.differs + 1 if differs(one, now, applied) else 0
             frozen = now is not None and self._watched_ns > epoch.seen_ns + FROZEN_NS
-            wanted = (now is None or values(now) != values(one)) if asked else epoch.differs >= IN_A_ROW and not frozen
+            wanted = (now is None or values(now) != values(one)) if asked else epoch.differs >= needed and not frozen
             if wanted:
                 out.append(one)
         return out

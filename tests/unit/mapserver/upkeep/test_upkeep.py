@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapserver.config import ServerConfig, StoreConfig, TrustConfig
+from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
 from mapserver.fleet.decisions import CalibrationDecision
@@ -51,9 +51,15 @@ HOUR_NS = 3600 * 10**9
 class Site:
     """A writer with its upkeep over a folder, and what was published."""
 
-    def __init__(self, folder: Path, judge_s: float = 60.0, *, exclude: bool = True) -> None:
+    def __init__(
+        self, folder: Path, judge_s: float = 60.0, *, exclude: bool = True, calibrates: bool = True
+    ) -> None:
         self.published: list[GroundChange] = []
-        self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0), trust=TrustConfig(judge_s, exclude))
+        self.config = ServerConfig(
+            store=StoreConfig(archive_after_h=0.0),
+            trust=TrustConfig(judge_s, exclude),
+            calibration=CalibrationConfig(automatic=calibrates),
+        )
         self.writer = open_writer(folder, self.config)
         self.upkeep = Upkeep(self.writer, self.published.append, past_of(self.writer))
 
@@ -173,7 +179,7 @@ def test_a_decision_outlives_the_server(opened, tmp_path, snapshot):
 
 def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
-    with opened(judge_s=JUDGE_S) as site:
+    with opened(judge_s=JUDGE_S, calibrates=False) as site:  # its evidence is of what it sent
         deliver(site, sent)
         wait_for(lambda: site.writer.run(lambda store: store.facts).excluded == {"c"})
         row = site.machine("c")
