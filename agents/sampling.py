@@ -23,7 +23,7 @@ from protocol.rotations import wrap_angle
 
 NOTHING = np.empty(0, SAMPLE_DTYPE)
 EVERY_M = 0.5  # driven from one sample to the next: a cell of the map at its usual size
-LAG_S = 4.0  # of driving behind a place, that shows on which side of a border it lies
+LAG_S = 2.0  # the ground under the wheels shows in the forces for about so long
 MAX_STD_M = 20.0  # samples of a position less sure than this are withheld: they would blur the map
 HISTORY_S = 30.0  # how long poses are kept: a sample looks back by LAG_S, and a withheld fix by less
 LAG_NS, HISTORY_NS = round(LAG_S * 1e9), round(HISTORY_S * 1e9)

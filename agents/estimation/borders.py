@@ -4,8 +4,8 @@ A history is kept for every step that may be the first one on a new ground, sinc
 of the ground behind it: of all histories that end with the same border, the likeliest is the only one that can win
 (Fearnhead and Liu 2007, On-line inference for multiple changepoint problems, with maxima in place of sums). Each has a
 Kalman filter of its own. With l, t the c_rr under the leading and the trailing axle and w the leading one's share of
-the load, a step measures regressor (w l + (1 - w) t) + noise; a border makes l unknown, and t becomes l once the trailing
-axle has come up. The score of a history is the logarithm of how likely its measurements and its borders are.
+the load, a step measures regressor (w l + (1 - w) t) + noise; a border makes l unknown, and t becomes l once the
+trailing axle has come up. The score of a history is the logarithm of how likely its measurements and its borders are.
 
 So a border is where all that came behind it says it was, and is taken back when more steps speak against it.
 """
@@ -87,7 +87,10 @@ class BorderSearch:
         if step.distance_m <= 0 or scores[parent] == -np.inf:
             return
         level, variance = rows[LEAD, parent], rows[LEAD_VAR, parent]
-        score = scores[parent] + math.log(BORDERS_PER_M * step.distance_m)
+        borders = BORDERS_PER_M * step.distance_m
+        score = (
+            scores[parent] + borders + math.log(-math.expm1(-borders))
+        )  # the odds of one or more, of a Poisson process
         behind_m = step.wheelbase_m + step.distance_m / 2  # a step shows the ground at its middle
         new = [level, level, JUMP_STD**2, 0.0, variance, score, behind_m]
         self._rows = np.column_stack([rows, new])

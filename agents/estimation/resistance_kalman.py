@@ -23,7 +23,7 @@ crosses a border.
 
 import math
 from bisect import bisect_left
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -34,7 +34,7 @@ from agents.estimation.borders import FIRST_C_RR, FIRST_STD, JUMP_STD, BorderSea
 from protocol.arrays import Floats
 
 LEAD, TRAIL, SCALE = 0, 1, 2
-KEPT = 160  # steps: 8 s, more than a sample waits for what comes after it
+KEPT = 100  # steps: 5 s, more than a sample waits for what comes after it
 NEAR_NS = 150_000_000  # a stamp this far from a usable step has no estimate
 NOISE = 0.004  # least density of the noise of raw c_rr [1/sqrt(Hz)]; larger noise is measured
 NOISE_S = 20.0  # over which noise is measured
@@ -158,14 +158,9 @@ class KalmanResistance:
     def _set_borders(self, numbers: Collection[int]) -> None:
         """Have borders before these steps, by their numbers; filter again from the first that changes."""
         first = self._count - len(self._steps) + 1
-        for index, filtered in enumerate(self._steps):
-            if filtered.border != (first + index in numbers):
-                self._filter_again(index, [first + i in numbers for i in range(len(self._steps))])
-                return
-
-    def _filter_again(self, index: int, borders: Sequence[bool]) -> None:
-        """Filter all steps from one on; borders: before each of all that are kept."""
-        for i in range(index, len(self._steps)):
+        borders = [number in numbers for number in range(first, self._count + 1)]
+        changed = [i for i, old in enumerate(self._steps) if old.border != borders[i]]
+        for i in range(changed[0] if changed else len(borders), len(borders)):
             self._steps[i] = _filtered(self._before(i), self._steps[i].measured, border=borders[i])
 
     def _smoothed(self, index: int) -> tuple[Floats, Floats]:
