@@ -51,9 +51,7 @@ HOUR_NS = 3600 * 10**9
 class Site:
     """A writer with its upkeep over a folder, and what was published."""
 
-    def __init__(
-        self, folder: Path, judge_s: float = 60.0, *, exclude: bool = True, calibrates: bool = True
-    ) -> None:
+    def __init__(self, folder: Path, judge_s: float = 60.0, *, exclude: bool = True, calibrates: bool = True) -> None:
         self.published: list[GroundChange] = []
         self.config = ServerConfig(
             store=StoreConfig(archive_after_h=0.0),
