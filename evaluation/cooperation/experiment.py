@@ -24,7 +24,7 @@ WHOLE_S, LEAST_S = 1200.0, 300.0  # of a lone machine's recording
 ALONE, FOUR = "one", "four"
 DIGITS = 4
 DECIDED = ("c_rr_pct", "grade_pct")  # that are shown with what was decided in the end, too
-DRIVEN = ("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct")
+ENDS_ALONE = ("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct", "places_c_rr_pct")  # in the end alone
 SPEEDUPS = (Goal({"arm": FOUR}, "speedup", ">=", 3.0),)
 ENDS = (Goal({"arm": FOUR}, "c_rr_pct", "<=", 6.0),)
 # Sahlholm and Johansson's trucks: 0.17 % grade after six passes.
@@ -121,7 +121,7 @@ def arm_row(outcome: Outcome) -> Row:
         "arrived_min": [each.by_arrival[:, 0] for each in scored],
     }
     until = {name: [minutes_until(steps, part, SHARE_PCT) for part in parts] for name, parts in covered.items()}
-    ends = {name: _mean([each.end[name] for each in scored]) for name in (*FIGURES, *DRIVEN)}
+    ends = {name: _mean([each.end[name] for each in scored]) for name in (*FIGURES, *ENDS_ALONE)}
     row: Row = {
         "arm": outcome.judging.name,
         "machines": arm.machines,

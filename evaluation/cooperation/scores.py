@@ -17,7 +17,7 @@ from evaluation.cooperation.central import central_timeline
 from evaluation.cooperation.drives import SharedDrive, length_m
 from evaluation.cooperation.live import LiveRun
 from evaluation.cooperation.maps import Layers, Timeline
-from evaluation.cooperation.network import Network, figures, network
+from evaluation.cooperation.network import LAYERS, Network, figures, network
 from evaluation.fleet.cases import GAIN, Rows, gain
 from evaluation.fleet.drives import Scene, scene
 from evaluation.fleet.solving import served
@@ -124,7 +124,11 @@ def _solve(task: Task[Judging], cache: Path) -> Scored:
             {"rounds": i + 1, "minutes": (stamp - START_NS) / 60e9, **then, "decided": later}
             for i, (stamp, then, later) in enumerate(zip(ends, *after, strict=True))
         ],
-        end={**figures(last, cells), **driven_figures(last, true, names)},
+        end={
+            **figures(last, cells),
+            **driven_figures(last, true, names),
+            "places_c_rr_pct": places_c_rr_pct(lines[0], true, names, cells),
+        },
         repaved=repaved_rows(drive, lines[0], lines[1], true, names) if drive.repaves else [],
         spoiled=spoiled_costs(run, lines[0], last, true, names, arm) if run and arm.spoiled else {},
         alarms=alarms,
@@ -159,6 +163,13 @@ def driven_figures(layers: Layers, true: Scene, names: Sequence[str]) -> Row:
     score = driven_score(layers, true, names)
     figures_of = (score.wrong_resistance_pct, score.wrong_grade_pct, score.known_pct)
     return dict(zip(("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct"), figures_of, strict=True))
+
+
+def places_c_rr_pct(line: Timeline, true: Scene, names: Sequence[str], cells: Network) -> float:
+    """`c_rr_pct` of a map of the same samples with true values: what comes of their places alone."""
+    rows = {name: line.samples[line.machine == line.machines.index(name)] for name in names}
+    exact = {name: with_true_values(table, true, name) for name, table in rows.items()}
+    return figures(folded(exact.items(), window_of(true.truth), LAYERS), cells)["c_rr_pct"]
 
 
 def driven_score(layers: Mapping[str, AnyArray], true: Scene, names: Sequence[str]) -> DrivenScore:

@@ -25,7 +25,7 @@ def scored(arm, *, share_per_min: float, central: bool = False) -> Scored:
     over_time = np.zeros((len(MINUTES), len(FIGURES)))
     over_time[:, 0] = np.minimum(100.0, share_per_min * MINUTES)
     figures = dict.fromkeys(FIGURES, 5.0)
-    driven = dict.fromkeys(("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct"), 1.0)
+    driven = dict.fromkeys(("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct", "places_c_rr_pct"), 1.0)
     rounds = [
         {"rounds": n, "minutes": float(n), **figures, "grade_pct": 0.4 / n, "decided": figures} for n in range(1, 7)
     ]
