@@ -1,11 +1,12 @@
 """Where the ground under a machine changed: of all histories of borders, the likeliest by all steps so far.
 
-A history is kept for every step that may be the first one on a new ground, since what lies before a border says nothing
-of the ground behind it: of all histories that end with the same border, the likeliest is the only one that can win
-(Fearnhead and Liu 2007, On-line inference for multiple changepoint problems, with maxima in place of sums). Each has a
-Kalman filter of its own. With l, t the c_rr under the leading and the trailing axle and w the leading one's share of
-the load, a step measures regressor (w l + (1 - w) t) + noise; a border makes l unknown, and t becomes l once the
-trailing axle has come up. The score of a history is the logarithm of how likely its measurements and its borders are.
+A history is begun with every step that may be the first one on a new ground, and the likeliest are kept: what lies
+before a border says nothing of the ground behind it, so that of all histories that end with the same border the
+likeliest is the only one that can win (Fearnhead and Liu 2007, On-line inference for multiple changepoint problems,
+with maxima in place of sums). Each has a Kalman filter of its own. With l, t the c_rr under the leading and the
+trailing axle and w the leading one's share of the load, a step measures regressor (w l + (1 - w) t) + noise; a border
+makes l unknown, and t becomes l once the trailing axle has come up. The score of a history is the logarithm of how
+likely its measurements and its borders are.
 
 So a border is where all that came behind it says it was, and is taken back when more steps speak against it.
 """
@@ -17,11 +18,10 @@ import math
 import numpy as np
 
 from agents.estimation.balance import BalanceStep
-from protocol.arrays import Floats
 
 FIRST_C_RR, FIRST_STD = 0.03, 0.1
 JUMP_STD = 0.1  # of c_rr behind a border, from what it was before: as unknown as at first
-BORDERS_PER_M = 0.02  # a border every 50 m; five times as many or as few find the same ones
+BORDERS_PER_M = 0.02  # a border every 50 m; maps with five times as many hardly differ
 # Noise is no sooner gone than a torque's error of a second, and a bump of the ground looks like a change of it: so many
 # times the variance of white noise, or small borders are seen where there are none.
 COLOURED = 2.0
@@ -87,33 +87,27 @@ class BorderSearch:
         if step.distance_m <= 0 or scores[parent] == -np.inf:
             return
         level, variance = rows[LEAD, parent], rows[LEAD_VAR, parent]
-        borders = BORDERS_PER_M * step.distance_m
-        score = (
-            scores[parent] + borders + math.log(-math.expm1(-borders))
-        )  # the odds of one or more, of a Poisson process
+        expected = BORDERS_PER_M * step.distance_m
+        odds = expected + math.log(-math.expm1(-expected))  # logarithm: one or more of a Poisson process, against none
         behind_m = step.wheelbase_m + step.distance_m / 2  # a step shows the ground at its middle
-        new = [level, level, JUMP_STD**2, 0.0, variance, score, behind_m]
+        new = [level, level, JUMP_STD**2, 0.0, variance, scores[parent] + odds, behind_m]
         self._rows = np.column_stack([rows, new])
         recent = (border for border in self._borders[parent] if border > number - self._remembered)
         self._borders.append((*recent, number))
 
     def _measure(self, step: BalanceStep, raw: float, r: float) -> None:
         """Condition all histories on the step, and score them."""
-        rows, (lead, trail) = self._rows, _weights(step)
-        of_lead = lead * rows[LEAD_VAR] + trail * rows[COVARIANCE]
-        of_trail = lead * rows[COVARIANCE] + trail * rows[TRAIL_VAR]
-        variance = lead * of_lead + trail * of_trail + COLOURED * r
+        rows, lead = self._rows, step.regressor * step.lead_share
+        trail = step.regressor - lead
+        with_lead = lead * rows[LEAD_VAR] + trail * rows[COVARIANCE]  # covariances with what is measured
+        with_trail = lead * rows[COVARIANCE] + trail * rows[TRAIL_VAR]
+        variance = lead * with_lead + trail * with_trail + COLOURED * r
         innovation = raw - lead * rows[LEAD] - trail * rows[TRAIL]
         square = innovation**2 / variance
         rows[SCORE] -= 0.5 * (np.minimum(square, LIKELY) + np.log(variance))
         innovation *= np.sqrt(LIKELY / np.maximum(square, LIKELY))
-        rows[LEAD] += of_lead / variance * innovation
-        rows[TRAIL] += of_trail / variance * innovation
-        rows[LEAD_VAR] -= of_lead**2 / variance
-        rows[COVARIANCE] -= of_lead * of_trail / variance
-        rows[TRAIL_VAR] -= of_trail**2 / variance
-
-
-def _weights(step: BalanceStep) -> Floats:
-    """Regressors of the ground under the leading and the trailing axle (2,)."""
-    return step.regressor * np.array([step.lead_share, 1 - step.lead_share])
+        rows[LEAD] += with_lead / variance * innovation
+        rows[TRAIL] += with_trail / variance * innovation
+        rows[LEAD_VAR] -= with_lead**2 / variance
+        rows[COVARIANCE] -= with_lead * with_trail / variance
+        rows[TRAIL_VAR] -= with_trail**2 / variance

@@ -94,7 +94,7 @@ class KalmanResistance:
         self._steps: list[_Filtered] = []
         self._first = _start(SCALE_STD**2 if estimates_mass else 0.0)  # the last step that is not kept
         self._noise = _Noise()
-        self._search = BorderSearch(2 * KEPT)
+        self._search = BorderSearch(2 * KEPT + 1)
         self._count = 0  # of all steps
         self._load_has_changed = False  # since the last step
 
@@ -126,8 +126,9 @@ class KalmanResistance:
 
         So the ground does not seem to change where the calibration does.
         """
-        self._search.shift(-_shift(self._before(len(self._steps)), zero, scale))
-        shift = _shift(self._first, zero, scale)
+        believed = float(self._before(len(self._steps)).x[LEAD])
+        first = self._first.measured.step
+        shift = (zero + scale * first.share) / first.regressor
         x = self._first.x - shift * np.array([1.0, 1.0, 0.0])
         self._first = self._first._replace(x=x)
         self._noise.interrupt()
@@ -135,6 +136,8 @@ class KalmanResistance:
             step = old.measured.step
             step = replace(step, raw=step.raw - zero - scale * step.share)
             self._steps[i] = _filtered(self._before(i), old.measured._replace(step=step), border=old.border)
+        # Ahead and in reverse a zero counts with opposite signs: what both come to, the filter knows.
+        self._search.shift(float(self._before(len(self._steps)).x[LEAD]) - believed)
 
     def at(self, stamp_ns: int) -> tuple[float, float] | None:
         """c_rr and its variance under the load centre at a recent stamp, smoothed by the steps after it."""
@@ -159,8 +162,8 @@ class KalmanResistance:
         """Have borders before these steps, by their numbers; filter again from the first that changes."""
         first = self._count - len(self._steps) + 1
         borders = [number in numbers for number in range(first, self._count + 1)]
-        changed = [i for i, old in enumerate(self._steps) if old.border != borders[i]]
-        for i in range(changed[0] if changed else len(borders), len(borders)):
+        changed = next((i for i, old in enumerate(self._steps) if old.border != borders[i]), len(borders))
+        for i in range(changed, len(borders)):
             self._steps[i] = _filtered(self._before(i), self._steps[i].measured, border=borders[i])
 
     def _smoothed(self, index: int) -> tuple[Floats, Floats]:
@@ -215,7 +218,7 @@ def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filte
     middle_m = measured.distance_m - step.distance_m / 2  # a step counts at its end, and shows the ground at its middle
     crossing_m = middle_m if border else before.crossing_m
     A, free = IDENTITY, 0.0
-    if not math.isnan(crossing_m) and before.measured.step.regressor * step.regressor < 0:
+    if before.is_crossing and before.measured.step.regressor * step.regressor < 0:
         # Back across a border that only one axle had crossed: the axle that led is the trailing one now.
         A, crossing_m, free = TRAIL_IS_LEAD, math.nan, JUMP_STD**2
     elif border:
@@ -232,12 +235,6 @@ def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filte
     K = Ph / (measured.h @ Ph + measured.r)
     x, P = x0 + K * (step.raw - measured.h @ x0), P0 - K[:, None] * Ph
     return _Filtered(measured, border, crossing_m, A, x0, P0, x, P)
-
-
-def _shift(filtered: _Filtered, zero: float, scale: float) -> float:
-    """By how much c_rr is less at a step if zero and scale are taken off."""
-    step = filtered.measured.step
-    return (zero + scale * step.share) / step.regressor
 
 
 def _same_ground(variance: float) -> Floats:

@@ -1,8 +1,8 @@
 """When what the solver says replaces what counts: where it is off by more than it is unsure, twice in a row.
 
-What the solver says changes with every sample, and old maps are to stay as people know them. Of a machine of which
-nothing counts yet, once is enough: nobody knows a map of it, and what it says of itself is the least sure of all. All
-times are site time.
+What the solver says changes with every sample, and old maps are to stay as people know them. In the first minutes of a
+machine of which nothing counts yet, once is enough: nobody knows that map, and it is off by all of the machine's zero.
+All times are site time.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from mapserver.fleet.spans import at, values
 
 IN_A_ROW = 2  # solves that have to differ from what counts, if anything does
 LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better
+FIRST_NS = 600 * 10**9  # so long after it was first seen, a machine's map is new
 FROZEN_NS = 4 * 3600 * 10**9  # so long after it was first seen, an epoch keeps its zero
 MOST_STEP_NS = 600 * 10**9  # of site time between two judgements: more is a jump, of a wrong clock or at night
 
@@ -64,7 +65,8 @@ class Hysteresis:
             or _Epoch(self._watched_ns - (newest_ns - one.from_ns if begins else 0))
             for one in proposed
         }
-        needed = IN_A_ROW if counts else 1
+        is_new = self._watched_ns < min(epoch.seen_ns for epoch in own.values()) + FIRST_NS
+        needed = 1 if is_new and not counts else IN_A_ROW
         out = []
         for one in proposed:
             epoch, now = own[one.from_ns], at(counts, one.from_ns)

@@ -491,3 +491,19 @@ def test_a_calibration_counts_by_direction() -> None:
     feed(kalman, reverse)
     kalman.recalibrate(0.02, 0.0)
     assert at_step(kalman, 99)[0] == pytest.approx(0.06, abs=1e-5)
+
+
+@pytest.mark.parametrize("reverse", [1, 5, 20, 60])
+def test_a_change_of_the_calibration_soon_after_a_turn_is_no_border(reverse: int) -> None:
+    """A zero counts with opposite signs ahead and in reverse, so what both say of one ground is not shifted by it."""
+    rng = np.random.default_rng(11)
+    n, zero = 300 + reverse + 100, 0.01
+    direction = np.where(np.arange(n) < 300, 1.0, -1.0)
+    raw = direction * 0.04 + zero + white_noise(NOISE, n, rng)
+    steps = [replace(s, regressor=d, raw=r) for s, d, r in zip(level_steps(raw), direction, raw, strict=True)]
+    kalman = KalmanResistance()
+    feed(kalman, steps[: 300 + reverse])
+    kalman.recalibrate(zero, 0.0)
+    feed(kalman, [replace(s, raw=s.raw - zero) for s in steps[300 + reverse :]])
+    assert not [border for border in borders(kalman) if border >= 300 + reverse]
+    assert at_step(kalman, n - 1)[0] == pytest.approx(0.04, abs=4e-3)

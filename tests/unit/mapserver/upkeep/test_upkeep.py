@@ -189,7 +189,7 @@ def test_a_machine_that_contradicts_all_others_is_excluded(opened):
 
 
 def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
-    with opened(judge_s=JUDGE_S, exclude=False) as site:
+    with opened(judge_s=JUDGE_S, calibrates=False, exclude=False) as site:
         deliver(site, fleet({"c": 1.6}))
         wait_for(lambda: site.machine("c")["contradicts"])
         never = threading.Event()
@@ -201,7 +201,7 @@ def test_a_bad_machine_is_only_named_where_the_server_may_not_exclude(opened):
 
 
 def test_a_person_overrules_the_audit_and_hands_back(opened):
-    with opened(judge_s=JUDGE_S) as site:
+    with opened(judge_s=JUDGE_S, calibrates=False) as site:
         deliver(site, fleet({"c": 1.6}))
         wait_for(lambda: site.writer.run(lambda store: store.facts).excluded == {"c"})
         assert site.upkeep.trust("c", True, "I know better", 20.0)["by"] == "person"
