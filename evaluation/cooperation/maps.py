@@ -61,6 +61,10 @@ class Timeline:
         chosen = np.isin(self.machine, numbers)
         return Timeline(self.samples[chosen], self.machine[chosen], self.machines, self.time_ns[chosen], self.facts)
 
+    def by_machine(self, names: Iterable[str]) -> dict[str, Table]:
+        """The samples of each of some machines."""
+        return {name: self.samples[self.machine == self.machines.index(name)] for name in names}
+
     def facts_at(self, time_ns: int) -> Facts:
         """What was decided by then."""
         return [each for from_ns, each in self.facts if from_ns <= time_ns][-1]

@@ -167,8 +167,7 @@ def driven_figures(layers: Layers, true: Scene, names: Sequence[str]) -> Row:
 
 def places_c_rr_pct(line: Timeline, true: Scene, names: Sequence[str], cells: Network) -> float:
     """`c_rr_pct` of a map of the same samples with true values: what comes of their places alone."""
-    rows = {name: line.samples[line.machine == line.machines.index(name)] for name in names}
-    exact = {name: with_true_values(table, true, name) for name, table in rows.items()}
+    exact = {name: with_true_values(rows, true, name) for name, rows in line.by_machine(names).items()}
     return figures(folded(exact.items(), window_of(true.truth), LAYERS), cells)["c_rr_pct"]
 
 
@@ -253,7 +252,7 @@ def spoiled_costs(run: LiveRun, line: Timeline, last: Layers, true: Scene, names
     estimated_cost_pct: with estimated values. excluded_min: when it was excluded.
     """
     *good, bad = names
-    rows = {name: line.samples[line.machine == line.machines.index(name)] for name in names}
+    rows = line.by_machine(names)
     exact = {name: with_true_values(table, true, name) for name, table in rows.items()}
     if arm.spoiled == BAD:
         exact[bad]["applied_zero"] = exact[bad]["applied_scale"] = 0.0  # nothing was taken off true values

@@ -33,7 +33,8 @@ SURE_AXIS = 0.2  # least length of the mean axis, 0 to 1, that is a preferred on
 # a machine bridges and sensors that lag [m/m], and how machines sit on slopes, as a share of the slope.
 ZERO_STD, MODEL_SHARE = 0.0015, 0.05
 UNEVEN_STD, SLOPE_SHARE = 0.0045, 0.05
-SPREAD_SHARE = 0.5  # of what votes for c_rr differ by, that their centre is off by, however many there are
+# The centre of the votes for c_rr is off by so much of what they differ by, however many there are.
+SPREAD_SHARE = 0.5
 # Votes for the class that leads less are mostly errors of places: shares to this power are right as often as they say.
 SHARPNESS = 1.5
 
@@ -107,7 +108,7 @@ def resistance(cells: CellEvidence) -> Floats:
 
 
 def resistance_std(cells: CellEvidence) -> Floats:
-    """Standard deviation of `resistance` [-]: what votes differ by, and what they err in alike."""
+    """Standard deviation of `resistance` [-]: half of what votes differ by, and what they err in alike."""
     c_rr = resistance(cells)
     spread = SPREAD_SHARE * c_rr * LOG_STEP * robust_spread(cells.votes(ev.RESISTANCE))
     deviation: Floats = np.sqrt(spread**2 + ZERO_STD**2 + (MODEL_SHARE * c_rr) ** 2)

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.processes
 
 START_NS, HOUR_NS, SIZE = 1_767_225_600 * 10**9, 3600 * 10**9, 48
 BAD, OLD, NEW = 1.6, 0.06, 0.02
-CONFIG = "[store]\narchive_after_h = 0\n[trust]\njudge_s = 0.2\n"
+CONFIG = "[store]\narchive_after_h = 0\n[trust]\njudge_s = 0.2\n[calibration]\nautomatic = false\n"
 
 
 def sweep(seed: int, hour: float, gain: float = 1.0, *, repaved: bool = False) -> Table:

@@ -45,6 +45,8 @@ class WebSite:
         self.folder, self.children = folder, children
         self.endpoint = free_endpoint()
         (folder / "site.toml").write_text(SITE_TOML)
+        # What machines of tests measure is what they sent, whenever the solver looks.
+        (folder / "server.toml").write_text("[calibration]\nautomatic = false\n")
         children.start("router", "router", "--listen", self.endpoint).expect("ready", READY_S)
         self.server = self.start_server()
         self.web = self.start_web(*words)
@@ -55,7 +57,8 @@ class WebSite:
         self.client: Client = children.enter_context(connect(self.endpoint, NAME))
 
     def start_server(self) -> Child:
-        words = ("--site-file", self.folder / "site.toml", "--store", self.folder / "store")
+        files = ("--site-file", self.folder / "site.toml", "--config", self.folder / "server.toml")
+        words = (*files, "--store", self.folder / "store")
         child = self.children.start("server", "server", "--endpoint", self.endpoint, *words)
         child.expect("ready", READY_S)
         return child
