@@ -19,7 +19,7 @@ R = NOISE**2 / STEP_S
 STEP_M = 0.1
 
 
-def found(steps: Sequence[BalanceStep], remembered: int = 200) -> list[tuple[int, ...]]:
+def borders_after(steps: Sequence[BalanceStep], remembered: int = 200) -> list[tuple[int, ...]]:
     """The borders after each step, by its index."""
     search = BorderSearch(remembered)
     return [search.update(index, step, step.raw, R) for index, step in enumerate(steps)]
@@ -48,18 +48,18 @@ def test_no_history_is_likelier_than_the_one_that_is_found(monkeypatch: pytest.M
     raw = levels[np.minimum(np.arange(30) // 10, 2)] + white_noise(NOISE, 30, rng)
     histories = [h for count in range(3) for h in itertools.combinations(range(1, 30), count)]
     likeliest = max(histories, key=lambda history: evidence(raw, history))
-    assert found(level_steps(raw))[-1] == likeliest
+    assert borders_after(level_steps(raw))[-1] == likeliest
 
 
 def test_one_ground_has_no_border_and_a_jolt_is_none() -> None:
     raw = 0.05 + white_noise(NOISE, 400, np.random.default_rng(1))
     raw[200:203] += 0.3
-    assert found(level_steps(raw))[-1] == ()
+    assert borders_after(level_steps(raw))[-1] == ()
 
 
 def test_a_border_is_where_it_lies_however_late_it_is_seen() -> None:
     raw = 0.02 + 0.02 * (np.arange(200) >= 100) + white_noise(NOISE / 4, 200, np.random.default_rng(2))
-    after = found(level_steps(raw))
+    after = borders_after(level_steps(raw))
     seen = next(index for index, history in enumerate(after) if history)
     assert seen > 105
     assert abs(after[-1][0] - 100) <= 3
@@ -78,7 +78,7 @@ def test_histories_are_few_and_forget_what_nobody_asks_for() -> None:
 
 def test_a_machine_that_stands_crosses_no_border() -> None:
     steps = [replace(step, distance_m=0.0) for step in level_steps(0.02 + 0.1 * (np.arange(100) >= 50))]
-    assert not any(found(steps))
+    assert not any(borders_after(steps))
 
 
 def test_after_a_long_way_of_which_nothing_is_known_another_ground_is_no_surprise() -> None:
@@ -86,10 +86,10 @@ def test_after_a_long_way_of_which_nothing_is_known_another_ground_is_no_surpris
     raw = 0.03 + 0.02 * (np.arange(60) >= 40)
     near = level_steps(raw)
     far = [replace(step, distance_m=60.0) if index == 40 else step for index, step in enumerate(near)]
-    assert found(near)[-1] == ()
-    assert found(far)[-1] == (40,)
+    assert borders_after(near)[-1] == ()
+    assert borders_after(far)[-1] == (40,)
     endless = [replace(step, distance_m=1e6) if index == 40 else step for index, step in enumerate(near)]
-    assert found(endless)[-1] == (40,)
+    assert borders_after(endless)[-1] == (40,)
 
 
 def test_a_calibration_shifts_what_is_believed_and_no_border_comes_of_it() -> None:
