@@ -15,7 +15,7 @@ from mapserver.fleet.correction import ANY_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS, NOTHING_STATED, Stated
 from mapserver.fleet.spans import at, values
 
-IN_A_ROW = 2  # solves that have to differ from what counts, if anything does
+IN_A_ROW = 2  # solves that have to differ from what counts; one, of a new machine of which nothing counts
 LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better
 FIRST_NS = 600 * 10**9  # so long after it was first seen, a machine's map is new
 FROZEN_NS = 4 * 3600 * 10**9  # so long after it was first seen, an epoch keeps its zero
