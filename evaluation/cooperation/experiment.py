@@ -194,10 +194,13 @@ def repaved_rows(outcome: Outcome) -> list[Row]:
     out = []
     for parts in zip(*(each.repaved for each in outcome.scored), strict=True):
         row: Row = {"ground": parts[0]["ground"], "cells": parts[0]["cells"]}
-        for name in ("passes", "minutes", "arrived_min"):
+        for name in ("passes", "least_passes", "minutes", "arrived_min"):
             values = [part[name] for part in parts]
             row[name] = None if None in values else float(np.median(values))
-        by_seed = {"passes": [part["passes"] for part in parts], "by_pass_pct": [part["by_pass_pct"] for part in parts]}
+        by_seed = {
+            name: [part[name] for part in parts]
+            for name in ("passes", "least_passes", "by_pass_pct", "driven_by_pass_pct")
+        }
         out.append(rounded({**row, "by_seed": by_seed}, DIGITS))
     return out
 

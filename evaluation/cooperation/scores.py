@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from evaluation.campaign.experiment import Experiment, Task, read_result, replay_task
 from evaluation.campaign.figures import Row
@@ -37,6 +38,7 @@ AFTER_S = 30.0  # of a recording's end, when all its samples become final and ar
 SHARE_PCT = 90.0  # of the network's cells, or of those that were repaved
 ROUNDS = (1, 2, 3, 4, 5, 6)  # of its tours, that every machine has driven
 PASSES = 12  # over repaved ground that are looked at, at most
+REACH_M = 1.0  # from a load centre: cells further off were not driven, and no map could know what became of them
 NEAR_M = 6.0  # of repaved ground: a change that is listed there is no false alarm
 CENTRAL = "central"
 
@@ -198,6 +200,7 @@ def repaved_rows(
     """Of each ground that is repaved: after how many passes, and when, SHARE_PCT of its cells have the new class.
 
     Cells of the network that lie 2 m inside. A pass begins after the change, and counts as it leaves the ground.
+    least_passes: when SHARE_PCT of the cells had been driven at all since the change.
     """
     tracks = [true.tracks[name] for name in names]
     before = network(true_ground(drive.ground, drive.seed), ())
@@ -210,15 +213,34 @@ def repaved_rows(
         by_machine = [passes(track, inside(change.outline, track.place_m), changed_ns) for track in tracks]
         ends = np.sort(np.concatenate(by_machine))[:PASSES]
         shown_then = (_classes(layers, cells) for layers in line.maps(ends.tolist(), window_of(true.truth)))
-        shares = [100.0 * float((classes == new).mean()) for classes in shown_then]
-        shown = next((i for i, share in enumerate(shares) if share >= SHARE_PCT), None)
-        row: Row = {"ground": name, "cells": len(new), "passes": None, "minutes": None, "arrived_min": None}
+        shown_pct = [100.0 * float((classes == new).mean()) for classes in shown_then]
+        reached_pct = [driven_pct(tracks, cells.place_m, changed_ns, end) for end in ends.tolist()]
+        shown, reached = _first(shown_pct), _first(reached_pct)
+        row: Row = {
+            "ground": name,
+            "cells": len(new),
+            "passes": None if shown is None else shown + 1,
+            "least_passes": None if reached is None else reached + 1,
+            "minutes": None,
+            "arrived_min": None,
+        }
         if shown is not None:
             arrived_ns = int(arrivals.time_ns[arrivals.samples["stamp_ns"] <= ends[shown]].max())
             minutes = [(stamp - changed_ns) / 60e9 for stamp in (int(ends[shown]), arrived_ns)]
-            row |= {"passes": shown + 1, "minutes": minutes[0], "arrived_min": minutes[1]}
-        rows.append(row | {"by_pass_pct": shares})
+            row |= {"minutes": minutes[0], "arrived_min": minutes[1]}
+        rows.append(row | {"by_pass_pct": shown_pct, "driven_by_pass_pct": reached_pct})
     return rows
+
+
+def _first(shares_pct: Sequence[float]) -> int | None:
+    return next((i for i, share in enumerate(shares_pct) if share >= SHARE_PCT), None)
+
+
+def driven_pct(tracks: Iterable[LoadTrack], place_m: Floats, from_ns: int, to_ns: int) -> float:
+    """Share of places (n, 2) that load centres came within REACH_M of between two stamps."""
+    whole = np.concatenate([track.place_m[(track.stamp_ns > from_ns) & (track.stamp_ns <= to_ns)] for track in tracks])
+    off_m, _ = cKDTree(whole[np.isfinite(whole[:, 0])]).query(place_m)
+    return 100.0 * float((off_m <= REACH_M).mean())
 
 
 def passes(track: LoadTrack, there: Bools, from_ns: int) -> Ints:

@@ -30,7 +30,16 @@ def scored(arm, *, share_per_min: float, central: bool = False) -> Scored:
         {"rounds": n, "minutes": float(n), **figures, "grade_pct": 0.4 / n, "decided": figures} for n in range(1, 7)
     ]
     grounds = [
-        {"ground": name, "cells": 9, "passes": passes, "minutes": 1.0, "arrived_min": 2.5, "by_pass_pct": [0.0, 95.0]}
+        {
+            "ground": name,
+            "cells": 9,
+            "passes": passes,
+            "least_passes": 2,
+            "minutes": 1.0,
+            "arrived_min": 2.5,
+            "by_pass_pct": [0.0, 95.0],
+            "driven_by_pass_pct": [50.0, 100.0],
+        }
         for name, passes in (("shared", 2), ("west", 3))
     ]
     costs = {"cost_pct": -0.02, "let_in_pct": 4.0, "estimated_cost_pct": 0.3, "excluded_min": 3.0, "excluded": ["x"]}

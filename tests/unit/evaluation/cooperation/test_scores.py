@@ -9,6 +9,7 @@ from evaluation.cooperation.drives import FOUR, REPAVED, TOURS, length_m, lines,
 from evaluation.cooperation.live import LiveRun
 from evaluation.cooperation.maps import Timeline
 from evaluation.cooperation.scores import (
+    driven_pct,
     false_alarms,
     inside,
     minutes_until,
@@ -99,10 +100,22 @@ def test_repaved_ground_is_shown_once_enough_of_its_cells_have_the_new_class():
     assert (west["ground"], west["passes"]) == ("west", 2)
     assert west["by_pass_pct"][0] == 0.0
     assert west["by_pass_pct"][1] > 95.0
+    assert west["least_passes"] == 1  # its line goes over all of these cells
+    assert west["driven_by_pass_pct"][0] > 95.0
     left_s = (inside(REPAVED["west"], there_m).sum() - 1) / 2  # of its line
     assert west["minutes"] * 60 == pytest.approx(100.0 + left_s, abs=1.0)
     assert west["arrived_min"] == pytest.approx(west["minutes"] + 1.0, abs=0.05)
     assert (shared["ground"], shared["passes"], shared["by_pass_pct"]) == ("shared", None, [])
+
+
+def test_a_place_is_driven_once_a_load_centre_was_near_it_after_the_change():
+    along = track(np.stack([np.arange(10.0), np.zeros(10)], axis=1), step_s=1.0)
+    beside = track(np.stack([np.arange(10.0), np.full(10, 3.0)], axis=1), step_s=1.0)
+    places = np.array([[2.0, 0.9], [6.0, 0.9], [6.0, 3.0], [6.0, 1.5]])
+    changed_ns, end_ns = START_NS + 3 * 10**9, START_NS + 8 * 10**9
+    assert driven_pct([along], places, changed_ns, end_ns) == 25.0
+    assert driven_pct([along, beside], places, changed_ns, end_ns) == 50.0
+    assert driven_pct([along, beside], places, changed_ns, changed_ns + 10**9) == 0.0
 
 
 def test_changes_that_are_listed_elsewhere_are_false_alarms():
