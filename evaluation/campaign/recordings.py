@@ -5,6 +5,7 @@ What is kept is named by digests of the code and the options that it was made wi
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import shutil
@@ -30,6 +31,7 @@ MACHINE = "loader"
 _scenario = cache(load_scenario)
 ROOT = Path(__file__).parents[2]
 SUFFIXES = (".py", ".toml", ".urdf")  # of sources
+_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 # Of the protocol, what machines and their simulation know: a change of the map's queries leaves recordings as they are.
 MACHINES_PROTOCOL = (
     *(f"protocol/{folder}" for folder in ("machine", "site", "wire")),
@@ -150,9 +152,24 @@ def track_file(folder: Path) -> Path:
 
 @cache
 def code_version(*names: str) -> str:
-    """Digest of the sources of packages or modules, as paths from the project's root; raises FileNotFoundError."""
+    """Digest of the sources of packages or modules, as paths from the project's root; raises FileNotFoundError.
+
+    Comments, docstrings and layout do not count, so that results outlive what is only said in another way.
+    """
     files = sorted(path for name in names for path in _sources(ROOT / name))
-    return digest(*(f"{path.relative_to(ROOT)}\n{path.read_text(encoding='utf-8')}" for path in files))
+    return digest(*(f"{path.relative_to(ROOT)}\n{what_counts(path)}" for path in files))
+
+
+def what_counts(path: Path) -> str:
+    """The text of a source that results depend on: of Python its syntax tree, without docstrings."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".py":
+        return text
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+            del node.body[0]
+    return ast.dump(tree)
 
 
 def digest(*texts: str) -> str:

@@ -117,8 +117,8 @@ def add_options(parser: ArgumentParser) -> None:
         "file to write the map to that the paper plots, with the first seed: 2 x m x n x 3, x, y and value of each cell"
     )
     paper.add_argument("--tensor", type=OutputFile((".npy",)), metavar="FILE", help=tensor)
-    tables = "lone: the paper's own, of one machine; fleets: maps of four, and how far they are believed (default all)"
-    paper.add_argument("--tables", choices=("all", "lone", "fleets"), default="all", help=tables)
+    tables = "positions: Tables 1 and 2 alone; maps: Table 3, and all else that is of maps (default %(default)s)"
+    paper.add_argument("--tables", choices=("all", "positions", "maps"), default="all", help=tables)
     quick = "short drives of its own without PyBullet, and few rows: to see that all works"
     for action in (paper, cooperation):
         action.add_argument("--quick", action="store_true", help=quick)
@@ -196,20 +196,20 @@ def _localisation(arguments: Namespace) -> Report:
 
 def _paper(arguments: Namespace) -> Report:
     from evaluation.paper import experiment
-    from evaluation.paper.drives import ALONE, FLEETS, QUICK, Plan
+    from evaluation.paper.drives import QUICK, Plan
     from evaluation.paper.report import readable
 
-    if arguments.tables != "all" and (arguments.plots or arguments.tensor):
-        raise ConfigError("--tables", "pictures and the tensor are of all tables: leave out --plots and --tensor")
+    if arguments.tables == "positions" and (arguments.plots or arguments.tensor):
+        raise ConfigError("--tables positions", "makes no maps to draw or to write: leave out --plots and --tensor")
     if arguments.tables != "all" and arguments.quick:
         raise ConfigError("--quick", "has tables of its own: leave out --tables")
     plan = Plan(_seeds(arguments), arguments.seconds)
     if _is_quick(arguments, DEFAULT_S):
         plan = QUICK
-    elif arguments.tables == "lone":
-        plan = replace(plan, sources=ALONE)
-    elif arguments.tables == "fleets":
-        plan = replace(plan, positions=(), sources=FLEETS)
+    elif arguments.tables == "positions":
+        plan = replace(plan, sources=())
+    elif arguments.tables == "maps":
+        plan = replace(plan, positions=())
 
     def work(runner: Runner) -> tuple[Report, Any]:
         report, outcomes = experiment.run(runner, plan)

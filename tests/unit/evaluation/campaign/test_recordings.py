@@ -72,6 +72,22 @@ def test_the_version_of_code_changes_with_each_source_in_it(tmp_path: Path, monk
     assert len(seen | {recordings.code_version.__wrapped__("a.py", "package")}) == 4
 
 
+def test_what_is_only_said_in_another_way_is_the_same_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recordings, "ROOT", tmp_path)
+    sources = (
+        'def f(x):\n    return {"a": x}\n',
+        '"""A module."""\n\ndef f(x):  # of x\n    """A function."""\n    return {\n        "a": x,\n    }\n',
+        'def f(x):\n    return {"b": x}\n',
+        'def f(x):\n    "a"\n',
+    )
+    seen = []
+    for source in sources:
+        (tmp_path / "a.py").write_text(source)
+        seen.append(recordings.code_version.__wrapped__("a.py"))
+    assert seen[0] == seen[1]
+    assert len(set(seen)) == 3
+
+
 def test_a_source_that_is_not_there_is_an_error():
     with pytest.raises(FileNotFoundError, match="nowhere"):
         recordings.code_version("protocol/units.py", "nowhere.py")

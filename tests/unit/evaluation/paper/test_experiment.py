@@ -158,12 +158,12 @@ def test_options_reach_the_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 def test_one_of_the_tables_may_be_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     asked: list[Plan] = []
     monkeypatch.setattr(experiment, "run", lambda _, plan: (asked.append(plan), ({"rows": []}, None))[1])
-    for tables in ("lone", "fleets"):
+    for tables in ("positions", "maps"):
         assert cli.main(["eval", "paper", "--json", "--seeds", "2", "--tables", tables]) == 0
     whole = Plan(range(2), 1200.0)
-    assert asked == [replace(whole, sources=ALONE), replace(whole, positions=(), sources=FLEETS)]
+    assert asked == [replace(whole, sources=()), replace(whole, positions=())]
     for more in (["--quick"], ["--tensor", "map.npy"], ["--plots", "plots"]):
-        assert cli.main(["eval", "paper", "--tables", "fleets", *more]) == 1
+        assert cli.main(["eval", "paper", "--tables", "positions", *more]) == 1
         assert "leave out --" in capsys.readouterr().err
 
 
