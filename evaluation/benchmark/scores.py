@@ -15,13 +15,17 @@ from evaluation.campaign.figures import Report, Row, half_width, root_mean_squar
 from evaluation.campaign.workers import each
 from evaluation.fleet.drives import Scene, scene
 from evaluation.fleet.solving import served
+from evaluation.maps.cases import CELL_M
 from evaluation.maps.methods import METHODS, Layers, folded, in_order, merge_hard
 from evaluation.maps.score import border_distance, driven_cells, region_of, score_driven, true_layers, window_of
 from evaluation.maps.uncertainty import Believed
+from mapserver.config import ServerConfig
+from mapserver.layers.gap_filling import AREA_LAYERS, Area
 from protocol.arrays import Bools
 from protocol.site.ground_classes import UNKNOWN, resistance_class
 
-OURS = "soft_votes"  # with the map server's own calibration of machines
+# The map server with its own calibration of machines: what is known, and with its gaps filled.
+OURS, FILLED = "soft_votes", "soft_votes_filled"
 INTERIOR_M = 2.0  # from a border; nearer to one, 1 m of the position decides
 # Of one recording, over driven cells. right_pct is what entries are ordered by: nobody gains by leaving cells out.
 FIGURES = (
@@ -35,6 +39,8 @@ FIGURES = (
     "brier",
 )
 DIGITS = 3
+FILLING = tuple(AREA_LAYERS[f"{name}_filled"] for name in VALUES)
+GROUND = tuple(dict.fromkeys(name for layer in FILLING for name in layer.needs))  # that gaps are filled from
 
 
 @dataclass(frozen=True)
@@ -49,13 +55,22 @@ class Entry:
         path = self.folder / f"{drive.name}.csv" if self.folder else drive.folder(cache) / SAMPLES_FILE
         if self.folder and not is_samples(path):
             return read_map(path, true.truth)
-        samples = read_samples(path)
+        samples, window = read_samples(path), window_of(true.truth)
         if self.folder or self.name == OURS:
-            return folded(served(samples).items(), window_of(true.truth))
-        return merge_hard(METHODS[self.name], in_order(samples.values()), VALUES, window_of(true.truth))
+            return folded(served(samples).items(), window)
+        if self.name == FILLED:
+            return gaps_filled(folded(served(samples).items(), window, GROUND))
+        return merge_hard(METHODS[self.name], in_order(samples.values()), VALUES, window)
 
 
-BASELINES = tuple(Entry(name) for name in (*METHODS, OURS))
+def gaps_filled(layers: Layers) -> Layers:
+    """VALUES as the map server fills gaps between cells of GROUND."""
+    read = ServerConfig().read
+    area = Area(layers, CELL_M, read.fill_reach_m, read.boundaries)
+    return {name: layer.derive(area) for name, layer in zip(VALUES, FILLING, strict=True)}
+
+
+BASELINES = tuple(Entry(name) for name in (*METHODS, OURS, FILLED))
 
 
 def run(

@@ -125,6 +125,10 @@ def test_an_entry_of_the_same_samples_is_as_good_as_ours_and_one_of_the_truth_is
     rows = {row["entry"]: row for row in scores.run(data, QUICK, (ours, best), 1)["rows"]}
     assert {**rows["ours"], "entry": ""} == {**rows["soft_votes"], "entry": ""}
     assert (rows["best"]["right_pct"], next(iter(rows))) == (100.0, "best")
+    filled, known = rows["soft_votes_filled"], rows["soft_votes"]
+    assert filled["known_pct"] > known["known_pct"]
+    assert filled["right_pct"] > known["right_pct"]
+    assert filled["brier"] is None
 
 
 def write_truth(path: Path, true: Scene) -> None:
@@ -149,7 +153,7 @@ def test_the_command_makes_and_scores(made, data: Path, capsys: pytest.CaptureFi
     assert [row["name"] for row in json.loads(capsys.readouterr().out)["rows"]] == [d.name for d in QUICK.drives]
     assert cli.main(["bench", "score", *words]) == 0
     assert {row["entry"] for row in json.loads(capsys.readouterr().out)["rows"]} == {
-        *("last_write", "mean", "median", "kalman", "soft_votes")
+        *("last_write", "mean", "median", "kalman", "soft_votes", "soft_votes_filled")
     }
     assert cli.main(["bench", "score", str(data / "nobody"), *words]) == 1
     assert "an entry has one for each recording" in capsys.readouterr().err
