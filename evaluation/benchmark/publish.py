@@ -10,16 +10,14 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from evaluation.benchmark.recordings import HASHES, published_hashes
+from evaluation.benchmark.recordings import HASHES, PARTS, published_hashes
 from evaluation.campaign.figures import Report
 from protocol.files import write_whole
-
-HASHED = ("recording", "samples")
 
 
 def with_hashes(published: Mapping[str, Mapping[str, Mapping[str, str]]], made: Report) -> Report:
     """The published hashes with those of a report of `sitegrid bench make` in place of its edition's."""
-    return {**published, made["edition"]: {row["name"]: {part: row[part] for part in HASHED} for row in made["rows"]}}
+    return {**published, made["edition"]: {row["name"]: {part: row[part] for part in PARTS} for row in made["rows"]}}
 
 
 def main(paths: Sequence[str]) -> int:

@@ -22,6 +22,7 @@ from evaluation.maps.uncertainty import Believed
 from mapserver.config import ServerConfig
 from mapserver.layers.gap_filling import AREA_LAYERS, Area
 from protocol.arrays import Bools
+from protocol.errors import ConfigError
 from protocol.site.ground_classes import UNKNOWN, resistance_class
 
 # The map server with its own calibration of machines: what is known, and with its gaps filled.
@@ -55,7 +56,7 @@ class Entry:
         path = self.folder / f"{drive.name}.csv" if self.folder else drive.folder(cache) / SAMPLES_FILE
         if self.folder and not is_samples(path):
             return read_map(path, true.truth)
-        samples, window = read_samples(path), window_of(true.truth)
+        samples, window = read_samples(path, true.tracks), window_of(true.truth)
         if self.folder or self.name == OURS:
             return folded(served(samples).items(), window)
         if self.name == FILLED:
@@ -85,6 +86,7 @@ def run(
     drives = edition.drives
     for drive in drives:
         require_made(drive, cache)
+    _check_entries(entries, drives)
     jobs = [(entry, drive, cache) for drive in drives for entry in entries]
     figures: dict[tuple[str, str], Row] = {}
     for (entry, drive, _), row in each(_score, jobs, processes):
@@ -93,6 +95,21 @@ def run(
     rows = [summarise(entry, {drive.name: figures[entry.name, drive.name] for drive in drives}) for entry in entries]
     rows.sort(key=lambda row: -row["right_pct"])
     return {"recordings": len(drives), "seconds": edition.seconds, "rows": rows}
+
+
+def _check_entries(entries: Sequence[Entry], drives: Sequence[BenchDrive]) -> None:
+    """ConfigError for a name that comes twice, and for a file that is missing or has not its columns."""
+    names = [entry.name for entry in entries]
+    for entry in entries:
+        if not entry.folder:
+            continue
+        if not entry.folder.is_dir():
+            raise ConfigError(entry.folder, "is no folder; an entry is one with a file NAME.csv for each recording")
+        if names.count(entry.name) > 1 or not entry.name.isprintable():
+            taken = "stands in the table already" if entry.name.isprintable() else "cannot be printed"
+            raise ConfigError(entry.folder, f"an entry is called as its folder, and {entry.name!r} {taken}; rename it")
+        for drive in drives:
+            is_samples(entry.folder / f"{drive.name}.csv")
 
 
 def _score(job: tuple[Entry, BenchDrive, Path]) -> Row:
@@ -127,7 +144,7 @@ def figures_of(layers: Layers, true: Scene) -> Row:
 
 def _believed(layers: Layers, known: Bools, right: Bools) -> Believed | None:
     """Confidence of the known cells, where a map states any; a cell without is as sure as a coin of two."""
-    if CONFIDENCE not in layers or not np.isfinite(layers[CONFIDENCE]).any():
+    if CONFIDENCE not in layers or not np.isfinite(layers[CONFIDENCE]).any() or not known.any():
         return None
     return Believed(np.nan_to_num(layers[CONFIDENCE][known], nan=0.5), right[known])
 

@@ -11,12 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, Protocol, TypeVar
+from zipfile import BadZipFile
 
 import numpy as np
 
 from evaluation.campaign.recordings import PlannedDrive, RecordedDrive, code_version, digest, load, make
 from evaluation.campaign.workers import each
-from protocol.errors import SitegridError
+from protocol.errors import SitegridError, StoreError
 from protocol.files import whole_file
 
 Progress = Callable[[float, float, str], None]  # simulated seconds done, all of them, what was done last
@@ -124,9 +125,12 @@ def write_result(result: Any, file: BinaryIO) -> None:
 
 
 def read_result(kind: type[Result], path: Path) -> Result:
-    """Read what `write_result` wrote."""
-    with np.load(path) as columns:
-        return kind(**{name: value if value.ndim else json.loads(str(value)) for name, value in columns.items()})
+    """Read what `write_result` wrote; a StoreError where that is damaged."""
+    try:
+        with path.open("rb") as file, np.load(file) as columns:
+            return kind(**{name: value if value.ndim else json.loads(str(value)) for name, value in columns.items()})
+    except (EOFError, ValueError, TypeError, BadZipFile) as error:
+        raise StoreError(path, f"is damaged ({error}); delete it, and start again") from None
 
 
 # --- in the worker processes -----------------------------------------------------------------------------------------

@@ -49,6 +49,9 @@ def run(arguments: Namespace) -> int:
     if arguments.json:
         say(plain({"made": made_by(arguments.words), **report}))
     else:
-        rows = [{name: value for name, value in row.items() if name != "by_recording"} for row in plain(report)["rows"]]
+        hidden = {"by_recording", *recordings.PARTS}  # what is too wide to be read
+        rows = [{name: value for name, value in row.items() if name not in hidden} for row in plain(report)["rows"]]
         tell(table(rows))
+        if others := [row["name"] for row in rows if row.get("published") is False]:
+            tell(f"not as published: {', '.join(others)}; docs/benchmark.md says when that is so")
     return 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evaluation.benchmark import publish, recordings, scores
-from evaluation.benchmark.recordings import FULL, QUICK, file_hash
+from evaluation.benchmark.recordings import FULL, PARTS, QUICK, part_hash
 from evaluation.benchmark.scores import FIGURES, Entry, figures_of, summarise
 from evaluation.campaign.experiment import Runner
 from evaluation.fleet.drives import Scene, scene
@@ -81,14 +81,24 @@ def test_there_are_24_recordings_on_seeds_that_nothing_else_has():
     assert {drive.machines for drive in drives} == {4, 5}
 
 
-def test_hashes_are_of_names_and_contents_in_any_order(tmp_path: Path):
-    a, b = tmp_path / "a", tmp_path / "b"
-    a.write_text("1")
-    b.write_text("2")
-    first = file_hash([a, b], tmp_path)
-    assert first == file_hash([b, a], tmp_path)
-    b.write_text("3")
-    assert file_hash([a, b], tmp_path) != first
+def test_hashes_are_of_names_and_contents_and_of_an_archive_s_numbers(tmp_path: Path):
+    logs, truth = tmp_path / "logs", tmp_path / "truth"
+    logs.mkdir()
+    truth.mkdir()
+    (logs / "a").write_text("1")
+    (logs / "b").write_text("2")
+    first = part_hash(tmp_path, "logs")
+    assert first == part_hash(tmp_path, "logs")
+    (logs / "b").rename(logs / "c")
+    assert part_hash(tmp_path, "logs") != first
+    np.savez(truth / "map.npz", a=np.arange(3))
+    whole = part_hash(tmp_path, "truth")
+    np.savez_compressed(truth / "map.npz", a=np.arange(3))
+    assert part_hash(tmp_path, "truth") == whole
+    np.savez(truth / "map.npz", a=np.arange(4))
+    assert part_hash(tmp_path, "truth") != whole
+    (truth / "map.npz").write_bytes(b"PK")
+    assert part_hash(tmp_path, "truth") != whole
 
 
 # --- from nothing to the table ---------------------------------------------------------------------------------------
@@ -108,7 +118,10 @@ def made(data: Path) -> list[dict]:
 def test_the_quick_edition_has_the_published_hashes_and_the_stored_figures(made, data: Path):
     """`sitegrid bench score --quick --json` printed the figures; where sums round otherwise samples have other bits."""
     known = PUBLISHED[recordings.edition_key(QUICK)]
-    assert {row["name"]: row["recording"] for row in made} == {name: each["recording"] for name, each in known.items()}
+    parts = ("logs", "truth")
+    assert {row["name"]: [row[part] for part in parts] for row in made} == {
+        name: [each[part] for part in parts] for name, each in known.items()
+    }
     if arithmetic() == ARITHMETIC:
         assert [row["published"] for row in made] == [True] * len(QUICK.drives)
     assert plain(scores.run(data, QUICK, (), 1)) == json.loads(STORED.read_text())
@@ -142,8 +155,50 @@ def write_truth(path: Path, true: Scene) -> None:
 
 
 def test_without_recordings_one_line_says_what_to_do(tmp_path: Path):
-    with pytest.raises(ConfigError, match="make it with `sitegrid bench make`"):
+    with pytest.raises(ConfigError, match=r"`sitegrid bench make --quick --data .*` makes it"):
         scores.run(tmp_path, QUICK, (), 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["truth/tracks/loader-1.csv", "truth/truth_map.npz", "samples.csv"])
+def test_a_recording_that_was_cut_is_not_scored_on(made, data: Path, part: str):
+    path = QUICK.drives[0].folder(data) / part
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    try:
+        with pytest.raises(ConfigError, match="is not what was made; delete the folder"):
+            scores.run(data, QUICK, (), 1)
+        if part != "samples.csv":  # which are written again
+            with pytest.raises(ConfigError, match="truth: is not what was made"):
+                recordings.make(Runner(data), QUICK)
+    finally:
+        path.write_bytes(whole)
+
+
+@pytest.mark.slow
+def test_entries_are_looked_at_before_anything_is_scored(made, data: Path, tmp_path: Path):
+    def entry(name: str) -> Path:
+        folder = tmp_path / name
+        folder.mkdir(parents=True)
+        for drive in QUICK.drives:
+            (folder / f"{drive.name}.csv").write_text("x_m,y_m,resistance,grade_east,grade_north\n5,5,0.02,0,0\n")
+        return folder
+
+    none, cut = tmp_path / "none", entry("cut")
+    (cut / f"{QUICK.drives[1].name}.csv").unlink()
+    for folders, problem in (
+        ([entry("a/mine"), entry("b/mine")], "'mine' stands in the table already; rename it"),
+        ([entry("soft_votes")], "'soft_votes' stands in the table already; rename it"),
+        ([entry("two\nlines")], "cannot be printed; rename it"),
+        ([none], "is no folder"),
+        ([cut], "an entry has one for each recording"),
+    ):
+        with pytest.raises(ConfigError, match=problem):
+            scores.run(data, QUICK, folders, 1)
+
+
+def test_shorter_recordings_have_names_of_their_own():
+    assert not {drive.name for drive in FULL.drives} & {drive.name for drive in QUICK.drives}
 
 
 @pytest.mark.slow
@@ -156,16 +211,19 @@ def test_the_command_makes_and_scores(made, data: Path, capsys: pytest.CaptureFi
         *("last_write", "mean", "median", "kalman", "soft_votes", "soft_votes_filled")
     }
     assert cli.main(["bench", "score", str(data / "nobody"), *words]) == 1
-    assert "an entry has one for each recording" in capsys.readouterr().err
+    assert "nobody: is no folder" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_a_recording_that_differs_from_the_published_one_is_seen(made, data: Path, monkeypatch):
+def test_a_recording_that_differs_from_the_published_one_is_seen(made, data: Path, monkeypatch, capsys):
     changed = {
-        key: {name: {**each, "samples": "0"} for name, each in rows.items()} for key, rows in published().items()
+        key: {name: {**each, "samples.csv": "0"} for name, each in rows.items()} for key, rows in published().items()
     }
     monkeypatch.setattr(recordings, "published_hashes", lambda: changed)
     assert [row["published"] for row in recordings.make(Runner(data), QUICK)] == [False, False]
+    assert cli.main(["bench", "make", "--data", str(data), "--quick", "--processes", "1"]) == 0
+    said = "not as published: paper_site-2000-60s, loading-2000-60s; docs/benchmark.md says when that is so"
+    assert said in capsys.readouterr().out
     monkeypatch.setattr(recordings, "published_hashes", dict)
     assert [row["published"] for row in recordings.make(Runner(data), replace(QUICK))] == [None, None]
 
@@ -180,7 +238,7 @@ def test_what_was_made_can_be_published(made, monkeypatch, tmp_path: Path):
     monkeypatch.setattr(recordings, "HASHES", hashes)
     assert publish.main([str(report)]) == 0
     key = recordings.edition_key(QUICK)
-    own = {row["name"]: {part: row[part] for part in publish.HASHED} for row in made}
+    own = {row["name"]: {part: row[part] for part in PARTS} for row in made}
     assert json.loads(hashes.read_text()) == {"other": {}, key: own}
 
 

@@ -137,6 +137,17 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path):
     assert result.median is None
 
 
+def test_a_result_that_is_damaged_is_named_with_what_to_do(tmp_path: Path):
+    path = tmp_path / "result.npz"
+    with path.open("wb") as file:
+        write_result(Numbers(3, np.arange(3.0)), file)
+    whole = path.read_bytes()
+    for cut in (len(whole) // 2, 0):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(SitegridError, match=r"result.npz: is damaged .*; delete it, and start again"):
+            read_result(Numbers, path)
+
+
 @pytest.mark.parametrize("experiment", [table.EXPERIMENT, ground.EXPERIMENT, maps.EXPERIMENT], ids=lambda e: e.name)
 def test_results_depend_on_sources_that_exist_and_on_the_code_that_makes_them(experiment: Experiment):
     assert code_version(*experiment.sources)  # raises where one of them does not exist
