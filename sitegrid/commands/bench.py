@@ -40,7 +40,8 @@ def run(arguments: Namespace) -> int:
     raise_interrupts()  # the bar hides the cursor of the terminal
     edition, processes = recordings.QUICK if arguments.quick else recordings.FULL, arguments.processes or cores()
     title = {"make": "fleets drive, agents make samples", "score": "maps are compared with the truth"}[arguments.what]
-    with Display(title, headless=arguments.json) as display:
+    kept = arguments.data if arguments.what == "make" else None
+    with Display(title, headless=arguments.json, kept=kept) as display:
         if arguments.what == "make":
             rows = recordings.make(Runner(arguments.data, processes, display.show), edition)
             report = {"edition": recordings.edition_key(edition), "rows": rows}

@@ -330,7 +330,7 @@ def _experiment(
     from evaluation.campaign.workers import cores
 
     raise_interrupts()  # the bar hides the cursor of the terminal
-    with Display(title, headless=arguments.json) as display:
+    with Display(title, headless=arguments.json, kept=arguments.out) as display:
         runner = Runner(arguments.out, arguments.processes or cores(), display.show)
         report, outcomes = work(runner)
     if not arguments.json:

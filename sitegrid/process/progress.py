@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from sitegrid.process.lifetime import note
@@ -13,9 +14,13 @@ EVERY_S = 5.0  # between two plain lines
 
 
 class Display:
-    """Progress of a run; use it as a context. title: what goes on."""
+    """Progress of a run; use it as a context. title: what goes on.
 
-    def __init__(self, title: str, *, headless: bool) -> None:
+    kept: where what is done is kept, if the same command goes on with it; who interrupts is told.
+    """
+
+    def __init__(self, title: str, *, headless: bool, kept: Path | None = None) -> None:
+        self._kept = kept
         self._bar: Any = None
         self._task: Any = None
         self._next_s = 0.0
@@ -41,7 +46,9 @@ class Display:
             self._bar.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._bar:
             with suppress(OSError):
                 self._bar.stop()
+        if self._kept and kind is KeyboardInterrupt:
+            note(f"interrupted; what is done is kept in {self._kept}, and the same command goes on with it")

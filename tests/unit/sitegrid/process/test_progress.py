@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import sys
+from pathlib import Path
+
+import pytest
 
 from sitegrid.process import progress
 from sitegrid.process.progress import Display
@@ -32,3 +35,11 @@ def test_plain_lines_come_now_and_then_only(monkeypatch, capsys):
     for second in (1, 2, 3):
         display.show(second, 10, "recording")
     assert capsys.readouterr().err.count("recording") == 2
+
+
+@pytest.mark.parametrize("kept", [None, Path("out")])
+def test_who_interrupts_is_told_whether_the_command_goes_on(kept: Path | None, capsys):
+    with pytest.raises(KeyboardInterrupt), Display("machines drive", headless=True, kept=kept):
+        raise KeyboardInterrupt
+    said = capsys.readouterr().err
+    assert ("interrupted; what is done is kept in out, and the same command goes on with it" in said) == bool(kept)
