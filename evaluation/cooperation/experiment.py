@@ -15,8 +15,8 @@ from evaluation.cooperation.arms import Arm, arms
 from evaluation.cooperation.central import central_tasks
 from evaluation.cooperation.drives import REPAVED, TWO
 from evaluation.cooperation.live import LiveRun
-from evaluation.cooperation.network import FIGURES
-from evaluation.cooperation.scores import ROUNDS, SHARE_PCT, Judging, Scored, minutes_until
+from evaluation.cooperation.network import FIGURES, SHARE_PCT
+from evaluation.cooperation.scores import ROUNDS, Judging, Scored, minutes_until
 from evaluation.fleet import drives as fleet_drives
 from protocol.errors import SitegridError
 

@@ -15,6 +15,7 @@ from protocol.arrays import Bools, Floats, Floats32, Ints
 from protocol.site.ground_classes import UNKNOWN, resistance_class
 
 SURE = 0.6  # confidence from which a cell counts as known for certain
+SHARE_PCT = 90.0  # of the network's cells that are to be known, or of those that were repaved
 BORDER_M, BREAK_M = 2.0, 5.0  # from a border of soils, from a break of slope: nearer cells are judged apart
 STEP_M = 0.1  # between points of a line
 SLOPE_STEP = 0.01  # gradients that differ by less are one slope

@@ -15,7 +15,8 @@ from evaluation.campaign import pictures
 from evaluation.campaign.experiment import Runner
 from evaluation.campaign.figures import Report, Row
 from evaluation.campaign.pictures import BLUE, GREEN, ORANGE, VERMILION, head
-from evaluation.cooperation.scores import CENTRAL, SHARE_PCT
+from evaluation.cooperation.network import SHARE_PCT
+from evaluation.cooperation.scores import CENTRAL
 
 MACHINES = {"one": VERMILION, "two": ORANGE, "four": BLUE, "eight": GREEN}
 LINKS = {CENTRAL: GREEN, "four": BLUE, "slow": ORANGE, "lost": VERMILION}

@@ -23,6 +23,7 @@ from protocol.wire.session import free_endpoint
 from sitegrid.process.children import Child, Children, ProcessError
 from tests.integration.compose_database import DATABASE, DatabaseServer
 
+NOT_HERE = ("", "PATH", "NUMBA_CACHE_DIR")  # in an empty folder each service would compile the kernels anew
 _ENV = re.compile(r"^ENV (?P<pairs>(?:.*\\\n)*.*)$", re.MULTILINE)
 CHECK_S = 0.5  # between two health checks, in place of the file's own
 
@@ -42,9 +43,13 @@ def needed(services: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def image_environment(dockerfile: Path) -> dict[str, str]:
-    """What the image sets, but the path."""
+    """What the image sets, but NOT_HERE."""
     pairs = [p for match in _ENV.finditer(dockerfile.read_text()) for p in shlex.split(match["pairs"])]
-    return {name: value for name, _, value in (pair.partition("=") for pair in pairs) if name and name != "PATH"}
+    return {
+        name: value
+        for name, _, value in (pair.partition("=") for pair in pairs)
+        if name not in {"", "PATH", "NUMBA_CACHE_DIR"}
+    }
 
 
 @dataclass
