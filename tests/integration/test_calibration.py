@@ -225,7 +225,7 @@ def test_the_map_of_an_archive_and_its_facts_is_the_live_one(site: SiteRun):
 
 def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path: Path, children: Children):
     """It comes with the first acknowledgement of samples, and counts at a standstill or at the end of a tour."""
-    sim = SimConfig(machines=2, seconds=240, speed=10, seed=3, world="fast")
+    sim = SimConfig(machines=2, seconds=160, speed=10, seed=3, world="fast")
     site = SiteRun(tmp_path, children, free_endpoint(), sim)
     one, other = (config.stem for config in site.configs)
     with site.configs[0].open("a", encoding="utf-8") as text:

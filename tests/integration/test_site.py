@@ -10,6 +10,7 @@ import pytest
 from protocol.errors import LinkError, QueryError
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
+from sitegrid.client import connect
 from sitegrid.process.children import Children, wait_until
 from tests.integration.site_run import SiteRun, kill  # beside this file
 
@@ -146,5 +147,6 @@ def test_queries_that_are_refused_are_counted_and_say_why(site_run: SiteRun):
 
 def test_a_site_without_a_server_says_what_to_do(site_run: SiteRun):
     site_run.start_router()
-    with site_run.connect() as client, pytest.raises(LinkError, match="start one with `sitegrid server`"):
+    connected = connect(site_run.endpoint, site_run.site, timeout_s=1.0)
+    with connected as client, pytest.raises(LinkError, match="start one with `sitegrid server`"):
         client.info()

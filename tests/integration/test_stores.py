@@ -23,7 +23,7 @@ SOME = 20  # samples
 def site_run(tmp_path: Path, children: Children) -> SiteRun:
     """Machines that drive on for long after all of them have samples in the map."""
     return SiteRun(
-        tmp_path, children, free_endpoint(), SimConfig(machines=3, seconds=160, speed=8, seed=3, world="fast")
+        tmp_path, children, free_endpoint(), SimConfig(machines=2, seconds=120, speed=8, seed=3, world="fast")
     )
 
 
