@@ -15,7 +15,6 @@ import pytest
 from hypothesis import settings
 
 from benchmarks.postgres import server as postgres
-from evaluation.campaign.workers import cores
 from sitegrid.process.lifetime import SIGNALS
 from tests.paths import ROOT, SHARED_DATA
 
@@ -28,11 +27,6 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 # Repeatable on every machine, and no complaint about a slow one.
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, print_blob=True)
 settings.load_profile("repeatable")
-
-
-def pytest_xdist_auto_num_workers() -> int:
-    """Processes that run tests: more than there are cores, since tests wait a third of their time for others."""
-    return cores() * 3 // 2
 
 
 @pytest.fixture(scope="session")
