@@ -147,6 +147,8 @@ def test_queries_that_are_refused_are_counted_and_say_why(site_run: SiteRun):
 
 def test_a_site_without_a_server_says_what_to_do(site_run: SiteRun):
     site_run.start_router()
-    connected = connect(site_run.endpoint, site_run.site, timeout_s=1.0)
-    with connected as client, pytest.raises(LinkError, match="start one with `sitegrid server`"):
+    with (
+        connect(site_run.endpoint, site_run.site, timeout_s=1.0) as client,
+        pytest.raises(LinkError, match="start one with `sitegrid server`"),
+    ):
         client.info()
