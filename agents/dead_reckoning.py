@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder, Imu, Odometry, Reading, Steering, Torque, WheelReading
+from protocol.machine.readings import Encoder, Imu, Odometry, Payload, Reading, Steering, Torque, WheelReading
 from protocol.units import GRAVITY_MPS2
 
 TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
@@ -116,20 +116,22 @@ class _Wheel:
 class DeadReckoning:
     """Accumulates wheel travel and turn, without GPS. Readings of one stamp come with those of wheels last.
 
-    slip: wheel slip per traction (drive force over weight), taken off where the machine has a torque sensor. travel_m:
+    slip: wheel slip per traction (drive force over weight), taken off where the machine has a torque sensor. weighs:
+    whether payload readings count. mass_kg: with payload; a caller that estimates it may set it. travel_m:
     of `base_link`, down in reverse; distance_m: up in reverse too. traction: the newest. wheels: as of their newest
     reading. stands_since_ns: since when no wheel has rolled.
     """
 
-    def __init__(self, machine: MachineConfig, slip: float) -> None:
+    def __init__(self, machine: MachineConfig, slip: float, *, weighs: bool = True) -> None:
         self.wheels = WheelSpeed()
         self.stamp_ns = 0
         self.travel_m = 0.0
         self.angle_rad = 0.0
         self.distance_m = 0.0
         self.traction = 0.0
+        self.mass_kg = machine.mass_kg
         self.stands_since_ns = 0
-        self._machine = machine
+        self._machine, self._weighs = machine, weighs
         self._slip = slip
         self._up: dict[str, list[float]] = {}  # the vertical of `base_link` in each gyro's axes
         self._gyro_ns: dict[str, int] = {}
@@ -155,9 +157,11 @@ class DeadReckoning:
             self._curvature = math.tan(reading.angle_rad) / self._machine.wheelbase_m
             self._turned_ns = reading.stamp_ns
         elif isinstance(reading, Torque):
-            weight_n = self._machine.mass_kg * GRAVITY_MPS2
+            weight_n = self.mass_kg * GRAVITY_MPS2
             traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
             self.traction = traction if abs(traction) <= MAX_TRACTION else 0.0
+        elif isinstance(reading, Payload) and self._weighs:
+            self.mass_kg = self._machine.mass_kg + reading.payload_kg
 
     @property
     def pose(self) -> DeadReckonedPose:

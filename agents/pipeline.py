@@ -18,7 +18,7 @@ from agents.localisation.filters.belief import DivergedError, PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.localisation.imu_steps import Sensed
-from agents.localisation.localiser import LocalisationConfig, Localiser
+from agents.localisation.localiser import HeadingRefutedError, LocalisationConfig, Localiser
 from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler, Samples, joined
 from agents.smoothed_track import SmoothedTrack
 from agents.stream_order import Decision, StreamOrder, by_stamp
@@ -39,13 +39,15 @@ class Accepted(NamedTuple):
     """Readings of one stamp that count, at the stamp of what they measured; a tuple, as there are hundreds a second.
 
     poses: what they made possible or changed, oldest first. smoothed: past poses that became final with them, oldest
-    first. restarts: nothing before them counts any more; then smoothed are all that remained.
+    first. restarts: nothing before them counts any more; then smoothed are all that remained, and off_m is how far off
+    the places before may be.
     """
 
     readings: list[Sensed]
     poses: list[PoseBelief]
     smoothed: list[SmoothedPose]
     restarts: bool
+    off_m: float = 0.0
 
 
 class Positioning:
@@ -53,6 +55,7 @@ class Positioning:
 
     def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
         self._machine, self._config = in_name_order(machine), config.localisation
+        self._mass = config.estimation.mass
         self._projection, self._extent_m = Projection(site), site.extent_m
         self._sensors = {s.name: s for s in machine.sensors if s.use}
         self._order = StreamOrder()
@@ -86,6 +89,10 @@ class Positioning:
     def remaining(self) -> list[SmoothedPose]:
         """Smoothed poses that are not final, as known by now: the last words on them where the stream ends."""
         return self.localiser.remaining()
+
+    def conclude(self) -> list[PoseBelief]:
+        """Poses of a heading that what is known by now proves, as the stream ends or pauses."""
+        return self.localiser.conclude(self.dead_reckoning.distance_m)
 
     def accept(self, reading: Reading) -> Iterable[Accepted]:
         """Take in one reading; returns what counts of the stamp that it ends, to be iterated at once.
@@ -128,7 +135,7 @@ class Positioning:
         """Take in the readings of one stamp; None where all are refused."""
         taken: list[Sensed] = []
         smoothed: list[SmoothedPose] = []
-        restarts = False
+        restarts, off_m = False, 0.0
         for reading in readings:
             if (decision := self._order.decide(reading)) is Decision.REFUSE:
                 continue
@@ -142,11 +149,12 @@ class Positioning:
             self.dead_reckoning.update(reading, sensor)
         try:
             poses = self.localiser.update(taken, self.dead_reckoning)
-        except DivergedError:
-            self._counters["filter_restarts"] += 1
+        except (DivergedError, HeadingRefutedError) as error:
+            self._counters["heading_refuted" if isinstance(error, HeadingRefutedError) else "filter_restarts"] += 1
+            off_m = getattr(error, "off_m", 0.0)
             smoothed += self._restart()
             poses, restarts = [], True
-        return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts)
+        return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts, off_m)
 
     def _restart(self) -> list[SmoothedPose]:
         """Start again, and keep the counts; returns the smoothed poses that remained."""
@@ -159,9 +167,15 @@ class Positioning:
 
     def _start(self) -> None:
         """Start with nothing known, as after power-up or a jump of the clock."""
-        self.dead_reckoning = DeadReckoning(self._machine, self._config.slip)
-        self.localiser = Localiser(self._machine, self._projection, self._config)
+        weighs = self._mass == "message"
+        self.dead_reckoning = DeadReckoning(self._machine, self._config.slip, weighs=weighs)
+        self.localiser = Localiser(self._machine, self._projection, self._config, is_weighed=self._is_weighed())
         self.poses = PoseHistory()
+
+    def _is_weighed(self) -> bool:
+        """Whether the load is known; a machine whose data have no place for one carries none."""
+        carries = self._machine.payload_x_m or self._machine.payload_z_m
+        return not carries or self._mass != "message" or any(s.kind == "payload" for s in self._sensors.values())
 
 
 class Pipeline:
@@ -199,12 +213,14 @@ class Pipeline:
     def settle(self) -> Samples:
         """Samples of all that is known now, all of them final: no reading may come for long."""
         rest = self._take(self._positioning.finish())
-        return joined([*rest, self._settle(self._positioning.remaining())])
+        proven = self._positioning.conclude()
+        self._sampler.is_placing = self._positioning.localiser.is_proven
+        return joined([*rest, *self._place(proven), self._settle(self._positioning.remaining())])
 
     def finish(self) -> Samples:
         """The same, as the stream ends; what has no place then is counted."""
         samples = self.settle()
-        self._sampler.withheld["no_pose"] += self._sampler.waiting
+        self._withhold_waiting()
         return samples
 
     def consider(self, offer: Any) -> None:
@@ -222,6 +238,8 @@ class Pipeline:
         std_m = float(np.sqrt(np.linalg.eigvalsh(pose.covariance_m2)[-1])) if pose else None
         return {
             "aligned": localiser.is_aligned,
+            "heading_proven": localiser.is_proven,
+            "repeating": localiser.repeating,
             "position_std_m": std_m,
             "counters": dict(self._counters + self._positioning.counters),
             "withheld": dict(self._sampler.withheld),
@@ -236,20 +254,21 @@ class Pipeline:
         return [samples for accepted in stamps for samples in self._take_one(accepted)]
 
     def _take_one(self, accepted: Accepted) -> list[Samples]:
-        readings, poses, smoothed, restarts = accepted
+        readings, poses, smoothed, restarts, off_m = accepted
         self._track.append(smoothed)
         made: list[Samples] = []
         if restarts:
-            made.append(self._settle(()))
+            made.append(self._settle((), off_m))
             self._count_withheld()
             self._start(self._estimator.calibration)
-        for pose in poses:  # each at once: after a late alignment they are more than the history holds
-            self._positioning.poses.append(pose)
-            made += self._due_samples()
+        self._sampler.is_placing = self._positioning.localiser.is_proven
+        made += self._place(poses)
         stamp_ns = readings[0][0].stamp_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
         speed_mps, known_c_rr, newest = float(belief.x[SPEED]) if belief else 0.0, self._known_c_rr(), self.pose
+        if mass_kg := self._estimator.estimated_mass_kg:
+            dead_reckoning.mass_kg = mass_kg
         for reading, sensor in readings:
             self._estimator.update(reading, sensor, dead_reckoning, known_c_rr, newest)
             distance_m = self._odometer.update(reading, dead_reckoning.distance_m, speed_mps)
@@ -259,19 +278,36 @@ class Pipeline:
             made.append(Samples(NOTHING, self._sampler.final_samples(self._track.corrected)))
         return made
 
+    def _place(self, poses: Sequence[PoseBelief]) -> list[Samples]:
+        """Samples that poses make possible; each pose at once: of a late alignment they are more than history holds."""
+        made: list[Samples] = []
+        for pose in poses:
+            self._positioning.poses.append(pose)
+            made += self._due_samples()
+        return made
+
     def _due_samples(self) -> list[Samples]:
         rows = self._sampler.due_samples(self._newest_ns, self._estimator.at)
         if not len(rows):
             return []
         return [Samples(rows, NOTHING if self._smooths else self._sampler.final_samples(lambda pose: pose))]
 
-    def _settle(self, remaining: Sequence[SmoothedPose]) -> Samples:
-        """Samples of all that is known. remaining: smoothed poses that are not final."""
+    def _settle(self, remaining: Sequence[SmoothedPose], off_m: float = 0.0) -> Samples:
+        """Samples of all that is known. remaining: smoothed poses that are not final. off_m: how far off places are."""
         rows = self._sampler.due_samples(self._newest_ns, self._estimator.at, waits=False)
-        return Samples(rows, self._sampler.final_samples(lambda pose: self._track.corrected_by_now(pose, remaining)))
+
+        def corrected(pose: PoseBelief) -> PoseBelief:
+            known = self._track.corrected_by_now(pose, remaining)
+            return replace(known, covariance_m2=known.covariance_m2 + off_m**2 * np.eye(2)) if off_m else known
+
+        return Samples(rows, self._sampler.final_samples(corrected))
+
+    def _withhold_waiting(self) -> None:
+        unproven = self.pose is not None and not self._sampler.is_placing
+        self._sampler.withheld["heading_unproven" if unproven else "no_pose"] += self._sampler.waiting
 
     def _count_withheld(self) -> None:
-        self._sampler.withheld["no_pose"] += self._sampler.waiting
+        self._withhold_waiting()
         self._counters.update({f"withheld_{reason}": n for reason, n in self._sampler.withheld.items()})
 
     def _known_c_rr(self) -> float | None:

@@ -112,12 +112,14 @@ class Odometer:
 class Sampler:
     """Makes samples; counts by reason what is `withheld` and what is sampled `without_resistance`.
 
-    poses: where the machine was. load_centre_m: how far ahead of the pose a sample lies.
+    poses: where the machine was. load_centre_m: how far ahead of the pose a sample lies. is_placing: whether poses may
+    become samples; marks wait until then.
     """
 
     def __init__(self, poses: PoseHistory, load_centre_m: float) -> None:
         self.withheld: Counter[str] = Counter()
         self.without_resistance: Counter[str] = Counter()
+        self.is_placing = True
         self._poses = poses
         self._load_centre_m = load_centre_m
         self._marked_m = 0.0
@@ -148,7 +150,7 @@ class Sampler:
             mark = self._marks.popleft()
             self._estimated.append((mark, estimate_at(mark.stamp_ns)))
         newest = self._poses.newest
-        if not self._estimated or not newest or self._estimated[0][0].stamp_ns > newest.stamp_ns:
+        if not self.is_placing or not self._estimated or not newest or self._estimated[0][0].stamp_ns > newest.stamp_ns:
             return NOTHING
         made: list[Place] = []
         while self._estimated and self._estimated[0][0].stamp_ns <= newest.stamp_ns:

@@ -30,6 +30,7 @@ NEAR_NS = 200_000_000  # a stamp this far from a step has no slope
 SILENT_NS = 1_000_000_000  # other sensors have readings, but no step was made for so long
 JOLTS = frozenset({"accelerometer", "slip"})  # then the accelerometer does not show the slope ahead
 LOADING_S = 3.0  # a machine that stands so long may have loaded or dumped
+MAX_LOADED = 4.0  # loaded mass over empty mass; forces that say more are no mass
 MODEL_STD = 0.0015  # error of the balance itself [-], which no calibration removes
 
 
@@ -130,6 +131,16 @@ class GroundEstimator:
             return NOTHING_KNOWN.reason
         reason = self._judged[-1].reason if self._judged else ""
         return reason if reason in FAULTS else ""
+
+    @property
+    def estimated_mass_kg(self) -> float | None:
+        """Mass with payload, by forces; None where the configuration does not ask for it.
+
+        A scale error s of drive force over mass means a true mass of m / (1 - s).
+        """
+        if self._config.mass != "estimated":
+            return None
+        return self._machine.mass_kg / max(1 - self._resistance.scale, 1 / MAX_LOADED)
 
     @property
     def calibration(self) -> Calibration:

@@ -98,6 +98,11 @@ class KalmanResistance:
         self._count = 0  # of all steps
         self._load_has_changed = False  # since the last step
 
+    @property
+    def scale(self) -> float:
+        """The scale error of drive force over mass [-]; 0 where it is not estimated."""
+        return float(self._before(len(self._steps)).x[SCALE])
+
     def update(self, step: BalanceStep) -> None:
         """Filter a step, and search for a border."""
         self._noise.update(step)

@@ -56,6 +56,11 @@ class RecursiveResistance:
         self._stamp_ns = 0
         self._force = (0.0, 1.0)  # share and regressor of the last step
 
+    @property
+    def scale(self) -> float:
+        """The scale error of drive force over mass [-]; 0 where it is not estimated."""
+        return float(self._squares.parameters[0])
+
     def update(self, step: BalanceStep) -> None:
         """Add a step."""
         self._force = (step.share, step.regressor)

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation.filters import state
 from agents.localisation.filters.belief import Belief
-from agents.localisation.gps import Fix
+from agents.localisation.gps import MIN_FIX_STD_M, Fix
 from agents.localisation.imu_steps import FilterStep
 from protocol.arrays import Floats
 from protocol.rotations import wrap_angle
@@ -17,52 +17,84 @@ from protocol.units import GRAVITY_MPS2
 
 DISTANCE_M = 12.0  # driven before the heading is taken from GPS,
 SPREAD_M = 3.0  # and the least spread of the positions around their mean, against slow errors of GPS
-MIN_FIXES = 4
+MIN_FIXES = 4.0  # of equal weight
+MAX_STD_RAD = 0.3  # of a heading that a filter can start from: it linearises
+MAX_MISFIT = 2.5  # mean square of residuals over their variance; more, and a first stretch may be off
+MIN_SCALE, MAX_SCALE = 0.8, 1.25  # of dead reckoning: wheels of another radius, and slow errors of GPS on a short way
 SPEED_STD_MPS = 3.0  # of the first belief: the machine may drive already, and wheels take a moment to show it
 GIVEN_STD_M, GIVEN_STD_RAD = 0.5, 0.02  # of a start that is configured
 GYRO_BIAS_RADPS = 5e-3  # standard deviations of the first belief: bias of each yaw gyro,
 WHEEL_SCALE = 0.03  # and scale of the wheels
+TO_COMPLEX = np.array([1.0, 1.0j])
+TINY = 1e-9
 
 
 @dataclass(frozen=True)
 class Alignment:
     """The dead-reckoned frame in `map`: rotation [rad] with its standard deviation, and the place of its origin [m].
 
-    fix_std_m: standard deviation of the origin.
+    fix_std_m: standard deviation of the origin. since_ns: stamp of the first fix that counts.
     """
 
     rotation_rad: float
     std_rad: float
     origin_m: tuple[float, float]
     fix_std_m: float
+    since_ns: int = 0
 
 
-def align(reckoned_m: Floats, fixes_m: Floats, fix_std_m: float) -> Alignment | None:
+def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Alignment, int] | None:
     """Fit dead-reckoned antenna positions (n, 2) onto fixes (n, 2) by rotation and shift (Umeyama 1991, in 2-D).
 
-    fix_std_m: error of one fix. Returns None where all positions coincide. The standard deviation takes half the
-    spread for granted: slow GPS errors do not average out.
+    variance_m2: of each fix (n,), slow errors included; they weigh it. Returns the alignment and the index of the first
+    fix that counts: 0, unless the residuals say that a first stretch is off; then the rest that shows the heading best
+    counts. None where nothing shows it. Points are complex numbers here: with centred d and f and weights w,
+
+        rotation = arg sum w conj(d) f        residuals = sum w |f|^2 + s^2 sum w |d|^2 - 2 s |sum w conj(d) f|
+
+    where s is the scale of dead reckoning, within bounds. The standard deviation takes half the spread for granted, as
+    slow errors do not average out, and grows with residuals that are larger than the variances say (Birge 1932).
     """
-    origin, target = reckoned_m.mean(axis=0), fixes_m.mean(axis=0)
-    d, f = reckoned_m - origin, fixes_m - target
-    spread_m = float(np.sqrt((d**2).sum(axis=1).mean()))
-    if spread_m < 1e-6:
+    n, weight = len(fixes_m), 1 / variance_m2
+    about_d, about_f = reckoned_m[-1], fixes_m[-1]  # sums stay small
+    d, f = (reckoned_m - about_d) @ TO_COMPLEX, (fixes_m - about_f) @ TO_COMPLEX
+    columns = (
+        weight,
+        weight**2,
+        weight * d,
+        weight * f,
+        weight * d.conj() * f,
+        weight * abs(d) ** 2,
+        weight * abs(f) ** 2,
+    )
+    total, squares, sum_d, sum_f, product, d_d, f_f = (np.cumsum(c[::-1])[::-1] for c in columns)  # from each fix on
+    product = product - sum_d.conj() * sum_f / total
+    d_d, f_f = (d_d - abs(sum_d) ** 2 / total).real, (f_f - abs(sum_f) ** 2 / total).real
+    scale = np.clip(abs(product) / np.maximum(d_d, TINY), MIN_SCALE, MAX_SCALE)
+    residuals = np.maximum(f_f + scale**2 * d_d - 2 * scale * abs(product), 0.0)
+    misfit = residuals / np.maximum(2.0 * np.arange(n, 0, -1) - 4, 1.0)
+    fix_std_m, spread_m = np.sqrt(total / squares), np.sqrt(np.maximum(d_d, 0.0) / total)
+    std_rad = fix_std_m * np.sqrt(np.maximum(misfit, 1.0)) / (2 * np.maximum(spread_m, TINY))
+    shows = (spread_m >= SPREAD_M) & (total**2 / squares >= MIN_FIXES * (1 - TINY)) & (std_rad <= MAX_STD_RAD)
+    if not shows.any():
         return None
-    rotation = math.atan2(float((d[:, 0] * f[:, 1] - d[:, 1] * f[:, 0]).sum()), float((d * f).sum()))
-    shift = target - _turned(rotation, *origin.tolist())
-    return Alignment(rotation, fix_std_m / (2 * spread_m), (float(shift[0]), float(shift[1])), fix_std_m)
+    first = 0 if shows[0] and misfit[0] <= MAX_MISFIT else int(np.argmin(np.where(shows, std_rad, np.inf)))
+    rotation = float(np.angle(product[first]))
+    mean_d, mean_f = sum_d[first] / total[first], sum_f[first] / total[first]
+    from_d, to_f = complex(*about_d) + mean_d, complex(*about_f) + mean_f
+    origin = to_f - from_d * complex(math.cos(rotation), math.sin(rotation))
+    return Alignment(rotation, float(std_rad[first]), (origin.real, origin.imag), float(fix_std_m[first])), first
 
 
-def align_fixes(fixes: Sequence[Fix], distance_m: float) -> Alignment | None:
-    """The alignment by absolute fixes, once the distance driven shows the heading; None before."""
+def align_fixes(fixes: Sequence[Fix]) -> Alignment | None:
+    """The alignment by absolute fixes, in the order of their stamps; None where they do not show the heading."""
     absolute = [fix for fix in fixes if fix.is_absolute]
-    if distance_m < DISTANCE_M or len(absolute) < MIN_FIXES:
+    if len(absolute) < MIN_FIXES:
         return None
     antennas = np.array([fix.reckoned_antenna_m for fix in absolute])
-    if float(np.sqrt(((antennas - antennas.mean(axis=0)) ** 2).sum(axis=1).mean())) < SPREAD_M:
-        return None
-    std_m = math.sqrt(sum(float(fix.variance_m2.mean()) for fix in absolute) / len(absolute))
-    return align(antennas, np.array([fix.position_m for fix in absolute]), std_m)
+    variance_m2 = np.array([float(fix.variance_m2.mean()) for fix in absolute])
+    found = align(antennas, np.array([fix.position_m for fix in absolute]), np.maximum(variance_m2, MIN_FIX_STD_M**2))
+    return replace(found[0], since_ns=absolute[found[1]].stamp_ns) if found else None
 
 
 def align_start(start: Sequence[float], reckoned: DeadReckonedPose) -> Alignment:

@@ -16,7 +16,14 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation import measurements
 from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor
-from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, anchor_states
+from agents.localisation.filters.belief import (
+    Belief,
+    Change,
+    Conditioned,
+    Measurement,
+    anchor_states,
+    restate_states,
+)
 from agents.localisation.filters.late_measurements import RELOCK
 from agents.localisation.filters.motion import GpsError, gps_covariance
 from agents.localisation.filters.state import YAW, Layout
@@ -31,6 +38,7 @@ MIN_FIX_STD_M = 0.3  # receivers state less than their error; one whose std is c
 GATE_SIGMA = 4.0  # fixes further off are refused: outliers of GPS are common
 AGREED_NS = 3_000_000_000  # so old a fix may be to say whether its receiver agrees with the filter
 FADED = 15  # correlation times after which a jump is forgotten
+RESTATED = 4.0  # a receiver that states a variance so many times as large or small has another error from then on
 MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
 
 
@@ -88,6 +96,7 @@ class Receivers(ModalSensors[Fix]):
         self._projection, self._layout, self._slow = projection, layout, slow
         self._states = {s.name: i for i, s in enumerate(drifting(sensors))} if slow else {}
         self._drift_m2 = dict.fromkeys(self._states, MIN_DRIFT_M2)  # variance of the slow error, without an anchor's
+        self._stated_m2: dict[str, float] = {}  # the same, as it was when it last became another one
         absolute = [s.name for s in self._sensors.values() if s.mode == ABSOLUTE]
         self._compared = {name: i for i, name in enumerate(absolute)} if slow and machine_share is None else {}
         self._estimator = ShareEstimator(len(absolute))
@@ -152,6 +161,11 @@ class Receivers(ModalSensors[Fix]):
         """Note what the filter made of a fix: the receiver's error has its first value now."""
         super().confirm(fix, result)
         name = fix.sensor.name
+        if name in self._states:
+            drift_m2 = self._drift_m2[name]
+            before_m2 = self._stated_m2.setdefault(name, drift_m2)
+            if not 1 / RESTATED < drift_m2 / before_m2 < RESTATED:
+                self._stated_m2[name] = drift_m2
         self._monitors[name].note(result, self._believed_error(name, result.belief))
         if fix.sensor.mode == DIFFERENTIAL or not math.isfinite(result.nis):
             return  # a velocity says nothing of the place
@@ -162,7 +176,7 @@ class Receivers(ModalSensors[Fix]):
             if self._refused[name] % RELOCK:
                 return
             del self._off_m[name]
-            if self._is_outvoted(fix):
+            if self.is_outvoted(fix):
                 self._jumps[name] = (fix.stamp_ns, float((result.innovation**2).mean()))
             return
         self._refused[name] = 0
@@ -201,10 +215,13 @@ class Receivers(ModalSensors[Fix]):
         opens: tuple[slice, ...] = (measurements.PLACE,)
         if self._slow:
             error = self._layout.gps_error(self._states[sensor.name])
-            self._drift_m2[sensor.name] = _drift_m2(fix)
+            self._drift_m2[sensor.name] = drift_m2 = _drift_m2(fix)
+            before_m2 = self._stated_m2.get(sensor.name, drift_m2)
             if sensor.name not in self._confirmed:  # a receiver brings its own unknown error
                 change = self._joining(fix, error)
-            if self._is_outvoted(fix):
+            elif not 1 / RESTATED < drift_m2 / before_m2 < RESTATED:
+                change = partial(restate_states, states=error, before=before_m2, after=drift_m2)
+            if self.is_outvoted(fix):
                 opens = (error,)
             elif not self._votes(fix) and self._has_jumped(fix.sensor.name, _mean(self._white(fix))):
                 # nobody tells whether receiver or filter went wrong: the motion will show
@@ -213,7 +230,7 @@ class Receivers(ModalSensors[Fix]):
         gate = sensor.gate(GATE_SIGMA)
         return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
 
-    def _is_outvoted(self, fix: Fix) -> bool:
+    def is_outvoted(self, fix: Fix) -> bool:
         """Whether as many other receivers agree with the filter as do not: then a refused one errs, not the filter."""
         votes = self._votes(fix)
         return sum(votes) > votes.count(False)

@@ -1,44 +1,38 @@
-"""The localiser: readings in, poses out. Until it knows its heading it only collects.
+"""The localiser: readings in, poses out. It collects until the heading shows, then judges it until it is proven.
 
-It is one module because every kind of event meets here the one filter that all of them change.
+A heading that GPS shows may be wrong: a receiver that has just started is tens of metres off, and says so or not. So it
+is unproven at first, and all events are kept. A receiver that the filter refuses RELOCK times in a row takes such a
+heading back: what came before its refusals counts no longer, and the rest is aligned and filtered again.
 """
 
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-from agents.dead_reckoning import DeadReckoning, turn_source
-from agents.localisation.alignment import Alignment, align_fixes, align_start, start_belief
+from agents.dead_reckoning import DeadReckoning
+from agents.localisation.alignment import DISTANCE_M, Alignment, align_fixes, align_start
 from agents.localisation.consistency import Consistency
-from agents.localisation.corrections import Corrections, not_used
 from agents.localisation.filters.belief import Belief, Filter, Measurement, PoseBelief, pose_of
 from agents.localisation.filters.ekf import Ekf
-from agents.localisation.filters.late_measurements import Fusion
-from agents.localisation.filters.motion import GpsError, MotionModel
-from agents.localisation.filters.smoother import SmoothedPose, nothing_past
-from agents.localisation.filters.state import YAW, Layout, X, Y, Z
+from agents.localisation.filters.smoother import SmoothedPose
+from agents.localisation.filters.state import YAW
 from agents.localisation.filters.ukf import Ukf
-from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.gps import Fix
 from agents.localisation.gps_velocity import gps_velocity
-from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
-from agents.localisation.measurements import STANDSTILL
-from agents.localisation.motion_sensors import MotionSensors, shows_tilt
-from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import ABSOLUTE, MachineConfig
+from agents.localisation.repeats import Repeats
+from agents.localisation.tracker import Event, Tracker, TrackerConfig
+from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction, Gps, GpsVelocity
+from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
-# Without GPS for so long, wheels and IMUs teach neither place and heading nor the wheels' scale s and the gyros' bias:
-# they show none of them, but h = (1 + s) v and the centripetal w x v are linearised at a speed and a rate that jitter
-# from step to step, which looks like information. Fixes outweigh it; without them it bent the scale by 6 % and the bias
-# by 0.4 degrees per second in ten minutes. Standstills and absolute headings still teach all that correlates with them.
-UNPLACED_S = 5.0
-COLLECTED = 24_000  # steps and fixes kept while the heading is unknown: 20 minutes; a machine that waits needs no more
-Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
+COLLECTED = 24_000  # steps, fixes and poses kept while the heading is unproven: 20 minutes
+PROVEN_S, PROVEN_M = 30.0, 24.0  # time and way without refusals after which a heading is proven
+REFUTED_SIGMA = 3.0  # a proven heading is refuted if refused fixes show one that is further off
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
 MAX_LAG_S = 3600.0  # each second of it is a node to smooth
@@ -81,209 +75,243 @@ class LocalisationConfig:
         return self.lag_s if self.profile == "default" else 0.0
 
 
+class HeadingRefutedError(ArithmeticError):
+    """A proven heading is wrong. off_m: how far the place was off when that showed."""
+
+    def __init__(self, off_m: float) -> None:
+        super().__init__(f"the heading is wrong, the place by {off_m:.0f} m")
+        self.off_m = off_m
+
+
 class Localiser:
     """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order.
 
-    engine: the filter; an evaluation may put one that watches it in its place, before the first reading.
+    engine: the filter; an evaluation may put one that watches it in its place, before the first reading. is_weighed:
+    whether the machine's load is known. is_proven: whether poses may become samples.
     """
 
     def __init__(
-        self, machine: MachineConfig, projection: Projection, config: LocalisationConfig, step_s: float = STEP_S
+        self,
+        machine: MachineConfig,
+        projection: Projection,
+        config: LocalisationConfig,
+        step_s: float = STEP_S,
+        *,
+        is_weighed: bool = True,
     ) -> None:
-        self._config = config
         self.engine = _engine(config)
-        augmented = config.profile == "default"
-        layout = _layout_of(machine) if augmented else Layout()
-        self._gatherer = StepGatherer(machine, step_s)
-        self._receivers = Receivers(
-            machine.sensors, projection, layout, slow=augmented, machine_share=machine.machine_share
+        self.is_proven = False
+        self._config = config
+        tyres, is_started = (config.slip, config.slip_soft), bool(config.start)
+        self._tracker_config = TrackerConfig(
+            machine, projection, config.profile, tyres, step_s, config.smoothing_s, is_started, is_weighed
         )
-        self._base = machine.base
-        self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
-        self._references = References(machine.sensors, layout, slow=augmented)
-        source, on_plane = turn_source(machine), not shows_tilt(machine, config.profile)
-        tyres = config.slip, config.slip_soft
-        self._body = MotionSensors(machine, layout, step_s, tyres, on_plane=on_plane)
-        turn_error = self._body.turn_error_radps if augmented and source and source.kind == "odometry" else 0.0
-        self._model = MotionModel(layout, on_plane, self._gps_errors(), turn_error_radps=turn_error)
-        self._fusion: Fusion | None = None
-        self._placed_ns = 0  # stamp of the newest fix or velocity by GPS that was accepted
+        self._tracker = Tracker(self._tracker_config)
+        self._gatherer = StepGatherer(machine, step_s)
+        self._repeats = Repeats()
+        self._counters: Counter[str] = Counter()
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
         self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
+        self._refused: deque[Fix] = deque(maxlen=COLLECTED)  # since the filter took one
+        self._since: tuple[int, float] = (0, 0.0)  # stamp of the first fix that counts, and the way at the alignment
+        self._poses: deque[PoseBelief] = deque(maxlen=COLLECTED)  # of the unproven heading
+        self._smoothed: list[SmoothedPose] = []
 
     @property
     def is_aligned(self) -> bool:
         """Whether the heading is known."""
-        return self._fusion is not None
+        return self._tracker.fusion is not None
 
     @property
     def counters(self) -> Counter[str]:
         """Measurements used and gated, readings refused."""
-        of_parts = [part.counters for part in (self._fusion, self._corrections) if part]
-        return sum(of_parts, self._body.counters + self._gatherer.counters)
+        return self._tracker.counters + self._gatherer.counters + self._repeats.counters + self._counters
+
+    @property
+    def repeating(self) -> list[str]:
+        """Names of receivers that have repeated one value for long while the machine moved."""
+        return self._repeats.lasting
 
     @property
     def consistency(self) -> dict[str, Consistency]:
         """How consistent the filter is with each GPS receiver, of those with enough fixes."""
-        return self._receivers.consistency
+        return self._tracker.receivers.consistency
 
     def base_report(self) -> dict[str, Any] | None:
         """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
-        if self._corrections:
-            return self._corrections.report(self._fusion.belief.stamp_ns if self._fusion else 0)
-        return not_used(self._base, self._config.profile) if self._base else None
+        return self._tracker.base_report()
 
     @property
     def machine_share(self) -> float | None:
         """Share of the slow variance that the receivers have in common, as it is taken for; None of fewer than two."""
-        return self._receivers.machine_share
+        return self._tracker.receivers.machine_share
 
     @property
     def wheel_scale(self) -> float | None:
         """How much further the wheels turn than the machine moves [-], as believed; None where it is no state."""
-        states = self._model.layout.wheel_scales
-        return float(self.belief.x[states.start]) if self.belief and states.stop > states.start else None
+        return self._tracker.wheel_scale
 
     @property
     def belief(self) -> Belief | None:
         """The whole state, once it is known."""
-        return self._fusion.belief if self._fusion else None
+        return self._tracker.belief
 
     def take_smoothed(self) -> list[SmoothedPose]:
-        """Smoothed poses that became final since the last call, oldest first."""
-        return self._fusion.take_smoothed() if self._fusion else []
+        """Smoothed poses that became final since the last call, oldest first; none of an unproven heading."""
+        if self._tracker.fusion:
+            self._smoothed += self._tracker.fusion.take_smoothed()
+        if not self.is_proven:
+            return []
+        taken, self._smoothed = self._smoothed, []
+        return taken
 
     def remaining(self) -> list[SmoothedPose]:
-        """Smoothed poses within the lag, as known by now; the last is the newest belief's. They stay."""
-        return self._fusion.remaining() if self._fusion else []
+        """Smoothed poses that are not final, as known by now; the last is the newest belief's. They stay."""
+        fusion = self._tracker.fusion
+        return self._smoothed + fusion.remaining() if fusion else []
 
     def take(self, correction: Correction) -> None:
         """Keep a correction of a base station until it is due, with a later reading."""
-        if self._corrections and self._fusion:
-            self._corrections.take(correction, self._fusion.belief.stamp_ns)
+        self._tracker.correct(correction)
 
     def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in the readings of one stamp, after dead reckoning did; returns poses that became possible or changed.
 
-        In the order of their stamps.
+        In the order of their stamps; those of an unproven heading once more when it is proven. Raises
+        HeadingRefutedError where a proven heading is wrong: nothing is left to go on with but a new start.
         """
+        distance_m, was_proven = dead_reckoning.distance_m, self.is_proven
+        beliefs: list[Belief] = []
+        for event in self._events(readings, dead_reckoning):
+            beliefs += self._filter(event, distance_m) if self.is_aligned else self._collect(event, distance_m)
+        poses = [pose_of(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
+        if was_proven:
+            return poses
+        self._keep(poses)
+        return self._proven_poses() if self.is_proven else poses
+
+    def conclude(self, distance_m: float) -> list[PoseBelief]:
+        """Prove the heading by what there is, as no more may come; returns the poses that may become samples now."""
+        if self.is_proven or not self._holds(distance_m):
+            return []
+        self.is_proven = True
+        return self._proven_poses()
+
+    def _events(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[Event]:
+        """What the filter takes of the readings of one stamp; a step that they end comes first."""
         fast: list[Sensed] = []
         events: list[Event] = []
         for reading, sensor in readings:
-            if isinstance(reading, Gps):
-                events.append(self._receivers.fix(reading, dead_reckoning.pose))
-            elif isinstance(reading, GpsVelocity):
-                events.append(gps_velocity(reading, sensor))
+            if isinstance(reading, Gps | GpsVelocity):
+                if self._repeats.is_repeated(reading, dead_reckoning.distance_m):
+                    continue
+                if isinstance(reading, Gps):
+                    events.append(self._tracker.receivers.fix(reading, dead_reckoning.pose))
+                else:
+                    events.append(gps_velocity(reading, sensor))
             else:
                 fast.append((reading, sensor))
-        if fast and (step := self._gatherer.gather(fast, dead_reckoning)):
-            events.insert(0, step)
-        beliefs: list[Belief] = []
-        for event in events:
-            known = self._fusion
-            beliefs += self._filter(known, event) if known else self._collect(event, dead_reckoning.distance_m)
-        return [pose_of(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
+        step = self._gatherer.gather(fast, dead_reckoning) if fast else None
+        return [step, *events] if step else events
 
-    def _filter(self, fusion: Fusion, event: Event) -> list[Belief]:
-        """Beliefs that an event changed, and then a correction that is due."""
-        beliefs = self._filter_own(fusion, event)
-        return beliefs + self._correct(fusion, self._corrections, event) if self._corrections else beliefs
-
-    def _filter_own(self, fusion: Fusion, event: Event) -> list[Belief]:
-        """Beliefs that an event of the machine's own sensors changed."""
-        if not isinstance(event, FilterStep):
-            return self._place(fusion, event)
-        absolute = self._references.measurements(event, fusion.belief)
-        errors = self._references.errors
-        layout = fusion.model.layout
-        unplaced = layout.wheel_scale and event.stamp_ns - self._placed_ns > UNPLACED_S * 1e9
-        reckons = unplaced and bool(self._placed_ns or self._config.start)  # else the fix that aligned it comes at once
-        fusion.model = replace(fusion.model, traction=event.traction, heading_errors=errors, reckons=reckons)
-        beliefs: list[Belief] = []
-        for orientation in self._references.own_stamped(event):
-            beliefs += self._filter_modal(fusion, self._references, orientation)
-        inertial, turn, wheels = self._body.inertial(event), self._body.turn(event), self._body.wheels(event)
-        if unplaced:
-            headed = (YAW, *range(layout.gyro_biases.start, layout.gyro_biases.stop)) if reckons else ()
-            considers = (X, Y, Z, layout.wheel_scales.start, *headed)
-            inertial, wheels = ([_considering(m, considers) for m in several] for several in (inertial, wheels))
-        measurements = [*inertial, *absolute, *turn, *wheels]
-        return beliefs + (fusion.add(measurements) if measurements else [])
-
-    def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:
-        """Beliefs that a fix or a velocity by GPS changed."""
-        if isinstance(event, Fix):
-            name, beliefs = event.sensor.name, self._filter_modal(fusion, self._receivers, event)
-        else:
-            name, beliefs = event.sensor, fusion.add([event])
-        if beliefs and fusion.last[name].accepted:
-            self._placed_ns = max(self._placed_ns, event.stamp_ns)
+    def _filter(self, event: Event, distance_m: float) -> list[Belief]:
+        """Beliefs that an event changed; a fix may prove the heading, or take it back."""
+        if not self.is_proven:
+            self._remember(event)
+        beliefs = self._tracker.filter(event)
+        if isinstance(event, Fix) and event.is_absolute and self._config.profile == "default":
+            if self._is_wrong(event):
+                return self._take_back(distance_m)
+            self.is_proven = self.is_proven or (self._is_old(event) and self._holds(distance_m))
         return beliefs
 
-    def _correct(self, fusion: Fusion, corrections: Corrections, event: Event) -> list[Belief]:
-        """Beliefs that a base station's corrections changed, as of what the event shows."""
-        if isinstance(event, Fix):
-            corrections.compare(event, fusion.belief, *self._receivers.expected(event))
-        if not isinstance(event, FilterStep):
-            return []
-        corrections.follow(fusion.belief)
-        if (measurement := corrections.measurement(fusion.belief)) is None:
-            return []
-        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
-        beliefs = fusion.add([measurement])
-        corrections.confirm(fusion.last[measurement.sensor])
-        return beliefs
+    def _is_wrong(self, fix: Fix) -> bool:
+        """Whether this fix shows that the alignment is wrong; HeadingRefutedError where that was proven."""
+        if self._tracker.is_accepted(fix):
+            self._refused.clear()
+            return False
+        self._refused.append(fix)
+        if not self._tracker.has_relocked or self._tracker.receivers.is_outvoted(fix):
+            return False
+        shown = align_fixes(self._refused)
+        if not self.is_proven or not shown:
+            return not self.is_proven
+        belief = self._tracker.belief
+        assert belief is not None
+        believed_rad = float(belief.x[YAW]) - fix.reckoned.angle_rad
+        std_rad = math.hypot(shown.std_rad, math.sqrt(belief.P[YAW, YAW]))
+        if abs(wrap_angle(shown.rotation_rad - believed_rad)) > REFUTED_SIGMA * std_rad:
+            raise HeadingRefutedError(self._tracker.off_m(fix))
+        return False
 
-    def _gps_errors(self) -> tuple[GpsError, ...]:
-        """Slow errors of the machine's receivers and, where it uses one, of the base station's."""
-        base = self._corrections
-        return self._receivers.errors_beside(base.base_error, base.site_share) if base else self._receivers.errors
+    def _take_back(self, distance_m: float) -> list[Belief]:
+        """Start again with what came since the filter refused fixes."""
+        self._counters["heading_taken_back"] += 1
+        self._tracker = Tracker(self._tracker_config)
+        self._poses.clear()
+        self._smoothed.clear()
+        self._forget(self._refused[0].stamp_ns)
+        self._refused.clear()
+        alignment = align_fixes(self._fixes)
+        return self._start(alignment, distance_m) if alignment else []
 
-    def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
-        """Filter a value whose sensor may count from what is believed at its stamp."""
-        if sensors.needs_anchor(value):
-            sensors.anchor(value, fusion.at(value.stamp_ns))
-        measurement = sensors.measurement(value)
-        if measurement is None:
-            return []
-        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
-        beliefs = fusion.add([measurement])
-        if beliefs:
-            sensors.confirm(value, fusion.last[measurement.sensor])
-        return beliefs
+    def _forget(self, before_ns: int) -> None:
+        """Let fixes and velocities of a first stretch that is off no longer count."""
+        self._counters["fix_before_alignment"] += sum(fix.stamp_ns < before_ns for fix in self._fixes)
+        for kept in (self._fixes, self._velocities):
+            while kept and kept[0].stamp_ns < before_ns:
+                kept.popleft()
 
-    def _collect(self, event: Event, distance_m: float) -> list[Belief]:
-        """Keep an event until the heading is known, then filter all that was kept."""
-        alignment: Alignment | None = None
+    def _is_old(self, fix: Fix) -> bool:
+        return fix.stamp_ns - self._since[0] >= PROVEN_S * 1e9
+
+    def _holds(self, distance_m: float) -> bool:
+        """Whether the machine has driven far enough for a wrong heading to show, and no fix is refused."""
+        return self.is_aligned and distance_m - self._since[1] >= PROVEN_M and not self._refused
+
+    def _keep(self, poses: Sequence[PoseBelief]) -> None:
+        """Keep poses of an unproven heading; one replaces those that are not older."""
+        for pose in poses:
+            while self._poses and pose.stamp_ns <= self._poses[-1].stamp_ns:
+                self._poses.pop()
+            self._poses.append(pose)
+
+    def _proven_poses(self) -> list[PoseBelief]:
+        """All poses since the start; nothing is kept any longer."""
+        poses = list(self._poses)
+        for kept in (self._poses, self._steps, self._fixes, self._velocities):
+            kept.clear()
+        return poses
+
+    def _remember(self, event: Event) -> None:
         if isinstance(event, Fix):
             self._fixes.append(event)
-            alignment = align_fixes(self._fixes, distance_m) if self._steps else None
         elif isinstance(event, Measurement):
             self._velocities.append(event)
         else:
             self._steps.append(event)
-            alignment = align_start(self._config.start, self._steps[0].reckoned) if self._config.start else None
-        return self._start(alignment) if alignment else []
 
-    def _start(self, alignment: Alignment) -> list[Belief]:
-        first, layout = self._steps[0], self._model.layout
-        belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
-        belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
-        self._fusion = Fusion(self.engine, self._model, belief)
-        beliefs = [belief]
+    def _collect(self, event: Event, distance_m: float) -> list[Belief]:
+        """Keep an event until the heading is known, then filter all that was kept."""
+        self._remember(event)
+        alignment: Alignment | None = None
+        if isinstance(event, FilterStep):
+            alignment = align_start(self._config.start, self._steps[0].reckoned) if self._config.start else None
+        elif isinstance(event, Fix) and self._steps and distance_m >= DISTANCE_M:
+            alignment = align_fixes(self._fixes)
+        return self._start(alignment, distance_m) if alignment else []
+
+    def _start(self, alignment: Alignment, distance_m: float) -> list[Belief]:
+        """Filter all that was kept. A start that is given needs no proof, nor has the profile `paper` any."""
+        self._forget(alignment.since_ns)
+        self._since = self._fixes[0].stamp_ns if self._fixes else 0, distance_m
+        self.is_proven = bool(self._config.start) or self._config.profile != "default"
+        beliefs = [self._tracker.start(self.engine, alignment, self._steps[0])]
         events: list[Event] = [*list(self._steps)[1:], *self._fixes, *self._velocities]
         for event in sorted(events, key=lambda e: e.stamp_ns):
-            beliefs += self._filter(self._fusion, event)
-        self._steps.clear()
-        self._fixes.clear()
-        self._velocities.clear()
+            beliefs += self._tracker.filter(event)
         return beliefs
-
-
-def _considering(measurement: Measurement, states: tuple[int, ...]) -> Measurement:
-    """The measurement, which leaves these states as they are; a standstill is no jitter, and teaches."""
-    return measurement if measurement.sensor == STANDSTILL else replace(measurement, considers=states)
 
 
 def _engine(config: LocalisationConfig) -> Filter:
@@ -293,13 +321,3 @@ def _engine(config: LocalisationConfig) -> Filter:
     from agents.localisation.filters.textbook import TextbookEkf, TextbookUkf
 
     return TextbookEkf() if config.filter == "ekf" else TextbookUkf()
-
-
-def _layout_of(machine: MachineConfig) -> Layout:
-    """States for the slow errors of a machine's sensors."""
-    source = turn_source(machine)
-    imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
-    turns = imus + (source is not None and source.kind != "imu")
-    receivers, references = drifting(machine.sensors), heading_references(machine.sensors)
-    base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
-    return Layout(turns, True, len(receivers) + base, len(references), base)

@@ -6,6 +6,8 @@ Driven wheels turn further than the machine moves, by a share that grows with tr
 
 traction: drive force over weight, signed ahead. rolling: the part of it that neither climbs nor accelerates, which an
 accelerometer ahead measures together. s0, s1: `slip` and `slip_soft` of the tyres; soft ground resists, and gives way.
+
+A load that nobody weighs makes the traction, and so the slip, seem larger than it is.
 """
 
 import math
@@ -16,6 +18,7 @@ import numpy as np
 from agents.dead_reckoning import turn_source
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Measurement
+from agents.localisation.filters.motion import SLIP_STD
 from agents.localisation.filters.state import Layout
 from agents.localisation.headings import UNKNOWN_STD
 from agents.localisation.imu_steps import FilterStep, Turn
@@ -27,19 +30,29 @@ from protocol.units import GRAVITY_MPS2
 STANDSTILL_S = 1.0  # after so long without travel the machine stands; coarse ticks of one that crawls come sooner
 STEERED_S = 1.0  # how long the error of a steering angle stays the same
 ROLLING_S = 0.5  # time constant of the low-pass on the rolling resistance
+LOAD_DOUBT = 0.5  # standard deviation of the slip, over the slip, where a load of up to the empty mass is not weighed
 
 
 class MotionSensors:
     """The motion sensors of one machine.
 
     step_s: length of a filter step. tyres: their `slip` and `slip_soft`. on_plane: whether the filter takes the machine
-    to be on a plane. There an IMU measures the turn alone: tilt and what changes it are no states.
+    to be on a plane. There an IMU measures the turn alone: tilt and what changes it are no states. is_weighed: whether
+    the load is known. slip_std: of the slip per traction, by the newest step.
     """
 
     def __init__(
-        self, machine: MachineConfig, layout: Layout, step_s: float, tyres: tuple[float, float], *, on_plane: bool
+        self,
+        machine: MachineConfig,
+        layout: Layout,
+        step_s: float,
+        tyres: tuple[float, float],
+        *,
+        on_plane: bool,
+        is_weighed: bool = True,
     ) -> None:
         self.counters: Counter[str] = Counter()
+        self.slip_std, self._load_doubt = SLIP_STD, 0.0 if is_weighed else LOAD_DOUBT
         self._layout, self._step_s, self._on_plane = layout, step_s, on_plane
         (self._slip, self._slip_soft), self._rolling = tyres, 0.0
         used = [s for s in machine.sensors if s.use]
@@ -105,6 +118,7 @@ class MotionSensors:
             ahead = sum(float(force[0]) for force in forces) / len(forces)
             self._rolling = rolling_resistance(self._rolling, step.traction, ahead, self._step_s)
         slip = self._slip + self._slip_soft * self._rolling
+        self.slip_std = math.hypot(SLIP_STD, self._load_doubt * slip)
         z = np.array([machine_speed(step.wheels.speed_mps, step.traction, slip), 0.0, 0.0])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
         R, gate, offset_m = self._wheels_R, self._wheels_gate, step.wheels.offset_m

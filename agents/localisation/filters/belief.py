@@ -166,6 +166,21 @@ def open_states(belief: Belief, states: slice, covariance: Floats) -> Belief:
     return Belief(belief.stamp_ns, belief.x, P, past=belief.past)
 
 
+def restate_states(belief: Belief, states: slice, before: float, after: float) -> Belief:
+    """The belief with a stationary error of this variance instead of the one before.
+
+    An error is a sum of errors that come and go: one that grows gets another part, which is independent of it. One that
+    shrinks from e keeps, of variances s before and r after, r / s of it: the part that stays has covariance r with e.
+    """
+    kept = min(after / before, 1.0)
+    x, M = belief.x.copy(), np.eye(len(belief.x))
+    x[states] *= kept
+    M[states, states] *= kept
+    P = M @ belief.P @ M.T
+    P[states, states] += np.eye(states.stop - states.start) * (after - kept**2 * before)
+    return Belief(belief.stamp_ns, x, P, past=_mapped(belief, M))
+
+
 def _mapped(belief: Belief, M: Floats) -> Past | None:
     """The past after a change that maps the state's error by M (n, n)."""
     return belief.past and belief.past.mapped(M)

@@ -89,8 +89,9 @@ class MotionModel:
 
     on_plane: whether the machine moves on a plane. gps_errors: one per receiver of the layout. heading_errors:
     of the first references of the layout; headings of the others count from an anchor, and their errors walk. traction:
-    drive force over weight [-], 0 where it is not known. turn_error_radps: standard deviation of the lasting error of
-    an odometry's turn rate, 0 where the turn comes from another sensor. reckons: whether nothing shows the place.
+    drive force over weight [-], 0 where it is not known; slip_std: of the wheels' slip per traction. turn_error_radps:
+    standard deviation of the lasting error of an odometry's turn rate, 0 where the turn comes from another sensor.
+    reckons: whether nothing shows the place.
     """
 
     layout: Layout
@@ -98,6 +99,7 @@ class MotionModel:
     gps_errors: tuple[GpsError, ...] = ()
     heading_errors: tuple[HeadingError, ...] = ()
     traction: float = 0.0
+    slip_std: float = SLIP_STD
     turn_error_radps: float = 0.0
     reckons: bool = False
 
@@ -122,7 +124,8 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         scale[state] = math.exp(-dt_s / error.time_s)
         Q[state, state] = error.std_rad**2 * -math.expm1(-2 * dt_s / error.time_s)
     of_position = Q[POSITION, POSITION]
-    of_position += _slip(belief.x * scale, dt_s, _slip_variance_m2(model.traction * float(belief.x[SPEED]), dt_s))
+    slipping_mps = model.slip_std * model.traction * float(belief.x[SPEED])
+    of_position += _slip(belief.x * scale, dt_s, _slip_variance_m2(slipping_mps, dt_s))
     if model.turn_error_radps:
         turn = layout.gyro_biases.stop - 1
         Q[turn, turn] += 2 * model.turn_error_radps**2 * dt_s / BEND_S
@@ -245,12 +248,12 @@ def _jacobian(x: Floats, dt_s: float) -> Floats:
     return F
 
 
-def _slip_variance_m2(traction_mps: float, dt_s: float) -> float:
-    """Variance along the body of the distance that a wrong slip adds in a step; traction times speed.
+def _slip_variance_m2(std_mps: float, dt_s: float) -> float:
+    """Variance along the body of the distance that a wrong slip adds in a step; std_mps: of the slipping speed.
 
-    The integral of a Gauss-Markov error of SLIP_STD and SLIP_TIME_S grows by 2 std^2 time per second.
+    The integral of a Gauss-Markov error of that deviation and SLIP_TIME_S grows by 2 std^2 time per second.
     """
-    return SLIP_STD**2 * 2 * SLIP_TIME_S * traction_mps**2 * dt_s
+    return 2 * SLIP_TIME_S * std_mps**2 * dt_s
 
 
 def _slip(x: Floats, dt_s: float, along_m2: float) -> Floats:

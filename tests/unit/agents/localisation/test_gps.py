@@ -14,7 +14,7 @@ from agents.localisation.filters.motion import MotionModel
 from agents.localisation.filters.state import POSITION, VELOCITY, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Receivers
-from agents.localisation.localiser import _layout_of
+from agents.localisation.tracker import layout_of
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Reading
@@ -45,7 +45,7 @@ def at_rest(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: s
 
 def each_second(vehicle: MachineConfig, errors_m: Floats, place_m: Floats, engine: str = "ekf") -> list[Belief]:
     """What is believed of it after each of those seconds; no fix comes in where an error is NaN."""
-    layout = _layout_of(vehicle)
+    layout = layout_of(vehicle)
     receivers = Receivers(vehicle.sensors, PROJECTION, layout, slow=True, machine_share=vehicle.machine_share)
     reckoned = localiser(vehicle).dead_reckoning.pose
     variance = np.full(layout.n, 1e-6)
@@ -153,7 +153,7 @@ def test_a_receiver_that_joins_errs_as_the_others_do_by_their_share(order: tuple
     """Whoever comes first: the errors of all have the covariance that they keep from then on."""
     share, variance = 0.8, 0.75 * STATED_M2
     vehicle = sharing(3, share)
-    layout = _layout_of(vehicle)
+    layout = layout_of(vehicle)
     receivers = Receivers(vehicle.sensors, PROJECTION, layout, slow=True, machine_share=share)
     belief = Belief(START_NS, np.zeros(layout.n), np.eye(layout.n))
     first_m = np.array([2.0, -1.0])
@@ -253,7 +253,7 @@ def test_what_a_lone_receiver_is_off_by_is_half_its_own_and_half_the_places(engi
     assert np.hypot(*beliefs[RELOCKED_S - 1].x[:2]) < 0.1  # refused
     belief, along = beliefs[RELOCKED_S], jump / jump_m
     np.testing.assert_allclose(belief.x[:2], jump / 2, rtol=0.01)
-    np.testing.assert_allclose(belief.x[_layout_of(vehicle).gps_error(0)], jump / 2, rtol=0.01)
+    np.testing.assert_allclose(belief.x[layout_of(vehicle).gps_error(0)], jump / 2, rtol=0.01)
     assert math.sqrt(along @ belief.P[:2, :2] @ along) == pytest.approx(math.sqrt(0.5) * jump_m, rel=0.01)
     assert outside(belief, np.zeros(2)) < 1
     assert outside(belief, jump) < 1
@@ -355,8 +355,8 @@ def test_a_receiver_without_a_place_does_not_vote_on_it() -> None:
 def test_results_that_could_not_be_computed_say_nothing_of_a_receiver() -> None:
     """However many there are, errors and places stay finite, and nobody is outvoted by them."""
     vehicle = sharing(2, 0.5)
-    receivers = Receivers(vehicle.sensors, PROJECTION, _layout_of(vehicle), slow=True, machine_share=0.5)
-    belief = Belief(START_NS, np.zeros(_layout_of(vehicle).n), np.eye(_layout_of(vehicle).n))
+    receivers = Receivers(vehicle.sensors, PROJECTION, layout_of(vehicle), slow=True, machine_share=0.5)
+    belief = Belief(START_NS, np.zeros(layout_of(vehicle).n), np.eye(layout_of(vehicle).n))
     one = receivers.fix(fix(vehicle.sensor("gps-1"), START_NS, 0.0, 0.0, 0.0), localiser(vehicle).dead_reckoning.pose)
     before = receivers.measurement(one) and receivers.errors
     nothing = Conditioned(belief, np.full(2, np.nan), np.full((2, 2), np.nan), math.nan, accepted=False)

@@ -1,0 +1,224 @@
+"""The tracker: filters all that a machine senses, from one alignment on.
+
+It is one module because every kind of event meets here the one filter that all of them change.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from agents.dead_reckoning import turn_source
+from agents.localisation.alignment import Alignment, start_belief
+from agents.localisation.corrections import Corrections, not_used
+from agents.localisation.filters.belief import Belief, Filter, Measurement
+from agents.localisation.filters.late_measurements import Fusion
+from agents.localisation.filters.motion import GpsError, MotionModel
+from agents.localisation.filters.smoother import nothing_past
+from agents.localisation.filters.state import YAW, Layout, X, Y, Z
+from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.headings import References, heading_references
+from agents.localisation.imu_steps import FilterStep
+from agents.localisation.measurements import STANDSTILL
+from agents.localisation.motion_sensors import MotionSensors, shows_tilt
+from agents.localisation.sensor_modes import ModalSensors, Value
+from protocol.machine.machine_config import ABSOLUTE, MachineConfig
+from protocol.machine.readings import Correction
+from protocol.site.site_config import Projection
+
+# Without GPS for so long, wheels and IMUs teach neither place and heading nor the gyros' bias: they show none of them,
+# but the centripetal w x v is linearised at a speed and a rate that jitter from step to step, which looks like
+# information. Fixes outweigh it; without them it bent the bias by 0.4 degrees per second in ten minutes. Standstills
+# and absolute headings still teach all that correlates with them.
+UNPLACED_S = 5.0
+Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """What a tracker is built of.
+
+    profile: of localisation. tyres: `slip` and `slip_soft`. smoothing_s: lag of the smoother. is_started: whether the
+    start is configured, so that a machine without GPS reckons from there. is_weighed: whether its load is known.
+    """
+
+    machine: MachineConfig
+    projection: Projection
+    profile: str
+    tyres: tuple[float, float]
+    step_s: float
+    smoothing_s: float
+    is_started: bool
+    is_weighed: bool
+
+    @property
+    def slow(self) -> bool:
+        """Whether slow errors of sensors are states."""
+        return self.profile == "default"
+
+
+class Tracker:
+    """Filters events into beliefs. fusion: None until `start`.
+
+    has_relocked: whether the newest fix of a receiver made the filter accept it again, after too many refusals.
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        machine, slow = config.machine, config.slow
+        layout = layout_of(machine) if slow else Layout()
+        share, projection = machine.machine_share, config.projection
+        self.fusion: Fusion | None = None
+        self.has_relocked = False
+        self.receivers = Receivers(machine.sensors, projection, layout, slow=slow, machine_share=share)
+        self._config = config
+        self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
+        self._references = References(machine.sensors, layout, slow=slow)
+        source, on_plane = turn_source(machine), not shows_tilt(machine, config.profile)
+        self._body = MotionSensors(
+            machine, layout, config.step_s, config.tyres, on_plane=on_plane, is_weighed=config.is_weighed or not slow
+        )
+        turn_error = self._body.turn_error_radps if slow and source and source.kind == "odometry" else 0.0
+        self._model = MotionModel(layout, on_plane, self._gps_errors(), turn_error_radps=turn_error)
+        self._placed_ns = 0  # stamp of the newest fix or velocity by GPS that was accepted
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Measurements used and gated, readings refused."""
+        of_parts = [part.counters for part in (self.fusion, self._corrections) if part]
+        return sum(of_parts, Counter(self._body.counters))
+
+    @property
+    def belief(self) -> Belief | None:
+        """The whole state, once it is known."""
+        return self.fusion.belief if self.fusion else None
+
+    @property
+    def wheel_scale(self) -> float | None:
+        """How much further the wheels turn than the machine moves [-], as believed; None where it is no state."""
+        states = self._model.layout.wheel_scales
+        return float(self.belief.x[states.start]) if self.belief and states.stop > states.start else None
+
+    def base_report(self) -> dict[str, Any] | None:
+        """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
+        if self._corrections:
+            return self._corrections.report(self.belief.stamp_ns if self.belief else 0)
+        base = self._config.machine.base
+        return not_used(base, self._config.profile) if base else None
+
+    def correct(self, correction: Correction) -> None:
+        """Keep a correction of a base station until it is due, with a later reading."""
+        if self._corrections and self.belief:
+            self._corrections.take(correction, self.belief.stamp_ns)
+
+    def start(self, engine: Filter, alignment: Alignment, first: FilterStep) -> Belief:
+        """Begin to filter, with the belief at the first step."""
+        layout = self._model.layout
+        belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
+        belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
+        self.fusion = Fusion(engine, self._model, belief)
+        return belief
+
+    def filter(self, event: Event) -> list[Belief]:
+        """Beliefs that an event changed, and then a correction that is due."""
+        fusion = self.fusion
+        assert fusion is not None, "filter before start"
+        own = self._filter_step(fusion, event) if isinstance(event, FilterStep) else self._place(fusion, event)
+        return own + self._correct(fusion, self._corrections, event) if self._corrections else own
+
+    def is_accepted(self, fix: Fix) -> bool:
+        """Whether the filter took the newest fix of this receiver."""
+        last = self.fusion.last.get(fix.sensor.name) if self.fusion else None
+        return last is not None and last.accepted
+
+    def off_m(self, fix: Fix) -> float:
+        """How far the newest fix of this receiver is off."""
+        last = self.fusion.last.get(fix.sensor.name) if self.fusion else None
+        return float(np.hypot(*last.innovation)) if last else 0.0
+
+    def _filter_step(self, fusion: Fusion, event: FilterStep) -> list[Belief]:
+        """Beliefs that the machine's motion changed."""
+        absolute = self._references.measurements(event, fusion.belief)
+        errors = self._references.errors
+        layout = fusion.model.layout
+        unplaced = layout.wheel_scale and event.stamp_ns - self._placed_ns > UNPLACED_S * 1e9
+        reckons = unplaced and bool(self._placed_ns or self._config.is_started)  # else the fix that aligned it comes
+        inertial, turn, wheels = self._body.inertial(event), self._body.turn(event), self._body.wheels(event)
+        slip_std = self._body.slip_std
+        fusion.model = replace(
+            fusion.model, traction=event.traction, slip_std=slip_std, heading_errors=errors, reckons=reckons
+        )
+        beliefs: list[Belief] = []
+        for orientation in self._references.own_stamped(event):
+            beliefs += self._filter_modal(fusion, self._references, orientation)
+        # Wheels show nothing of their own scale s; but h = (1 + s) v is linearised at a speed that jitters.
+        scale = tuple(range(layout.wheel_scales.start, layout.wheel_scales.stop))
+        if unplaced:
+            headed = (YAW, *range(layout.gyro_biases.start, layout.gyro_biases.stop)) if reckons else ()
+            considers = (X, Y, Z, *scale, *headed)
+            inertial, wheels = ([_considering(m, considers) for m in several] for several in (inertial, wheels))
+        elif scale:
+            wheels = [_considering(m, scale) for m in wheels]
+        measurements = [*inertial, *absolute, *turn, *wheels]
+        return beliefs + (fusion.add(measurements) if measurements else [])
+
+    def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:
+        """Beliefs that a fix or a velocity by GPS changed."""
+        if isinstance(event, Fix):
+            name = event.sensor.name
+            before = fusion.counters[f"{name}_relocked"]
+            beliefs = self._filter_modal(fusion, self.receivers, event)
+            self.has_relocked = fusion.counters[f"{name}_relocked"] > before
+        else:
+            name, beliefs = event.sensor, fusion.add([event])
+        if beliefs and fusion.last[name].accepted:
+            self._placed_ns = max(self._placed_ns, event.stamp_ns)
+        return beliefs
+
+    def _correct(self, fusion: Fusion, corrections: Corrections, event: Event) -> list[Belief]:
+        """Beliefs that a base station's corrections changed, as of what the event shows."""
+        if isinstance(event, Fix):
+            corrections.compare(event, fusion.belief, *self.receivers.expected(event))
+        if not isinstance(event, FilterStep):
+            return []
+        corrections.follow(fusion.belief)
+        if (measurement := corrections.measurement(fusion.belief)) is None:
+            return []
+        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
+        beliefs = fusion.add([measurement])
+        corrections.confirm(fusion.last[measurement.sensor])
+        return beliefs
+
+    def _gps_errors(self) -> tuple[GpsError, ...]:
+        """Slow errors of the machine's receivers and, where it uses one, of the base station's."""
+        base, receivers = self._corrections, self.receivers
+        return receivers.errors_beside(base.base_error, base.site_share) if base else receivers.errors
+
+    def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
+        """Filter a value whose sensor may count from what is believed at its stamp."""
+        if sensors.needs_anchor(value):
+            sensors.anchor(value, fusion.at(value.stamp_ns))
+        measurement = sensors.measurement(value)
+        if measurement is None:
+            return []
+        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
+        beliefs = fusion.add([measurement])
+        if beliefs:
+            sensors.confirm(value, fusion.last[measurement.sensor])
+        return beliefs
+
+
+def _considering(measurement: Measurement, states: Sequence[int]) -> Measurement:
+    """The measurement, which leaves these states as they are; a standstill is no jitter, and teaches."""
+    return measurement if measurement.sensor == STANDSTILL else replace(measurement, considers=tuple(states))
+
+
+def layout_of(machine: MachineConfig) -> Layout:
+    """States for the slow errors of a machine's sensors."""
+    source = turn_source(machine)
+    imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
+    turns = imus + (source is not None and source.kind != "imu")
+    receivers, references = drifting(machine.sensors), heading_references(machine.sensors)
+    base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
+    return Layout(turns, True, len(receivers) + base, len(references), base)
