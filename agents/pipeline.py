@@ -39,8 +39,8 @@ class Accepted(NamedTuple):
     """Readings of one stamp that count, at the stamp of what they measured; a tuple, as there are hundreds a second.
 
     poses: what they made possible or changed, oldest first. smoothed: past poses that became final with them, oldest
-    first. restarts: nothing before them counts any more; then smoothed are all that remained, and off_m is how far off
-    the places before may be.
+    first. restarts: nothing before them counts any more; then smoothed are all that remained, off_m is how far off the
+    places before may be, and concluded are poses that may become samples now as nothing will prove them any further.
     """
 
     readings: list[Sensed]
@@ -48,6 +48,7 @@ class Accepted(NamedTuple):
     smoothed: list[SmoothedPose]
     restarts: bool
     off_m: float = 0.0
+    concluded: Sequence[PoseBelief] = ()
 
 
 class Positioning:
@@ -135,11 +136,13 @@ class Positioning:
         """Take in the readings of one stamp; None where all are refused."""
         taken: list[Sensed] = []
         smoothed: list[SmoothedPose] = []
+        concluded: list[PoseBelief] = []
         restarts, off_m = False, 0.0
         for reading in readings:
             if (decision := self._order.decide(reading)) is Decision.REFUSE:
                 continue
             if decision is Decision.RESTART:
+                concluded += self.conclude()
                 smoothed += self._restart()
                 taken, restarts = [], True
             taken.append((reading, self._sensors[reading.sensor]))
@@ -152,9 +155,10 @@ class Positioning:
         except (DivergedError, HeadingRefutedError) as error:
             self._counters["heading_refuted" if isinstance(error, HeadingRefutedError) else "filter_restarts"] += 1
             off_m = getattr(error, "off_m", 0.0)
+            concluded += self.conclude()
             smoothed += self._restart()
             poses, restarts = [], True
-        return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts, off_m)
+        return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts, off_m, concluded)
 
     def _restart(self) -> list[SmoothedPose]:
         """Start again, and keep the counts; returns the smoothed poses that remained."""
@@ -213,9 +217,8 @@ class Pipeline:
     def settle(self) -> Samples:
         """Samples of all that is known now, all of them final: no reading may come for long."""
         rest = self._take(self._positioning.finish())
-        proven = self._positioning.conclude()
-        self._sampler.is_placing = self._positioning.localiser.is_proven
-        return joined([*rest, *self._place(proven), self._settle(self._positioning.remaining())])
+        proven = self._place(self._positioning.conclude())
+        return joined([*rest, *proven, self._settle(self._positioning.remaining())])
 
     def finish(self) -> Samples:
         """The same, as the stream ends; what has no place then is counted."""
@@ -254,15 +257,18 @@ class Pipeline:
         return [samples for accepted in stamps for samples in self._take_one(accepted)]
 
     def _take_one(self, accepted: Accepted) -> list[Samples]:
-        readings, poses, smoothed, restarts, off_m = accepted
+        readings, poses, smoothed, restarts, off_m, concluded = accepted
         self._track.append(smoothed)
         made: list[Samples] = []
         if restarts:
+            made += self._place(concluded)
             made.append(self._settle((), off_m))
             self._count_withheld()
             self._start(self._estimator.calibration)
-        self._sampler.is_placing = self._positioning.localiser.is_proven
-        made += self._place(poses)
+        for pose in poses:
+            self._positioning.poses.append(pose)
+        if self._positioning.localiser.is_proven:
+            made += self._place(poses)
         stamp_ns = readings[0][0].stamp_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
@@ -279,10 +285,10 @@ class Pipeline:
         return made
 
     def _place(self, poses: Sequence[PoseBelief]) -> list[Samples]:
-        """Samples that poses make possible; each pose at once: of a late alignment they are more than history holds."""
+        """Samples that proven poses make possible; each pose at once: after a late alignment history holds not all."""
         made: list[Samples] = []
         for pose in poses:
-            self._positioning.poses.append(pose)
+            self._sampler.poses.append(pose)
             made += self._due_samples()
         return made
 
@@ -303,7 +309,7 @@ class Pipeline:
         return Samples(rows, self._sampler.final_samples(corrected))
 
     def _withhold_waiting(self) -> None:
-        unproven = self.pose is not None and not self._sampler.is_placing
+        unproven = self.pose is not None and self._sampler.poses.newest is None
         self._sampler.withheld["heading_unproven" if unproven else "no_pose"] += self._sampler.waiting
 
     def _count_withheld(self) -> None:
@@ -323,7 +329,7 @@ class Pipeline:
         """Start with nothing known but the calibration, as after power-up or a jump of the clock."""
         config, machine = self._config, self._machine
         self._estimator = GroundEstimator(machine, config.estimation, known)
-        self._sampler = Sampler(self._positioning.poses, machine.load_centre_m)
+        self._sampler = Sampler(machine.load_centre_m)
         self._odometer = Odometer()
         self._track = SmoothedTrack()
 

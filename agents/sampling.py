@@ -112,15 +112,13 @@ class Odometer:
 class Sampler:
     """Makes samples; counts by reason what is `withheld` and what is sampled `without_resistance`.
 
-    poses: where the machine was. load_centre_m: how far ahead of the pose a sample lies. is_placing: whether poses may
-    become samples; marks wait until then.
+    poses: where the machine was, of a heading that is proven. load_centre_m: how far ahead of the pose a sample lies.
     """
 
-    def __init__(self, poses: PoseHistory, load_centre_m: float) -> None:
+    def __init__(self, load_centre_m: float) -> None:
         self.withheld: Counter[str] = Counter()
         self.without_resistance: Counter[str] = Counter()
-        self.is_placing = True
-        self._poses = poses
+        self.poses = PoseHistory()
         self._load_centre_m = load_centre_m
         self._marked_m = 0.0
         self._marks: deque[Mark] = deque()  # wait for the estimator
@@ -149,13 +147,13 @@ class Sampler:
         while self._marks and self._marks[0].stamp_ns <= now_ns - LAG_NS * waits:
             mark = self._marks.popleft()
             self._estimated.append((mark, estimate_at(mark.stamp_ns)))
-        newest = self._poses.newest
-        if not self.is_placing or not self._estimated or not newest or self._estimated[0][0].stamp_ns > newest.stamp_ns:
+        newest = self.poses.newest
+        if not self._estimated or not newest or self._estimated[0][0].stamp_ns > newest.stamp_ns:
             return NOTHING
         made: list[Place] = []
         while self._estimated and self._estimated[0][0].stamp_ns <= newest.stamp_ns:
             mark, estimate = self._estimated.popleft()
-            pose = self._poses.at(mark.stamp_ns)
+            pose = self.poses.at(mark.stamp_ns)
             if pose and self._is_usable(pose, estimate):
                 made.append(Place(mark, pose, estimate))
             elif not pose:

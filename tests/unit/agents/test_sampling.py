@@ -36,15 +36,7 @@ class Asked:
         return self._estimate
 
 
-class PlacedSampler(Sampler):
-    """A sampler and its poses."""
-
-    def __init__(self, load_centre_m: float = 0.0) -> None:
-        self.poses = PoseHistory()
-        super().__init__(self.poses, load_centre_m)
-
-
-def drive(sampler: PlacedSampler, estimate: GroundEstimate = ESTIMATE, **options: float) -> Table:
+def drive(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, **options: float) -> Table:
     """Drive 10 m east at 2 m/s from x = 0, with a pose and a look at the wheels every 50 ms; then wait for the lag."""
     rows = []
     for i in range(101):
@@ -63,7 +55,7 @@ def sampled(sampler: Sampler, estimate: GroundEstimate = ESTIMATE, now_s: float 
 
 
 def test_one_sample_per_stretch_that_says_how_long_it_is() -> None:
-    rows = drive(PlacedSampler(1.5))
+    rows = drive(Sampler(1.5))
     assert len(rows) == 10 / EVERY_M
     assert rows["distance_m"] == pytest.approx(EVERY_M)
     assert rows["x_m"] == pytest.approx(1.5 + EVERY_M * np.arange(1, len(rows) + 1))
@@ -71,7 +63,7 @@ def test_one_sample_per_stretch_that_says_how_long_it_is() -> None:
 
 
 def test_distance_of_a_stretch_is_at_most_twice_that_of_a_sample() -> None:
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     sampler.poses.append(pose(0))
     sampler.mark(ns(0), 30.0)
     assert sampled(sampler)["distance_m"].tolist() == [2 * EVERY_M]
@@ -79,7 +71,7 @@ def test_distance_of_a_stretch_is_at_most_twice_that_of_a_sample() -> None:
 
 def test_load_centre_lies_ahead() -> None:
     for heading, place in ((0.0, (1.5, 5.0)), (math.pi / 2, (0.0, 6.5)), (math.pi, (-1.5, 5.0))):
-        sampler = PlacedSampler(1.5)
+        sampler = Sampler(1.5)
         sampler.poses.append(pose(0, heading_rad=heading))
         sampler.mark(ns(0), 0.5)
         (row,) = sampled(sampler)
@@ -88,7 +80,7 @@ def test_load_centre_lies_ahead() -> None:
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])
 def test_gradient_is_turned_into_the_map(heading: float) -> None:
-    sampler = PlacedSampler(1.5)
+    sampler = Sampler(1.5)
     sampler.poses.append(pose(0, heading_rad=heading))
     sampler.mark(ns(0), 0.5)
     (row,) = sampled(sampler)
@@ -103,7 +95,7 @@ def test_gradient_is_turned_into_the_map(heading: float) -> None:
 
 
 def test_estimator_is_asked_for_the_stamp_of_the_mark_once_the_lag_has_passed() -> None:
-    sampler, asked = PlacedSampler(), Asked(ESTIMATE)
+    sampler, asked = Sampler(0.0), Asked(ESTIMATE)
     for t in (0.0, 0.5, LAG_S - 0.001, LAG_S, LAG_S + 0.2):
         sampler.poses.append(pose(t))
         if t == 0.0:
@@ -115,7 +107,7 @@ def test_estimator_is_asked_for_the_stamp_of_the_mark_once_the_lag_has_passed() 
 
 def test_an_estimate_is_asked_in_time_even_if_no_pose_is_known_yet() -> None:
     """An estimator remembers seconds, a late alignment takes minutes."""
-    sampler, asked = PlacedSampler(), Asked(ESTIMATE)
+    sampler, asked = Sampler(0.0), Asked(ESTIMATE)
     for i in range(1, 400):
         sampler.mark(ns(i * 0.25), i * 0.5)
         assert not len(sampler.due_samples(ns(i * 0.25), asked))
@@ -123,7 +115,7 @@ def test_an_estimate_is_asked_in_time_even_if_no_pose_is_known_yet() -> None:
 
 
 def test_what_still_waits_is_sampled_without_waiting_and_all_in_the_order_of_stamps() -> None:
-    sampler, rows = PlacedSampler(), []
+    sampler, rows = Sampler(0.0), []
     for i in range(101):
         sampler.poses.append(pose(i * 0.05, 0.1 * i))
         sampler.mark(ns(i * 0.05), 0.1 * i)
@@ -138,7 +130,7 @@ def test_what_still_waits_is_sampled_without_waiting_and_all_in_the_order_of_sta
 
 def test_nothing_is_lost_while_no_pose_is_known() -> None:
     """The heading is found late: the poses then come all at once, from the beginning of the drive on."""
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     for i in range(1, 21):
         sampler.mark(ns(i * 0.25), i * 0.5)
         assert not len(sampled(sampler, now_s=i * 0.25))
@@ -162,7 +154,7 @@ def moved(by_m: float, turn_rad: float, variance_m2: float) -> Callable[[PoseBel
 
 def test_final_sample_is_that_of_the_corrected_pose() -> None:
     """Load centre and gradient turn with the heading; what was measured at the place stays."""
-    sampler = PlacedSampler(1.5)
+    sampler = Sampler(1.5)
     (pending,) = drive(sampler)[:1]
     (final,) = sampler.final_samples(lambda p: moved(3.0, 0.5, 0.25)(p) if p.x_m < 0.75 else None)
     c, s = math.cos(0.5), math.sin(0.5)
@@ -175,7 +167,7 @@ def test_final_sample_is_that_of_the_corrected_pose() -> None:
 
 
 def test_samples_become_final_once_each_and_in_their_order() -> None:
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     pending = drive(sampler)
     assert sampler.pending == len(pending) == 20
     first = sampler.final_samples(lambda p: p if p.stamp_ns <= pending["stamp_ns"][6] else None)
@@ -190,7 +182,7 @@ def test_samples_become_final_once_each_and_in_their_order() -> None:
 
 
 def test_marks_before_the_first_pose_are_counted() -> None:
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     for t in (-1.0, -0.5, 0.5):
         sampler.mark(ns(t), t + 2)
     sampler.poses.append(pose(0))
@@ -201,13 +193,13 @@ def test_marks_before_the_first_pose_are_counted() -> None:
 
 @pytest.mark.parametrize("reason", ["pitch_transient", "accelerometer"])
 def test_where_the_slope_is_blurred_place_distance_and_mass_are_sampled_and_counted(reason: str) -> None:
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     rows = drive(sampler, replace(NOTHING_KNOWN, reason=reason, mass_kg=22_000.0))
     assert len(rows) == 20
     for name in (*RESISTANCE, *GRADE):
         assert np.isnan(rows[name]).all()
     assert rows["mass_kg"] == pytest.approx(22_000.0)
-    assert rows["distance_m"] == pytest.approx(drive(PlacedSampler())["distance_m"])
+    assert rows["distance_m"] == pytest.approx(drive(Sampler(0.0))["distance_m"])
     assert sampler.without_resistance == {reason: 20}
     assert not sampler.withheld
     check_samples(rows, 1e4)
@@ -215,7 +207,7 @@ def test_where_the_slope_is_blurred_place_distance_and_mass_are_sampled_and_coun
 
 @pytest.mark.parametrize("reason", ["braking", "no_torque", "torque_frozen", "standstill", "settling"])
 def test_position_and_slope_are_sampled_without_resistance_and_counted(reason: str) -> None:
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     rows = drive(sampler, replace(ESTIMATE, c_rr=math.nan, c_rr_var=math.nan, reason=reason))
     assert len(rows) == 20
     assert np.isnan(rows["c_rr"]).all()
@@ -227,7 +219,7 @@ def test_position_and_slope_are_sampled_without_resistance_and_counted(reason: s
 
 
 def test_where_nothing_is_known_of_the_ground_the_place_is_sampled() -> None:
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     rows = drive(sampler, NOTHING_KNOWN)
     assert len(rows) == 20
     assert np.isnan(rows["grade_e"]).all()
@@ -235,13 +227,13 @@ def test_where_nothing_is_known_of_the_ground_the_place_is_sampled() -> None:
 
 
 def test_samples_of_an_unsure_place_are_withheld_and_counted() -> None:
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     assert not len(drive(sampler, variance_m2=201.0))  # that north is twice as much, a deviation of 20.05 m
     assert sampler.withheld == {"unsure_position": 20}
 
 
 def test_good_samples_are_counted_nowhere() -> None:
-    sampler = PlacedSampler()
+    sampler = Sampler(0.0)
     drive(sampler)
     assert not sampler.withheld
     assert not sampler.without_resistance

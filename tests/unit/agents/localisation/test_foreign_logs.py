@@ -88,7 +88,7 @@ def net_m(made: Drive, poses: Sequence[PoseBelief]) -> float:
 
 def scale_of(positioning: Positioning, belief: Belief) -> tuple[float, float]:
     """The wheels' scale and its standard deviation."""
-    state = positioning.localiser._model.layout.wheel_scales.start
+    state = positioning.localiser._tracker._model.layout.wheel_scales.start
     return float(belief.x[state]), math.sqrt(belief.P[state, state])
 
 
@@ -202,7 +202,7 @@ def test_tilt_is_estimated_where_something_shows_it_and_holds_it(
     sensors: tuple[SensorConfig, ...], profile: str, in_space: bool
 ) -> None:
     config = LocalisationConfig(profile=profile)
-    assert Localiser(cart(*sensors, ODOMETRY, GPS), PROJECTION, config)._model.on_plane is not in_space
+    assert Localiser(cart(*sensors, ODOMETRY, GPS), PROJECTION, config)._tracker._model.on_plane is not in_space
 
 
 @pytest.mark.parametrize("engine", ["ekf", "ukf"])

@@ -68,7 +68,7 @@ def test_a_reference_holds_the_heading_of_a_machine_without_gps() -> None:
     assert off_rad(left, made) > 0.2
     assert off_rad(held, made) < 0.04
     assert held.belief
-    assert held.belief.x[held._model.layout.gyro_bias(0)] == pytest.approx(2e-3, abs=7e-4)
+    assert held.belief.x[held._tracker._model.layout.gyro_bias(0)] == pytest.approx(2e-3, abs=7e-4)
 
 
 @pytest.mark.slow
@@ -157,4 +157,6 @@ def test_what_it_states_is_not_believed_unless_it_is_configured(options: dict[st
     made = drive(LAPS[:2], vehicle)
     located = localiser(vehicle, start=START)
     located.run(until(with_ahrs(made, variance=1e-6), 0.0))
-    assert located._references.errors == (HeadingError(pytest.approx(std_rad, rel=0.1), pytest.approx(300.0, rel=0.1)),)
+    assert located._tracker._references.errors == (
+        HeadingError(pytest.approx(std_rad, rel=0.1), pytest.approx(300.0, rel=0.1)),
+    )

@@ -82,7 +82,7 @@ def test_nothing_that_was_driven_before_the_alignment_is_lost() -> None:
     made = drive([Leg(3), *S_BEND], VEHICLE)
     located = localiser(VEHICLE)
     aligned_ns = next(r.stamp_ns for r in made.readings if located.run([r]) and located.is_aligned)
-    beliefs = localiser(VEHICLE).run(made.readings)
+    beliefs = localiser(VEHICLE).run([r for r in made.readings if not after(r, 30)])
     assert aligned_ns > START_NS + 8 * 10**9
     assert beliefs[0].stamp_ns <= START_NS + 200_000_000
     stamps = [b.stamp_ns for b in beliefs]
@@ -116,8 +116,8 @@ def test_outlier_is_gated_and_counted() -> None:
 
 def test_filter_opens_up_again_after_a_lock_out() -> None:
     """The receiver is 60 m off for good, as after a change of its datum: the filter resists, then follows."""
-    made = drive([*S_BEND, Leg(10)], VEHICLE)
-    readings = [moved(r, 60) if isinstance(r, Gps) and after(r, 20) else r for r in made.readings]
+    made = drive([*S_BEND, Leg(20)], VEHICLE)
+    readings = [moved(r, 60) if isinstance(r, Gps) and after(r, 40) else r for r in made.readings]
     located = localiser(VEHICLE)
     beliefs = located.run(readings)
     assert (located.counters["gps-1_gated"], located.counters["gps-1_relocked"]) == (15, 1)

@@ -188,7 +188,8 @@ def test_slow_errors_cancel_in_a_velocity_but_for_what_they_change_meanwhile(tim
     gps = fix(SensorConfig("gps-1", "gps"), START_NS, 3.0, 4.0, 0.0, 4.0)
     pair = (gps, replace(gps, stamp_ns=START_NS + SECOND // 2))
     first, second = (
-        located._receivers.measurement(located._receivers.fix(r, located.dead_reckoning.pose)) for r in pair
+        located._tracker.receivers.measurement(located._tracker.receivers.fix(r, located.dead_reckoning.pose))
+        for r in pair
     )
     assert first is None
     assert np.diag(second.R).tolist() == pytest.approx([2 * (1.0 + 3.0 * slow) / 0.5**2] * 2)
@@ -200,7 +201,7 @@ def test_error_of_a_relative_receiver_is_that_of_two_fixes_and_of_the_belief_the
     made = drive([Leg(2)], vehicle)
     believed = next(b for b in located.beliefs(made.readings) if b.stamp_ns > START_NS + SECOND // 5)
     expected = 2 * 0.75 * 2.0 + float(np.trace(believed.P[:2, :2])) / 2
-    assert located._receivers.errors[0].variance_m2 == pytest.approx(expected, rel=0.15)
+    assert located._tracker.receivers.errors[0].variance_m2 == pytest.approx(expected, rel=0.15)
 
 
 def test_fixes_far_apart_make_no_velocity() -> None:
@@ -280,7 +281,7 @@ def test_relative_fixes_are_those_of_the_paper_s_transform_seen_from_the_shared_
     vehicle = replace(machine(receivers=0), sensors=(*machine(receivers=0).sensors, sensor))
     located = localiser(vehicle, start=START)
     located.beliefs(drive([Leg(1)], vehicle, without=("gps-1",)).readings)
-    fusion = located._fusion
+    fusion = located._tracker.fusion
     roll_pitch_yaw = rng.normal(size=3) * (0.1, 0.1, 2.0)
     turn = map_from_base(roll_pitch_yaw)
     places = np.array([100.0, -50.0, 7.0]) + rng.normal(size=(5, 3)) * 30
@@ -291,10 +292,10 @@ def test_relative_fixes_are_those_of_the_paper_s_transform_seen_from_the_shared_
     map_from_world[:3, :3], map_from_world[:3, 3] = turn, believed
     for i, place in enumerate(places):
         geodetic = PROJECTION.to_geodetic(*place.tolist())
-        raw = located._receivers.fix(Gps("gps-1", stamp, *geodetic, 1.0, 1.0, 1.0), located.dead_reckoning.pose)
+        raw = located._tracker.receivers.fix(Gps("gps-1", stamp, *geodetic, 1.0, 1.0, 1.0), located.dead_reckoning.pose)
         if i == 0:
-            located._receivers.anchor(raw, fusion.at(stamp))
-        shifted = located._receivers.measurement(raw)
+            located._tracker.receivers.anchor(raw, fusion.at(stamp))
+        shifted = located._tracker.receivers.measurement(raw)
         paper = map_from_world @ world_from_utm @ np.append(place, 1.0)
         assert shifted.z == pytest.approx(paper[:2], abs=1e-5)
 
@@ -379,7 +380,7 @@ def test_heading_of_a_reference_wanders_as_the_machine_s_own() -> None:
     vehicle = of_ahrs(mode="relative", measures=("heading",))
     located = localiser(vehicle, start=START)
     located.beliefs(drive([Leg(1)], vehicle).readings)
-    model = located._fusion.model
+    model = located._tracker.fusion.model
     error = model.layout.heading_errors.start
     assert error == len(located.belief.x) - 1
     assert motion(model, located.belief, 2.0).Q[error, error] == pytest.approx(2.0 * HEADING_WALK**2)

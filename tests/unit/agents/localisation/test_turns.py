@@ -251,8 +251,10 @@ def test_the_error_of_a_turn_is_unsure_at_first_and_that_of_odometry_changes(
     vehicle = truck(*sensors)
     located, beliefs = run(vehicle, driven(vehicle, Wrong(), [Leg(1)]).readings, start=(10.0, 20.0, 0.7))
     assert beliefs[0].P[ERROR, ERROR] == pytest.approx(0.02**2, rel=0.01)
-    assert located._fusion
-    assert motion(located._fusion.model, beliefs[0], 2.0).Q[ERROR, ERROR] == pytest.approx(2 * (per_s + 5e-5**2))
+    assert located._tracker.fusion
+    assert motion(located._tracker.fusion.model, beliefs[0], 2.0).Q[ERROR, ERROR] == pytest.approx(
+        2 * (per_s + 5e-5**2)
+    )
 
 
 def test_the_paper_s_profile_has_no_state_for_the_error_of_the_turn() -> None:
