@@ -14,6 +14,7 @@ from protocol.units import GRAVITY_MPS2
 
 TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
 STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
+LOADING_S = 3.0  # a machine that stands so long may have loaded or dumped
 PAUSE_S = 1.0  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
 PAUSE_NS = round(PAUSE_S * 1e9)
 MAX_TRACTION = 1.0  # no tyre on any ground drives with more than its load: a wrong unit must not move the machine

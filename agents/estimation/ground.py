@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any
 
-from agents.dead_reckoning import DeadReckoning
+from agents.dead_reckoning import LOADING_S, DeadReckoning
 from agents.estimation.balance import Balance, Balancer, BalanceStep
 from agents.estimation.calibration import UNCALIBRATED, ZERO_STD, Calibration, Calibrator
 from agents.estimation.closed_tours import ClosedTours
@@ -29,7 +29,6 @@ KEPT = 400  # steps: 20 s
 NEAR_NS = 200_000_000  # a stamp this far from a step has no slope
 SILENT_NS = 1_000_000_000  # other sensors have readings, but no step was made for so long
 JOLTS = frozenset({"accelerometer", "slip"})  # then the accelerometer does not show the slope ahead
-LOADING_S = 3.0  # a machine that stands so long may have loaded or dumped
 MAX_LOADED = 4.0  # loaded mass over empty mass; forces that say more are no mass
 MODEL_STD = 0.0015  # error of the balance itself [-], which no calibration removes
 

@@ -7,7 +7,8 @@ Driven wheels turn further than the machine moves, by a share that grows with tr
 traction: drive force over weight, signed ahead. rolling: the part of it that neither climbs nor accelerates, which an
 accelerometer ahead measures together. s0, s1: `slip` and `slip_soft` of the tyres; soft ground resists, and gives way.
 
-A load that nobody weighs makes the traction, and so the slip, seem larger than it is.
+A load that nobody weighs makes the traction, and so the slip, seem larger than it is. A machine takes one up as it
+stands.
 """
 
 import math
@@ -15,7 +16,7 @@ from collections import Counter
 
 import numpy as np
 
-from agents.dead_reckoning import turn_source
+from agents.dead_reckoning import LOADING_S, turn_source
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Measurement
 from agents.localisation.filters.motion import SLIP_STD
@@ -52,7 +53,8 @@ class MotionSensors:
         is_weighed: bool = True,
     ) -> None:
         self.counters: Counter[str] = Counter()
-        self.slip_std, self._load_doubt = SLIP_STD, 0.0 if is_weighed else LOAD_DOUBT
+        self.slip_std, self._is_weighed = SLIP_STD, is_weighed
+        self._load_doubt = 0.0
         self._layout, self._step_s, self._on_plane = layout, step_s, on_plane
         (self._slip, self._slip_soft), self._rolling = tyres, 0.0
         used = [s for s in machine.sensors if s.use]
@@ -118,12 +120,19 @@ class MotionSensors:
             ahead = sum(float(force[0]) for force in forces) / len(forces)
             self._rolling = rolling_resistance(self._rolling, step.traction, ahead, self._step_s)
         slip = self._slip + self._slip_soft * self._rolling
+        if not self._is_weighed:
+            self._doubt_load(step.still_s)
         self.slip_std = math.hypot(SLIP_STD, self._load_doubt * slip)
         z = np.array([machine_speed(step.wheels.speed_mps, step.traction, slip), 0.0, 0.0])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
         R, gate, offset_m = self._wheels_R, self._wheels_gate, step.wheels.offset_m
         rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate, offset_m)
         return [rolled, measurements.standstill(step.stamp_ns)] if step.still_s >= STANDSTILL_S else [rolled]
+
+    def _doubt_load(self, still_s: float) -> None:
+        """Doubt the slip from the first stop on at which the machine may have loaded."""
+        if still_s >= LOADING_S:
+            self._load_doubt = LOAD_DOUBT
 
     def _whole_imu(self, index: int, sensor: SensorConfig) -> Measurement:
         """A measurement of an IMU, of which only stamp and value are to be set."""
