@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.dead_reckoning import DeadReckonedPose, WheelSpeed
-from agents.localisation.alignment import DISTANCE_M, align, align_fixes, align_start, start_belief
+from agents.localisation.alignment import align, align_fixes, align_start, start_belief
 from agents.localisation.filters.state import ATTITUDE, SPEED, YAW, Layout
 from agents.localisation.gps import Fix
 from agents.localisation.imu_steps import FilterStep
@@ -15,7 +15,7 @@ from protocol.units import GRAVITY_MPS2
 
 
 def test_no_alignment_where_all_positions_coincide() -> None:
-    assert align(np.full((9, 2), 3.0), np.random.default_rng(0).normal(size=(9, 2)), 1.0) is None
+    assert align(np.full((9, 2), 3.0), np.random.default_rng(0).normal(size=(9, 2)), np.ones(9)) is None
 
 
 def fixes(length_m: float, turn_rad: float, n: int = 8, **options: Any) -> list[Fix]:
@@ -29,28 +29,61 @@ def fixes(length_m: float, turn_rad: float, n: int = 8, **options: Any) -> list[
     ]
 
 
+def stating(collected: list[Fix], std_m: float) -> list[Fix]:
+    return [replace(fix, variance_m2=np.full(2, std_m**2)) for fix in collected]
+
+
 def reckoned(x_m: float = 0.0) -> DeadReckonedPose:
     return DeadReckonedPose(0, x_m, 0.0, x_m, 0.0)
 
 
 def test_fixes_show_how_the_reckoned_frame_lies() -> None:
-    alignment = align_fixes(fixes(20.0, 0.9), 20.0)
+    alignment = align_fixes(fixes(20.0, 0.9))
     assert alignment.rotation_rad == pytest.approx(0.9)
     assert alignment.origin_m == pytest.approx((5.0, 7.0))
     assert alignment.fix_std_m == pytest.approx(math.sqrt(2.0))
 
 
 @pytest.mark.parametrize(
-    ("collected", "distance_m"),
+    "collected",
     [
-        (fixes(20.0, 0.9), DISTANCE_M - 0.1),  # too short a way
-        (fixes(20.0, 0.9, n=3), 20.0),  # too few
-        (fixes(2.0, 0.9), 20.0),  # there and back, in one place
-        (fixes(20.0, 0.9, mode="relative"), 20.0),  # nothing absolute
+        fixes(20.0, 0.9, n=3),  # too few
+        fixes(2.0, 0.9),  # there and back, in one place
+        fixes(20.0, 0.9, mode="relative"),  # nothing absolute
+        stating(fixes(20.0, 0.9), 30.0),  # too unsure
+        [*stating(fixes(20.0, 0.9), 30.0), *fixes(2.0, 0.9)],  # what is sure has no spread
     ],
 )
-def test_heading_is_not_taken_from_too_little(collected: list[Fix], distance_m: float) -> None:
-    assert align_fixes(collected, distance_m) is None
+def test_heading_is_not_taken_from_too_little(collected: list[Fix]) -> None:
+    assert align_fixes(collected) is None
+
+
+def shifted(collected: list[Fix], east_m: float) -> list[Fix]:
+    return [replace(fix, position_m=fix.position_m + (east_m, 0.0)) for fix in collected]
+
+
+@pytest.mark.parametrize("first_off", range(2, 12, 3))
+def test_a_first_stretch_that_is_off_does_not_count(first_off: int) -> None:
+    """By 40 m, which the receiver does not state."""
+    whole = fixes(40.0, 0.9, n=20)
+    alignment = align_fixes([*shifted(whole[:first_off], 40.0), *whole[first_off:]])
+    assert alignment.rotation_rad == pytest.approx(0.9)
+    assert alignment.origin_m == pytest.approx((5.0, 7.0))
+    assert alignment.since_ns == first_off
+
+
+def test_a_first_stretch_counts_as_little_as_it_states() -> None:
+    whole = fixes(40.0, 0.9, n=20)
+    alignment = align_fixes([*stating(shifted(whole[:6], 30.0), 30.0), *whole[6:]])
+    assert alignment.rotation_rad == pytest.approx(0.9, abs=0.01)
+    assert alignment.since_ns == 0
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.4])
+def test_wheels_of_another_radius_do_not_hide_the_heading(scale: float) -> None:
+    whole = fixes(40.0, 0.9, n=20)
+    reckoned_wrong = [replace(fix, reckoned=reckoned(scale * fix.reckoned.x_m)) for fix in whole]
+    assert align_fixes(reckoned_wrong).rotation_rad == pytest.approx(0.9)
 
 
 def step(force: tuple[float, float, float] | None = None) -> tuple[FilterStep, list[Any]]:
@@ -88,7 +121,7 @@ def test_start_is_where_the_machine_is_now_not_where_dead_reckoning_began() -> N
 def test_a_spread_twice_as_large_makes_the_heading_surer() -> None:
     stds = []
     for length_m in (20.0, 40.0):
-        alignment = align_fixes(fixes(length_m, 0.9), length_m)
+        alignment = align_fixes(fixes(length_m, 0.9))
         stds.append(math.sqrt(start_belief(alignment, *step(), Layout(), 0.0).P[YAW, YAW]))
     assert stds[1] < 0.75 * stds[0]
 
@@ -106,7 +139,8 @@ def test_align_recovers_rotation_and_shift(seed: int) -> None:
     reckoned = rng.uniform(-20, 20, (30, 2))
     rotation, shift = rng.uniform(-math.pi, math.pi), rng.uniform(-500, 500, 2)
     c, s = math.cos(rotation), math.sin(rotation)
-    alignment = align(reckoned, reckoned @ np.array([[c, s], [-s, c]]) + shift, 2.0)
+    alignment, first = align(reckoned, reckoned @ np.array([[c, s], [-s, c]]) + shift, np.full(30, 4.0))
+    assert first == 0, f"seed={seed}"
     assert alignment.rotation_rad == pytest.approx(rotation), f"seed={seed}"
     assert alignment.origin_m == pytest.approx(tuple(shift)), f"seed={seed}"
     spread_m = float(np.sqrt(reckoned.var(axis=0).sum()))
