@@ -246,9 +246,7 @@ def test_machine_without_imu_or_torque_gives_samples_without_resistance_or_slope
     assert len(rows) > 50
     assert np.isnan(rows["c_rr"]).all()
     assert np.isnan(rows["grade_e"]).all()
-    no_torque = (
-        Pipeline(SITE, VEHICLE, STARTED).step(drive(S_BEND, VEHICLE, without=("torque",)).readings).pending
-    )
+    no_torque = Pipeline(SITE, VEHICLE, STARTED).step(drive(S_BEND, VEHICLE, without=("torque",)).readings).pending
     check_samples(no_torque, SITE.extent_m)
     assert np.isnan(no_torque["c_rr"]).all()
     assert np.isfinite(no_torque["grade_e"]).all()
