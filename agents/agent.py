@@ -18,6 +18,7 @@ from agents.delivery.uplink_thread import Check, Sign, UplinkThread, linger
 from agents.delivery.write_buffer import WriteBuffer
 from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
+from agents.first_sample import FirstSample
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Presence
@@ -71,6 +72,7 @@ class Agent:
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
         self._unsaved, self._spool_problem = WriteBuffer(), ""
+        self._first_sample = FirstSample(machine)
         self._readings = 0
         self._samples = 0
         self._newest_ns = 0
@@ -99,9 +101,11 @@ class Agent:
                 self._consider_offer()
                 self._calibration_file.write(self._pipeline.calibration)
                 self._yield_name()
+                self._tell_what_is_missing()
                 self._presence.show_health(self._newest_ns, self.report(driver))
         driver.close()
         self._take(self._pipeline.finish())
+        self._tell_what_is_missing()
         self._write()
         self._calibration_file.write(self._pipeline.calibration)
         delivered = linger(self._is_delivered, wait, clock, 0.0 if is_stopped() else self._config.linger_s)
@@ -117,6 +121,7 @@ class Agent:
             "pid": owner.pid,
             "readings": self._readings,
             "samples": self._samples,
+            "no_sample": self._first_sample.why_not,
             "driver": dict(driver.counters()),
             "pipeline": self._pipeline.health(),
             "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._unsaved.given_up},
@@ -143,6 +148,7 @@ class Agent:
         if readings:
             self._newest_ns = max(self._newest_ns, readings[-1].stamp_ns)
         before = self._pipeline.pose
+        self._first_sample.take(readings)
         self._take(self._pipeline.step(self._holdout.split(readings) if self._holdout else readings))
         if self._holdout:
             self._holdout.compare(self._pipeline)
@@ -154,6 +160,12 @@ class Agent:
     def _take(self, made: Samples) -> None:
         """Have samples written at the end of the second."""
         self._unsaved.add(made.pending, made.final)
+        if len(made.pending):
+            self._first_sample.sampled()
+
+    def _tell_what_is_missing(self) -> None:
+        if why := self._first_sample.judge(self._pipeline.health):
+            log.warning("samples are missing why=%r", why)
 
     def _write(self) -> None:
         """Write to the spool; while the disk is full or fails samples wait in memory, and the machine goes on."""

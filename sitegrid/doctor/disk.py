@@ -122,8 +122,9 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
     message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
-    problems = [uplink.get("problem"), *(values.get(f"{part}_problem") for part in ("spool", "calibration"))]
-    advice = "; ".join(str(problem) for problem in (*problems, values.get("spool_damage")) if problem)
+    named = ("no_sample", "spool_problem", "calibration_problem", "spool_damage")
+    problems = [uplink.get("problem"), *map(values.get, named)]
+    advice = "; ".join(str(problem) for problem in problems if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""
     lost = any(spool.get(key) for key in ("dropped", "put_aside", "gone"))
     return Finding(Level.WARN if advice or lost else Level.PASS, "spool", message, advice)

@@ -1,0 +1,78 @@
+"""Why a machine has no sample yet: one sentence, once it has had readings for a while."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+from agents.localisation.alignment import DISTANCE_M
+from agents.localisation.localiser import PROVEN_M, PROVEN_S
+from agents.sampling import MAX_STD_M
+from agents.stream_order import GAP_NS
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Correction, Encoder, Gps, Odometry, Reading, Torque
+
+WAIT_NS = 30 * 10**9  # in the readings' time; a machine that drives off has its heading after 10 to 20 s
+WHEELS = frozenset({Encoder.kind, Odometry.kind})
+
+
+class FirstSample:
+    """Follows the readings of a machine until it has a sample. why_not: empty while nothing is known to be missing."""
+
+    def __init__(self, machine: MachineConfig) -> None:
+        self.why_not = ""
+        self._sensors = {sensor.name: sensor.kind for sensor in machine.sensors if sensor.use}
+        self._kinds: set[str] = set()
+        self._first_ns = self._newest_ns = 0
+        self._is_sampled = self._is_judged = False
+
+    def take(self, readings: Sequence[Reading]) -> None:
+        """Take in readings. The time counts from the first one behind a gap, as localisation starts anew there."""
+        own = [reading for reading in readings if not isinstance(reading, Correction)]  # that has another clock
+        if self._is_judged or not own:
+            return
+        self._kinds.update(r.kind for r in own if self._sensors.get(r.sensor) == r.kind)
+        if abs(own[0].stamp_ns - self._newest_ns) > GAP_NS:
+            self._first_ns = own[0].stamp_ns
+        self._newest_ns = own[-1].stamp_ns
+
+    def sampled(self) -> None:
+        """Note that there is a sample, pending or final."""
+        self._is_sampled, self.why_not = True, ""
+
+    def judge(self, health: Callable[[], Mapping[str, Any]]) -> str:
+        """What is missing, in one sentence, once: WAIT_NS after the first reading. health: of the pipeline.
+
+        Where samples wait for the proof of the heading, that has PROVEN_S more.
+        """
+        waited_ns = self._newest_ns - self._first_ns
+        if self._is_judged or waited_ns < WAIT_NS:
+            return ""
+        state = health()
+        waits_for_proof = not self._is_sampled and state["aligned"] and not state["heading_proven"]
+        if waits_for_proof and waited_ns < WAIT_NS + PROVEN_S * 1e9:
+            return ""
+        self._is_judged = True
+        has_torque = Torque.kind in self._kinds
+        if self._is_sampled:
+            return "" if has_torque else "samples have no rolling resistance: no torque readings"
+        causes = missing(self._kinds, state) + ["no torque readings"] * (not has_torque)
+        self.why_not = f"no sample after {waited_ns // 10**9} s of readings: {', '.join(causes)}"
+        return self.why_not
+
+
+def missing(kinds: Collection[str], health: Mapping[str, Any]) -> list[str]:
+    """Why no sample can be made. kinds: of the readings of the machine's own sensors. health: of the pipeline."""
+    if not kinds:
+        return ["none of them is of a sensor in the config"]
+    if health["heading_proven"]:
+        unsure = health["withheld"].get("unsure_position")
+        return [f"the position is less certain than {MAX_STD_M:g} m" if unsure else "the machine has not moved"]
+    causes = [] if WHEELS & set(kinds) else ["no wheel readings (encoder or odometry)"]
+    if Gps.kind not in kinds:
+        causes.append("no GPS fixes")
+    elif health["counters"].get("fix_outside_site"):
+        causes.append("GPS fixes outside the site")
+    elif health["repeating"]:
+        causes.append(f"{', '.join(health['repeating'])} repeats one fix")
+    if not causes and health["aligned"]:
+        return [f"the heading is not proven until fixes agree with it for {PROVEN_S:g} s and {PROVEN_M:g} m"]
+    return causes or [f"the heading is unknown until the machine has driven {DISTANCE_M:g} m with GPS fixes"]
