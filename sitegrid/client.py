@@ -422,11 +422,12 @@ def _goes_back(first: TilesAnswer, answer: TilesAnswer) -> bool:
 
 
 def connect(
-    endpoint: str = DEFAULT_ENDPOINT, site: str = "paper", *, timeout_s: float = 10.0, keys: Path | None = None
+    endpoint: str = DEFAULT_ENDPOINT, site: str | None = None, *, timeout_s: float = 10.0, keys: Path | None = None
 ) -> Client:
     """Connect to the router at `endpoint` and ask for the map of `site`; LinkError if no router is there.
 
-    keys: folder of this client's keys, on a site that has them.
+    keys: folder of this client's keys, on a site that has them. site: default that of the keys, else `paper`.
     """
-    config = join(endpoint, keys, site=site)
-    return Client(open_session(config), config.endpoint, site, timeout_s)
+    config = join(endpoint, keys, site=site or "")
+    name = site or (config.credentials.identity.site if config.credentials else "paper")
+    return Client(open_session(config), config.endpoint, name, timeout_s)

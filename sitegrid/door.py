@@ -18,6 +18,7 @@ from importlib import import_module
 import zenoh
 
 from protocol.errors import SitegridError, one_line
+from protocol.version import package_version
 from protocol.wire.session import reason_of
 from sitegrid import commands
 from sitegrid.options.groups import add_command
@@ -77,6 +78,7 @@ def _run(words: Sequence[str]) -> int:
 def build_parser() -> ArgumentParser:
     """The parser of all commands."""
     parser = ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
+    parser.add_argument("--version", action="version", version=f"sitegrid {package_version()}")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True)
     those = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")
     for word, name in sorted((info.name.rpartition(".")[2], info.name) for info in those if not info.ispkg):

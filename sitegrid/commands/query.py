@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from argparse import ArgumentParser, Namespace
+from argparse import SUPPRESS, ArgumentParser, Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -45,11 +45,7 @@ HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
-    add_network(parser)
-    add_site(parser)
-    after = "wait until this journal row is in the map; for changes: list those after this number"
-    parser.add_argument("--after", type=int, default=0, help=after)
-    parser.add_argument("--layers", default="", help="layers, comma-separated; default all")
+    _add_common(parser)
     queries = parser.add_subparsers(metavar="QUERY", required=True)
     point = _add_query(queries, _point, "the cell at a position, in metres")
     _add_numbers(point, "x_m", "y_m")
@@ -95,8 +91,19 @@ def add_options(parser: ArgumentParser) -> None:
 
 def _add_query(queries: Subparsers, ask: Ask, summary: str) -> ArgumentParser:
     query = add_action(queries, ask.__name__.removeprefix("_"), summary, sentence(summary))
+    _add_common(query, again=True)
     query.set_defaults(ask=ask)
     return query
+
+
+def _add_common(parser: ArgumentParser, *, again: bool = False) -> None:
+    """Options of every query, before its name and after it."""
+    add_network(parser, again=again)
+    add_site(parser, again=again)
+    after = "wait until this journal row is in the map; for changes: list those after this number"
+    parser.add_argument("--after", type=int, default=SUPPRESS if again else 0, help=after)
+    layers = "layers, comma-separated; default all"
+    parser.add_argument("--layers", default=SUPPRESS if again else "", help=layers)
 
 
 def _add_numbers(query: ArgumentParser, *names: str) -> None:

@@ -24,19 +24,23 @@ def add_action(actions: Subparsers, name: str, summary: str, description: str | 
     parser: ArgumentParser = actions.add_parser(name, help=summary, description=description)
     # without a default, which would overwrite a --json before the second word
     parser.add_argument("--json", action="store_true", default=SUPPRESS, help="print JSON for machines")
+    verbose = "log normal events too, not only warnings and errors"
+    parser.add_argument("--verbose", action="store_true", default=SUPPRESS, help=verbose)
     return parser
 
 
-def add_network(parser: ArgumentParser) -> None:
-    """Options of a command that connects to the router."""
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="router to connect to (default %(default)s)")
+def add_network(parser: ArgumentParser, *, again: bool = False) -> None:
+    """Options of a command that connects to the router. again: after its second word too, so without defaults."""
+    router = f"router to connect to (default {DEFAULT_ENDPOINT})"
+    parser.add_argument("--endpoint", default=SUPPRESS if again else DEFAULT_ENDPOINT, help=router)
     keys = "folder with the keys of this process (see `sitegrid keys`); the default endpoint is tls/... then"
-    parser.add_argument("--keys", type=Path, metavar="FOLDER", help=keys)
+    parser.add_argument("--keys", type=Path, default=SUPPRESS if again else None, metavar="FOLDER", help=keys)
 
 
-def add_site(parser: ArgumentParser) -> None:
-    """The name of the site that is asked."""
-    parser.add_argument("--site", default="paper", help="name of the site (default %(default)s)")
+def add_site(parser: ArgumentParser, *, again: bool = False) -> None:
+    """The name of the site that is asked; see `connect` where it is not given. again: see `add_network`."""
+    site = "name of the site (default: that of the keys, else paper)"
+    parser.add_argument("--site", default=SUPPRESS if again else None, help=site)
 
 
 def sentence(summary: str) -> str:

@@ -35,14 +35,14 @@ AROUND_M = 30.0  # of the map around a drive
 STEP_M, MOST_STEPS = 5.0, 1000  # of a drive's profile
 MAX_POSES = 50_000  # of one machine: nearly three hours at 5 Hz
 LAYERS = ("resistance", "grade_east", "grade_north")
-SAMPLES_FOLLOW = "samples follow a minute or two behind"  # the smoother's lag, which only agents know
+SAMPLES_FOLLOW = "the map follows a minute or two later"  # the smoother's lag, which only agents know
 
 
 def run(arguments: Namespace) -> int:
     """Draw the map; with --follow again and again until stopped."""
     stop = stop_flag()
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
-        tracks = TrackRecorder(client.session, arguments.site)
+        tracks = TrackRecorder(client.session, client.site)
         drawn = 0
         while not stop.is_set():
             drawn += _draw_if_possible(client, arguments, tracks.tracks())

@@ -43,12 +43,12 @@ class PatientProtocol(H11Protocol):
 
 def serve(
     opened: ExitStack,
-    sites: Sequence[tuple[str, str]],
+    sites: Sequence[tuple[str | None, str]],
     address: tuple[str, int],
     arguments: Namespace,
     stop: threading.Event,
 ) -> int:
-    """Serve sites, each a name and an endpoint, until `stop` is set."""
+    """Serve sites, each a name (see `connect` for None) and an endpoint, until `stop` is set."""
     listening = opened.enter_context(_listen(address))
     person = TokenFile(arguments.tokens).person if arguments.tokens else None
     clients = [connect(endpoint, name, keys=arguments.keys) for name, endpoint in sites]
@@ -72,7 +72,7 @@ def serve(
         watch = asyncio.create_task(_stop_with(server, stop))
         scheme, (host, port) = "https" if arguments.tls else "http", listening.getsockname()[:2]
         url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
-        say({"ready": "web", "url": url, "sites": [name for name, _ in sites]})
+        say({"ready": "web", "url": url, "sites": [client.site for client in clients]})
         await server._serve([listening])  # noqa: SLF001 - `serve` would take the signals that stop_flag has
         stop.set()
         await watch

@@ -157,7 +157,7 @@ class Stop:
 class Nothing:
     """Stands for a client and for its tracks."""
 
-    session = None
+    session = site = None
 
     def __enter__(self) -> Nothing:
         return self

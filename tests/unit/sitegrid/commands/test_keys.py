@@ -20,6 +20,7 @@ from protocol.wire.codec import MAX_BATCH_BYTES
 from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from sitegrid.cli import main
+from sitegrid.client import connect
 from sitegrid.door import build_parser
 from sitegrid.security.access import access_control, router_settings
 from sitegrid.security.join import is_loopback, join
@@ -55,6 +56,17 @@ def refused(capsys, folder: Path, action: str, *words: str) -> str:
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     return error
+
+
+def test_whoever_asks_with_keys_asks_the_site_of_the_keys(folder: Path, monkeypatch):
+    monkeypatch.setattr("sitegrid.client.open_session", lambda _: None)
+    other = folder.parent / "quarry"
+    assert main(["keys", "init", "--dir", str(other), "--site", "quarry"]) == 0
+    assert act(other, "add", "office", "--role", "visitor") == 0
+    assert connect(keys=other / "office").site == "quarry"
+    assert connect().site == "paper"
+    with pytest.raises(ConfigError, match="for site 'quarry', 'pit' is needed"):
+        connect(site="pit", keys=other / "office")
 
 
 # --- certificates ----------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,6 +39,7 @@ from sitegrid.asking import PAST_S
 from sitegrid.cli import main
 from sitegrid.client import Client
 from sitegrid.commands import query
+from sitegrid.door import build_parser
 from tests.paths import GOLDEN
 from tests.unit.records import STORE, map_info, version
 
@@ -104,7 +106,7 @@ class Reply:
 @pytest.fixture
 def session(monkeypatch) -> Session:
     session = Session()
-    monkeypatch.setattr(query, "connect", lambda endpoint, site, **_: Client(session, endpoint, site))  # type: ignore[arg-type]
+    monkeypatch.setattr("sitegrid.client.open_session", lambda _: session)
     return session
 
 
@@ -301,6 +303,29 @@ def test_people_see_the_time_of_an_answer(session: Session, capsys):
     assert first_line("point", "1", "2", *minus) == "cell at 0.5, 1.5 m, minus that of 2025-06-15 15:05:00Z"
     line = first_line("region", "0", "1", "1", "2", *as_of, *minus)
     assert "as of 2025-06-15 15:06:00Z, minus that of 2025-06-15 15:05:00Z, journal row 17" in line
+
+
+def test_every_option_of_query_stands_before_its_name_or_after_it(capsys):
+    parser = build_parser()
+
+    def helped(*words: str) -> str:
+        with pytest.raises(SystemExit):
+            parser.parse_args(["query", *words, "--help"])
+        return capsys.readouterr().out
+
+    values = {"--json": [], "--verbose": [], "--layers": ["visits"], "--after": ["3"], "--site": ["pit"]}
+    values |= {"--endpoint": ["tcp/h:1"], "--keys": ["k"]}
+    assert set(re.findall(r"^  (--[a-z]+)", helped(), re.MULTILINE)) == values.keys()
+    places = {"point": 2, "points": 2, "history": 2, "region": 4, "route": 4, "way": 4}
+    names = re.findall(r"^    ([a-z]+) ", helped(), re.MULTILINE)
+    assert places.keys() < set(names)
+    for name in names:
+        ask = [name, *["1"] * places.get(name, 0)]
+        for option, value in values.items():
+            before, after = (
+                parser.parse_args(["query", *words]) for words in ([option, *value, *ask], [*ask, option, *value])
+            )
+            assert before == after != parser.parse_args(["query", *ask]), (name, option)
 
 
 VERSION = {"store": STORE, "merged": 17, "fact": 3}
