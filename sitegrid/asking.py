@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum, auto
+from typing import Any
 
 import zenoh
 
@@ -32,6 +33,7 @@ AGAIN_S = 0.1
 PAST_S = 120.0  # how much longer an answer may take that has to be folded from the journal
 LOOK_S = 1.0  # between two looks for followers, each 0.1 ms of the router
 LOOK_WAIT_S = 1.0
+KNOWN_S = 1.0  # for the router's news of who answers
 AVOID_S = 10.0  # a follower that did not answer: after the lease of its link its token is gone
 FOLLOWERS_TRIED = 2  # for one question, before the server is asked: each may take half of the time that is left
 FOLLOWER_WAIT_S = 1.0  # for a row, at a follower that lacks it: one that follows has it after 0.5 s
@@ -106,6 +108,20 @@ class Followers:
         """Ask others for a while, and look again who is there."""
         self._avoided[name] = time.monotonic() + AVOID_S
         self._look_s = 0.0
+
+
+def is_answered(session: zenoh.Session, key: str) -> bool:
+    """Whether the router knows of somebody who answers on a key: it says so also where it lets nobody ask."""
+    querier: Any = session.declare_querier(key)  # its matching_status is an object, although declared a bool
+    try:
+        end_s = time.monotonic() + KNOWN_S
+        while not querier.matching_status.matching:
+            if time.monotonic() >= end_s:
+                return False
+            time.sleep(0.02)
+        return True
+    finally:
+        querier.undeclare()
 
 
 def preferred(client: bytes, names: set[str]) -> list[str]:

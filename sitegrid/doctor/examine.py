@@ -17,7 +17,7 @@ from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials
-from sitegrid.asking import Asker
+from sitegrid.asking import Asker, is_answered
 from sitegrid.doctor import Finding, Level, base, disk, network, skipped
 from sitegrid.doctor.keys import check_certificate, read_certificate
 from sitegrid.doctor.positions import check_positions
@@ -101,7 +101,7 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
         problem = f"site {subject.site}: the map server's answer cannot be read: {error}"
         unread = Finding(Level.FAIL, "server", problem, "update the older side")
         return [unread, *(skipped(name, "the server's answer cannot be read") for name in OF_SERVER[1:])]
-    is_there = info is not None or network.is_answered(session, keys.map_query(subject.site, "info"))
+    is_there = info is not None or is_answered(session, keys.map_query(subject.site, "info"))
     findings = [network.check_server(subject.site, info, is_there=is_there, role=role)]
     if info is not None:
         site = subject.site_file
@@ -133,7 +133,7 @@ def _permission(subject: Subject, session: zenoh.Session, info: MapInfo | None) 
         return skipped("permission", "give --site-file FILE, for the server does not say the site's frame")
     keys_folder = subject.options.keys
     answer = network.ask_permission(session, subject.site, subject.machine, site.frame, keys_folder)
-    is_there = answer is not None or network.is_answered(session, keys.ingest(subject.site, subject.machine))
+    is_there = answer is not None or is_answered(session, keys.ingest(subject.site, subject.machine))
     return network.check_permission(subject.machine, answer, is_there=is_there, has_keys=keys_folder is not None)
 
 

@@ -27,12 +27,12 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_reply, encode_batch
 from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, open_session
+from sitegrid.asking import KNOWN_S
 from sitegrid.doctor import Finding, Level, skipped
 from sitegrid.security.join import signer
 
 ANSWER_S = 5.0
 LINK_S = 3.0
-KNOWN_S = 1.0  # for the router's news of who answers
 HEALTH_S = 3.0  # an agent reports its health every second
 AHEAD_S = 60.0  # of the newest stamp and the server's clock: more than clocks set by hand are off
 OFFSET_S = 1.0  # of two clocks, beyond which the ages on the map are off
@@ -87,20 +87,6 @@ def check_link(link: RouterLink) -> Finding:
 
 
 # --- map server ------------------------------------------------------------------------------------------------------
-
-
-def is_answered(session: zenoh.Session, key: str) -> bool:
-    """Whether the router knows of somebody who answers on a key: it says so also where it lets nobody ask."""
-    querier: Any = session.declare_querier(key)  # its matching_status is an object, although declared a bool
-    try:
-        end_s = time.monotonic() + KNOWN_S
-        while not querier.matching_status.matching:
-            if time.monotonic() >= end_s:
-                return False
-            time.sleep(0.02)
-        return True
-    finally:
-        querier.undeclare()
 
 
 def ask_info(session: zenoh.Session, site: str) -> tuple[MapInfo | None, tuple[int, int]]:

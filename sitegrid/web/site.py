@@ -14,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from typing import Any, TypeVar
 
+import zenoh
+
 from protocol.errors import LinkError, MessageError, QueryError
 from protocol.queries.answers import MapInfo, MapVersion
 from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
@@ -21,6 +23,7 @@ from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_pose
 from protocol.wire.messages import Pose
+from sitegrid.asking import is_answered
 from sitegrid.client import Client
 from sitegrid.listener import Listener
 from sitegrid.web.values import plain
@@ -53,6 +56,7 @@ class SiteFeed:
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=f"ask-{client.site}")
         self.watchers = 0
         self._task: asyncio.Task[None] | None = None
+        self._looking: asyncio.Task[None] | None = None
         self._poses: dict[str, tuple[Pose, float]] = {}
         self._tracks: dict[str, deque[Pose]] = {}
         self._poses_lock = threading.Lock()
@@ -149,6 +153,7 @@ class SiteFeed:
         if self._listener is None:
             key = keys.poses_all(self.name)
             self._listener = await self.ask(Listener, self.client.session, key, decode_pose, self._on_pose)
+            self._looking = asyncio.create_task(self._look_for_server())
         next_state_s = 0.0
         idle_s = 0.0
         while idle_s < LINGER_S:
@@ -167,6 +172,13 @@ class SiteFeed:
             await asyncio.sleep(max(0.05, PERIOD_S - (time.monotonic() - began_s)))
             idle_s = 0.0 if self.watchers else idle_s + PERIOD_S
         self._task = None
+
+    async def _look_for_server(self) -> None:
+        """Say soon that there is no map server: the first question to it waits longer for one that starts again."""
+        with contextlib.suppress(zenoh.ZError):  # the session was closed meanwhile
+            is_there = await self.ask(is_answered, self.client.session, keys.map_query(self.name, "tiles"))
+            self.is_away |= not is_there and self.answer is None
+            await self._notify()
 
     async def _notify(self) -> None:
         async with self.moved:

@@ -247,21 +247,45 @@ def test_a_server_that_is_gone_is_named_and_comes_back(browser, web: WebSite):
     tab.close()
 
 
-def test_an_empty_map_says_what_to_do(browser, tmp_path: Path):
+def seen(tab: Tab, *places: tuple[float, float]) -> bool:
+    """Whether places are on the screen, right of the rail."""
+    return all(260 < x < 1280 and 0 < y < 720 for x, y in (tab.pixel_of(*place) for place in places))
+
+
+def test_an_empty_map_says_what_to_do_and_what_comes_is_in_sight_until_the_view_is_moved(browser, tmp_path: Path):
     with Children(tmp_path) as children:
         web = WebSite(tmp_path, children)
+        kill(web.server)
         tab = Tab(browser, web.url)
+        tab.until("document.getElementById('notice').textContent.includes('No map server answers')")
+        assert "what it said last" not in tab.page.locator("#notice").inner_text(), "it said nothing yet"
+        web.server = web.start_server()
         tab.until("document.getElementById('notice').textContent.includes('No ground known yet')")
         assert "sitegrid agent" in tab.page.locator("#notice code").inner_text()
-        for i, x_m in enumerate((400.0, 600.0)):
-            pose = Pose(f"machine-{i}", START_NS, x_m, 300.0, 0.0, 2.0, 1.0, 0.0, 1.0)
+
+        def machine_at(*place: float) -> None:
+            pose = Pose("machine-9", START_NS, *place, 0.0, 2.0, 1.0, 0.0, 1.0)
             web.session.put(keys.pose(NAME, pose.machine), encode_pose(pose))
+            tab.until(f"sitegrid.machines.get('machine-9')?.x_m === {place[0]}")
+
+        machine_at(400.0, 300.0)
         tab.until("document.getElementById('notice').textContent.includes('Machines are driving')")
-        places = "[...sitegrid.machines.values()].map((m) => sitegrid.view.toScreen(m.x_m, m.y_m))"
-        assert all(0 < x < 1280 and 0 < y < 800 for x, y in tab.js(places)), "they are in sight"
         assert "small" in tab.js("document.getElementById('notice').className")
+        assert seen(tab, (400, 300))
         web.drive(8)
-        tab.until("document.getElementById('notice').hidden && sitegrid.map.tiles.size > 0")
+        tab.until("document.getElementById('notice').hidden && sitegrid.map.tiles.size > 0 && !sitegrid.view.flight")
+        west, south, east, north = tab.js("sitegrid.map.bounds()")
+        assert seen(tab, (400, 300), (west, south), (east, north)), "ground and machines"
+        machine_at(-700.0, 900.0)
+        tab.until("!sitegrid.view.flight")
+        assert seen(tab, (-700, 900), (west, south), (east, north)), "again, with what is new"
+        tab.page.mouse.move(640, 300)
+        tab.page.mouse.wheel(0, -400)
+        tab.until("sitegrid.view.moved")
+        moved = tab.js("[sitegrid.view.x, sitegrid.view.y, sitegrid.view.scale]")
+        machine_at(3000.0, 900.0)
+        tab.page.wait_for_timeout(300)
+        assert tab.js("[sitegrid.view.x, sitegrid.view.y, sitegrid.view.scale]") == moved
         tab.close()
 
 

@@ -13,7 +13,8 @@ const SHOWS = [["machines", "Machines", "M"], ["tracks", "Tracks, last minute", 
 const NOTICES = {
   loading: ["Loading the map", "One moment; the first tiles are on their way."],
   empty: ["No ground known yet", "Start a machine's agent; the map fills as it drives.", "sitegrid agent --config loader-1.toml --site-file site.toml --spool spool.db"],
-  driving: ["Machines are driving.", "Their ground follows a minute or two behind them, once their positions are surer.", null, true],
+  driving: ["Machines are driving.", "The map follows a minute or two later.", null, true],
+  absent: ["No map server answers", "The map is shown as soon as one does. The first start of one takes about a minute."],
   away: ["No map server answers.", "This is what it said last. Trying again every 2 s.", null, true],
   offline: ["The page's server does not answer.", "This is what it said last. Trying again every 2 s.", null, true],
   refused: ["This link has no permission", "Ask the office for a visitor's token, then open the new link."],
@@ -23,6 +24,7 @@ const PANEL_PX = 420, PANEL_PART = 0.62; // of the window's right that the panel
 const HOLD_PX = 14; // beside the line between two times, where it can be taken
 const SAID_MS = 6000; // how long what just failed is shown
 const AGAIN_MS = 2000; // before a panel that could not be read is asked for again
+const NEAR_M = 5, ROOM_M = 15; // around a machine: what is in sight, and what is made so where it leaves that
 const REST_MS = 120; // a pointer that stays so long asks for the value
 
 const asked = new URLSearchParams(location.search);
@@ -197,7 +199,7 @@ function setState(state) {
   if (state === page.state && state !== "loading") return;
   page.state = state;
   const empty = state === "live" && !page.map.tiles.size;
-  const kind = !empty ? state : page.machines.size ? "driving" : "empty";
+  const kind = state === "away" && !page.map.store ? "absent" : !empty ? state : page.machines.size ? "driving" : "empty";
   const [title, text, command, small] = NOTICES[kind] ?? [];
   const notice = byId("notice");
   notice.hidden = !title;
@@ -380,15 +382,28 @@ function help() {
 function fit() {
   Object.assign(view, { width: innerWidth, height: innerHeight }); // before the first picture too
   view.margins = margins(PANELS[page.panel]?.wholeSite);
-  view.fit(page.map.bounds() ?? aroundMachines() ?? [-50, -50, 50, 50]);
+  page.fitted = groundAndMachines(ROOM_M);
+  view.fit(page.fitted ?? [-50, -50, 50, 50]);
   page.redraw();
   keepLink();
 }
 
+// A map that grows and machines that drive stay in sight, as long as nobody has moved the view.
+function keepInSight() {
+  if (view.moved || page.time.at !== null || (page.state === "loading" && !page.restored)) return;
+  const near = groundAndMachines(NEAR_M);
+  if (!near || !page.fitted) return near && fit();
+  if (around([page.fitted, near]).every((edge, i) => edge === page.fitted[i])) return;
+  page.fitted = around([page.fitted, groundAndMachines(ROOM_M)]);
+  view.fly(page.fitted, view.margins, moves());
+  view.moved = false;
+}
+
 const isPhone = () => innerWidth <= 720;
 const margins = (besidePanel) => (isPhone() ? [16, 172, 16, besidePanel ? PANEL_PART * innerHeight + 32 : 130] : [272, 66, besidePanel ? PANEL_PX : 24, 96]);
+const moves = () => !matchMedia("(prefers-reduced-motion: reduce)").matches;
 function fly(box) {
-  view.fly(box, margins(true), !matchMedia("(prefers-reduced-motion: reduce)").matches);
+  view.fly(box, margins(true), moves());
   page.redraw();
 }
 
@@ -418,16 +433,18 @@ function keepLink() {
   linkTimer = setTimeout(() => history.replaceState(null, "", linkOf()), 250);
 }
 function linkOf() {
-  const parts = { site: page.site, layer: page.layer.id, palette: page.palette, at: `${view.x.toFixed(1)},${view.y.toFixed(1)},${view.scale.toFixed(2)}` };
+  const parts = { site: page.site, layer: page.layer.id, palette: page.palette };
+  if (view.moved) parts.at = `${view.x.toFixed(1)},${view.y.toFixed(1)},${view.scale.toFixed(2)}`;
   if (page.time.at !== null) parts.time = new Date(page.time.at / 1e6).toISOString();
   if (page.time.other !== null) Object.assign(parts, { other: new Date(page.time.other / 1e6).toISOString(), mode: page.time.mode });
   if (page.panel) Object.assign(parts, PANELS[page.panel].link(page));
   return `${location.pathname}?${new URLSearchParams(parts)}`;
 }
 
-function aroundMachines() { // where there is no map yet
-  const all = [...page.machines.values()], x = all.map((m) => m.x_m), y = all.map((m) => m.y_m), room_m = 40;
-  return all.length ? [Math.min(...x) - room_m, Math.min(...y) - room_m, Math.max(...x) + room_m, Math.max(...y) + room_m] : null;
+const around = (boxes) => [0, 1, 2, 3].map((i) => (i < 2 ? Math.min : Math.max)(...boxes.map((box) => box[i])));
+function groundAndMachines(room_m) { // null where neither is known
+  const boxes = [...page.machines.values()].map(({ x_m: x, y_m: y }) => [x - room_m, y - room_m, x + room_m, y + room_m]), ground = page.map.bounds();
+  return ground || boxes.length ? around(ground ? [ground, ...boxes] : boxes) : null;
 }
 
 function restoreLink() {
@@ -448,6 +465,7 @@ const on = {
     page.state = "loading"; // so that the state is shown anew: the map may have been empty until now
     setState("live");
     if (first && !page.restored) { page.restored = true; restoreLink(); }
+    keepInSight();
     page.received = performance.now();
     buildLegend();
     panelAges();
@@ -461,10 +479,8 @@ const on = {
       while (machine.track.length && now_s - machine.track[0].seen_s > 60) machine.track.shift();
       page.machines.set(pose.machine, { ...machine, ...pose, seen_s });
     }
-    if (page.state === "live" && !page.map.tiles.size) { // their ground comes later
-      if (!view.moved) fit();
-      if (!known) { page.state = "loading"; setState("live"); }
-    }
+    if (page.state === "live" && !page.map.tiles.size && !known) { page.state = "loading"; setState("live"); } // their ground comes later
+    keepInSight();
     page.redraw();
     showStatus();
   },
