@@ -2,19 +2,31 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
+SIZE_demo := 340 MB to load, 1.2 GB on disk
+SIZE_dev := 670 MB to load, 2.4 GB on disk
 
 # make quick: unit tests that are not slow, in about a minute.
 .PHONY: venv demo quick test check chaos fuzz soak bench
 
-venv: $(VENV)/.installed
+venv: $(VENV)/.dev
 
-$(VENV)/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
-	touch $@
+demo: $(VENV)/.demo
+	@$(BIN)/sitegrid demo --web
 
-demo: venv
-	$(BIN)/sitegrid demo --web
+# An extra of this project and all that it needs. pip is silent while it unpacks: a terminal shows how far it is.
+$(VENV)/.%: pyproject.toml constraints.txt
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
+		echo "Python 3.11 is needed, since PyBullet has wheels for no other, and '$(PYTHON)' is" \
+		"$$("$(PYTHON)" --version 2>&1 | grep -x 'Python [0-9.]*' || echo none): say make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@echo "Installing into $(VENV): $(SIZE_$*)"
+	@began=$$(date +%s); \
+	{ [ ! -t 1 ] || while kill -0 $$$$ && sleep 1; do \
+		printf '\r  %s s, %s MB ' $$(($$(date +%s) - began)) "$$(du -sm $(VENV) | cut -f1)"; done; } 2>/dev/null & \
+	"$(PYTHON)" -m venv $(VENV) && mkdir -p $(VENV)/tmp && \
+	TMPDIR=$(abspath $(VENV))/tmp $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		--config-settings editable_mode=compat --editable '.[$*]'; \
+	status=$$?; kill $$! 2>/dev/null; rm -rf $(VENV)/tmp; echo; exit $$status
+	@touch $@ $(if $(filter dev,$*),$(VENV)/.demo)
 
 quick: venv
 	$(BIN)/python -m pytest --quiet --numprocesses auto -m "not slow and not processes" tests/unit

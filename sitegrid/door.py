@@ -92,6 +92,8 @@ def build_parser() -> ArgumentParser:
 def _extra_for(error: ModuleNotFoundError, extra: str) -> str:
     """What to install for a command that misses a module; nothing where the module is ours, or no extra has it."""
     module = str(error.name).partition(".")[0]
+    if module == "pybullet" and sys.version_info >= (3, 12):
+        return "PyBullet has wheels for Python 3.11 alone: run this with that, or in the fast world (--world fast)"
     extras = ",".join(dict.fromkeys(filter(None, (extra, BESIDE.get(module)))))
     if not extras or module in OURS or module in sys.stdlib_module_names:
         return ""

@@ -71,7 +71,7 @@ def run(seconds: float, runs: int) -> Report:
 @contextmanager
 def _demo(folder: Path, seconds: float) -> Iterator[str]:
     """The demo, once it has driven; gives the address of its page."""
-    words = ("demo", "--stay", "--headless", "--no-log", "--seconds", f"{seconds:g}", "--out", str(folder / "demo"))
+    words = ("demo", "--stay", "--headless", "--seconds", f"{seconds:g}", "--out", str(folder / "demo"))
     command, root = [sys.executable, "-m", "sitegrid.cli", *words], Path(__file__).parents[2]
     with subprocess.Popen(command, cwd=root, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as child:  # noqa: S603
         try:

@@ -7,9 +7,11 @@ from pathlib import Path
 
 from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import positive
+from sitegrid.process.lifetime import stop_flag
+from sitegrid.process.progress import Display
 
 HELP = "run the whole system in simulation and draw the maps"
-EXTRA = "agent,server,sim,web"
+EXTRA = "demo"
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -22,16 +24,17 @@ def add_options(parser: ArgumentParser) -> None:
     add("--machines", type=int, help="number of machines in the scenario's first fleet (overrides the scenario)")
     add("--seed", type=int, help="random seed (overrides the scenario)")
     add("--out", type=FOLDER, default="demo-output", help="folder for pictures and stores (default %(default)s)")
-    add("--web", action="store_true", help="show the map in browsers meanwhile; prints the address at the start")
-    add("--stay", action="store_true", help="keep map server and page up in the end, until Ctrl-C; with --web")
+    add("--web", action="store_true", help="show the map in browsers meanwhile; on a terminal until Ctrl-C")
+    add("--stay", action="store_true", help="with the page, and until Ctrl-C wherever it runs")
     add("--headless", action="store_true", help="no live display; print plain lines")
-    add("--log", type=Path, help="manifest of a real log, which another agent replays")
+    add("--log", type=Path, help="manifest of a log, which another agent replays")
     add("--data", type=Path, help="folder with the CSV files of that log")
-    add("--no-log", action="store_true", help="do not replay a log, even if the default log exists")
 
 
 def run(arguments: Namespace) -> int:
     """Run the demo."""
-    from sitegrid.demo.run import run as run_demo
+    stop = stop_flag(None)  # it has children to end
+    with Display("Python starts", headless=arguments.headless or arguments.json) as display:
+        from sitegrid.demo.run import run as run_demo  # takes some seconds
 
-    return run_demo(arguments)
+        return run_demo(arguments, stop, display)

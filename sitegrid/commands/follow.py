@@ -17,6 +17,7 @@ from protocol.wire.keys import check_name
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
 from sitegrid.options.outputs import FOLDER
+from sitegrid.process.kernels import compilation_reported
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
 from sitegrid.security.join import join
 
@@ -58,7 +59,8 @@ def run(arguments: Namespace) -> int:
     config = from_table(ServerConfig, table, str(arguments.config))
     name = check_name(arguments.name or _host(), "--name")
     with ExitStack() as opened:
-        warm_up(config)
+        with compilation_reported():
+            warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="follower", name=name, site=site.name)
         session = opened.enter_context(closing(open_session(joined)))
         if arguments.copy:

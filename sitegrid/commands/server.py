@@ -19,6 +19,7 @@ from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
 from sitegrid.options.outputs import FOLDER
 from sitegrid.options.values import address
+from sitegrid.process.kernels import compilation_reported
 from sitegrid.process.lifetime import end_in_time, return_large_blocks, say, stop_flag, tell
 from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
@@ -68,7 +69,8 @@ def run(arguments: Namespace) -> int:
     table = load_toml(arguments.config) if arguments.config else {}
     config = from_table(ServerConfig, table, str(arguments.config))
     with ExitStack() as opened:
-        warm_up(config)
+        with compilation_reported():
+            warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="server", site=site.name)
         ingest = opened.enter_context(closing(open_session(joined)))
         readers = opened.enter_context(closing(open_session(joined)))

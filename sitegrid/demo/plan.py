@@ -19,9 +19,7 @@ from sitegrid.client import connect
 from sitegrid.pictures.draw import TrackRecorder, draw
 from sitegrid.process.children import Child, Children, wait_until
 
-DEFAULT_MANIFEST = Path("evaluation/logs/rl_test1_husky/log.toml")
-DEFAULT_DATA = Path("../shared/data/rl_test1_husky")
-READY_S = 120.0  # the first start in a new folder compiles kernels: most of a minute on a busy machine
+READY_S = 120.0  # without a word, until a process counts as stuck
 LOG_SPEED = 20.0  # times real time
 SIM_OPTIONS = ("scenario", "world", "machines", "seed", "seconds", "speed")  # those that the demo passes on
 
@@ -62,10 +60,11 @@ def make_plan(arguments: Namespace) -> DemoPlan:
     except ValueError as error:
         raise ConfigError("sitegrid demo", str(error)) from None
     scenario = resolve(config)
-    manifest, data = _log_of(arguments)
-    log = open_log(manifest, data) if manifest else None
-    work = _emptied(arguments.out / "work")
-    return DemoPlan(arguments.out, work, free_endpoint(), config, scenario, write_configs(config, work), log, manifest)
+    if arguments.data and not arguments.log:
+        raise ConfigError("--data", "is the folder of a log; name the log with --log")
+    log = open_log(arguments.log, arguments.data) if arguments.log else None
+    work, endpoint = _emptied(arguments.out / "work"), free_endpoint()
+    return DemoPlan(arguments.out, work, endpoint, config, scenario, write_configs(config, work), log, arguments.log)
 
 
 def _emptied(work: Path) -> Path:
@@ -77,23 +76,11 @@ def _emptied(work: Path) -> Path:
     return work
 
 
-def _log_of(arguments: Namespace) -> tuple[Path | None, Path | None]:
-    """The log to replay: as asked for, or the default one where its data lies."""
-    if arguments.data and not arguments.log:
-        raise ConfigError("--data", "is the folder of a log; name the log with --log")
-    if arguments.log and not arguments.no_log:
-        return arguments.log, arguments.data
-    default = not arguments.no_log and DEFAULT_MANIFEST.exists() and DEFAULT_DATA.exists()
-    return (DEFAULT_MANIFEST, DEFAULT_DATA) if default else (None, None)
-
-
 def start_server(plan: DemoPlan, children: Children, name: str, site_file: Path) -> Child:
-    """A map server, ready."""
+    """A map server, which is ready some seconds later."""
     store = plan.work / ("store" if name == "server" else f"store-{name}")
     words = ("server", "--endpoint", plan.endpoint, "--site-file", site_file, "--store", store)
-    child = children.start(name, *words)
-    child.expect("ready", READY_S)
-    return child
+    return children.start(name, *words)
 
 
 def start_agent(plan: DemoPlan, children: Children, config: Path) -> Child:
@@ -131,6 +118,7 @@ class LogReplay:
         self._site = log.site
         self._machine = log.machine.name
         self._server = start_server(plan, children, "log-server", plan.manifest)
+        self._server.expect("ready", READY_S)
         self._client = connect(plan.endpoint, log.site.name)
         self._tracks = TrackRecorder(self._client.session, log.site.name)
         files = ("--spool", plan.work / "log.db", "--audit", plan.work / "log.audit")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from argparse import Namespace
@@ -35,50 +36,68 @@ from sitegrid.demo.plan import (
 )
 from sitegrid.pictures.draw import TrackRecorder, draw, draw_both, draw_differences, truth_layers
 from sitegrid.process.children import Child, Children
-from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
+from sitegrid.process.lifetime import note, plain, say, tell, wait
 from sitegrid.process.progress import Display
 
-SAMPLES_FOLLOW = f"samples follow after {LocalisationConfig().lag_s:g} s"  # of the smoother, of site time
+SAMPLES_FOLLOW = f"the map starts to fill after {LocalisationConfig().lag_s:g} s"  # the smoother's lag, in site time
 
 
-def run(arguments: Namespace) -> int:
+def run(arguments: Namespace, stop: threading.Event, display: Display) -> int:
     """Run the demo; returns 1 if a sample was lost or counted twice, or a child failed."""
-    stop = stop_flag(None)  # it has children to end
     began_s = time.monotonic()
     plan = make_plan(arguments)
-    with Children(plan.work) as children:
-        display = Display("machines drive", headless=arguments.headless or arguments.json)
-        children.start("router", "router", "--listen", plan.endpoint).expect("ready", READY_S)
-        url = start_web(plan, children) if arguments.web or arguments.stay else ""
-        if url:
-            note(f"the map is at {url}")
-        result = _drive(plan, children, stop, display)
-        if result is None:
-            note("stopped; everything is ended")
-            return 130
-        result["wall_s"] = round(time.monotonic() - began_s, 1)
-        say(plain(result)) if arguments.json else _print(result)
-        if arguments.stay:
-            start_server(plan, children, "server", plan.site_file)
-            note(f"the map stays at {url} until Ctrl-C")
-            wait(stop)
+    if not arguments.json:
+        note("A site on this host: router, map server, page, simulator, and an agent per machine, each its own process")
+    display.begin("router and page start")
+
+    def meanwhile(line: dict[str, Any]) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        if "note" in line:
+            display.begin("server starts", line["note"])
+
+    try:
+        with Children(plan.work, meanwhile) as children:
+            with display:
+                children.start("router", "router", "--listen", plan.endpoint).expect("ready", READY_S)
+                url = start_web(plan, children) if arguments.web or arguments.stay else ""
+                if url:
+                    note(f"the map is at {url}")
+                result = _drive(plan, children, stop, display)
+                if stays(arguments):
+                    start_server(plan, children, "server", plan.site_file).expect("ready", READY_S)
+                result["wall_s"] = round(time.monotonic() - began_s, 1)
+            say(plain(result)) if arguments.json else _print(result)
+            if stays(arguments):
+                note(f"the map stays at {url} until Ctrl-C; another terminal can ask it:")
+                note(f"  {sys.argv[0]} query --endpoint {plan.endpoint} --site {plan.scenario.site.name} machines")
+                wait(stop)
+    except KeyboardInterrupt:
+        note("stopped; everything is ended")
+        raise
     return 0 if result["lost"] == result["double"] == 0 else 1
 
 
-def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: Display) -> dict[str, Any] | None:
-    """Start everything, wait for the end, judge and draw; None if stopped on the way."""
+def stays(arguments: Namespace) -> bool:
+    """Whether the page stays in the end: where it is asked for, and on a terminal, which has a Ctrl-C."""
+    return arguments.stay or (arguments.web and not arguments.json and sys.stderr.isatty())
+
+
+def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: Display) -> dict[str, Any]:
+    """Start everything, wait for the end, judge and draw."""
+    display.begin("server starts")
     server = start_server(plan, children, "server", plan.site_file)
     bases = [start_base(plan, children, base.name) for base in plan.scenario.base_station]
     agents = {path.stem: start_agent(plan, children, path) for path in plan.configs}
+    server.expect("ready", READY_S)
     log_replay = LogReplay(plan, plan.log, children) if plan.log else None
     for child in [*bases, *agents.values()]:
         child.expect("ready", READY_S)
     sim = start_sim(plan, children)
     with connect(plan.endpoint, plan.scenario.site.name) as client:
         tracks = TrackRecorder(client.session, plan.scenario.site.name)
-        with display:
-            if not _watch(plan, client, tracks, (sim, agents), (stop, display)):
-                return None
+        _watch(plan, client, tracks, (sim, agents), (stop, display))
+        display.begin("pictures are drawn, and every sample is accounted for")
         for child in [*bases, *agents.values()]:
             child.expect("ended", READY_S)
         client.calibrate(wait_s=MAX_WAIT_S)  # with the last samples too, and the map that we read has it
@@ -103,13 +122,14 @@ def _watch(
     tracks: TrackRecorder,
     children: tuple[Child, dict[str, Child]],
     control: tuple[threading.Event, Display],
-) -> bool:
-    """Show progress and redraw the map until the machines have driven; False if stopped."""
+) -> None:
+    """Show progress and redraw the map until the machines have driven; KeyboardInterrupt if stopped."""
     (sim, agents), (stop, display) = children, control
     simulated_s, next_picture_s = 0.0, time.monotonic() + 3
-    while sim.code is None or any(agent.code is None for agent in agents.values()):
+    display.begin("machines drive")
+    while sim.code is None or (not sim.code and any(agent.code is None for agent in agents.values())):
         if stop.wait(0.25):
-            return False
+            raise KeyboardInterrupt
         for line in sim.lines():
             simulated_s = line.get("simulated_s", simulated_s)
         display.show(simulated_s, plan.scenario.seconds, _what(client))
@@ -118,7 +138,6 @@ def _watch(
             next_picture_s = time.monotonic() + 3
     if sim.code:
         raise ConfigError("sitegrid demo", f"the simulator ended with {sim.code}; see {plan.work / 'sim.log'}")
-    return True
 
 
 def _what(client: Client) -> str:

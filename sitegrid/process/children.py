@@ -18,6 +18,7 @@ from typing import Any
 from protocol.errors import SitegridError
 
 END_S = 8.0  # after SIGTERM; then it is killed
+Meanwhile = Callable[[dict[str, Any]], None]
 
 
 class ProcessError(SitegridError):
@@ -30,8 +31,10 @@ class ProcessError(SitegridError):
 class Child:
     """One `sitegrid` process and the JSON lines that it prints."""
 
-    def __init__(self, name: str, words: list[str], errors: Path | None = None) -> None:
-        self.name = name
+    def __init__(
+        self, name: str, words: list[str], errors: Path | None = None, meanwhile: Meanwhile = lambda _: None
+    ) -> None:
+        self.name, self._meanwhile = name, meanwhile
         self._errors = errors.open("ab") if errors else None
         self._process = subprocess.Popen(  # noqa: S603 - our own command, no shell
             [sys.executable, "-m", "sitegrid.cli", *words],
@@ -55,19 +58,20 @@ class Child:
         """JSON lines that have come in since the last call."""
         return [self._lines.get_nowait() for _ in range(self._lines.qsize())]  # this thread alone takes them
 
-    def expect(self, key: str, timeout_s: float) -> dict[str, Any]:
-        """Wait for a line that has `key`; ProcessError if the process ends or the time is up first."""
-        end_s = time.monotonic() + timeout_s
+    def expect(self, key: str, silent_s: float) -> dict[str, Any]:
+        """Wait for a line that has `key`, as long as others come; ProcessError if the process ends, or says nothing."""
+        end_s = time.monotonic() + silent_s
         while (left_s := end_s - time.monotonic()) > 0:
-            try:
-                line = self._lines.get(timeout=min(left_s, 0.1))
-            except queue.Empty:
-                if self.code is not None and self._lines.empty() and not self._reader.is_alive():
-                    raise ProcessError(self.name, f"ended with {self.code} instead of printing `{key}`") from None
-                continue
+            line = self._line(min(left_s, 0.1))
             if key in line:
                 return line
-        raise ProcessError(self.name, f"did not print `{key}` within {timeout_s:g} s")
+            if line:
+                end_s = time.monotonic() + silent_s
+            elif self.code is not None and self._lines.empty() and not self._reader.is_alive():
+                see = f"; see {self._errors.name}" if self._errors else ""
+                raise ProcessError(self.name, f"ended with {self.code} instead of printing `{key}`{see}")
+            self._meanwhile(line)
+        raise ProcessError(self.name, f"did not print `{key}` within {silent_s:g} s")
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal, if it still runs."""
@@ -96,6 +100,13 @@ class Child:
             self._errors.close()
         return code
 
+    def _line(self, wait_s: float) -> dict[str, Any]:
+        """The next line, empty if none comes in time."""
+        try:
+            return self._lines.get(timeout=wait_s)
+        except queue.Empty:
+            return {}
+
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
@@ -108,16 +119,19 @@ class Child:
 
 
 class Children(ExitStack):
-    """All children of a run; leaving the block ends them, the youngest first."""
+    """All children of a run; leaving the block ends them, the youngest first.
 
-    def __init__(self, log_folder: Path | None = None) -> None:
+    meanwhile: is called ten times a second while a line is waited for, with another one that came in or with nothing.
+    """
+
+    def __init__(self, log_folder: Path | None = None, meanwhile: Meanwhile = lambda _: None) -> None:
         super().__init__()
-        self._log_folder = log_folder
+        self._log_folder, self._meanwhile = log_folder, meanwhile
 
     def start(self, name: str, *words: str | Path | float) -> Child:
         """Start `sitegrid <words>`."""
         errors = self._log_folder / f"{name}.log" if self._log_folder else None
-        child = Child(name, [str(word) for word in words], errors)
+        child = Child(name, [str(word) for word in words], errors, self._meanwhile)
         self.callback(child.stop)
         return child
 

@@ -1,4 +1,4 @@
-"""Progress of a long run: a bar on a terminal, elsewhere a plain line now and then."""
+"""Progress of a long run: a bar on a terminal, which moves without news too; elsewhere a plain line now and then."""
 
 from __future__ import annotations
 
@@ -26,11 +26,20 @@ class Display:
         self._next_s = 0.0
         if not headless and sys.stderr.isatty():
             from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
             columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[what]}"))
-            self._bar = Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True))
+            times = (TimeElapsedColumn(), TimeRemainingColumn())
+            self._bar = Progress(*columns, *times, console=Console(stderr=True))
             self._task = self._bar.add_task(title, total=None, what="")
+
+    def begin(self, title: str, what: str = "") -> None:
+        """Go on with something else, of which nobody knows how long it takes."""
+        if self._bar:
+            self._bar.remove_task(self._task)
+            self._task = self._bar.add_task(title, total=None, what=what)
+        else:
+            note(f"{title} {what}".rstrip())
 
     def show(self, done_s: float, total_s: float, what: str) -> None:
         """Show how many simulated seconds are done, and what there is to say."""
@@ -49,6 +58,8 @@ class Display:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._bar:
             with suppress(OSError):
+                if not self._bar.tasks[0].total:  # else a bar without an end would stay on the screen
+                    self._bar.update(self._task, visible=False)
                 self._bar.stop()
         if self._kept and kind is KeyboardInterrupt:
             note(f"interrupted; what is done is kept in {self._kept}, and the same command goes on with it")

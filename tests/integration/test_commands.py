@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import pty
+import re
 import signal
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import cv2
@@ -116,7 +119,7 @@ def test_demo_prints_one_object_with_its_proof(tmp_path: Path, husky_data: Path)
 
 
 def test_ctrl_c_ends_everything_that_the_demo_started(tmp_path: Path):
-    words = ["demo", "--headless", "--no-log", "--machines", "1", "--json", "--out", str(tmp_path)]
+    words = ["demo", "--headless", "--machines", "1", "--json", "--out", str(tmp_path)]
     command = [sys.executable, "-m", "sitegrid.cli", *words]
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
@@ -131,6 +134,29 @@ def test_ctrl_c_ends_everything_that_the_demo_started(tmp_path: Path):
         demo.wait()
     assert demo.returncode == 130
     assert "everything is ended" in errors
+    assert not [pid for pid in started if is_alive(pid)]
+
+
+def test_on_a_terminal_the_page_of_the_demo_stays_until_ctrl_c(tmp_path: Path):
+    terminal, its_end = pty.openpty()
+    words = ["demo", "--web", "--machines", "1", "--world", "fast", "--seconds", "20", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "sitegrid", *words]
+    with subprocess.Popen(command, stdin=its_end, stdout=its_end, stderr=its_end) as demo:
+        try:
+            shown = b""
+            while not (stays := re.search(rb"stays at (http://\S+)/ until Ctrl-C", shown)):
+                shown += os.read(terminal, 4096)
+            started = children_of(demo.pid)
+            with urllib.request.urlopen(f"{stays[1].decode()}/api/v1/sites/paper/info", timeout=20) as answer:
+                assert json.load(answer)["samples_merged"] > 0
+            assert b"A site on this host: router, map server" in shown
+            demo.send_signal(signal.SIGINT)
+            assert demo.wait(30) == 0
+        finally:
+            demo.kill()
+            os.close(terminal)
+            os.close(its_end)
+    assert len(started) == 3, "router, map server, page"
     assert not [pid for pid in started if is_alive(pid)]
 
 

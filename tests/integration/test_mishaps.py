@@ -139,7 +139,7 @@ def test_nohup_keeps_a_process(tmp_path: Path):
 
 
 def test_a_demo_whose_terminal_is_closed_leaves_nothing(tmp_path: Path):
-    words = ("demo", "--headless", "--no-log", "--machines", 1, "--world", "fast", "--out", tmp_path / "out")
+    words = ("demo", "--headless", "--machines", 1, "--world", "fast", "--out", tmp_path / "out")
     with subprocess.Popen(sitegrid(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo:
         try:
             wait_until(lambda: len(children_of(demo.pid)) >= 2, READY_S, "router and server")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -21,32 +23,39 @@ def test_each_name_resolves_to_this_project(name: str, root: Path):
     assert module.__doc__
 
 
-def test_it_is_never_uploaded_and_has_its_extras(root: Path):
+def test_it_is_never_uploaded_and_the_readme_names_its_extras(root: Path):
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
     assert "Private :: Do Not Upload" in project["classifiers"]
-    assert set(project["optional-dependencies"]) == {
-        *(
-            "agent",
-            "archive",
-            "cluster",
-            "postgres",
-            "server",
-            "sim",
-            "entries",
-            "eval",
-            "web",
-            "export",
-            "ros",
-            "bench",
-            "oracle",
-            "paper",
-            "security",
-            "all",
-            "dev",
-        )
-    }
+    readme = (root / "README.md").read_text()
+    assert all(f"`.[{extra}]`" in readme for extra in project["optional-dependencies"])
+    assert all(project["optional-dependencies"].values()), "none is empty"
     base = {requirement.split(">")[0] for requirement in project["dependencies"]}
     assert base == {"eclipse-zenoh", "msgpack", "numpy"}
+
+
+def test_make_refuses_another_python_in_one_sentence_and_installs_nothing(root: Path, tmp_path: Path):
+    python, venv = tmp_path / "python", tmp_path / "venv"
+    python.write_text('#!/bin/sh\n[ "$1" = --version ] && echo Python 3.12.1\nexit 1\n')
+    python.chmod(0o755)
+    command = ["make", "--silent", "demo", f"PYTHON={python}", f"VENV={venv}"]
+    made = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert made.returncode == 2
+    sentence, _ = made.stderr.splitlines()  # and what make says of its own
+    assert sentence.startswith(
+        f"Python 3.11 is needed, since PyBullet has wheels for no other, and '{python}' is Python 3.12.1"
+    )
+    assert (made.stdout, venv.exists()) == ("", False)
+
+
+def test_beside_the_clone_the_package_is_imported_and_not_the_folder(root: Path, tmp_path: Path):
+    if not any((Path(sys.prefix) / stamp).exists() for stamp in (".dev", ".demo")):
+        pytest.skip("this Python's environment was not made by `make`")
+    (tmp_path / "sitegrid").mkdir()  # as a clone's folder
+    code = "import sitegrid; print(sitegrid.__file__)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env={}, capture_output=True, text=True, check=True
+    )
+    assert Path(done.stdout.strip()) == root / "sitegrid" / "__init__.py"
 
 
 def test_pins_are_exact_and_name_no_host(root: Path):

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from protocol.errors import ConfigError
 from protocol.site.site_file import load_site
-from sitegrid.demo import plan as planning
-from sitegrid.demo.plan import DEFAULT_MANIFEST, DemoPlan, make_plan, start_sim
+from sitegrid.demo.plan import DemoPlan, make_plan, start_sim
+from sitegrid.demo.run import stays
 from sitegrid.door import build_parser
 from tests.paths import ROOT
 
@@ -20,14 +21,14 @@ def plan_of(tmp_path: Path, *words: str) -> DemoPlan:
 
 def test_options_reach_the_simulation(tmp_path: Path):
     words = ("--seconds", "33", "--speed", "7", "--machines", "2", "--seed", "9", "--scenario", "repaved")
-    demo = plan_of(tmp_path, *words, "--world", "fast", "--no-log")
+    demo = plan_of(tmp_path, *words, "--world", "fast")
     scenario = demo.scenario
     assert (scenario.seconds, scenario.seed, scenario.world, len(scenario.change)) == (33, 9, "fast", 2)
     assert (scenario.machine_names, demo.config.speed) == (("loader-1", "loader-2"), 7)
 
 
 def test_the_demo_drives_the_papers_site_in_pybullet_by_default(tmp_path: Path):
-    demo = plan_of(tmp_path, "--no-log")
+    demo = plan_of(tmp_path)
     assert (demo.scenario.site.name, demo.scenario.world) == ("paper", "pybullet")
     assert len(demo.configs) == 3
 
@@ -39,22 +40,33 @@ def test_every_option_is_passed_on_to_the_simulator(tmp_path: Path):
 
     options = ("--seconds", "33.0", "--speed", "7.0", "--machines", "2", "--seed", "9")
     options = (*options, "--scenario", "repaved", "--world", "fast")
-    words = start_sim(plan_of(tmp_path, *options, "--no-log"), Started())
+    words = start_sim(plan_of(tmp_path, *options), Started())
     pairs = dict(zip(options[::2], options[1::2], strict=True))
     assert all(words[words.index(name) + 1] == value for name, value in pairs.items())
 
 
 def test_the_plan_writes_a_file_for_the_site_and_each_machine(tmp_path: Path):
-    demo = plan_of(tmp_path, "--machines", "2", "--no-log")
+    demo = plan_of(tmp_path, "--machines", "2")
     assert [path.name for path in demo.configs] == ["loader-1.toml", "loader-2.toml"]
     assert load_site(demo.site_file).name == "paper"
     assert demo.out == tmp_path
 
 
+@pytest.mark.parametrize(
+    ("words", "on_terminal", "elsewhere"),
+    [([], False, False), (["--web"], True, False), (["--web", "--json"], False, False), (["--stay"], True, True)],
+)
+def test_the_page_stays_on_a_terminal_or_where_it_is_asked_for(words, on_terminal, elsewhere, monkeypatch):
+    arguments = build_parser().parse_args(["demo", *words])
+    for is_terminal, expected in ((True, on_terminal), (False, elsewhere)):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
+        assert stays(arguments) == expected
+
+
 def test_an_earlier_run_is_cleared_away(tmp_path: Path):
-    old = plan_of(tmp_path, "--no-log").work / "loader-9.db"
+    old = plan_of(tmp_path).work / "loader-9.db"
     old.write_text("old")
-    plan_of(tmp_path, "--no-log")
+    plan_of(tmp_path)
     assert not old.exists()
 
 
@@ -63,7 +75,7 @@ def test_what_is_not_of_an_earlier_run_is_left_alone(tmp_path: Path):
     mine = tmp_path / "work" / "thesis.tex"
     mine.write_text("mine")
     with pytest.raises(ConfigError, match="is not of an earlier demo"):
-        plan_of(tmp_path, "--no-log")
+        plan_of(tmp_path)
     assert mine.exists()
 
 
@@ -72,19 +84,9 @@ def test_the_data_of_no_log_are_refused(tmp_path: Path):
         plan_of(tmp_path, "--data", str(tmp_path))
 
 
-@pytest.mark.slow
-def test_the_default_log_is_used_only_where_its_data_lies(tmp_path: Path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_log_is_replayed_where_it_is_named(tmp_path: Path):
     assert plan_of(tmp_path).log is None
-    manifest = ROOT / DEFAULT_MANIFEST
-    monkeypatch.setattr(planning, "DEFAULT_MANIFEST", manifest)
-    monkeypatch.setattr(planning, "DEFAULT_DATA", tmp_path)
-    assert plan_of(tmp_path).log.name == "rl_test1_husky"
-    assert plan_of(tmp_path, "--no-log").log is None
-
-
-def test_a_log_of_ones_own_needs_no_default(tmp_path: Path):
-    manifest = ROOT / DEFAULT_MANIFEST
+    manifest = ROOT / "evaluation/logs/rl_test1_husky/log.toml"
     demo = plan_of(tmp_path, "--log", str(manifest), "--data", str(tmp_path))
     assert demo.log.data == tmp_path
     with pytest.raises(ConfigError, match=r"nowhere.toml: no such file"):

@@ -12,6 +12,8 @@ import time
 import pytest
 
 from sitegrid.door import build_parser
+from sitegrid.process.children import Children, ProcessError
+from sitegrid.process.kernels import COMPILING
 
 STUBBORN = """
 import sys, time
@@ -143,3 +145,43 @@ def test_large_blocks_go_back_to_the_system():
 
     assert grown_mib("steady") < 10
     assert grown_mib("as it is") > 25
+
+
+def test_a_child_is_waited_for_as_long_as_it_says_that_it_goes_on(tmp_path, monkeypatch):
+    """Kernels take longer than a child may be silent; whoever waits hears of them, and may end it in between."""
+    program = tmp_path / "program"
+    lines = "\n".join(["echo '{\"compiling\": 1}'"] * 4 + ["echo '{\"ready\": 1}'", "exec sleep 60"])
+    program.write_text(f"#!/bin/sh\n{lines}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("sitegrid.process.children.sys.executable", str(program))
+    now_s = 0.0
+    monkeypatch.setattr("sitegrid.process.children.time.monotonic", lambda: now_s)
+
+    def meanwhile(line: dict) -> None:
+        nonlocal now_s
+        now_s += 10 if line else 0.01
+
+    with Children(tmp_path, meanwhile) as children:
+        child = children.start("server")
+        assert child.expect("ready", 15) == {"ready": 1}
+        assert now_s >= 40
+        with pytest.raises(ProcessError, match=r"server: did not print `ended` within 0\.05 s"):
+            child.expect("ended", 0.05)
+
+
+def test_compiled_kernels_are_named_and_those_of_the_cache_are_not(tmp_path, monkeypatch):
+    code = """
+import numba
+from sitegrid.process.kernels import compilation_reported
+@numba.njit(cache=True)
+def twice(x):
+    return 2 * x
+with compilation_reported():
+    twice(1)
+"""
+    (tmp_path / "kernel.py").write_text(code)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    command = [sys.executable, str(tmp_path / "kernel.py")]
+    first, second = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2))
+    assert json.loads(first) == {"compiling": 1, "note": COMPILING}
+    assert second == ""

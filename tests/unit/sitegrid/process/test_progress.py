@@ -22,10 +22,14 @@ def test_a_terminal_gets_a_bar_and_headless_gets_lines(monkeypatch):
     with Display("machines drive", headless=False) as display:
         display.show(5, 10, "7 samples, 3 cells")
         assert display._bar.tasks[0].completed == 5
+        display.begin("agents start", "soon")
+        (task,) = display._bar.tasks
+        assert (task.description, task.total, task.fields["what"]) == ("agents start", None, "soon")
     with Display("machines drive", headless=True) as display:
         assert display._bar is None
         display.show(5, 10, "7 samples, 3 cells")
-    assert "5 of 10 s, 7 samples, 3 cells" in sys.stderr.getvalue()
+        display.begin("agents start", "soon")
+    assert sys.stderr.getvalue().endswith("5 of 10 s, 7 samples, 3 cells\nagents start soon\n")
 
 
 def test_plain_lines_come_now_and_then_only(monkeypatch, capsys):
