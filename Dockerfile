@@ -1,4 +1,4 @@
-# One image for router, map server, agents and simulator: the first word after `sitegrid` decides (see compose.yaml).
+# One image for router, map server, page, agents and simulator: the first word after `sitegrid` decides (see compose.yaml).
 FROM python:3.11-slim AS build
 WORKDIR /build
 RUN python -m venv /venv
@@ -11,7 +11,7 @@ COPY evaluation evaluation
 COPY benchmarks benchmarks
 COPY sitegrid sitegrid
 RUN /venv/bin/pip install --no-cache-dir --disable-pip-version-check \
-    --constraint constraints.txt ".[agent,server,postgres,sim,export,security]"
+    --constraint constraints.txt ".[demo,postgres,security]"
 
 FROM python:3.11-slim
 RUN useradd --uid 10001 --create-home sitegrid \

@@ -21,13 +21,15 @@ def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add = parser.add_argument
     add_network(parser)
-    sites = "a site to show; with =ENDPOINT, by another router; may be repeated (default paper)"
+    sites = "a site to show; with =ENDPOINT, by another router; may be repeated (default: that of the keys, else paper)"
     add("--site", type=_site, action="append", metavar="NAME[=ENDPOINT]", dest="sites", help=sites)
     usual = ("127.0.0.1", 8080)
     listen = "address to listen on; port 0 takes a free one (default 127.0.0.1:8080)"
     add("--listen", type=address, default=usual, metavar="[HOST:]PORT", help=listen)
+    safety = parser.add_mutually_exclusive_group()
     tokens = "let in only people with a token; FOLDER is that of the site's keys (see `sitegrid keys token`)"
-    add("--tokens", type=Path, metavar="FOLDER", help=tokens)
+    safety.add_argument("--tokens", type=Path, metavar="FOLDER", help=tokens)
+    safety.add_argument("--insecure", action="store_true", help="show the map to other hosts without tokens")
     tls = "serve HTTPS; FOLDER holds cert.pem and key.pem"
     add("--tls", type=Path, metavar="FOLDER", help=tls)
 
@@ -37,12 +39,13 @@ def run(arguments: Namespace) -> int:
     from sitegrid.web.process import serve
 
     host, port = arguments.listen
-    if not arguments.tokens and not _is_loopback(host):
-        problem = f"{host} is reached from other hosts: give people tokens (`sitegrid keys token`) and pass --tokens"
+    if not (arguments.tokens or arguments.insecure or _is_loopback(host)):
+        advice = "give people tokens (`sitegrid keys token`) and pass --tokens, or say --insecure"
+        problem = f"{host} is reached from other hosts: {advice}"
         raise ConfigError("--listen", problem)
     stop = stop_flag()
     with ExitStack() as opened:
-        sites = arguments.sites or [("paper", None)]
+        sites = arguments.sites or [(None, None)]
         return serve(opened, [(name, at or arguments.endpoint) for name, at in sites], (host, port), arguments, stop)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import urllib.request
 from pathlib import Path
@@ -45,9 +46,11 @@ def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
         assert client.info().samples_merged > 0
     with urllib.request.urlopen(f"http://127.0.0.1:{run.ports['9464']}/metrics", timeout=10) as answer:
         text = answer.read().decode()
+    with urllib.request.urlopen(f"http://127.0.0.1:{run.ports['8080']}/api/v1/sites/paper/info", timeout=10) as answer:
+        assert json.load(answer)["cells"] > 0
     assert all(f'sitegrid_machine_samples_total{{machine="{name}"}}' in text for name in machines)
     checked = [name for name, service in services.items() if "healthcheck" in service]
-    assert checked == ["router", "server"]
+    assert checked == ["router", "server", "web"]
     assert all(run.check(name) for name in checked)
     assert {name: child.code for name, child in run.started.items()} == dict.fromkeys(services), "none has ended"
     # An agent whose stream has ended is on its way out already; a signal in its last moment is Python's to take.

@@ -113,7 +113,7 @@ def test_profile_ha_has_two_servers_of_one_journal_and_not_the_one_without_datab
     journals = {line[line.index("--journal") + 1] for line in lines}
     assert len(journals) == 1
     assert [started[name]["volumes"] for name in ("server-a", "server-b")] == [["map-a:/data"], ["map-b:/data"]]
-    assert set(compose_run.needed(services())) == {"router", "server", "sim", *MACHINES}, "without the profile"
+    assert set(compose_run.needed(services())) == {"router", "server", "web", "sim", *MACHINES}, "without the profile"
 
 
 def test_the_journal_of_profile_ha_is_at_both_databases_and_goes_to_the_one_that_takes_commits():
@@ -129,6 +129,16 @@ def test_only_this_host_gets_in_while_there_are_no_keys():
     for name, service in services().items():
         assert all(port.startswith("127.0.0.1:") for port in service.get("ports", [])), name
     assert ("--insecure" in commands()[0]) != ("--keys" in commands()[0])
+
+
+def test_the_image_has_the_extra_of_every_command_in_compose():
+    import sitegrid.door
+
+    of_project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = set(re.search(r'"\.\[(.*)\]"', DOCKERFILE.read_text())[1].split(","))
+    extras |= set(re.findall(r"\w+", str([of_project[name] for name in extras])))
+    parser = sitegrid.door.build_parser()
+    assert {parser.parse_args(line).extra for line in commands()} - {""} <= extras
 
 
 def test_processes_get_the_time_that_they_take_to_end():
