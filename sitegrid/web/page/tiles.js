@@ -57,13 +57,20 @@ export class TileMap {
   bounds() {
     let box = null;
     for (const tile of this.tiles.values()) {
-      const resistance = this.plane(tile, "visits");
-      for (let i = 0; i < AREA; i++) if (resistance[i]) {
-        const x = tile.x * CELLS + (i % CELLS), y = tile.y * CELLS + Math.floor(i / CELLS);
-        box = box ? [Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x + 1), Math.max(box[3], y + 1)] : [x, y, x + 1, y + 1];
-      }
+      if (tile.box === undefined) tile.box = this.boxOf(tile); // once: the view asks several times a second
+      box = box && tile.box ? box.map((edge, i) => (i < 2 ? Math.min : Math.max)(edge, tile.box[i])) : box ?? tile.box;
     }
     return box && box.map((v) => v * this.cell_m);
+  }
+
+  boxOf(tile) {
+    const visits = this.plane(tile, "visits");
+    let box = null;
+    for (let i = 0; i < AREA; i++) if (visits[i]) {
+      const x = tile.x * CELLS + (i % CELLS), y = tile.y * CELLS + Math.floor(i / CELLS);
+      box = box ? [Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x + 1), Math.max(box[3], y + 1)] : [x, y, x + 1, y + 1];
+    }
+    return box;
   }
 
   // How many cells each of `bins` parts of a layer's palette has, and how many are known.
