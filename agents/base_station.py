@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from agents.localisation.filters.motion import BASE_OFFSET_WALK
-from agents.localisation.gps import MIN_DRIFT_M2, MIN_FIX_STD_M
+from agents.localisation.fix import MIN_FIX_STD_M
+from agents.localisation.gps import MIN_DRIFT_M2
 from agents.stream_order import Decision, StreamOrder
 from protocol.arrays import Floats
 from protocol.machine.machine_config import SensorConfig

@@ -7,7 +7,7 @@ from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig
 from agents.holdout import HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import PipelineConfig
+from agents.positioning import PipelineConfig
 from protocol.config import from_table, section
 from protocol.errors import ConfigError
 from protocol.files import load_toml

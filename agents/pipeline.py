@@ -4,182 +4,23 @@
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from operator import attrgetter
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from agents.dead_reckoning import DeadReckoning
 from agents.estimation.calibration import EDGE_M, Calibration
-from agents.estimation.ground import EstimationConfig, GroundEstimator
-from agents.localisation.filters.belief import DivergedError, PoseBelief
+from agents.estimation.ground import GroundEstimator
+from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
-from agents.localisation.imu_steps import Sensed
-from agents.localisation.localiser import HeadingRefutedError, LocalisationConfig, Localiser
-from agents.sampling import NOTHING, Odometer, PoseHistory, Sampler, Samples, joined
+from agents.positioning import Accepted, PipelineConfig, Positioning, in_name_order
+from agents.sampling import NOTHING, Odometer, Sampler, Samples, joined
 from agents.smoothed_track import SmoothedTrack
-from agents.stream_order import Decision, StreamOrder, by_stamp
-from protocol.machine.machine_config import ABSOLUTE, MachineConfig
-from protocol.machine.readings import Correction, Gps, Reading
-from protocol.site.site_config import Projection, SiteConfig
-
-
-@dataclass(frozen=True)
-class PipelineConfig:
-    """Options of the pure core, one table per stage."""
-
-    localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
-    estimation: EstimationConfig = field(default_factory=EstimationConfig)
-
-
-class Accepted(NamedTuple):
-    """Readings of one stamp that count, at the stamp of what they measured; a tuple, as there are hundreds a second.
-
-    poses: what they made possible or changed, oldest first. smoothed: past poses that became final with them, oldest
-    first. restarts: nothing before them counts any more; then smoothed are all that remained, off_m is how far off the
-    places before may be, and concluded are poses that may become samples now as nothing will prove them any further.
-    """
-
-    readings: list[Sensed]
-    poses: list[PoseBelief]
-    smoothed: list[SmoothedPose]
-    restarts: bool
-    off_m: float = 0.0
-    concluded: Sequence[PoseBelief] = ()
-
-
-class Positioning:
-    """Dead reckoning and localisation of one machine, and the history of its poses."""
-
-    def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
-        self._machine, self._config = in_name_order(machine), config.localisation
-        self._mass = config.estimation.mass
-        self._projection, self._extent_m = Projection(site), site.extent_m
-        self._sensors = {s.name: s for s in machine.sensors if s.use}
-        self._order = StreamOrder()
-        self._counters: Counter[str] = Counter()
-        self._start()
-
-    @property
-    def pose(self) -> PoseBelief | None:
-        """The newest pose, None until the start heading is known."""
-        return self.poses.newest
-
-    def pose_at(self, stamp_ns: int) -> PoseBelief | None:
-        """Pose at a recent stamp, None where it is not known."""
-        return self.poses.at(stamp_ns)
-
-    @property
-    def counters(self) -> Counter[str]:
-        """What was used and refused, before restarts too."""
-        return self._counters + self._order.counters + self.localiser.counters
-
-    def step(self, readings: Sequence[Reading]) -> list[SmoothedPose]:
-        """Take in readings in the order of their stamps; returns the smoothed poses that became final."""
-        smoothed: list[SmoothedPose] = []
-        for reading in readings:
-            for accepted in self.accept(reading):
-                smoothed += accepted.smoothed
-                for pose in accepted.poses:
-                    self.poses.append(pose)
-        return smoothed
-
-    def remaining(self) -> list[SmoothedPose]:
-        """Smoothed poses that are not final, as known by now: the last words on them where the stream ends."""
-        return self.localiser.remaining()
-
-    def conclude(self) -> list[PoseBelief]:
-        """Poses of a heading that what is known by now proves, as the stream ends or pauses."""
-        return self.localiser.conclude(self.dead_reckoning.distance_m)
-
-    def accept(self, reading: Reading) -> Iterable[Accepted]:
-        """Take in one reading; returns what counts of the stamp that it ends, to be iterated at once.
-
-        The caller appends the poses to `poses`, one by one, before it takes the next.
-        """
-        sensor = self._sensors.get(reading.sensor)
-        if sensor is None or sensor.kind != reading.kind:
-            self._counters["reading_unknown_sensor"] += 1
-            return ()
-        if isinstance(reading, Correction):  # of another one's clock, and late: it takes effect with the next readings
-            self.localiser.take(replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)))
-            return ()
-        if isinstance(reading, Gps) and sensor.mode == ABSOLUTE and not self._is_on_site(reading):
-            self._counters["fix_outside_site"] += 1
-            return ()
-        known_ns = max(reading.stamp_ns, sensor.true_ns(reading.stamp_ns))  # never before it was true
-        ended = self._order.gather(reading, known_ns)
-        return self._accept(ended) if ended else ()
-
-    def finish(self) -> Iterable[Accepted]:
-        """Take in the readings of the last stamp, as the stream ends; like `accept`."""
-        return self._accept(self._order.rest())
-
-    def _accept(self, readings: Sequence[Reading]) -> Iterator[Accepted]:
-        for group in by_stamp(map(self._undelayed, readings)):
-            if accepted := self._take(group):
-                yield accepted
-
-    def _is_on_site(self, fix: Gps) -> bool:
-        """Whether a fix may be: receivers without one state places on the equator; and sites are mistaken."""
-        x_m, y_m, _ = self._projection.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
-        return max(abs(x_m), abs(y_m)) <= self._extent_m
-
-    def _undelayed(self, reading: Reading) -> Reading:
-        sensor = self._sensors[reading.sensor]
-        return replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)) if sensor.delay_s else reading
-
-    def _take(self, readings: Sequence[Reading]) -> Accepted | None:
-        """Take in the readings of one stamp; None where all are refused."""
-        taken: list[Sensed] = []
-        smoothed: list[SmoothedPose] = []
-        concluded: list[PoseBelief] = []
-        restarts, off_m = False, 0.0
-        for reading in readings:
-            if (decision := self._order.decide(reading)) is Decision.REFUSE:
-                continue
-            if decision is Decision.RESTART:
-                concluded += self.conclude()
-                smoothed += self._restart()
-                taken, restarts = [], True
-            taken.append((reading, self._sensors[reading.sensor]))
-        if not taken:
-            return None
-        for reading, sensor in taken:
-            self.dead_reckoning.update(reading, sensor)
-        try:
-            poses = self.localiser.update(taken, self.dead_reckoning)
-        except (DivergedError, HeadingRefutedError) as error:
-            self._counters["heading_refuted" if isinstance(error, HeadingRefutedError) else "filter_restarts"] += 1
-            off_m = getattr(error, "off_m", 0.0)
-            concluded += self.conclude()
-            smoothed += self._restart()
-            poses, restarts = [], True
-        return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts, off_m, concluded)
-
-    def _restart(self) -> list[SmoothedPose]:
-        """Start again, and keep the counts; returns the smoothed poses that remained."""
-        if self.localiser.is_aligned:  # a start that was configured is far behind by now
-            self._config = replace(self._config, start=())
-        self._counters.update(self.localiser.counters)
-        smoothed = self.localiser.take_smoothed() + self.remaining()
-        self._start()
-        return smoothed
-
-    def _start(self) -> None:
-        """Start with nothing known, as after power-up or a jump of the clock."""
-        weighs = self._mass == "message"
-        self.dead_reckoning = DeadReckoning(self._machine, self._config.slip, weighs=weighs)
-        self.localiser = Localiser(self._machine, self._projection, self._config, is_weighed=self._is_weighed())
-        self.poses = PoseHistory()
-
-    def _is_weighed(self) -> bool:
-        """Whether the load is known; a machine whose data have no place for one carries none."""
-        carries = self._machine.payload_x_m or self._machine.payload_z_m
-        return not carries or self._mass != "message" or any(s.kind == "payload" for s in self._sensors.values())
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Reading
+from protocol.site.site_config import SiteConfig
 
 
 class Pipeline:
@@ -332,11 +173,6 @@ class Pipeline:
         self._sampler = Sampler(machine.load_centre_m)
         self._odometer = Odometer()
         self._track = SmoothedTrack()
-
-
-def in_name_order(machine: MachineConfig) -> MachineConfig:
-    """The machine with its sensors by name: the order of their tables in a file must not change any result."""
-    return replace(machine, sensors=tuple(sorted(machine.sensors, key=attrgetter("name"))))
 
 
 PoseSource = Positioning | Pipeline  # what locates a machine

@@ -9,7 +9,7 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation.filters import state
 from agents.localisation.filters.belief import Belief
-from agents.localisation.gps import MIN_FIX_STD_M, Fix
+from agents.localisation.fix import MIN_FIX_STD_M, Fix
 from agents.localisation.imu_steps import FilterStep
 from protocol.arrays import Floats
 from protocol.rotations import wrap_angle
@@ -93,8 +93,8 @@ def align_fixes(fixes: Sequence[Fix]) -> Alignment | None:
         return None
     antennas = np.array([fix.reckoned_antenna_m for fix in absolute])
     variance_m2 = np.array([float(fix.variance_m2.mean()) for fix in absolute])
-    found = align(antennas, np.array([fix.position_m for fix in absolute]), np.maximum(variance_m2, MIN_FIX_STD_M**2))
-    return replace(found[0], since_ns=absolute[found[1]].stamp_ns) if found else None
+    fitted = align(antennas, np.array([fix.position_m for fix in absolute]), np.maximum(variance_m2, MIN_FIX_STD_M**2))
+    return replace(fitted[0], since_ns=absolute[fitted[1]].stamp_ns) if fitted else None
 
 
 def align_start(start: Sequence[float], reckoned: DeadReckonedPose) -> Alignment:

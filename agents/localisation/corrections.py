@@ -23,7 +23,7 @@ from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, open_states, reset_states
 from agents.localisation.filters.motion import GpsError, map_from_base
 from agents.localisation.filters.state import ATTITUDE, VELOCITY, Layout
-from agents.localisation.gps import Fix
+from agents.localisation.fix import Fix
 from agents.localisation.site_share import WAIT_S, SiteShareEstimator
 from protocol.arrays import Floats
 from protocol.machine.machine_config import SensorConfig

@@ -8,7 +8,7 @@ and yaw (navsat_transform): on the way back into the map the rotations cancel, a
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -27,6 +27,7 @@ from agents.localisation.filters.belief import (
 from agents.localisation.filters.late_measurements import RELOCK
 from agents.localisation.filters.motion import GpsError, gps_covariance
 from agents.localisation.filters.state import YAW, Layout
+from agents.localisation.fix import MIN_FIX_STD_M, Fix
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from agents.localisation.shared_errors import MOST_SHARED, SharedFix, ShareEstimator
 from protocol.arrays import Floats
@@ -34,40 +35,11 @@ from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, Se
 from protocol.machine.readings import Gps
 from protocol.site.site_config import Projection
 
-MIN_FIX_STD_M = 0.3  # receivers state less than their error; one whose std is configured may be better
 GATE_SIGMA = 4.0  # fixes further off are refused: outliers of GPS are common
 AGREED_NS = 3_000_000_000  # so old a fix may be to say whether its receiver agrees with the filter
 FADED = 15  # correlation times after which a jump is forgotten
 RESTATED = 4.0  # a receiver that states a variance so many times as large or small has another error from then on
 MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
-
-
-@dataclass(frozen=True)
-class Fix:
-    """A fix in `map`, (2,) each [m, m2], and the dead-reckoned pose at that time."""
-
-    stamp_ns: int
-    sensor: SensorConfig
-    position_m: Floats
-    variance_m2: Floats
-    reckoned: DeadReckonedPose
-
-    @property
-    def is_absolute(self) -> bool:
-        """Whether it is a place in `map` without an anchor."""
-        return self.sensor.mode == ABSOLUTE
-
-    @property
-    def lever_m(self) -> Floats:
-        """Where the antenna sits (3,)."""
-        return np.array(self.sensor.mount.xyz_m)
-
-    @property
-    def reckoned_antenna_m(self) -> tuple[float, float]:
-        """Where the antenna is by dead reckoning, in its frame."""
-        (ahead, left, _), reckoned = self.sensor.mount.xyz_m, self.reckoned
-        c, s = math.cos(reckoned.angle_rad), math.sin(reckoned.angle_rad)
-        return reckoned.x_m + c * ahead - s * left, reckoned.y_m + s * ahead + c * left
 
 
 def drifting(sensors: Sequence[SensorConfig]) -> list[SensorConfig]:
@@ -161,11 +133,8 @@ class Receivers(ModalSensors[Fix]):
         """Note what the filter made of a fix: the receiver's error has its first value now."""
         super().confirm(fix, result)
         name = fix.sensor.name
-        if name in self._states:
-            drift_m2 = self._drift_m2[name]
-            before_m2 = self._stated_m2.setdefault(name, drift_m2)
-            if not 1 / RESTATED < drift_m2 / before_m2 < RESTATED:
-                self._stated_m2[name] = drift_m2
+        if name in self._states and (name not in self._stated_m2 or self._is_restated(name)):
+            self._stated_m2[name] = self._drift_m2[name]
         self._monitors[name].note(result, self._believed_error(name, result.belief))
         if fix.sensor.mode == DIFFERENTIAL or not math.isfinite(result.nis):
             return  # a velocity says nothing of the place
@@ -216,10 +185,10 @@ class Receivers(ModalSensors[Fix]):
         if self._slow:
             error = self._layout.gps_error(self._states[sensor.name])
             self._drift_m2[sensor.name] = drift_m2 = _drift_m2(fix)
-            before_m2 = self._stated_m2.get(sensor.name, drift_m2)
             if sensor.name not in self._confirmed:  # a receiver brings its own unknown error
                 change = self._joining(fix, error)
-            elif not 1 / RESTATED < drift_m2 / before_m2 < RESTATED:
+            elif self._is_restated(sensor.name):
+                before_m2 = self._stated_m2[sensor.name]
                 change = partial(restate_states, states=error, before=before_m2, after=drift_m2)
             if self.is_outvoted(fix):
                 opens = (error,)
@@ -229,6 +198,10 @@ class Receivers(ModalSensors[Fix]):
         R = np.diag(self._white(fix))
         gate = sensor.gate(GATE_SIGMA)
         return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
+
+    def _is_restated(self, name: str) -> bool:
+        """Whether a receiver states so much more or less than before that its slow error is another one."""
+        return not 1 / RESTATED < self._drift_m2[name] / self._stated_m2[name] < RESTATED
 
     def is_outvoted(self, fix: Fix) -> bool:
         """Whether as many other receivers agree with the filter as do not: then a refused one errs, not the filter."""

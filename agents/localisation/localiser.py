@@ -3,6 +3,8 @@
 A heading that GPS shows may be wrong: a receiver that has just started is tens of metres off, and says so or not. So it
 is unproven at first, and all events are kept. A receiver that the filter refuses RELOCK times in a row takes such a
 heading back: what came before its refusals counts no longer, and the rest is aligned and filtered again.
+
+It is one module because collecting, proving and taking back share all that is kept.
 """
 
 import math
@@ -19,7 +21,7 @@ from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import YAW
 from agents.localisation.filters.ukf import Ukf
-from agents.localisation.gps import Fix
+from agents.localisation.fix import Fix
 from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.repeats import Repeats

@@ -18,7 +18,8 @@ from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import nothing_past
 from agents.localisation.filters.state import YAW, Layout, X, Y, Z
-from agents.localisation.gps import Fix, Receivers, drifting
+from agents.localisation.fix import Fix
+from agents.localisation.gps import Receivers, drifting
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep
 from agents.localisation.measurements import STANDSTILL

@@ -12,7 +12,8 @@ import sys
 import time
 from collections.abc import Iterator
 
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from benchmarks.measure import in_child, memory_mb
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Imu, Reading

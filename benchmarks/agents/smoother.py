@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from benchmarks.agents.agent import SITE, bundles, machine
 from benchmarks.measure import Report, medians
 from protocol.machine.readings import Reading

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from agents.estimation.ground import EstimationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from evaluation.campaign.experiment import Experiment, Task
 from evaluation.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, toml_of
 from evaluation.ground.lag import all_samples

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from agents.estimation.ground import EstimationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from agents.sampling import LAG_S
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Goal, Report, Row, half_width, judge, rounded

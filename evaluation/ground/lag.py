@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from agents.sampling import Samples, joined
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Goal, Report, Row, half_width, judge, root_mean_square, rounded

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.pipeline import Positioning
+from agents.positioning import Positioning
 from evaluation.campaign.experiment import Experiment, Task
 from evaluation.campaign.recordings import MACHINES_PROTOCOL, RecordedDrive
 from evaluation.positions.configurations import Configuration, select

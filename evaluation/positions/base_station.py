@@ -20,7 +20,7 @@ import numpy as np
 
 from agents.base_station import BaseStation
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Goal, Report, Row, judge, rounded
 from evaluation.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive

@@ -17,7 +17,7 @@ from typing import Any
 
 from agents.localisation import alignment, measurements
 from agents.localisation.filters import motion as motion_model
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Report, Row, half_width, rounded
 from evaluation.campaign.recordings import MACHINES_PROTOCOL, PAPER, PlannedDrive, RecordedDrive, Setup

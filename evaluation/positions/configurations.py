@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import PipelineConfig
+from agents.positioning import PipelineConfig
 from evaluation.positions.published import POSITIONS, Group
 from protocol.errors import SitegridError
 from protocol.machine.machine_config import MachineConfig

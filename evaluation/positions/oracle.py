@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.localisation.localiser import MAX_LAG_S
-from agents.pipeline import Positioning
+from agents.positioning import Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Row, root_mean_square, rounded
 from evaluation.positions.batch_optimum import optimum

@@ -11,7 +11,7 @@ import numpy as np
 from agents.config import require_place
 from agents.holdout import NOTHING, Holdout, HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from evaluation.campaign.figures import Report, Row, root_mean_square, rounded
 from evaluation.campaign.truth import Truth
 from evaluation.positions.configurations import select

@@ -17,7 +17,8 @@ import numpy as np
 from agents.holdout import Holdout
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
-from agents.pipeline import PoseSource, Positioning
+from agents.pipeline import PoseSource
+from agents.positioning import Positioning
 from evaluation.campaign.figures import root_mean_square
 from evaluation.campaign.truth import Truth
 from evaluation.positions.consistency import ConsistencySummary, normalised_square, summarise

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from evaluation.campaign.experiment import Experiment, Runner, Task, replay_task
 from evaluation.campaign.figures import Report, Row, half_width, rounded
 from evaluation.campaign.recordings import MACHINES_PROTOCOL, PAPER, PlannedDrive, RecordedDrive, Setup

@@ -124,8 +124,9 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         scale[state] = math.exp(-dt_s / error.time_s)
         Q[state, state] = error.std_rad**2 * -math.expm1(-2 * dt_s / error.time_s)
     of_position = Q[POSITION, POSITION]
-    slipping_mps = model.slip_std * model.traction * float(belief.x[SPEED])
-    of_position += _slip(belief.x * scale, dt_s, _slip_variance_m2(slipping_mps, dt_s))
+    slip_mps = model.slip_std * model.traction * float(belief.x[SPEED])
+    # The integral of a Gauss-Markov error of SLIP_TIME_S grows by 2 std^2 time per second.
+    of_position += _slip(belief.x * scale, dt_s, 2 * SLIP_TIME_S * slip_mps**2 * dt_s)
     if model.turn_error_radps:
         turn = layout.gyro_biases.stop - 1
         Q[turn, turn] += 2 * model.turn_error_radps**2 * dt_s / BEND_S
@@ -246,14 +247,6 @@ def _jacobian(x: Floats, dt_s: float) -> Floats:
     F[POSITION, ACCELERATION] = R * (dt_s**2 / 2)
     F[VELOCITY, ACCELERATION] = EYE * dt_s
     return F
-
-
-def _slip_variance_m2(std_mps: float, dt_s: float) -> float:
-    """Variance along the body of the distance that a wrong slip adds in a step; std_mps: of the slipping speed.
-
-    The integral of a Gauss-Markov error of that deviation and SLIP_TIME_S grows by 2 std^2 time per second.
-    """
-    return 2 * SLIP_TIME_S * std_mps**2 * dt_s
 
 
 def _slip(x: Floats, dt_s: float, along_m2: float) -> Floats:

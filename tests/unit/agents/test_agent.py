@@ -15,17 +15,18 @@ from agents.config import AgentConfig
 from agents.delivery.spool import Spool, SpoolConfig
 from agents.estimation.ground import EstimationConfig
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from agents.sampling import LAG_S
 from protocol.machine.readings import Gps, Reading, Torque
 from protocol.wire.messages import CalibrationOffer
 from protocol.wire.offer_codec import encode_offer
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from tests.unit.agents.drives import S_BEND, SITE, VEHICLE, drive
+from tests.unit.agents.drives import S_BEND, SITE, START, VEHICLE, drive
 
 READ_S = 0.2
 LAG = 4.0
-CONFIG = PipelineConfig(LocalisationConfig("ekf", lag_s=LAG))
+CONFIG = PipelineConfig(LocalisationConfig("ekf", lag_s=LAG, start=START))
 READINGS = drive(S_BEND, VEHICLE).readings
 
 

@@ -10,7 +10,7 @@ from agents.config import MOST_LAG_S, AgentConfig, load_agent
 from agents.estimation.ground import NOTHING_KNOWN
 from agents.estimation.plausibility import FAULTS
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import PipelineConfig
+from agents.positioning import PipelineConfig
 from mapserver.trust.judgement import CLOCK_LIMIT_S
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig

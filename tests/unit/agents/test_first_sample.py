@@ -8,7 +8,8 @@ import pytest
 
 from agents.first_sample import WAIT_NS, FirstSample
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from protocol.machine.readings import Gps, Reading
 from tests.unit.agents.drives import SITE, VEHICLE, Leg, drive
 

@@ -6,7 +6,8 @@ import pytest
 
 from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity, Reading

@@ -12,7 +12,8 @@ import pytest
 from agents.estimation.calibration import Calibration
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import Pipeline, PipelineConfig, Positioning
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig, Positioning
 from agents.sampling import joined
 from protocol.arrays import Table
 from protocol.machine.log_folder import open_log

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from agents.sampling import joined
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig

@@ -8,7 +8,7 @@ import pytest
 from agents.dead_reckoning import DeadReckonedPose, WheelSpeed
 from agents.localisation.alignment import align, align_fixes, align_start, start_belief
 from agents.localisation.filters.state import ATTITUDE, SPEED, YAW, Layout
-from agents.localisation.gps import Fix
+from agents.localisation.fix import Fix
 from agents.localisation.imu_steps import FilterStep
 from protocol.machine.machine_config import Mount, SensorConfig
 from protocol.units import GRAVITY_MPS2
@@ -59,7 +59,7 @@ def test_heading_is_not_taken_from_too_little(collected: list[Fix]) -> None:
 
 
 def shifted(collected: list[Fix], east_m: float) -> list[Fix]:
-    return [replace(fix, position_m=fix.position_m + (east_m, 0.0)) for fix in collected]
+    return [replace(fix, position_m=fix.position_m + np.array([east_m, 0.0])) for fix in collected]
 
 
 @pytest.mark.parametrize("first_off", range(2, 12, 3))

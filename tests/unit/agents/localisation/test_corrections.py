@@ -15,7 +15,8 @@ from agents.localisation.filters.belief import Belief, Conditioned
 from agents.localisation.filters.state import Layout
 from agents.localisation.localiser import LocalisationConfig
 from agents.localisation.site_share import SiteShareEstimator
-from agents.pipeline import Pipeline, PipelineConfig, Positioning
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig, Positioning
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Correction, Gps, Reading
 from tests.unit.agents.drives import PROJECTION, SITE, START_NS, Drive, Leg, drive, machine

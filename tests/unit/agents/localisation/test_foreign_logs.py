@@ -15,7 +15,7 @@ from agents.localisation.consistency import CANNOT_TELL, CONSISTENT, INCONSISTEN
 from agents.localisation.filters.belief import Belief, PoseBelief
 from agents.localisation.filters.state import PITCH, ROLL
 from agents.localisation.localiser import LocalisationConfig, Localiser
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Odometry, Reading
 from tests.unit.agents.drives import LEVER_M, PROJECTION, SITE, START_NS, Drive, Leg, drive, fix

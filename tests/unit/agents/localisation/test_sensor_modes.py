@@ -12,7 +12,8 @@ from agents.localisation.filters.motion import HEADING_WALK, map_from_base, moti
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.localiser import LocalisationConfig
 from agents.localisation.sensor_modes import PAIR_S, StampedValue, rate_between
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Attitude, Encoder, Gps, Reading

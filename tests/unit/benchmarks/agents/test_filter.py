@@ -4,7 +4,8 @@ import math
 import numpy as np
 import pytest
 
-from agents.pipeline import Pipeline, PipelineConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from benchmarks.__main__ import main
 from benchmarks.agents import agent, smoother
 from benchmarks.agents import filter as filters

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from evaluation.outages import replays
 from evaluation.outages.replays import (
     BACK_S,

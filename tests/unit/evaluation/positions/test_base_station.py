@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from evaluation.positions.base_station import (
     CASES,
     GOALS,

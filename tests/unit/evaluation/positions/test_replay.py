@@ -10,7 +10,8 @@ import pytest
 
 from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.filters.belief import PoseBelief
-from agents.pipeline import Pipeline, PipelineConfig, PoseSource, Positioning
+from agents.pipeline import Pipeline, PoseSource
+from agents.positioning import PipelineConfig, Positioning
 from evaluation.campaign.truth import Truth
 from evaluation.positions.replay import STEP_NS, Trace, Track, covered, replay, score
 from protocol.machine.readings import Articulation, Reading

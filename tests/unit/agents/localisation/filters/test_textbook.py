@@ -17,7 +17,7 @@ from agents.localisation.filters.square_root import wrapped, wrapped_state
 from agents.localisation.filters.textbook import TextbookEkf, TextbookUkf
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.localiser import LocalisationConfig
-from agents.pipeline import PipelineConfig, Positioning
+from agents.positioning import PipelineConfig, Positioning
 from protocol.arrays import Floats
 from protocol.machine.machine_config import SensorConfig
 from tests.unit.agents.drives import PROJECTION, S_BEND, SITE, START, START_NS, RunLocaliser, drive, machine, with_ahrs

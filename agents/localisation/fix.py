@@ -1,0 +1,40 @@
+"""A fix of a GPS receiver, in `map` and in the frame of dead reckoning."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.dead_reckoning import DeadReckonedPose
+from protocol.arrays import Floats
+from protocol.machine.machine_config import ABSOLUTE, SensorConfig
+
+MIN_FIX_STD_M = 0.3  # receivers state less than their error; one whose std is configured may be better
+
+
+@dataclass(frozen=True)
+class Fix:
+    """A fix in `map`, (2,) each [m, m2], and the dead-reckoned pose at that time."""
+
+    stamp_ns: int
+    sensor: SensorConfig
+    position_m: Floats
+    variance_m2: Floats
+    reckoned: DeadReckonedPose
+
+    @property
+    def is_absolute(self) -> bool:
+        """Whether it is a place in `map` without an anchor."""
+        return self.sensor.mode == ABSOLUTE
+
+    @property
+    def lever_m(self) -> Floats:
+        """Where the antenna sits (3,)."""
+        return np.array(self.sensor.mount.xyz_m)
+
+    @property
+    def reckoned_antenna_m(self) -> tuple[float, float]:
+        """Where the antenna is by dead reckoning, in its frame."""
+        (ahead, left, _), reckoned = self.sensor.mount.xyz_m, self.reckoned
+        c, s = math.cos(reckoned.angle_rad), math.sin(reckoned.angle_rad)
+        return reckoned.x_m + c * ahead - s * left, reckoned.y_m + s * ahead + c * left
