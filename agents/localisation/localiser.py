@@ -223,40 +223,38 @@ class Localiser:
             self._remember(event)
         beliefs = self._tracker.filter(event)
         if isinstance(event, Fix) and event.is_absolute and self._config.profile == "default":
-            if self._is_wrong(event):
-                return self._take_back(distance_m)
+            if shown := self._contradiction(event):
+                return self._take_back(shown, distance_m)
             self.is_proven = self.is_proven or (self._is_old(event) and self._holds(distance_m))
         return beliefs
 
-    def _is_wrong(self, fix: Fix) -> bool:
-        """Whether this fix shows that the alignment is wrong; HeadingRefutedError where that was proven."""
+    def _contradiction(self, fix: Fix) -> Alignment | None:
+        """What refused fixes show instead, once they are too many; HeadingRefutedError where a heading was proven."""
         if self._tracker.is_accepted(fix):
             self._refused.clear()
-            return False
+            return None
         self._refused.append(fix)
         if not self._tracker.has_relocked or self._tracker.receivers.is_outvoted(fix):
-            return False
+            return None
         shown = align_fixes(self._refused)
         if not self.is_proven or not shown:
-            return not self.is_proven
+            return shown
         belief = self._tracker.belief
         assert belief is not None
         believed_rad = float(belief.x[YAW]) - fix.reckoned.angle_rad
         std_rad = math.hypot(shown.std_rad, math.sqrt(belief.P[YAW, YAW]))
         if abs(wrap_angle(shown.rotation_rad - believed_rad)) > REFUTED_SIGMA * std_rad:
             raise HeadingRefutedError(self._tracker.off_m(fix))
-        return False
+        return None
 
-    def _take_back(self, distance_m: float) -> list[Belief]:
-        """Start again with what came since the filter refused fixes."""
+    def _take_back(self, shown: Alignment, distance_m: float) -> list[Belief]:
+        """Start again with what came since the filter refused fixes, and with what they show."""
         self._counters["heading_taken_back"] += 1
         self._tracker = Tracker(self._tracker_config)
         self._poses.clear()
         self._smoothed.clear()
-        self._forget(self._refused[0].stamp_ns)
         self._refused.clear()
-        alignment = align_fixes(self._fixes)
-        return self._start(alignment, distance_m) if alignment else []
+        return self._start(shown, distance_m)
 
     def _forget(self, before_ns: int) -> None:
         """Let fixes and velocities of a first stretch that is off no longer count."""

@@ -1,7 +1,6 @@
-"""Values of GPS that repeat bit for bit: a receiver that hangs, one that is parked, a table that holds each value.
+"""Values of GPS that repeat bit for bit while the wheels turn: a receiver that hangs, or a table that holds each value.
 
-A measured value has noise, so a repeat is no new one: it counts once, however often it comes. While the wheels turn it
-is wrong besides, and counted.
+A measured value has noise, so a repeat is no new one: it counts once. Receivers of parked machines may pin theirs.
 """
 
 from collections import Counter
@@ -23,7 +22,7 @@ class _Value:
 
 
 class Repeats:
-    """Finds repeated values; counters: those of a machine that moved."""
+    """Finds repeated values."""
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
@@ -46,7 +45,8 @@ class Repeats:
             self._first[reading.sensor] = _Value(value, reading.stamp_ns, distance_m)
             self._lasting[reading.sensor] = False
             return False
-        if distance_m - first.distance_m >= MOVED_M:
-            self.counters[f"{reading.sensor}_repeated"] += 1
-            self._lasting[reading.sensor] = reading.stamp_ns - first.stamp_ns > LASTING_NS
+        if distance_m - first.distance_m < MOVED_M:
+            return False
+        self.counters[f"{reading.sensor}_repeated"] += 1
+        self._lasting[reading.sensor] = reading.stamp_ns - first.stamp_ns > LASTING_NS
         return True
