@@ -40,7 +40,7 @@ PNG_KEPT = 4000  # some 20 MB
 SMALL_ALREADY = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/x-npz")  # deflated inside
 MARGIN_M = 100.0  # around the map's bounds, which are of what is folded: a tile shows samples that still wait for it
 log = logging.getLogger("sitegrid.web")
-MAX_TILE_CELLS = 4_000_000  # of one XYZ tile; a lower zoom shows less than a site, and is empty
+MAX_TILE_CELLS = 4_000_000  # of one XYZ tile
 
 
 class WebApp:
@@ -180,7 +180,7 @@ async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tupl
     """An XYZ tile: the map's cells below its pixels."""
     pixels = mercator.pixels_of(*place, await feed.projection())
     cell_m = info.site.cell_m
-    bounds = _common(pixels.bounds(cell_m), info)
+    bounds = pixels.bounds(_known(info), cell_m) if info.merged else None
     if bounds is None:
         return mercator.empty_png(kind)
     if (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) > MAX_TILE_CELLS * cell_m**2:
@@ -191,14 +191,12 @@ async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tupl
     return mercator.value_png(values_px, layer) if kind == "value" else mercator.colour_png(values_px, layer)
 
 
-def _common(bounds: Bounds, info: MapInfo) -> Bounds | None:
-    """What of a rectangle the map may know; None for nothing."""
-    if not info.bounds:
-        return bounds if info.merged else None
-    known = [edge * info.site.cell_m for edge in info.bounds]
-    west, south = max(bounds.west_m, known[0] - MARGIN_M), max(bounds.south_m, known[1] - MARGIN_M)
-    east, north = min(bounds.east_m, known[2] + MARGIN_M), min(bounds.north_m, known[3] + MARGIN_M)
-    return Bounds(west, south, east, north) if west < east and south < north else None
+def _known(info: MapInfo) -> Bounds:
+    """Where the map may know anything: the whole site, until its blocks are counted."""
+    if info.bounds is None:
+        return Bounds(-info.site.extent_m, -info.site.extent_m, info.site.extent_m, info.site.extent_m)
+    west, south, east, north = (edge * info.site.cell_m for edge in info.bounds)
+    return Bounds(west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M)
 
 
 async def _geodetic_bounds(feed: SiteFeed, info: MapInfo) -> list[float]:
@@ -206,6 +204,8 @@ async def _geodetic_bounds(feed: SiteFeed, info: MapInfo) -> list[float]:
     projection = await feed.projection()
     corners = [projection.to_geodetic(x, y) for x in (west, east) for y in (south, north)]
     lats, lons = [corner[0] for corner in corners], [corner[1] for corner in corners]
+    if max(lons) - min(lons) > 180:  # a site on the 180th meridian: TileJSON has no rectangle across it
+        lons = [-180.0, 180.0]
     return [min(lons), min(lats), max(lons), max(lats)]
 
 

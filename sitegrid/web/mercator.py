@@ -26,23 +26,29 @@ MOST = 2**24 - 1
 
 @dataclass(frozen=True)
 class Pixels:
-    """Positions in `map` [m] of a tile's pixel centres, both (256, 256), row 0 in the north."""
+    """Positions in `map` [m] of a tile's pixel centres, both (256, 256), row 0 in the north.
+
+    Infinite on the far side of the Earth, which the site's projection does not reach.
+    """
 
     x_m: Floats
     y_m: Floats
 
-    def bounds(self, cell_m: float) -> Bounds:
-        """The rectangle of all, a cell wider."""
-        west, south, east, north = self.x_m.min(), self.y_m.min(), self.x_m.max(), self.y_m.max()
+    def bounds(self, known: Bounds, cell_m: float) -> Bounds | None:
+        """The rectangle of those that lie in a known one, a cell wider; None without any."""
+        x, y = self.x_m, self.y_m
+        inside = (x >= known.west_m) & (x < known.east_m) & (y >= known.south_m) & (y < known.north_m)
+        if not inside.any():
+            return None
+        (west, south), (east, north) = ((end(x[inside]), end(y[inside])) for end in (np.min, np.max))
         return Bounds(float(west) - cell_m, float(south) - cell_m, float(east) + cell_m, float(north) + cell_m)
 
     def sample(self, layer: Floats32, first_x_m: float, first_y_m: float, cell_m: float) -> Floats:
         """The cell that each pixel lies in (256, 256), NaN outside; first_x_m, first_y_m: the layer's outer corner."""
-        column = np.floor((self.x_m - first_x_m) / cell_m).astype(np.int64)
-        row = np.floor((self.y_m - first_y_m) / cell_m).astype(np.int64)
+        column, row = np.floor((self.x_m - first_x_m) / cell_m), np.floor((self.y_m - first_y_m) / cell_m)
         inside = (column >= 0) & (row >= 0) & (column < layer.shape[1]) & (row < layer.shape[0])
         out = np.full(column.shape, np.nan)
-        out[inside] = layer[row[inside], column[inside]]
+        out[inside] = layer[row[inside].astype(np.int64), column[inside].astype(np.int64)]
         return out
 
 

@@ -31,7 +31,7 @@ def place(parameters: Parameters, projection: Projection) -> tuple[float, float]
     """A position in `map` [m], given as x and y, or as lat and lon."""
     if {"lat", "lon"} <= set(parameters):
         lat_deg, lon_deg = number(parameters, "lat"), number(parameters, "lon")
-        if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+        if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 360):  # some programs count on beyond 180
             raise bad(Refusal.OUT_OF_RANGE, f"`lat`, `lon`: {lat_deg:g}, {lon_deg:g} is no place on Earth")
         x_m, y_m, _ = projection.to_map(lat_deg, lon_deg, 0.0)
         if not (math.isfinite(x_m) and math.isfinite(y_m)):

@@ -111,6 +111,8 @@ def test_gdal_shows_nothing_where_nobody_drove(web: WebSite):
         with rasterio.open(io.BytesIO(web.get(f"xyz/{kind}/resistance/12/0/0.png").body)) as png:
             shown = png.read(4) if kind == "colour" else png.read()
             assert (png.count, shown.any()) == (bands, False)
+        # the whole Earth, and half of it: most of that is beyond the site's projection
+        assert [web.get(f"xyz/{kind}/resistance/{z}/0/0.png").status for z in (0, 1)] == [200, 200]
 
 
 def test_tilejson_is_valid_and_its_template_leads_to_tiles(web: WebSite, projection):

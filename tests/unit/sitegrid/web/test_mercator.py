@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection, SiteConfig
 from sitegrid.web import mercator
 from sitegrid.web.mercator import FINE, coding, colour_png, pixels_of, tile_at, value_png
@@ -25,6 +26,18 @@ def test_the_tile_of_a_place_has_the_place_in_the_right_pixel():
             pixel_m = 40_075_016.7 * math.cos(math.radians(lat)) / 2**z / 256
             assert nearest <= 0.75 * pixel_m
             assert pixels.y_m[0, 0] > pixels.y_m[-1, 0], "row 0 is in the north"
+
+
+@pytest.mark.parametrize(("lat", "lon"), [(49.01, 8.4), (-16.8, 179.99995), (84.0, -40.0), (-80.0, 179.0)])
+def test_a_tile_of_any_zoom_has_what_the_map_knows_or_nothing(lat: float, lon: float):
+    projection, known, ones = Projection(SiteConfig("pit", lat, lon)), Bounds(-50, -50, 50, 50), np.ones((100, 100))
+    world = [(z, x, y) for z in (0, 1) for x in range(2**z) for y in range(2**z)]  # in part beyond the projection
+    for place in (*world, (14, *tile_at(lat, lon, 14))):
+        pixels = pixels_of(*place, projection)
+        shown = pixels.sample(ones, -50, -50, 1.0) == 1
+        bounds = pixels.bounds(known, 1.0)
+        assert (bounds is not None) == shown.any() == (place[0] == 14)
+        assert bounds is None or -51 <= bounds.west_m < bounds.east_m <= 51
 
 
 def test_values_survive_24_bits():
