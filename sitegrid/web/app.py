@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import json
 import logging
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Callable, Sequence
 from http import HTTPStatus
 from pathlib import Path
@@ -44,9 +44,11 @@ MAX_TILE_CELLS = 4_000_000  # of one XYZ tile
 
 
 class WebApp:
-    """All sites, and what answers for them. person: see Guard."""
+    """All sites, and what answers for them. person, counts: see Guard."""
 
-    def __init__(self, feeds: Sequence[SiteFeed], person: Callable[[str], str | None] | None = None) -> None:
+    def __init__(
+        self, feeds: Sequence[SiteFeed], person: Callable[[str], str | None] | None, counts: Counter[str]
+    ) -> None:
         self._feeds = {feed.name: feed for feed in feeds}
         self._pngs: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
         site = f"{PREFIX}/sites/{{site}}"
@@ -64,7 +66,7 @@ class WebApp:
         handlers: dict[Any, Any] = {HTTPException: _not_there, Exception: _failed}
         app = Starlette(routes=routes, exception_handlers=handlers, lifespan=self._lifespan)
         app.add_middleware(GZipMiddleware, minimum_size=1000, compresslevel=5, exclude_content_types=SMALL_ALREADY)
-        self.guard = Guard(app, person)
+        self.guard = Guard(app, person, counts)
         self.app: ASGIApp = self.guard
 
     @contextlib.asynccontextmanager

@@ -33,12 +33,15 @@ HEADERS = {
 
 
 class Guard:
-    """Middleware. person: whose token it is, None for nobody's; without it everybody may come in."""
+    """Middleware. person: whose token it is, None for nobody's; without it everybody may come in.
 
-    def __init__(self, app: ASGIApp, person: Callable[[str], str | None] | None = None) -> None:
+    counts: of what came in and what was refused, sockets among it.
+    """
+
+    def __init__(self, app: ASGIApp, person: Callable[[str], str | None] | None, counts: Counter[str]) -> None:
         self._app, self._person = app, person
         self._rates: OrderedDict[str, tuple[float, float]] = OrderedDict()
-        self.counts: Counter[str] = Counter()
+        self.counts = counts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request or connection, or refuse it."""

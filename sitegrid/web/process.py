@@ -1,4 +1,4 @@
-"""The web server's process: sockets, TLS, and the event loop."""
+"""The web server's process: its address, TLS, and the event loop."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from protocol.errors import ConfigError
 from protocol.wire.credentials import CERTIFICATE_FILE, KEY_FILE
@@ -21,24 +20,10 @@ from sitegrid.process.lifetime import say
 from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
 from sitegrid.web.site import SiteFeed
+from sitegrid.web.sockets import CONNECTIONS, Listening, PatientServer
 
-FIRST_S = 10.0  # until a new connection has sent its first request; a slow one holds a place that others need
-CONNECTIONS = 500
 MESSAGE_BYTES = 4096  # of what a page says
 ADDRESS_BYTES = 2**18  # that are read, to be refused by name: a line of 10,000 places; beyond, the connection ends
-
-
-class PatientProtocol(H11Protocol):
-    """HTTP/1.1 with an end to patience: a connection that does not finish its first headers is closed."""
-
-    def connection_made(self, transport: Any) -> None:
-        """Begin a connection, and the time that it has."""
-        super().connection_made(transport)
-        self.loop.call_later(FIRST_S, self._end_unless_begun)
-
-    def _end_unless_begun(self) -> None:
-        if self.scope is None and not self.transport.is_closing():
-            self.transport.close()
 
 
 def serve(
@@ -54,10 +39,10 @@ def serve(
     clients = [connect(endpoint, name, keys=arguments.keys) for name, endpoint in sites]
 
     async def run() -> None:
-        web = WebApp([SiteFeed(client) for client in clients], person)
+        web = WebApp([SiteFeed(client) for client in clients], person, listening.counts)
         config = uvicorn.Config(
             web.app,
-            http=PatientProtocol,
+            http="h11",
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
             h11_max_incomplete_event_size=ADDRESS_BYTES,
@@ -68,12 +53,12 @@ def serve(
             timeout_graceful_shutdown=1,
             **_tls(arguments.tls),
         )
-        server = uvicorn.Server(config)
+        server = PatientServer(config, listening)
         watch = asyncio.create_task(_stop_with(server, stop))
         scheme, (host, port) = "https" if arguments.tls else "http", listening.getsockname()[:2]
         url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
         say({"ready": "web", "url": url, "sites": [client.site for client in clients]})
-        await server._serve([listening])  # noqa: SLF001 - `serve` would take the signals that stop_flag has
+        await server._serve()  # noqa: SLF001 - `serve` would take the signals that stop_flag has
         stop.set()
         await watch
 
@@ -87,9 +72,9 @@ async def _stop_with(server: uvicorn.Server, stop: threading.Event) -> None:
     server.should_exit = True
 
 
-def _listen(address: tuple[str, int]) -> socket.socket:
+def _listen(address: tuple[str, int]) -> Listening:
     host, port = address[0].strip("[]"), address[1]
-    listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listening = Listening(socket.AF_INET6 if ":" in host else socket.AF_INET)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((host, port))
