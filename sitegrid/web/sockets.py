@@ -67,12 +67,18 @@ class Listening(socket.socket):
         self._accepted = [one for one in self._accepted if one[1].fileno() >= 0]
         return sum(one[0] == origin for one in self._accepted)
 
+    def has_place(self, origin: str, number: int) -> bool:
+        """Whether a socket, by its file's number, is among those that its origin may have: the first ones."""
+        numbers = (one[1].fileno() for one in self._accepted if one[0] == origin)
+        return number in [one for one in numbers if one >= 0][:OF_ADDRESS]
+
     def refuse(self, origin: str) -> None:
         """Count a socket that is refused, and name where it comes from."""
         self.counts["refused_connections"] += 1
         if (now_s := time.monotonic()) - self._logged_s > LOG_S:
             self._logged_s = now_s
-            log.warning("too many connections address=%s open=%d", origin, self.open_of(origin))
+            own, every = self.open_of(origin), len(self._accepted)
+            log.warning("too many connections address=%s open=%d of_all=%d", origin, own, every)
 
 
 def origin_of(host: str) -> str:
@@ -115,15 +121,15 @@ class PatientProtocol(H11Protocol):
 
     def __init__(self, listening: Listening, **given: Any) -> None:
         super().__init__(**given)
-        self._listening, self._is_crowded = listening, False
+        self._listening, self._has_place = listening, True
         self._deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
         """Begin a connection, and the time that its first request has."""
         super().connection_made(JoinedWrites(transport, self.loop))  # type: ignore[arg-type]
         origin = origin_of(self.client[0]) if self.client else ""
-        self._is_crowded = self._listening.open_of(origin) > OF_ADDRESS
-        if self._is_crowded:
+        self._has_place = self._listening.has_place(origin, transport.get_extra_info("socket").fileno())
+        if not self._has_place:
             self._listening.refuse(origin)
             self.app = problem_response(TOO_MANY)
         self._wait()
@@ -147,8 +153,7 @@ class PatientProtocol(H11Protocol):
 
     def _should_upgrade(self) -> bool:
         """WebSockets are connections too; what is not upgraded is told that there are too many."""
-        has_room = not self._is_crowded and len(self.connections) < CONNECTIONS
-        return has_room and super()._should_upgrade()
+        return self._has_place and len(self.connections) < CONNECTIONS and super()._should_upgrade()
 
 
 class PatientServer(uvicorn.Server):

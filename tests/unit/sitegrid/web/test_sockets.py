@@ -1,0 +1,166 @@
+"""One visitor's sockets: how many there may be, and how long each may take. Times are short here."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+import threading
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import uvicorn
+from starlette.responses import PlainTextResponse
+from starlette.types import Receive, Scope, Send
+
+from sitegrid.process.children import wait_until
+from sitegrid.security.certificates import issue, make_authority
+from sitegrid.web import sockets
+from sitegrid.web.sockets import Listening, PatientServer, origin_of
+
+WHOLE = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
+BODY = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 999\r\n\r\n"
+UPGRADE = b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+UPGRADE += b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+PATIENCE_S = 0.4
+
+
+@pytest.fixture(autouse=True)
+def _short_times_and_few_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"REQUEST_S": PATIENCE_S, "TLS_S": PATIENCE_S, "OF_ADDRESS": 3, "SPARE": 2}.items():
+        monkeypatch.setattr(sockets, name, value)
+
+
+async def app(scope: Scope, receive: Receive, send: Send) -> None:
+    """Answers a request, and takes a WebSocket until it goes."""
+    if scope["type"] == "http":
+        await PlainTextResponse("ok\n")(scope, receive, send)
+    else:
+        await send({"type": "websocket.accept"})
+        while (await receive())["type"] != "websocket.disconnect":
+            pass
+
+
+@contextlib.contextmanager
+def serving(**tls: Path) -> Iterator[Listening]:
+    with Listening(socket.AF_INET) as listening:
+        listening.bind(("127.0.0.1", 0))
+        options = {"http": "h11", "ws": "websockets-sansio", "lifespan": "off", "timeout_graceful_shutdown": 1}
+        server = PatientServer(uvicorn.Config(app, log_config=None, **options, **tls), listening)
+        thread = threading.Thread(target=lambda: asyncio.run(server._serve()))
+        thread.start()
+        try:
+            wait_until(lambda: server.started, 10, "the server")
+            yield listening
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+def opened(listening: Listening, address: str = "127.0.0.1") -> socket.socket:
+    return socket.create_connection(listening.getsockname(), 10, source_address=(address, 0))
+
+
+def asked(visitor: socket.socket, request: bytes = WHOLE) -> bytes:
+    """How an answer begins; empty where the connection is closed."""
+    try:
+        visitor.sendall(request)
+        return visitor.recv(1000)[9:12]
+    except ConnectionError:
+        return b""
+
+
+def has_ended(visitor: socket.socket, trickle: bytes = b"") -> bool:
+    """Wait until the server closes a connection, and send a byte now and then: it buys no time."""
+    visitor.settimeout(PATIENCE_S / 4)
+    for _ in range(40):
+        with contextlib.suppress(TimeoutError):
+            try:
+                if not visitor.recv(1000):
+                    return True
+            except ConnectionError:
+                return True
+        with contextlib.suppress(ConnectionError):
+            visitor.sendall(trickle)
+    return False
+
+
+@pytest.mark.parametrize(
+    "begun",
+    [
+        b"",
+        b"GET / HT",
+        WHOLE + b"GET / HTTP/1.1\r\nX: ",
+        b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 999\r\n\r\n123",
+    ],
+    ids=["nothing", "half a request", "half a second request", "half a body"],
+)
+def test_a_request_that_does_not_come_in_whole_ends_its_connection(begun: bytes):
+    with serving() as listening, opened(listening) as slow, opened(listening) as other:
+        slow.sendall(begun)
+        assert has_ended(slow, b"1" if begun else b"")
+        assert listening.counts["refused_slow"] >= 1
+        assert has_ended(other)
+        with opened(listening) as next_one:
+            assert asked(next_one) == b"200"
+
+
+def test_requests_that_come_in_whole_in_time_are_all_answered():
+    with serving() as listening, opened(listening) as slow:
+        slow.settimeout(PATIENCE_S / 2)
+        for _ in range(4):
+            slow.sendall(WHOLE[:9])
+            with pytest.raises(TimeoutError):
+                slow.recv(1)
+            assert asked(slow, WHOLE[9:]) == b"200"
+        assert not listening.counts
+
+
+def test_a_handshake_that_does_not_begin_ends_its_connection(tmp_path: Path):
+    now = datetime.now(UTC)
+    pair = issue(make_authority("pit", now, now + timedelta(1)), "web", now, now + timedelta(1), ("127.0.0.1",))
+    files = {"ssl_certfile": tmp_path / "cert.pem", "ssl_keyfile": tmp_path / "key.pem"}
+    for file, data in zip(files.values(), (pair.certificate, pair.key), strict=True):
+        file.write_bytes(data)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with serving(**files) as listening, opened(listening) as silent, context.wrap_socket(opened(listening)) as idle:
+        assert asked(idle) == b"200"
+        assert has_ended(silent)
+        with context.wrap_socket(opened(listening)) as asks_nothing:
+            assert has_ended(asks_nothing)
+
+
+def test_an_address_has_so_many_sockets_whatever_they_are(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sockets, "REQUEST_S", 60.0)
+    with serving() as listening, contextlib.ExitStack() as stack:
+        first, live, third, told, also_told, *more = (
+            stack.enter_context(opened(listening, "127.0.0.2")) for _ in range(9)
+        )
+        assert asked(live, UPGRADE) == b"101"
+        assert (asked(told), asked(also_told, UPGRADE)) == (b"429", b"429"), "a WebSocket is a socket"
+        assert b"" in map(asked, more), "to be told takes a place too"
+        assert (asked(first), asked(third)) == (b"200", b"200"), "those that came first stay"
+        assert asked(stack.enter_context(opened(listening, "127.0.0.3"))) == b"200", "another one finds a place"
+        for each in (first, third):
+            each.close()
+        wait_until(lambda: asked(stack.enter_context(opened(listening, "127.0.0.2"))) == b"200", 10, "a free place")
+        assert listening.counts["refused_connections"] >= 3
+
+
+def test_the_system_ends_a_connection_whose_answer_nobody_takes():
+    with Listening(socket.AF_INET) as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen()
+        with opened(listening), listening.accept()[0] as accepted:
+            timeout_ms = accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+        assert timeout_ms == 1e3 * sockets.STALLED_S
+
+
+def test_all_addresses_of_a_host_are_one_origin():
+    assert origin_of("192.0.2.7") == origin_of("::ffff:192.0.2.7") != origin_of("192.0.2.8")
+    assert origin_of("2001:db8::1") == origin_of("2001:db8::ffff:1") != origin_of("2001:db8:0:1::1")
+    assert origin_of("fe80::1%eth0") == origin_of("fe80::2%eth0")
