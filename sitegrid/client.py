@@ -315,7 +315,8 @@ class Client:
 
         Events are not repeated: ask `changes` for what was before, or was missed.
         """
-        listener = Listener(self.session, keys.changed(self.site), answer_codec.decode_change, callback)
+        key = keys.changed(self.site)
+        listener = Listener(self.session, key, lambda _, data: answer_codec.decode_change(data), callback)
         self._listeners.append(listener)
         return listener
 

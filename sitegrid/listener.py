@@ -6,6 +6,7 @@ import contextlib
 import logging
 import queue
 import threading
+from collections import Counter
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
@@ -14,6 +15,7 @@ import zenoh
 from protocol.errors import MessageError
 
 MOST_WAITING = 1000  # events; more are dropped
+MOST_NAMED = 1000  # keys whose events were refused: names are free to choose where there are no keys
 T = TypeVar("T")
 log = logging.getLogger("sitegrid.listener")
 
@@ -22,14 +24,18 @@ class Listener(Generic[T]):
     """Calls `callback` with every event put on a key, one after the other, on a thread of its own, until closed.
 
     Events that cannot be read, or come faster than the callback returns, are dropped; its errors are logged.
+    refused: how many could not be read, by reason; the log names each key and reason once.
     """
 
     def __init__(
-        self, session: zenoh.Session, key: str, decode: Callable[[bytes], T], callback: Callable[[T], object]
+        self, session: zenoh.Session, key: str, decode: Callable[[str, bytes], T], callback: Callable[[T], object]
     ) -> None:
+        """decode: key and payload to event, or MessageError."""
+        self.refused: Counter[str] = Counter()
+        self._named: set[tuple[str, str]] = set()
         self._decode, self._callback = decode, callback
         self._closed = False
-        self._waiting: queue.Queue[bytes | None] = queue.Queue(MOST_WAITING)
+        self._waiting: queue.Queue[tuple[str, bytes] | None] = queue.Queue(MOST_WAITING)
         self._thread = threading.Thread(target=self._run, name="listener", daemon=True)
         self._thread.start()
         self._subscriber = session.declare_subscriber(key, self._on_sample)
@@ -49,15 +55,21 @@ class Listener(Generic[T]):
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         try:
-            self._waiting.put_nowait(sample.payload.to_bytes())
+            self._waiting.put_nowait((str(sample.key_expr), sample.payload.to_bytes()))
         except queue.Full:
             log.warning("event dropped key=%s waiting=%d", sample.key_expr, MOST_WAITING)
 
     def _run(self) -> None:
-        while (data := self._waiting.get()) is not None:
+        while (event := self._waiting.get()) is not None:
             try:
-                self._callback(self._decode(data))
+                self._callback(self._decode(*event))
             except MessageError as error:
-                log.warning("event dropped error=%r", str(error))
+                self._refuse(event[0], error)
             except Exception:  # the callback's bug is not the end of the events
                 log.exception("callback failed")
+
+    def _refuse(self, key: str, error: MessageError) -> None:
+        self.refused[error.reason] += 1
+        if (key, error.reason) not in self._named and len(self._named) < MOST_NAMED:
+            self._named.add((key, error.reason))
+            log.warning("event refused key=%s reason=%s problem=%r", key, error.reason, str(error))

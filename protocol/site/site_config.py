@@ -17,6 +17,7 @@ from protocol.config import toml_lines
 from protocol.site.geometry import GridGeometry
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+MAX_EXTENT_M = 100_000.0  # of any site
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,8 @@ class SiteConfig:
             raise ValueError("origin_lat_deg, origin_lon_deg: not a place on Earth between 80 S and 84 N")
         if not 0.05 <= self.cell_m <= 100:
             raise ValueError(f"cell_m: {self.cell_m} is not between 0.05 and 100")
-        if not 10 <= self.extent_m <= 100_000:
-            raise ValueError(f"extent_m: {self.extent_m} is not between 10 and 100000")
+        if not 10 <= self.extent_m <= MAX_EXTENT_M:
+            raise ValueError(f"extent_m: {self.extent_m} is not between 10 and {MAX_EXTENT_M:g}")
         if self.clock not in ("data", "wall"):
             raise ValueError(f'clock: {self.clock!r} is neither "data" nor "wall"')
         if self.clock_tolerance_s < 0:

@@ -14,8 +14,8 @@ import numpy as np
 
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
-from protocol.machine.samples import COLUMNS, OPTIONAL, SAMPLE_DTYPE, check_samples, empty
-from protocol.site.site_config import NAME
+from protocol.machine.samples import COLUMNS, LIMITS, OPTIONAL, SAMPLE_DTYPE, check_samples, empty
+from protocol.site.site_config import MAX_EXTENT_M, NAME
 from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
 
 MAX_BATCH_BYTES = 4 * 2**20
@@ -289,6 +289,24 @@ def decode_pose(data: bytes) -> Pose:
     table = unpack(data, MAX_SMALL_BYTES)
     numbers = (take(table, name, float) for name in list(Pose.__dataclass_fields__)[2:])
     return Pose(take_name(table), take_stamp(table), *numbers)
+
+
+def receive_pose(key: str, data: bytes, extent_m: float = MAX_EXTENT_M) -> Pose:
+    """A live position that came in under a key: of the machine that the key names, and as plausible as a sample.
+
+    extent_m: how far from the origin a position may lie.
+    """
+    pose = decode_pose(data)
+    if not key.endswith(f"/machine/{pose.machine}/pose"):
+        raise MessageError(Refusal.WRONG_MACHINE, f"{pose.machine!r} sends under {key}", field="machine")
+    limits = {**LIMITS, "x_m": (-extent_m, extent_m), "y_m": (-extent_m, extent_m)}
+    for name in list(Pose.__dataclass_fields__)[2:]:
+        (low, high), value = limits[name], getattr(pose, name)
+        if not low <= value <= high:
+            raise MessageError(Refusal.OUT_OF_RANGE, f"{value:g} is not between {low:g} and {high:g}", field=name)
+    if pose.cov_xy_m2**2 > pose.cov_xx_m2 * pose.cov_yy_m2 + 1e-6 * max(pose.cov_xx_m2 * pose.cov_yy_m2, 1e-12):
+        raise MessageError(Refusal.COVARIANCE, "covariance is not positive semidefinite", field="cov_xy_m2")
+    return pose
 
 
 def encode_health(health: Health) -> bytes:

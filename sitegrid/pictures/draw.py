@@ -17,18 +17,19 @@ from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_
 from mapserver.pictures.profile import draw_drive
 from mapserver.pictures.worklist import draw_worklist
 from protocol.arrays import Floats32
-from protocol.errors import ConfigError, LinkError, MessageError, QueryError
+from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.queries.answers import MachineState, Region
 from protocol.queries.parameters import text_of
 from protocol.queries.requests import parse_query
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
-from protocol.wire.codec import decode_pose
+from protocol.wire.codec import receive_pose
 from protocol.wire.messages import Pose
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.explanations import calibrations
+from sitegrid.listener import Listener
 from sitegrid.process.lifetime import note, say, stop_flag
 
 AROUND_M = 30.0  # of the map around a drive
@@ -207,7 +208,7 @@ class TrackRecorder:
     def __init__(self, session: zenoh.Session, site: str) -> None:
         self._lock = threading.Lock()
         self._poses: dict[str, list[Pose]] = {}
-        self._subscriber = session.declare_subscriber(keys.poses_all(site), self._on_pose)
+        self._listener = Listener(session, keys.poses_all(site), receive_pose, self._on_pose)
 
     def poses(self) -> dict[str, list[Pose]]:
         """All poses so far, by machine."""
@@ -223,13 +224,9 @@ class TrackRecorder:
 
     def close(self) -> None:
         """Stop listening."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._listener.close()
 
-    def _on_pose(self, sample: zenoh.Sample) -> None:
-        try:
-            pose = decode_pose(sample.payload.to_bytes())
-        except MessageError:  # a pose that cannot be read is not drawn
-            return
+    def _on_pose(self, pose: Pose) -> None:
         with self._lock:
             poses = self._poses.setdefault(pose.machine, [])
             poses.append(pose)

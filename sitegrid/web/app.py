@@ -175,6 +175,10 @@ class WebApp:
         for name, figures in (("pages", [d.watchers for d in feeds]), ("server_away", [int(d.is_away) for d in feeds])):
             lines.append(f"# TYPE sitegrid_web_{name} gauge")
             lines += [f'sitegrid_web_{name}{{site="{d.name}"}} {n}' for d, n in zip(feeds, figures, strict=True)]
+        lines.append("# TYPE sitegrid_web_poses_refused_total counter")
+        for feed in feeds:
+            for reason, n in sorted(feed.refused.items()):
+                lines.append(f'sitegrid_web_poses_refused_total{{site="{feed.name}",reason="{reason}"}} {n}')
         return PlainTextResponse("\n".join(lines) + "\n", media_type="text/plain; version=0.0.4")
 
 

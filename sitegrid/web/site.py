@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from typing import Any, TypeVar
@@ -19,9 +19,9 @@ import zenoh
 from protocol.errors import LinkError, MessageError, QueryError
 from protocol.queries.answers import MapInfo, MapVersion
 from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
-from protocol.site.site_config import Projection, SiteConfig
+from protocol.site.site_config import MAX_EXTENT_M, Projection, SiteConfig
 from protocol.wire import keys
-from protocol.wire.codec import decode_pose
+from protocol.wire.codec import receive_pose
 from protocol.wire.messages import Pose
 from sitegrid.asking import is_answered
 from sitegrid.client import Client
@@ -152,7 +152,7 @@ class SiteFeed:
         """Ask again and again while somebody looks; ends when nobody does."""
         if self._listener is None:
             key = keys.poses_all(self.name)
-            self._listener = await self.ask(Listener, self.client.session, key, decode_pose, self._on_pose)
+            self._listener = await self.ask(Listener, self.client.session, key, self._pose, self._on_pose)
             self._looking = asyncio.create_task(self._look_for_server())
         next_state_s = 0.0
         idle_s = 0.0
@@ -206,6 +206,14 @@ class SiteFeed:
         """Where each machine was while somebody looked, oldest first: some MOST_POSES poses."""
         with self._poses_lock:
             return {name: list(track) for name, track in self._tracks.items()}
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """How many poses were not believed, by reason."""
+        return dict(self._listener.refused) if self._listener else {}
+
+    def _pose(self, key: str, data: bytes) -> Pose:
+        return receive_pose(key, data, self._info[1].site.extent_m if self._info else MAX_EXTENT_M)
 
     def _on_pose(self, pose: Pose) -> None:
         with self._poses_lock:

@@ -21,6 +21,9 @@ from websockets.sync.client import connect as open_socket
 
 from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
+from protocol.wire import keys
+from protocol.wire.codec import encode_pose
+from protocol.wire.messages import Pose
 from sitegrid.process.children import Children, wait_until
 from sitegrid.web import values
 from tests.integration.site_run import kill
@@ -228,6 +231,20 @@ def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
     wait_until(
         lambda: web.get("point", parameters, If_None_Match=first.headers["etag"]).status == 200, 10, "another map"
     )
+
+
+def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: WebSite):
+    def shown() -> list[object]:
+        for machine, x_m in (("machine-0", 5.0), ("machine-1", 1.0), ("machine-0", 1e308)):  # all by machine-0
+            pose = Pose(machine, web.now_ns, x_m, *[0.0] * 6)
+            web.session.put(keys.pose(NAME, "machine-0"), encode_pose(pose))
+        places = web.get("features/machines").json["features"]
+        return [place["properties"]["machine"] for place in places]
+
+    wait_until(lambda: shown() == ["machine-0"], 10, "a pose")
+    counted = web.get("/metrics").body.decode()
+    for reason in ("wrong_machine", "out_of_range"):
+        assert f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}' in counted
 
 
 def test_slow_headers_do_not_hold_a_place(web: WebSite):

@@ -12,7 +12,7 @@ from protocol.machine.readings import KINDS, Encoder, Imu, columns
 from protocol.machine.samples import COLUMNS, OPTIONAL, SAMPLE_DTYPE, empty
 from protocol.queries import answer_codec as answers
 from protocol.queries.answers import PointAnswer, Region
-from protocol.wire import codec, correction_codec
+from protocol.wire import codec, correction_codec, keys
 from protocol.wire.codec import decode_batch, encode_batch
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
 
@@ -391,6 +391,28 @@ def test_agent_that_has_read_nothing_shows_its_health():
 def test_pose_that_is_nowhere_is_refused():
     error = refusal(codec.encode_pose(Pose("m-1", T0, float("nan"), *[0.0] * 6)), codec.decode_pose)
     assert (error.reason, error.field) == (Refusal.NOT_FINITE, "x_m")
+
+
+@pytest.mark.parametrize(
+    ("changed", "key", "reason", "field"),
+    [
+        ({}, "m-2", Refusal.WRONG_MACHINE, "machine"),
+        ({}, "*", Refusal.WRONG_MACHINE, "machine"),
+        ({"x_m": 100.1}, "m-1", Refusal.OUT_OF_RANGE, "x_m"),
+        ({"y_m": -1e308}, "m-1", Refusal.OUT_OF_RANGE, "y_m"),
+        ({"heading_rad": 8.0}, "m-1", Refusal.OUT_OF_RANGE, "heading_rad"),
+        ({"speed_mps": -101.0}, "m-1", Refusal.OUT_OF_RANGE, "speed_mps"),
+        ({"cov_yy_m2": 1e7}, "m-1", Refusal.OUT_OF_RANGE, "cov_yy_m2"),
+        ({"cov_xx_m2": -1.0}, "m-1", Refusal.OUT_OF_RANGE, "cov_xx_m2"),
+        ({"cov_xy_m2": 0.3}, "m-1", Refusal.COVARIANCE, "cov_xy_m2"),
+    ],
+)
+def test_a_pose_is_of_the_machine_of_its_key_and_where_a_sample_could_be(changed, key, reason, field):
+    pose, extent_m = Pose("m-1", T0, 100.0, -100.0, 1.0, -2.0, 0.2, 0.1, 0.2), 100.0
+    assert codec.receive_pose(keys.pose("pit", "m-1"), codec.encode_pose(pose), extent_m) == pose
+    data = codec.encode_pose(dataclasses.replace(pose, **changed))
+    error = refusal(data, lambda sent: codec.receive_pose(f"sitegrid/pit/machine/{key}/pose", sent, extent_m))
+    assert (error.reason, error.field) == (reason, field)
 
 
 # --- whatever arrives, only a MessageError leaves --------------------------------------------------------------------
