@@ -14,7 +14,7 @@ import zenoh
 from mapserver.claim import WriterClaim
 from mapserver.config import ServerConfig
 from mapserver.evidence import grid
-from mapserver.ingest import batches
+from mapserver.ingest import batches, block_credit
 from mapserver.ingest.admission import Verify
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Incoming, Store
@@ -173,6 +173,7 @@ def warm_up(config: ServerConfig) -> None:
     """Have all kernels, before the first batch and the first question."""
     grid.warm_up(config.fold)
     batches.warm_up()
+    block_credit.warm_up(config.fold)
     records.warm_up()
     road_maps.warm_up(config.fold)
     routes.warm_up()

@@ -16,6 +16,7 @@ class Refusal(StrEnum):
     OUT_OF_RANGE = "out_of_range"
     COVARIANCE = "covariance"
     OUTSIDE_SITE = "outside_site"
+    SCATTERED = "scattered"
     FIRST_SEQ = "first_seq"
     GAP = "gap"
     WRONG_FRAME = "wrong_frame"

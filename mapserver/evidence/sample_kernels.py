@@ -110,6 +110,46 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
+def survey(
+    rows: Any, limits: tuple[float, float, float], before: tuple[float, float, float], driven_m: Any, keys: Any, at: Any
+) -> int:
+    """How far a machine drove, and into which blocks its rows vote where the row before did not.
+
+    limits: as of `locate`. before: where the machine was, NaN where that is not known, and metres of a row at most.
+    Fills driven_m (n,): metres until each row, each row's own the least of its distance, its shift and that; and, as
+    long as there is room, numbers of blocks (`block_key`) and of rows. Returns how many of these.
+    """
+    x, y, most_m = before
+    used, total, place = 0, 0.0, np.empty(5)
+    west, east, south, north = 0, -1, 0, -1  # blocks of the last row that votes
+    for k in range(len(rows)):
+        row = rows[k]
+        shift = np.hypot(row.x_m - x, row.y_m - y)
+        total += min(np.float64(row.distance_m), most_m, shift) if shift >= 0 else 0.0
+        x, y, driven_m[k] = row.x_m, row.y_m, total
+        reach = _place(row, limits, place) if row.distance_m > 0 else -1
+        if reach < 0:
+            continue
+        column, line = int(np.floor(place[0])), int(np.floor(place[1]))
+        first_x, last_x = (column - reach) >> 4, (column + reach) >> 4
+        first_y, last_y = (line - reach) >> 4, (line + reach) >> 4
+        for block_y in range(first_y, last_y + 1):
+            for block_x in range(first_x, last_x + 1):
+                if not (west <= block_x <= east and south <= block_y <= north):
+                    if used < len(keys):
+                        keys[used], at[used] = block_key(block_x, block_y), k
+                    used += 1
+        west, east, south, north = first_x, last_x, first_y, last_y
+    return used
+
+
+@numba.njit(cache=True, nogil=True)
+def block_key(x: int, y: int) -> int:
+    """One number for a block's column and row."""
+    return ((x + HALF) << BLOCK_BITS) | (y + HALF)
+
+
+@numba.njit(cache=True, nogil=True)
 def weigh(rows: Any, places: Any, stencils: Any, starts: Any, shares: Any) -> None:
     """Spread the weight of each row over its stencil.
 

@@ -18,6 +18,7 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_store, judge, signature_problem
 from mapserver.ingest.batches import decode_batches
+from mapserver.ingest.block_credit import BlockCredit
 from mapserver.ingest.decisions import Decision, Decisions, plain
 from mapserver.ingest.losses import by_machine, name_shortfalls
 from mapserver.ingest.standby import Standby
@@ -94,6 +95,7 @@ class Store:
             in_snapshot = self.grid.counts()
             fold_history(self.grid, self.history, self.merged, selection=Selection.by(facts))
             release_memory()
+            self._credit = BlockCredit(site.cell_m, config.fold, self.grid.folded_since(-1)[0])
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
             self._snapshot_samples = 0 if warm else self.journal.samples - tail  # what is warm is on no disk yet
@@ -141,10 +143,12 @@ class Store:
             self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
         except UnwrittenError as error:
             self.journal.rollback()
+            self._credit.drop()
             if isinstance(error, FencedError):
                 raise
             self.counters[f"refused_{Refusal.STORE}"] += len(group)
             return [Refused(Refusal.STORE, f"the server cannot write: {error.problem}") for _ in group]
+        self._credit.keep()
         for answer, admission in answers:
             self._count(answer, admission)
         self._fold([admission.batch for _, admission in answers if admission and len(admission.batch.rows)])
@@ -234,10 +238,11 @@ class Store:
             judge(batch, incoming.machine, self.site, self.now_ns, self._seen)
             replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
+            if new := len(admission.batch.rows) > 0:
+                self._credit.spend(batch.machine, admission.batch.rows, admission.trimmed)
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None
-        new = len(admission.batch.rows) > 0
         if new:
             self._received_ns = self.now_ns()
         row = self.journal.append(admission, self._received_ns) if new else self.journalled
