@@ -165,6 +165,8 @@ def check_losses(info: MapInfo) -> Finding:
     }
     texts = [f"{what}: " + ", ".join(f"{n} of {name}" for name, n in by.items()) for what, by in parts.items() if by]
     texts += info.shortfalls[-1:]
+    if count := info.counters.get(f"refused_{Refusal.SCATTERED}"):
+        texts.append(f"quarantined: samples of {count} batches, on new ground that their machines had not driven for")
     if not texts:
         return Finding(Level.PASS, "losses", "no machine has lost samples, and the store none")
     advice = "look at the disks of machines and server, and at their logs; a backup may have what the store lacks"

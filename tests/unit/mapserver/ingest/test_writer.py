@@ -591,6 +591,7 @@ BATCHES = [
     (Refusal.OUT_OF_RANGE, table(store="0123")),
     (Refusal.WALL_CLOCK, one(stamp_ns=NOW_NS + 10**13)),
     (Refusal.FAR_FUTURE, one(stamp_ns=NOW_NS + 10**15)),
+    (Refusal.SCATTERED, encode_batch(batch(samples(400, stamp_ns=NOW_NS, x_m=40.0 * np.arange(400))))),
 ]
 
 

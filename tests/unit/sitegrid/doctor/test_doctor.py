@@ -133,6 +133,7 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
         (network.check_losses(INFO), PASS, "no machine has lost samples, and the store none"),
         (network.check_losses(lossy(3, 0)), WARN, "declared lost: 3 of loader-1; look at"),
         (network.check_losses(lossy(0, 7)), WARN, "acknowledged and gone: 7 of loader-1; look at"),
+        (network.check_losses(replace(INFO, counters={"refused_scattered": 3})), WARN, "of 3 batches, on new ground"),
         (network.check_losses(replace(INFO, shortfalls=("a", "row 3 is gone"))), WARN, "row 3 is gone"),
         (server(None, is_there=True, role="visitor"), FAIL, "; the router denies the question"),
         (server(None, is_there=False), FAIL, "start `sitegrid server`"),
