@@ -28,6 +28,9 @@ _G_TOP = (ev.GRADE_BINS - 1) * ev.SHARE_ONE
 _SECTOR_RAD, _SECTORS = 2 * np.pi / ev.SECTORS, ev.SECTORS
 _UNITS, _ONE = ev.WEIGHT_UNITS_PER_M, ev.SHARE_ONE
 _HASH = np.uint64(HASH)
+SIGMAS = 3.0  # that a position may be off
+MOST_STEP_M = 2.0  # that one sample counts as driven: agents make one every 0.5 m
+NEAR_M = 5.0  # what is so near is no jump, whatever the distance: wheels read 5 times a second, at 25 m/s
 _TABLE = TABLE.astype(np.uint32)
 
 
@@ -111,25 +114,31 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def survey(
-    rows: Any, limits: tuple[float, float, float], before: tuple[float, float, float], driven_m: Any, keys: Any, at: Any
-) -> int:
-    """How far a machine drove, and into which blocks its rows vote where the row before did not.
+    rows: Any, limits: tuple[float, float, float], before: tuple[float, float, bool], steps: Any, keys: Any, at: Any
+) -> tuple[int, bool]:
+    """How far a machine drove, where it jumped, and into which blocks its rows vote where the row before did not.
 
-    limits: as of `locate`. before: where the machine was, NaN where that is not known, and metres of a row at most.
-    Fills driven_m (n,): metres until each row, each row's own the least of its distance, its shift and that; and, as
-    long as there is room, numbers of blocks (`block_key`) and of rows. Returns how many of these.
+    limits: as of `locate`. before: where the machine was, NaN where that is not known, and whether it had jumped there.
+    Fills steps (n, 2): metres until each row, and 1 where it jumped and had no vote since; and, as long as there is
+    room, numbers of blocks (`block_key`) and of rows. Returns how many of these, and whether it ends with a jump.
     """
-    x, y, most_m = before
-    used, total, place = 0, 0.0, np.empty(5)
+    x, y, has_jumped = before
+    used, driven_m, place = 0, 0.0, np.empty(5)
     west, east, south, north = 0, -1, 0, -1  # blocks of the last row that votes
     for k in range(len(rows)):
         row = rows[k]
-        shift = np.hypot(row.x_m - x, row.y_m - y)
-        total += min(np.float64(row.distance_m), most_m, shift) if shift >= 0 else 0.0
-        x, y, driven_m[k] = row.x_m, row.y_m, total
-        reach = _place(row, limits, place) if row.distance_m > 0 else -1
+        distance_m, shift_m = np.float64(row.distance_m), np.hypot(row.x_m - x, row.y_m - y)
+        variance_m2 = _largest(np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2))
+        off_m = SIGMAS * np.sqrt(min(variance_m2, limits[2]) + limits[1])
+        if shift_m <= max(distance_m, NEAR_M) + off_m:
+            driven_m += min(distance_m, shift_m, MOST_STEP_M)
+        else:
+            has_jumped = True
+        x, y, steps[k, 0], steps[k, 1] = row.x_m, row.y_m, driven_m, has_jumped
+        reach = _place(row, limits, place) if distance_m > 0 else -1
         if reach < 0:
             continue
+        has_jumped = False
         column, line = int(np.floor(place[0])), int(np.floor(place[1]))
         first_x, last_x = (column - reach) >> 4, (column + reach) >> 4
         first_y, last_y = (line - reach) >> 4, (line + reach) >> 4
@@ -140,7 +149,7 @@ def survey(
                         keys[used], at[used] = block_key(block_x, block_y), k
                     used += 1
         west, east, south, north = first_x, last_x, first_y, last_y
-    return used
+    return used, has_jumped
 
 
 @numba.njit(cache=True, nogil=True)
