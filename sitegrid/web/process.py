@@ -8,6 +8,7 @@ import threading
 from argparse import Namespace
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from sitegrid.process.lifetime import say
 from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
 from sitegrid.web.site import SiteFeed
-from sitegrid.web.sockets import CONNECTIONS, Listening, PatientServer
+from sitegrid.web.sockets import CONNECTIONS, TLS_S, Listening, PatientProtocol
 
 MESSAGE_BYTES = 4096  # of what a page says
 ADDRESS_BYTES = 2**18  # that are read, to be refused by name: a line of 10,000 places; beyond, the connection ends
@@ -39,10 +40,13 @@ def serve(
     clients = [connect(endpoint, name, keys=arguments.keys) for name, endpoint in sites]
 
     async def run() -> None:
+        if arguments.tls:  # uvicorn cannot be told how long a handshake may take
+            loop: Any = asyncio.get_running_loop()
+            loop.create_server = partial(loop.create_server, ssl_handshake_timeout=TLS_S, ssl_shutdown_timeout=TLS_S)
         web = WebApp([SiteFeed(client) for client in clients], person, listening.counts)
         config = uvicorn.Config(
             web.app,
-            http="h11",
+            http=partial(PatientProtocol, listening),  # type: ignore[arg-type] # what makes protocols
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
             h11_max_incomplete_event_size=ADDRESS_BYTES,
@@ -53,12 +57,12 @@ def serve(
             timeout_graceful_shutdown=1,
             **_tls(arguments.tls),
         )
-        server = PatientServer(config, listening)
+        server = uvicorn.Server(config)
         watch = asyncio.create_task(_stop_with(server, stop))
         scheme, (host, port) = "https" if arguments.tls else "http", listening.getsockname()[:2]
         url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
         say({"ready": "web", "url": url, "sites": [client.site for client in clients]})
-        await server._serve()  # noqa: SLF001 - `serve` would take the signals that stop_flag has
+        await server._serve([listening])  # noqa: SLF001 - `serve` would take the signals that stop_flag has
         stop.set()
         await watch
 

@@ -1,7 +1,7 @@
 """Sockets of the web server: how many an address may have, and how long each may keep others waiting.
 
-What a socket says is worked on by uvicorn. Here it is counted when it is accepted, before TLS, so that whatever it
-becomes (a handshake that never begins, half a request, a WebSocket) counts until it is closed.
+A socket is counted when it is accepted, before TLS, and until it is closed, whatever it becomes: a handshake that never
+begins, half a request, a WebSocket.
 """
 
 from __future__ import annotations
@@ -12,31 +12,23 @@ import socket
 import time
 from collections import Counter
 from http import HTTPStatus
-from ipaddress import ip_address
+from ipaddress import ip_address, ip_network
 from typing import Any
 
 import h11
-import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from sitegrid.web.problems import Problem, problem_response
 
 CONNECTIONS = 500
-# Sockets of one address: 28 browsers behind one NAT that load the page at the same time (six sockets each, and the live
-# one), or 200 pages that are open behind a proxy; and two such addresses leave places to others.
+# 28 browsers behind one NAT that load the page at the same time (six sockets each, and the live one), or 200 pages that
+# are open behind a proxy; two such addresses leave places to others.
 OF_ADDRESS = 200
-SPARE = 50  # more sockets of an address and in all: to say that there are too many takes one
+SPARE = 50  # more of an address and in all, who are told that there are too many: beyond, a socket is closed at once
 REQUEST_S = 10.0  # for a request to come in whole, from its first byte or the connection's begin
-TLS_S = 5.0  # for a handshake, three round trips
+TLS_S = 5.0  # for a handshake
 STALLED_S = 30.0  # until a socket that takes nothing is closed
 LOG_S = 10.0  # between two lines about refused sockets
-TOO_MANY = Problem(
-    HTTPStatus.TOO_MANY_REQUESTS,
-    "too_many",
-    f"this address has more than {OF_ADDRESS} connections; close some",
-    {"Connection": "close", "Retry-After": f"{REQUEST_S:.0f}"},
-)
-_RECEIVING = (h11.IDLE, h11.SEND_BODY)  # states of who sends a request that is not whole
 log = logging.getLogger("sitegrid.web")
 
 
@@ -53,7 +45,7 @@ class Listening(socket.socket):
         """As a socket's own; ConnectionAbortedError, which the event loop passes over, where there is no room."""
         connection, address = super().accept()
         origin = origin_of(address[0])
-        if self.open_of(origin) >= OF_ADDRESS + SPARE or len(self._accepted) >= CONNECTIONS + SPARE:
+        if len(self.open_of(origin)) >= OF_ADDRESS + SPARE or len(self._accepted) >= CONNECTIONS + SPARE:
             connection.close()
             self.refuse(origin)
             raise ConnectionAbortedError
@@ -62,53 +54,41 @@ class Listening(socket.socket):
         self._accepted.append((origin, connection))
         return connection, address
 
-    def open_of(self, origin: str) -> int:
-        """How many sockets of an origin are open."""
+    def open_of(self, origin: str) -> list[int]:
+        """Numbers of the files of an origin's open sockets, in the order in which they came."""
         self._accepted = [one for one in self._accepted if one[1].fileno() >= 0]
-        return sum(one[0] == origin for one in self._accepted)
-
-    def has_place(self, origin: str, number: int) -> bool:
-        """Whether a socket, by its file's number, is among those that its origin may have: the first ones."""
-        numbers = (one[1].fileno() for one in self._accepted if one[0] == origin)
-        return number in [one for one in numbers if one >= 0][:OF_ADDRESS]
+        return [connection.fileno() for name, connection in self._accepted if name == origin]
 
     def refuse(self, origin: str) -> None:
         """Count a socket that is refused, and name where it comes from."""
         self.counts["refused_connections"] += 1
         if (now_s := time.monotonic()) - self._logged_s > LOG_S:
-            self._logged_s = now_s
-            own, every = self.open_of(origin), len(self._accepted)
-            log.warning("too many connections address=%s open=%d of_all=%d", origin, own, every)
+            self._logged_s, own = now_s, len(self.open_of(origin))
+            log.warning("too many connections address=%s open=%d of_all=%d", origin, own, len(self._accepted))
 
 
 def origin_of(host: str) -> str:
-    """Whose address it is: one host has all of an IPv6 network of 64 bits."""
+    """Whose address it is: a host has all of an IPv6 network of 64 bits."""
     address = ip_address(host.partition("%")[0])
-    if address.version == 6:
-        return str(address.ipv4_mapped or ip_address(int(address) >> 64 << 64))
-    return str(address)
+    is_alone = address.version == 4 or address.ipv4_mapped
+    return host if is_alone else str(ip_network((int(address), 64), strict=False))
 
 
 class JoinedWrites:
     """A transport that sends what is written in one turn of the loop together: a small answer comes in one piece."""
 
-    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
-        self._transport, self._loop = transport, loop
-        self._parts: list[bytes] = []
+    def __init__(self, transport: asyncio.Transport) -> None:
+        self._transport, self._parts = transport, list[bytes]()
 
     def __getattr__(self, name: str) -> Any:
+        self._flush()
         return getattr(self._transport, name)
 
     def write(self, data: bytes) -> None:
         """Send it with what else is written until the loop's next turn."""
         if not self._parts:
-            self._loop.call_soon(self._flush)
+            asyncio.get_running_loop().call_soon(self._flush)
         self._parts.append(data)
-
-    def close(self) -> None:
-        """Close it once all is sent."""
-        self._flush()
-        self._transport.close()
 
     def _flush(self) -> None:
         parts, self._parts = self._parts, []
@@ -126,18 +106,20 @@ class PatientProtocol(H11Protocol):
 
     def connection_made(self, transport: Any) -> None:
         """Begin a connection, and the time that its first request has."""
-        super().connection_made(JoinedWrites(transport, self.loop))  # type: ignore[arg-type]
-        origin = origin_of(self.client[0]) if self.client else ""
-        self._has_place = self._listening.has_place(origin, transport.get_extra_info("socket").fileno())
+        super().connection_made(JoinedWrites(transport))  # type: ignore[arg-type]
+        origin = origin_of(transport.get_extra_info("peername")[0])
+        own = self._listening.open_of(origin)
+        self._has_place = transport.get_extra_info("socket").fileno() in own[:OF_ADDRESS]
         if not self._has_place:
             self._listening.refuse(origin)
-            self.app = problem_response(TOO_MANY)
+            detail, close = f"more than {OF_ADDRESS} connections of one address; close some", {"Connection": "close"}
+            self.app = problem_response(Problem(HTTPStatus.TOO_MANY_REQUESTS, "too_many", detail, close))
         self._wait()
 
     def data_received(self, data: bytes) -> None:
         """Go on with a request, or begin one, and the time that it has."""
         super().data_received(data)
-        if self.conn.their_state in _RECEIVING:
+        if self.conn.their_state in (h11.IDLE, h11.SEND_BODY):
             self._wait()
         elif self._deadline:
             self._deadline.cancel()
@@ -154,27 +136,3 @@ class PatientProtocol(H11Protocol):
     def _should_upgrade(self) -> bool:
         """WebSockets are connections too; what is not upgraded is told that there are too many."""
         return self._has_place and len(self.connections) < CONNECTIONS and super()._should_upgrade()
-
-
-class PatientServer(uvicorn.Server):
-    """uvicorn on a socket of ours."""
-
-    def __init__(self, config: uvicorn.Config, listening: Listening) -> None:
-        super().__init__(config)
-        self._listening = listening
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """As uvicorn's own, which cannot be told how long a handshake may take."""
-        await super().startup(sockets or [])
-        config, tls_s = self.config, TLS_S if self.config.ssl else None
-        given = {"config": config, "server_state": self.server_state, "app_state": self.lifespan.state}
-        self.servers = [
-            await asyncio.get_running_loop().create_server(
-                lambda: PatientProtocol(self._listening, **given),
-                sock=self._listening,
-                backlog=config.backlog,
-                ssl=config.ssl,
-                ssl_handshake_timeout=tls_s,
-                ssl_shutdown_timeout=tls_s,
-            )
-        ]

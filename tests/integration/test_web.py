@@ -11,7 +11,9 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_pose
 from protocol.wire.messages import Pose
 from sitegrid.process.children import Children, wait_until
+from sitegrid.security.certificates import issue, make_authority
 from sitegrid.web import values
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, READY_S, Frame, WebSite
@@ -247,11 +250,19 @@ def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: W
         assert f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}' in counted
 
 
-def test_slow_headers_do_not_hold_a_place(web: WebSite):
-    with socket.create_connection(("127.0.0.1", web.port)) as slow:
+def test_slow_headers_and_handshakes_do_not_hold_a_place(web: WebSite, tmp_path: Path):
+    now = datetime.now(UTC)
+    pair = issue(make_authority(NAME, now, now + timedelta(1)), "web", now, now + timedelta(1), ("127.0.0.1",))
+    (tmp_path / "cert.pem").write_bytes(pair.certificate)
+    (tmp_path / "key.pem").write_bytes(pair.key)
+    words = ("--endpoint", web.endpoint, "--listen", "0", "--site", NAME, "--tls", tmp_path)
+    url = web.children.start("tls", "web", *words).expect("ready", READY_S)["url"]
+    with (
+        socket.create_connection(("127.0.0.1", web.port), 30) as slow,
+        socket.create_connection(("127.0.0.1", urlsplit(url).port), 30) as silent,
+    ):
         slow.sendall(b"GET / HTTP/1.1\r\nHost: x\r\nX-Slow: ")
-        slow.settimeout(30)
-        assert slow.recv(1000) == b""
+        assert slow.recv(1000) == silent.recv(1000) == b""
 
 
 def test_two_sites_stand_behind_one_address(tmp_path: Path):
