@@ -15,7 +15,6 @@ import zenoh
 from protocol.errors import MessageError
 
 MOST_WAITING = 1000  # events; more are dropped
-MOST_NAMED = 1000  # keys whose events were refused: names are free to choose where there are no keys
 T = TypeVar("T")
 log = logging.getLogger("sitegrid.listener")
 
@@ -24,7 +23,7 @@ class Listener(Generic[T]):
     """Calls `callback` with every event put on a key, one after the other, on a thread of its own, until closed.
 
     Events that cannot be read, or come faster than the callback returns, are dropped; its errors are logged.
-    refused: how many could not be read, by reason; the log names each key and reason once.
+    refused: how many could not be read, by reason.
     """
 
     def __init__(
@@ -32,7 +31,6 @@ class Listener(Generic[T]):
     ) -> None:
         """decode: key and payload to event, or MessageError."""
         self.refused: Counter[str] = Counter()
-        self._named: set[tuple[str, str]] = set()
         self._decode, self._callback = decode, callback
         self._closed = False
         self._waiting: queue.Queue[tuple[str, bytes] | None] = queue.Queue(MOST_WAITING)
@@ -64,12 +62,8 @@ class Listener(Generic[T]):
             try:
                 self._callback(self._decode(*event))
             except MessageError as error:
-                self._refuse(event[0], error)
+                self.refused[error.reason] += 1
+                if self.refused[error.reason].bit_count() == 1:  # the first, second, fourth...: who floods fills no log
+                    log.warning("event refused key=%s reason=%s problem=%r", event[0], error.reason, str(error))
             except Exception:  # the callback's bug is not the end of the events
                 log.exception("callback failed")
-
-    def _refuse(self, key: str, error: MessageError) -> None:
-        self.refused[error.reason] += 1
-        if (key, error.reason) not in self._named and len(self._named) < MOST_NAMED:
-            self._named.add((key, error.reason))
-            log.warning("event refused key=%s reason=%s problem=%r", key, error.reason, str(error))

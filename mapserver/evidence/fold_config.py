@@ -7,7 +7,6 @@ every machine computes the same evidence, bit for bit.
 from __future__ import annotations
 
 import hashlib
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,10 +62,6 @@ class FoldConfig:
                 raise ValueError(f"{name}: {getattr(self, name)} is not between 1 and 1000")
         if not STD_FLOOR_M < self.std_cap_m <= 30:
             raise ValueError(f"std_cap_m: {self.std_cap_m} is not between {STD_FLOOR_M} and 30")
-
-    def widest_cells(self, cell_m: float) -> int:
-        """Cells to a side that the votes of one sample are spread over at most."""
-        return 2 * math.ceil(2 * math.hypot(self.std_cap_m, STD_FLOOR_M) / cell_m) + 1
 
     @property
     def bucket_ns(self) -> int:

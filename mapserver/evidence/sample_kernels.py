@@ -114,13 +114,13 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def survey(
-    rows: Any, limits: tuple[float, float, float], before: tuple[float, float, bool], steps: Any, keys: Any, at: Any
+    rows: Any, limits: tuple[float, float, float], before: tuple[float, float, bool], steps: Any, entered: Any
 ) -> tuple[int, bool]:
     """How far a machine drove, where it jumped, and into which blocks its rows vote where the row before did not.
 
     limits: as of `locate`. before: where the machine was, NaN where that is not known, and whether it had jumped there.
     Fills steps (n, 2): metres until each row, and 1 where it jumped and had no vote since; and, as long as there is
-    room, numbers of blocks (`block_key`) and of rows. Returns how many of these, and whether it ends with a jump.
+    room, entered: key of each block and number of the row. Returns how many of these, and whether it ends with a jump.
     """
     x, y, has_jumped = before
     used, driven_m, place = 0, 0.0, np.empty(5)
@@ -145,8 +145,8 @@ def survey(
         for block_y in range(first_y, last_y + 1):
             for block_x in range(first_x, last_x + 1):
                 if not (west <= block_x <= east and south <= block_y <= north):
-                    if used < len(keys):
-                        keys[used], at[used] = block_key(block_x, block_y), k
+                    if used < len(entered):
+                        entered[used] = block_key(block_x, block_y), k
                     used += 1
         west, east, south, north = first_x, last_x, first_y, last_y
     return used, has_jumped

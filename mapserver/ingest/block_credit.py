@@ -1,10 +1,8 @@
 """Credit for new ground: a machine may open as many blocks of the grid as it has driven for. No files, no clock.
 
 A block costs memory for as long as the map lives, and a sample of 80 bytes opens up to four: scattered over a site,
-each would cost 14 kB. So metres driven earn credit, and a block that nobody has opened spends it. A drive earns at
-least what it spends on new ground, as long as its positions are within three standard deviations of the truth. Jumps
-have credit of their own, which is scarce. What is refused is never journalled: the map stays a function of the journal.
-Credit is not kept: after a start of the server each machine has that of a new one.
+each would cost 14 kB. What is refused is never journalled, so the map stays a function of the journal. Credit is not
+kept: after a start of the server each machine has that of a new one (docs/decisions/0072-credit-for-new-ground.md).
 """
 
 from __future__ import annotations
@@ -38,30 +36,22 @@ class Account(NamedTuple):
 
 
 class BlockCredit:
-    """The accounts of all machines, and which blocks are open.
+    """The accounts of all machines. opened: keys of the blocks that are open.
 
-    `spend` takes effect with `keep`, as rows of a journal do with their commit, or not at all, with `drop`.
     most: credit of either kind [blocks]. per_m, jumps_per_m: that a metre earns.
     """
 
     def __init__(self, cell_m: float, config: FoldConfig, opened: Iterable[Block]) -> None:
-        """opened: blocks that have evidence."""
-        self._opened, self._accounts = {block_key(*block) for block in opened}, dict[str, Account]()
-        self._new_opened, self._new_accounts = set[int](), dict[str, Account]()
-        self._limits = cell_m, STD_FLOOR_M**2, config.std_cap_m**2
-        self._steps, self._keys, self._at = np.empty((1, 2)), np.empty(1, np.int64), np.empty(1, np.int64)
+        self.opened, self._accounts = {block_key(*block) for block in opened}, dict[str, Account]()
+        self._limits, self._entered = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2), np.empty((1, 2), np.int64)
         # What moves over new ground is a square, as wide as a sample's votes and what positions are off to either side.
         # At 45 degrees it meets sqrt(2) times as many blocks as along an axis.
-        edge = config.widest_cells(cell_m)
-        swept = BLOCK_CELLS + edge - 1 + 2 * SIGMAS * math.hypot(config.std_cap_m, STD_FLOOR_M) / cell_m
+        std = math.hypot(config.std_cap_m, STD_FLOOR_M) / cell_m
+        edge = 2 * math.ceil(2 * std) + 1
+        swept = BLOCK_CELLS + edge - 1 + 2 * SIGMAS * std
         self.per_m = math.sqrt(2) * swept / (BLOCK_CELLS**2 * cell_m)
         blocks = (2 + (edge - 2) // BLOCK_CELLS) ** 2
         self.most, self.jumps_per_m = float(JUMPS * blocks), blocks / JUMP_M
-
-    @property
-    def opened(self) -> int:
-        """How many blocks are open."""
-        return len(self._opened) + len(self._new_opened)
 
     def spend(self, machine: str, rows: Table, trimmed: int = 0) -> None:
         """Open the blocks of a machine's new samples; trimmed: samples of their batch before them.
@@ -69,57 +59,36 @@ class BlockCredit:
         MessageError names the first sample without credit; then nothing is opened. The sender gives up a sample that is
         refused alone, so the machine is there from then on, and what it drove since counts.
         """
-        before = self._new_accounts.get(machine) or self._accounts.get(machine) or Account(self.most)
-        entered, has_jumped = self._survey(rows, before)
+        before, steps = self._accounts.get(machine) or Account(self.most), np.empty((len(rows), 2))
+        used, has_jumped = survey(rows, self._limits, before[2:], steps, self._entered)
+        if used > len(self._entered):
+            self._entered = np.empty((used, 2), np.int64)
+            survey(rows, self._limits, before[2:], steps, self._entered)
         credit, counted_m, new = (before.jumps, before.driven), 0.0, set[int]()
-        for key, row in entered:
-            if key in self._opened or key in self._new_opened or key in new:
+        for key, row in self._entered[:used].tolist():
+            if key in self.opened or key in new:
                 continue
-            until_m, by_jump = self._steps[row].tolist()
+            until_m, by_jump = steps[row].tolist()
             jumps, driven = self._earned(credit, until_m - counted_m)
             pays = not by_jump and driven >= 1
             credit, counted_m = (jumps - (not pays), driven - pays), until_m
             if credit[0] < 0:
                 if len(rows) == 1:
                     self._move(machine, rows, (jumps, driven), has_jumped=bool(by_jump))
-                raise _refusal(rows, row, trimmed)
+                problem = f"{rows['x_m'][row]:.0f}, {rows['y_m'][row]:.0f} m is new ground, and the machine has not"
+                problem += " driven far enough to open more: look at its positions"
+                raise MessageError(Refusal.SCATTERED, problem, field="x_m", row=row + trimmed)
             new.add(key)
-        credit = self._earned(credit, self._steps.item(len(rows) - 1, 0) - counted_m)
+        credit = self._earned(credit, steps.item(len(rows) - 1, 0) - counted_m)
         self._move(machine, rows, credit, has_jumped=has_jumped)
-        self._new_opened |= new
-
-    def keep(self) -> None:
-        """Have what was spent count."""
-        self._accounts |= self._new_accounts
-        self._opened |= self._new_opened
-        self.drop()
-
-    def drop(self) -> None:
-        """Have nothing count that was spent since the last `keep`."""
-        self._new_accounts, self._new_opened = {}, set()
+        self.opened |= new
 
     def _earned(self, credit: tuple[float, float], driven_m: float) -> tuple[float, float]:
         jumps, driven = credit
         return min(jumps + self.jumps_per_m * driven_m, self.most), min(driven + self.per_m * driven_m, self.most)
 
     def _move(self, machine: str, rows: Table, credit: tuple[float, float], *, has_jumped: bool) -> None:
-        self._new_accounts[machine] = Account(*credit, rows["x_m"].item(-1), rows["y_m"].item(-1), has_jumped)
-
-    def _survey(self, rows: Table, account: Account) -> tuple[Iterable[tuple[int, int]], bool]:
-        """Blocks that samples come into, key and sample, in their order, and whether they end with a jump."""
-        if len(rows) > len(self._steps):
-            self._steps = np.empty((len(rows), 2))
-        while True:
-            used, has_jumped = survey(rows, self._limits, account[2:], self._steps, self._keys, self._at)
-            if used <= len(self._keys):
-                return zip(self._keys[:used].tolist(), self._at[:used].tolist(), strict=True), has_jumped
-            self._keys, self._at = np.empty(used, np.int64), np.empty(used, np.int64)
-
-
-def _refusal(rows: Table, row: int, trimmed: int) -> MessageError:
-    place = f"{rows['x_m'][row]:.0f}, {rows['y_m'][row]:.0f} m"
-    problem = f"{place} is new ground, and the machine has not driven far enough to open more: look at its positions"
-    return MessageError(Refusal.SCATTERED, problem, field="x_m", row=row + trimmed)
+        self._accounts[machine] = Account(*credit, rows["x_m"].item(-1), rows["y_m"].item(-1), has_jumped)
 
 
 def warm_up(config: FoldConfig) -> None:

@@ -1,4 +1,7 @@
-"""The store of one site: journal, grid and snapshots. One thread owns it (see writer.py)."""
+"""The store of one site: journal, grid and snapshots. One thread owns it (see writer.py).
+
+It is one module because whatever changes journal, grid or facts has to leave them in step.
+"""
 
 from __future__ import annotations
 
@@ -95,7 +98,7 @@ class Store:
             in_snapshot = self.grid.counts()
             fold_history(self.grid, self.history, self.merged, selection=Selection.by(facts))
             release_memory()
-            self._credit = BlockCredit(site.cell_m, config.fold, self.grid.folded_since(-1)[0])
+            self._credit = self._new_credit()
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
             self._snapshot_samples = 0 if warm else self.journal.samples - tail  # what is warm is on no disk yet
@@ -143,12 +146,11 @@ class Store:
             self.commits, self.commit_s = self.commits + 1, self.commit_s + time.monotonic() - began_s
         except UnwrittenError as error:
             self.journal.rollback()
-            self._credit.drop()
+            self._credit = self._new_credit()
             if isinstance(error, FencedError):
                 raise
             self.counters[f"refused_{Refusal.STORE}"] += len(group)
             return [Refused(Refusal.STORE, f"the server cannot write: {error.problem}") for _ in group]
-        self._credit.keep()
         for answer, admission in answers:
             self._count(answer, admission)
         self._fold([admission.batch for _, admission in answers if admission and len(admission.batch.rows)])
@@ -265,6 +267,10 @@ class Store:
         """The server's clock when the last row came in, 0 where none is in the journal."""
         is_there = last_row > self.journal.archived_row
         return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
+
+    def _new_credit(self) -> BlockCredit:
+        """Accounts for what the map has; what a commit that failed has spent is forgotten."""
+        return BlockCredit(self.site.cell_m, self.config.fold, self.grid.folded_since(-1)[0])
 
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
         """Count what became of a batch, once it is certain."""

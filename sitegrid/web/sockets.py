@@ -9,8 +9,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-import time
 from collections import Counter
+from contextlib import suppress
 from http import HTTPStatus
 from ipaddress import ip_address, ip_network
 from typing import Any
@@ -28,7 +28,6 @@ SPARE = 50  # more of an address and in all, who are told that there are too man
 REQUEST_S = 10.0  # for a request to come in whole, from its first byte or the connection's begin
 TLS_S = 5.0  # for a handshake
 STALLED_S = 30.0  # until a socket that takes nothing is closed
-LOG_S = 10.0  # between two lines about refused sockets
 log = logging.getLogger("sitegrid.web")
 
 
@@ -39,7 +38,6 @@ class Listening(socket.socket):
         super().__init__(family)
         self.counts: Counter[str] = Counter()
         self._accepted: list[tuple[str, socket.socket]] = []
-        self._logged_s = -LOG_S
 
     def accept(self) -> tuple[socket.socket, Any]:
         """As a socket's own; ConnectionAbortedError, which the event loop passes over, where there is no room."""
@@ -62,9 +60,9 @@ class Listening(socket.socket):
     def refuse(self, origin: str) -> None:
         """Count a socket that is refused, and name where it comes from."""
         self.counts["refused_connections"] += 1
-        if (now_s := time.monotonic()) - self._logged_s > LOG_S:
-            self._logged_s, own = now_s, len(self.open_of(origin))
-            log.warning("too many connections address=%s open=%d of_all=%d", origin, own, len(self._accepted))
+        if self.counts["refused_connections"].bit_count() == 1:  # the first, second, fourth...
+            own, every = len(self.open_of(origin)), len(self._accepted)
+            log.warning("too many connections address=%s open=%d of_all=%d", origin, own, every)
 
 
 def origin_of(host: str) -> str:
@@ -72,28 +70,6 @@ def origin_of(host: str) -> str:
     address = ip_address(host.partition("%")[0])
     is_alone = address.version == 4 or address.ipv4_mapped
     return host if is_alone else str(ip_network((int(address), 64), strict=False))
-
-
-class JoinedWrites:
-    """A transport that sends what is written in one turn of the loop together: a small answer comes in one piece."""
-
-    def __init__(self, transport: asyncio.Transport) -> None:
-        self._transport, self._parts = transport, list[bytes]()
-
-    def __getattr__(self, name: str) -> Any:
-        self._flush()
-        return getattr(self._transport, name)
-
-    def write(self, data: bytes) -> None:
-        """Send it with what else is written until the loop's next turn."""
-        if not self._parts:
-            asyncio.get_running_loop().call_soon(self._flush)
-        self._parts.append(data)
-
-    def _flush(self) -> None:
-        parts, self._parts = self._parts, []
-        if parts:
-            self._transport.write(b"".join(parts))
 
 
 class PatientProtocol(H11Protocol):
@@ -106,7 +82,7 @@ class PatientProtocol(H11Protocol):
 
     def connection_made(self, transport: Any) -> None:
         """Begin a connection, and the time that its first request has."""
-        super().connection_made(JoinedWrites(transport))  # type: ignore[arg-type]
+        super().connection_made(transport)
         origin = origin_of(transport.get_extra_info("peername")[0])
         own = self._listening.open_of(origin)
         self._has_place = transport.get_extra_info("socket").fileno() in own[:OF_ADDRESS]
@@ -121,9 +97,21 @@ class PatientProtocol(H11Protocol):
         super().data_received(data)
         if self.conn.their_state in (h11.IDLE, h11.SEND_BODY):
             self._wait()
-        elif self._deadline:
+            return
+        self._cork(1)
+        if self._deadline:
             self._deadline.cancel()
             self._deadline = None
+
+    def on_response_complete(self) -> None:
+        """Send what is left of an answer."""
+        self._cork(0)
+        super().on_response_complete()
+
+    def _cork(self, on: int) -> None:
+        """Have head and body of an answer leave together, where the system can: a small one comes in one piece."""
+        with suppress(AttributeError, OSError):
+            self.transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, on)
 
     def _wait(self) -> None:
         self._deadline = self._deadline or self.loop.call_later(REQUEST_S, self._give_up)

@@ -399,11 +399,8 @@ def test_pose_that_is_nowhere_is_refused():
         ({}, "m-2", Refusal.WRONG_MACHINE, "machine"),
         ({}, "*", Refusal.WRONG_MACHINE, "machine"),
         ({"x_m": 100.1}, "m-1", Refusal.OUT_OF_RANGE, "x_m"),
-        ({"y_m": -1e308}, "m-1", Refusal.OUT_OF_RANGE, "y_m"),
         ({"heading_rad": 8.0}, "m-1", Refusal.OUT_OF_RANGE, "heading_rad"),
-        ({"speed_mps": -101.0}, "m-1", Refusal.OUT_OF_RANGE, "speed_mps"),
         ({"cov_yy_m2": 1e7}, "m-1", Refusal.OUT_OF_RANGE, "cov_yy_m2"),
-        ({"cov_xx_m2": -1.0}, "m-1", Refusal.OUT_OF_RANGE, "cov_xx_m2"),
         ({"cov_xy_m2": 0.3}, "m-1", Refusal.COVARIANCE, "cov_xy_m2"),
     ],
 )

@@ -91,30 +91,19 @@ def test_a_request_that_does_not_come_in_whole_ends_its_connection(begun: bytes)
     with serving() as listening, opened(listening) as slow:
         slow.sendall(begun)
         assert has_ended(slow, b"1" if begun else b"")
-        assert listening.counts["refused_slow"] == 1
+        assert listening.counts == {"refused_slow": 1}
         with opened(listening) as other:
             assert asked(other) == b"200"
-
-
-def test_requests_that_come_in_whole_in_time_are_all_answered():
-    with serving() as listening, opened(listening) as slow:
-        slow.settimeout(PATIENCE_S / 2)
-        for _ in range(4):
-            slow.sendall(WHOLE[:9])
-            with pytest.raises(TimeoutError):
-                slow.recv(1)
-            assert asked(slow, WHOLE[9:]) == b"200"
-        assert not listening.counts
 
 
 def test_an_address_has_so_many_sockets_whatever_they_are(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sockets, "REQUEST_S", 60.0)
     with serving() as listening, contextlib.ExitStack() as stack:
-        first, live, third, told, also_told, *more = (
+        first, live, third, fourth, fifth, *more = (
             stack.enter_context(opened(listening, "127.0.0.2")) for _ in range(9)
         )
         assert asked(live, UPGRADE) == b"101"
-        assert (asked(told), asked(also_told, UPGRADE)) == (b"429", b"429"), "a WebSocket is a socket"
+        assert (asked(fourth), asked(fifth, UPGRADE)) == (b"429", b"429"), "a WebSocket is a socket"
         assert b"" in map(asked, more), "to be told takes a place too"
         assert (asked(first), asked(third)) == (b"200", b"200"), "those that came first stay"
         assert asked(stack.enter_context(opened(listening, "127.0.0.3"))) == b"200", "another one finds a place"
@@ -122,15 +111,6 @@ def test_an_address_has_so_many_sockets_whatever_they_are(monkeypatch: pytest.Mo
             each.close()
         wait_until(lambda: asked(stack.enter_context(opened(listening, "127.0.0.2"))) == b"200", 10, "a free place")
         assert listening.counts["refused_connections"] >= 3
-
-
-def test_the_system_ends_a_connection_whose_answer_nobody_takes():
-    with Listening(socket.AF_INET) as listening:
-        listening.bind(("127.0.0.1", 0))
-        listening.listen()
-        with opened(listening), listening.accept()[0] as accepted:
-            timeout_ms = accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
-        assert timeout_ms == 1e3 * sockets.STALLED_S
 
 
 def test_all_addresses_of_a_host_are_one_origin():
