@@ -64,7 +64,7 @@ class BlockCredit:
         if used > len(self._entered):
             self._entered = np.empty((used, 2), np.int64)
             survey(rows, self._limits, before[2:], steps, self._entered)
-        credit, counted_m, new = (before.jumps, before.driven), 0.0, set[int]()
+        credit, counted_m, new = before[:2], 0.0, set[int]()
         for key, row in self._entered[:used].tolist():
             if key in self.opened or key in new:
                 continue
@@ -74,7 +74,7 @@ class BlockCredit:
             credit, counted_m = (jumps - (not pays), driven - pays), until_m
             if credit[0] < 0:
                 if len(rows) == 1:
-                    self._move(machine, rows, (jumps, driven), has_jumped=bool(by_jump))
+                    self._move(machine, rows, self._earned(before[:2], until_m), has_jumped=bool(by_jump))
                 problem = f"{rows['x_m'][row]:.0f}, {rows['y_m'][row]:.0f} m is new ground, and the machine has not"
                 problem += " driven far enough to open more: look at its positions"
                 raise MessageError(Refusal.SCATTERED, problem, field="x_m", row=row + trimmed)

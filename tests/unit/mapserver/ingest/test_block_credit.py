@@ -90,13 +90,11 @@ def test_the_grid_opens_no_block_that_is_not_paid_for(cell_m: float):
 
 
 def test_what_is_refused_earns_nothing_however_often_it_comes_but_driving_on_does():
-    draw = np.random.default_rng(4)
-    credit, liar, rows = BlockCredit(1.0, CONFIG, ()), scattered(draw, 300), drive(draw, 2.0, 0.5, 0.0)
-    taken(credit, liar[:100])
-    for batch in (liar[100:], liar[200:201], liar[100:102], liar[200:201]):
-        assert not sum(taken(credit, batch) for _ in range(50))
-    rows["x_m"] += 5000.0  # where nobody was
-    assert 0.8 * len(rows) < taken(credit, rows) < len(rows)
+    credit, liar = BlockCredit(1.0, CONFIG, ()), scattered(np.random.default_rng(4), 300)
+    first = taken(credit, liar)
+    assert {taken(credit, liar) for _ in range(20)} == {first}
+    rows = samples(4000, x_m=5000 + 0.5 * np.arange(4000), y_m=0.0, distance_m=0.5)  # new ground, two blocks at a time
+    assert 3500 < taken(credit, rows) < 4000
 
 
 def test_what_is_refused_or_not_committed_is_neither_journalled_nor_paid_for(tmp_path, monkeypatch):
