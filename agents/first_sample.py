@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from agents.localisation.alignment import DISTANCE_M
-from agents.localisation.localiser import PROVEN_M, PROVEN_S
+from agents.localisation.localiser import PROVEN_S
 from agents.sampling import MAX_STD_M
 from agents.stream_order import GAP_NS
 from protocol.machine.machine_config import MachineConfig
@@ -74,5 +74,5 @@ def missing(kinds: Collection[str], health: Mapping[str, Any]) -> list[str]:
     elif health["repeating"]:
         causes.append(f"{', '.join(health['repeating'])} repeats one fix")
     if not causes and health["aligned"]:
-        return [f"the heading is not proven until fixes agree with it for {PROVEN_S:g} s and {PROVEN_M:g} m"]
+        return [f"the heading is not proven until fixes agree with it for {PROVEN_S:g} s and {DISTANCE_M:g} m"]
     return causes or [f"the heading is unknown until the machine has driven {DISTANCE_M:g} m with GPS fixes"]

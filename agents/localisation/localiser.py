@@ -33,7 +33,7 @@ from protocol.site.site_config import Projection
 
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps, fixes and poses kept while the heading is unproven: 20 minutes
-PROVEN_S, PROVEN_M = 30.0, 24.0  # time and way without refusals after which a heading is proven
+PROVEN_S = 30.0  # without refusals, after which a heading is proven if the machine has driven DISTANCE_M once more
 REFUTED_SIGMA = 3.0  # a proven heading is refuted if refused fixes show one that is further off
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
@@ -268,7 +268,7 @@ class Localiser:
 
     def _holds(self, distance_m: float) -> bool:
         """Whether the machine has driven far enough for a wrong heading to show, and no fix is refused."""
-        return self.is_aligned and distance_m - self._since[1] >= PROVEN_M and not self._refused
+        return self.is_aligned and distance_m - self._since[1] >= DISTANCE_M and not self._refused
 
     def _keep(self, poses: Sequence[PoseBelief]) -> None:
         """Keep poses of an unproven heading; one replaces those that are not older."""

@@ -65,7 +65,7 @@ def test_what_is_missing_is_said_once(readings: list[Reading], missing: str):
 def test_the_proof_of_a_heading_has_its_time():
     stopped = drive([Leg(20), Leg(4, 0.5), Leg(5), Leg(4, -0.5), Leg(30)], VEHICLE).readings
     assert said([r for r in stopped if r.stamp_ns < stopped[0].stamp_ns + 2 * WAIT_NS]) == []
-    sentence = "no sample after 60 s of readings: the heading is not proven until fixes agree with it for 30 s and 24 m"
+    sentence = "no sample after 60 s of readings: the heading is not proven until fixes agree with it for 30 s and 12 m"
     assert said(stopped) == [sentence]
 
 
