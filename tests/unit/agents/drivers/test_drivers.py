@@ -259,7 +259,7 @@ def run_agent(session: Any, folder: Path, config: AgentConfig, driver: Given, *,
 def test_agent_lingers_for_the_last_samples(sessions: tuple[Any, Any], tmp_path: Path, linger_s: float) -> None:
     """Nobody acknowledges: the samples stay in the spool, and the report says so."""
     config = AgentConfig(linger_s=linger_s, uplink=UplinkConfig(timeout_s=0.2))
-    driver = Given(drive([Leg(4, 0.5), Leg(6)], VEHICLE).readings)
+    driver = Given(drive([Leg(4, 0.5), Leg(14)], VEHICLE).readings)
     report, time_ = run_agent(sessions[1], tmp_path, config, driver)
     assert driver.closed
     assert report["samples"] > 20
@@ -271,7 +271,7 @@ def test_agent_lingers_for_the_last_samples(sessions: tuple[Any, Any], tmp_path:
 
 
 def test_agent_that_is_stopped_does_not_linger(sessions: tuple[Any, Any], tmp_path: Path) -> None:
-    driver = Given(drive([Leg(4, 0.5), Leg(6)], VEHICLE).readings)
+    driver = Given(drive([Leg(4, 0.5), Leg(14)], VEHICLE).readings)
     report, time_ = run_agent(sessions[1], tmp_path, AgentConfig(), driver, stopped=True)
     assert report["delivered"] is False
     assert time_.waits == []
