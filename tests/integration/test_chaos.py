@@ -103,7 +103,7 @@ def test_the_archive_goes_on_after_a_wrong_clock(tmp_path):
 @pytest.mark.processes
 @pytest.mark.parametrize("fault", [damage_faults.wal_flip, damage_faults.restored_store])
 def test_what_damage_takes_is_declared_and_named(tmp_path, fault):
-    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=40)
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=80)
     outcome = fault(scenario(tmp_path / "run", recordings=recordings, seconds=3.0))
     assert (outcome.lost, outcome.double, outcome.silent, outcome.problems) == (0, 0, 0, [])
     assert outcome.declared > 0
