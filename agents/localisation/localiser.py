@@ -205,13 +205,11 @@ class Localiser:
         fast: list[Sensed] = []
         events: list[Event] = []
         for reading, sensor in readings:
-            if isinstance(reading, Gps | GpsVelocity):
-                if self._repeats.is_repeated(reading, dead_reckoning.distance_m):
-                    continue
-                if isinstance(reading, Gps):
+            if isinstance(reading, Gps):
+                if not self._repeats.is_repeated(reading, dead_reckoning.distance_m):
                     events.append(self._tracker.receivers.fix(reading, dead_reckoning.pose))
-                else:
-                    events.append(gps_velocity(reading, sensor))
+            elif isinstance(reading, GpsVelocity):
+                events.append(gps_velocity(reading, sensor))
             else:
                 fast.append((reading, sensor))
         step = self._gatherer.gather(fast, dead_reckoning) if fast else None
