@@ -33,7 +33,7 @@ TINY = 1e-9
 class Alignment:
     """The dead-reckoned frame in `map`: rotation [rad] with its standard deviation, and the place of its origin [m].
 
-    fix_std_m: standard deviation of the origin. since_ns: stamp of the first fix that counts.
+    fix_std_m: standard deviation of the origin. since_ns: stamp of the first fix that counts; 0 where all do.
     """
 
     rotation_rad: float
@@ -94,7 +94,7 @@ def align_fixes(fixes: Sequence[Fix]) -> Alignment | None:
     antennas = np.array([fix.reckoned_antenna_m for fix in absolute])
     variance_m2 = np.array([float(fix.variance_m2.mean()) for fix in absolute])
     fitted = align(antennas, np.array([fix.position_m for fix in absolute]), np.maximum(variance_m2, MIN_FIX_STD_M**2))
-    return replace(fitted[0], since_ns=absolute[fitted[1]].stamp_ns) if fitted else None
+    return replace(fitted[0], since_ns=absolute[fitted[1]].stamp_ns if fitted[1] else 0) if fitted else None
 
 
 def align_start(start: Sequence[float], reckoned: DeadReckonedPose) -> Alignment:
