@@ -76,9 +76,11 @@ def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Ali
     fix_std_m, spread_m = np.sqrt(total / squares), np.sqrt(np.maximum(d_d, 0.0) / total)
     std_rad = fix_std_m * np.sqrt(np.maximum(misfit, 1.0)) / (2 * np.maximum(spread_m, TINY))
     shows = (spread_m >= SPREAD_M) & (total**2 / squares >= MIN_FIXES * (1 - TINY)) & (std_rad <= MAX_STD_RAD)
+    if misfit[0] <= MAX_MISFIT:
+        shows[1:] = False
     if not shows.any():
         return None
-    first = 0 if shows[0] and misfit[0] <= MAX_MISFIT else int(np.argmin(np.where(shows, std_rad, np.inf)))
+    first = int(np.argmin(np.where(shows, std_rad, np.inf)))
     rotation = float(np.angle(product[first]))
     mean_d, mean_f = sum_d[first] / total[first], sum_f[first] / total[first]
     from_d, to_f = complex(*about_d) + mean_d, complex(*about_f) + mean_f
