@@ -53,7 +53,7 @@ def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Ali
         rotation = arg sum w conj(d) f        residuals = sum w |f|^2 + s^2 sum w |d|^2 - 2 s |sum w conj(d) f|
 
     where s is the scale of dead reckoning, within bounds. The standard deviation takes half the spread for granted, as
-    slow errors do not average out, and grows with residuals that are larger than the variances say (Birge 1932).
+    slow errors do not average out, and grows with residuals that are far larger than the variances say (Birge 1932).
     """
     n, weight = len(fixes_m), 1 / variance_m2
     about_d, about_f = reckoned_m[-1], fixes_m[-1]  # sums stay small
@@ -74,7 +74,8 @@ def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Ali
     residuals = np.maximum(f_f + scale**2 * d_d - 2 * scale * abs(product), 0.0)
     misfit = residuals / np.maximum(2.0 * np.arange(n, 0, -1) - 4, 1.0)
     fix_std_m, spread_m = np.sqrt(total / squares), np.sqrt(np.maximum(d_d, 0.0) / total)
-    std_rad = fix_std_m * np.sqrt(np.maximum(misfit, 1.0)) / (2 * np.maximum(spread_m, TINY))
+    inflation = np.sqrt(np.where(misfit > MAX_MISFIT, misfit, 1.0))
+    std_rad = fix_std_m * inflation / (2 * np.maximum(spread_m, TINY))
     shows = (spread_m >= SPREAD_M) & (total**2 / squares >= MIN_FIXES * (1 - TINY)) & (std_rad <= MAX_STD_RAD)
     if misfit[0] <= MAX_MISFIT:
         shows[1:] = False

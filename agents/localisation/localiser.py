@@ -251,6 +251,7 @@ class Localiser:
         self._tracker = Tracker(self._tracker_config)
         self._poses.clear()
         self._smoothed.clear()
+        self._forget(self._refused[0].stamp_ns)
         self._refused.clear()
         return self._start(shown, distance_m)
 
