@@ -11,6 +11,7 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction, Encoder, Gps, Odometry, Reading, Torque
 
 WAIT_NS = 30 * 10**9  # in the readings' time; a machine that drives off has its heading after 10 to 20 s
+UNIT = 1.5  # no tyre is so far off: wheels that turn so much further or less far than the fixes go have another unit
 WHEELS = frozenset({Encoder.kind, Odometry.kind})
 
 
@@ -73,6 +74,8 @@ def missing(kinds: Collection[str], health: Mapping[str, Any]) -> list[str]:
         causes.append("GPS fixes outside the site")
     elif health["repeating"]:
         causes.append(f"{', '.join(health['repeating'])} repeats one fix")
+    if not causes and health["aligned"] and not 1 / UNIT < 1 + health["wheel_scale"] < UNIT:
+        return [f"the wheels turn {1 + health['wheel_scale']:.1f} times as far as the fixes go: look at their unit"]
     if not causes and health["aligned"]:
         return [f"the heading is not proven until fixes agree with it for {PROVEN_S:g} s and {DISTANCE_M:g} m"]
     return causes or [f"the heading is unknown until the machine has driven {DISTANCE_M:g} m with GPS fixes"]

@@ -84,6 +84,7 @@ class Pipeline:
             "aligned": localiser.is_aligned,
             "heading_proven": localiser.is_proven,
             "repeating": localiser.repeating,
+            "wheel_scale": localiser.wheel_scale,
             "position_std_m": std_m,
             "counters": dict(self._counters + self._positioning.counters),
             "withheld": dict(self._sampler.withheld),

@@ -33,13 +33,15 @@ TINY = 1e-9
 class Alignment:
     """The dead-reckoned frame in `map`: rotation [rad] with its standard deviation, and the place of its origin [m].
 
-    fix_std_m: standard deviation of the origin. since_ns: stamp of the first fix that counts; 0 where all do.
+    fix_std_m: standard deviation of the origin. wheel_scale: how much further the wheels turn than the fixes go [-], as
+    far as these show it. since_ns: stamp of the first fix that counts; 0 where all do.
     """
 
     rotation_rad: float
     std_rad: float
     origin_m: tuple[float, float]
     fix_std_m: float
+    wheel_scale: float = 0.0
     since_ns: int = 0
 
 
@@ -86,7 +88,9 @@ def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Ali
     mean_d, mean_f = sum_d[first] / total[first], sum_f[first] / total[first]
     from_d, to_f = complex(*about_d) + mean_d, complex(*about_f) + mean_f
     origin = to_f - from_d * complex(math.cos(rotation), math.sin(rotation))
-    return Alignment(rotation, float(std_rad[first]), (origin.real, origin.imag), float(fix_std_m[first])), first
+    wheel_scale = float(d_d[first] / max(abs(product[first]), TINY)) - 1
+    place = (origin.real, origin.imag)
+    return Alignment(rotation, float(std_rad[first]), place, float(fix_std_m[first]), wheel_scale), first
 
 
 def align_fixes(fixes: Sequence[Fix]) -> Alignment | None:

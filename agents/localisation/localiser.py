@@ -117,6 +117,7 @@ class Localiser:
         self._velocities: deque[Measurement] = deque(maxlen=COLLECTED)
         self._refused: deque[Fix] = deque(maxlen=COLLECTED)  # since the filter took one
         self._since: tuple[int, float] = (0, 0.0)  # stamp of the first fix that counts, and the way at the alignment
+        self._aligned_scale = 0.0  # of the wheels, by the newest alignment
         self._poses: deque[PoseBelief] = deque(maxlen=COLLECTED)  # of the unproven heading
         self._smoothed: list[SmoothedPose] = []
 
@@ -151,8 +152,11 @@ class Localiser:
 
     @property
     def wheel_scale(self) -> float | None:
-        """How much further the wheels turn than the machine moves [-], as believed; None where it is no state."""
-        return self._tracker.wheel_scale
+        """How much further the wheels turn than the machine moves [-]; None where it is no state.
+
+        As believed; while the heading is unproven, as the fixes showed it that aligned it.
+        """
+        return self._aligned_scale if self.is_aligned and not self.is_proven else self._tracker.wheel_scale
 
     @property
     def belief(self) -> Belief | None:
@@ -304,6 +308,7 @@ class Localiser:
     def _start(self, alignment: Alignment, distance_m: float) -> list[Belief]:
         """Filter all that was kept. A start that is given needs no proof, nor has the profile `paper` any."""
         self._forget(alignment.since_ns)
+        self._aligned_scale = alignment.wheel_scale
         self._since = self._fixes[0].stamp_ns if self._fixes else 0, distance_m
         self.is_proven = bool(self._config.start) or self._config.profile != "default"
         beliefs = [self._tracker.start(self.engine, alignment, self._steps[0])]

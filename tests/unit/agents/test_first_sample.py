@@ -10,7 +10,7 @@ from agents.first_sample import WAIT_NS, FirstSample
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
-from protocol.machine.readings import Gps, Reading
+from protocol.machine.readings import Encoder, Gps, Reading
 from tests.unit.agents.drives import SITE, VEHICLE, Leg, drive
 
 pytestmark = pytest.mark.slow
@@ -67,6 +67,17 @@ def test_the_proof_of_a_heading_has_its_time():
     assert said([r for r in stopped if r.stamp_ns < stopped[0].stamp_ns + 2 * WAIT_NS]) == []
     sentence = "no sample after 60 s of readings: the heading is not proven until fixes agree with it for 30 s and 12 m"
     assert said(stopped) == [sentence]
+
+
+def test_wheels_in_another_unit_are_named():
+    driven = drive([Leg(4, 0.5), Leg(64)], VEHICLE).readings
+    ticks = [
+        replace(r, left_ticks=3.6 * r.left_ticks, right_ticks=3.6 * r.right_ticks)
+        for r in driven
+        if isinstance(r, Encoder)
+    ]
+    (sentence,) = said(sorted([*ticks, *(r for r in driven if not isinstance(r, Encoder))], key=lambda r: r.stamp_ns))
+    assert sentence.endswith(": the wheels turn 3.6 times as far as the fixes go: look at their unit")
 
 
 def test_a_machine_that_stands_where_it_was_placed_has_not_moved():

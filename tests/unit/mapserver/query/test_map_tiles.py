@@ -179,8 +179,9 @@ def test_reasons_are_those_of_the_cell(tmp_path):
 def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
     monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 3000)
     with closing(open_writer(tmp_path)) as writer:
-        driven = np.sort(random_samples(3000, 4, half_m=200.0), order="x_m")  # no machine opens so much at once
-        send(writer, [incoming(driven)])
+        rows = random_samples(3000, 4, half_m=200.0)
+        quarters = [rows[2 * (rows["x_m"] < 0) + (rows["y_m"] < 0) == i] for i in range(4)]
+        send(writer, [incoming(quarter, machine=f"m-{i}") for i, quarter in enumerate(quarters)])  # each has its credit
         answers = answers_of(writer)
         for as_of_ns in (None, NOW_NS + 1800 * 10**9):
             pieces = [answers.tiles(TilesQuery(as_of_ns=as_of_ns))]
