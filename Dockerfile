@@ -7,8 +7,6 @@ COPY protocol protocol
 COPY agents agents
 COPY mapserver mapserver
 COPY sim sim
-COPY evaluation evaluation
-COPY benchmarks benchmarks
 COPY sitegrid sitegrid
 RUN /venv/bin/pip install --no-cache-dir --disable-pip-version-check \
     --constraint constraints.txt ".[demo,postgres,security]"

@@ -50,10 +50,10 @@ soak: venv
 	$(BIN)/python -m tests.soak --minutes 60 --speed 30
 
 bench: venv
-	$(BIN)/python -m benchmarks merge
-	$(BIN)/python -m benchmarks live
-	$(BIN)/python -m benchmarks query
-	$(BIN)/python -m benchmarks memory
-	$(BIN)/python -m benchmarks ingest
-	$(BIN)/python -m benchmarks sim
-	$(BIN)/python -m benchmarks filter
+	$(BIN)/python -m lab.speed merge
+	$(BIN)/python -m lab.speed live
+	$(BIN)/python -m lab.speed query
+	$(BIN)/python -m lab.speed memory
+	$(BIN)/python -m lab.speed ingest
+	$(BIN)/python -m lab.speed sim
+	$(BIN)/python -m lab.speed filter

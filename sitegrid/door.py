@@ -14,6 +14,7 @@ import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from importlib import import_module
+from types import ModuleType
 
 import zenoh
 
@@ -28,7 +29,7 @@ from sitegrid.process.logs import start_logging
 INTERRUPTED = 130  # as a shell has it: 128 and the number of SIGINT
 # What needs an extra in some commands only; all else is in the extra of the command (`EXTRA` of its module).
 BESIDE = {"cryptography": "security", "filterpy": "paper", "gtsam": "oracle"}
-OURS = ("protocol", "agents", "mapserver", "sim", "sitegrid", "evaluation", "benchmarks")
+OURS = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 ADVICE = {
     errno.EACCES: "run this as a user who may, or choose another place",
     errno.EPERM: "run this as a user who may, or choose another place",
@@ -41,11 +42,11 @@ ADVICE = {
 log = logging.getLogger("sitegrid.door")
 
 
-def run(words: Sequence[str]) -> int:
-    """Run a command; returns its exit code. SystemExit as argparse raises it: wrong usage, and help."""
+def run(words: Sequence[str], commands: ModuleType = commands, program: str = "sitegrid") -> int:
+    """Run one of these commands; returns its exit code. SystemExit as argparse raises it: wrong usage, and help."""
     streams.complete()
     try:
-        code = _run(words)
+        code = _run(words, commands, program)
     finally:
         streams.flush()
     if not code and streams.problem():
@@ -53,10 +54,10 @@ def run(words: Sequence[str]) -> int:
     return code
 
 
-def _run(words: Sequence[str]) -> int:
+def _run(words: Sequence[str], commands: ModuleType, program: str) -> int:
     extra = ""
     try:
-        arguments = build_parser().parse_args(words, Namespace(words=words))
+        arguments = build_parser(commands, program).parse_args(words, Namespace(words=words))
         extra = arguments.extra
         start_logging(verbose=arguments.verbose)
         return int(arguments.run(arguments))
@@ -75,9 +76,9 @@ def _run(words: Sequence[str]) -> int:
         return INTERRUPTED
 
 
-def build_parser() -> ArgumentParser:
-    """The parser of all commands."""
-    parser = ArgumentParser(prog="sitegrid", description="Many machines draw one map of the ground together.")
+def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> ArgumentParser:
+    """The parser of all commands, the modules of a package; its docstring's first line describes the program."""
+    parser = ArgumentParser(prog=program, description=(commands.__doc__ or "").partition("\n")[0])
     parser.add_argument("--version", action="version", version=f"sitegrid {package_version()}")
     nouns = parser.add_subparsers(metavar="COMMAND", required=True)
     those = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")

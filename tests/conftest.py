@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from benchmarks.postgres import server as postgres
 from sitegrid.process.lifetime import SIGNALS
+from tests import postgres_server as postgres
 from tests.paths import ROOT, SHARED_DATA
 
 # A shell starts what it runs in the background with SIGINT ignored, nohup with SIGHUP, and so would be all processes of

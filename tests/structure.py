@@ -1,4 +1,4 @@
-"""The house in figures: `python -m tests.structure [FOLDER]` prints a table of any checkout (docs/results/house.md)."""
+"""The house in figures: `python -m tests.structure [FOLDER]` prints a table of any checkout (lab/results/house.md)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tests.paths import ROOT
 
-PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid", "evaluation", "benchmarks")
+PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 CONFIGS = ("agent", "server", "sim")
 
 
@@ -54,7 +54,7 @@ def is_description(option: str) -> bool:
 
 
 def table(root: Path) -> str:
-    """What stands in docs/results/house.md."""
+    """What stands in lab/results/house.md."""
     rows = ["package     modules  lines  module: median / p90 / max  functions  function: median / p90 / max"]
     every = []
     for package in (*PACKAGES, "tests"):

@@ -19,7 +19,7 @@ from mapserver.journal.history import History, read_history
 from mapserver.journal.rows import ALL, LAST, JournalRows, Selection
 from protocol.arrays import Table
 
-# Kernels run beside each other, what is Python between them does not. Not more are tried: docs/results/refold.md
+# Kernels run beside each other, what is Python between them does not. Not more are tried: lab/results/refold.md
 THREADS = min(2, len(os.sched_getaffinity(0)))
 PIECE = 16_384  # samples
 AHEAD = 24  # pieces that are read ahead: about as many as are folded at once, while nothing is taken

@@ -1,4 +1,6 @@
-"""The commands of `sitegrid`, one module each: `HELP`, `add_options(parser)` and `run(arguments)`, the exit code.
+"""Many machines draw one map of the ground together.
+
+The commands of `sitegrid`, one module each: `HELP`, `add_options(parser)` and `run(arguments)`, the exit code.
 
 A command module imports at its top only what the base install has. What needs an extra is imported inside a function,
 so that every command describes itself in any install, and `sitegrid --help` is quick.

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from evaluation.audit import audit_store
 from mapserver.config import ServerConfig
 from protocol.errors import ConfigError
 from protocol.machine.log_folder import LogFolder, open_log
@@ -18,6 +17,7 @@ from sim.scenario.tables import Scenario
 from sitegrid.client import connect
 from sitegrid.pictures.draw import TrackRecorder, draw
 from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.proof.delivery import audit_store
 
 READY_S = 120.0  # without a word, until a process counts as stuck
 LOG_SPEED = 20.0  # times real time

@@ -10,10 +10,6 @@ from dataclasses import asdict
 from typing import Any
 
 from agents.localisation.localiser import LocalisationConfig
-from evaluation.audit import AuditResult, audit_store
-from evaluation.campaign.truth import position_rmse
-from evaluation.ground.truth import read_load_track
-from evaluation.maps.score import DrivenScore, MapScore, score, score_driven
 from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
@@ -38,6 +34,9 @@ from sitegrid.pictures.draw import TrackRecorder, draw, draw_both, draw_differen
 from sitegrid.process.children import Child, Children
 from sitegrid.process.lifetime import note, plain, say, tell, wait
 from sitegrid.process.progress import Display
+from sitegrid.proof.delivery import AuditResult, audit_store
+from sitegrid.proof.map_score import DrivenScore, MapScore, score, score_driven
+from sitegrid.proof.tracks import position_rmse, read_load_track
 
 SAMPLES_FOLLOW = f"the map starts to fill after {LocalisationConfig().lag_s:g} s"  # the smoother's lag, in site time
 

@@ -12,8 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from agents.delivery.audit import read_audit
-from benchmarks.measure import memory_mb
-from evaluation.audit import audit_store
+from lab.speed.measure import memory_mb
 from mapserver.config import ServerConfig
 from mapserver.journal.history import history_rows
 from mapserver.journal.location import JOURNAL_FILE
@@ -25,6 +24,7 @@ from protocol.machine.log_folder import open_log
 from protocol.site.site_config import site_toml
 from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
+from sitegrid.proof.delivery import audit_store
 from tests.chaos.leashed import Process
 from tests.chaos.outcome import Console, FaultOutcome, TimeSpan, longest_pause
 from tests.chaos.recordings import IDLE, SECONDS, SPEED, START_NS, Recordings

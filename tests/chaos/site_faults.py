@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import Enum
 
-from evaluation.cooperation.tcp_proxy import FAIR, Proxy, Weather
 from tests.chaos import stepped_clock
 from tests.chaos.chaos_site import HOUR_S, ROUTER, SERVER
 from tests.chaos.disk_shim import DiskError, FailingDisk, build
 from tests.chaos.net_namespace import OFFICE_IP, Cable, NotPermittedError
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun, Spell
+from tests.tcp_proxy import FAIR, Proxy, Weather
 
 KILLS = 250  # of the whole suite; never fewer than LEAST
 LEAST = 100

@@ -6,13 +6,13 @@ import sqlite3
 import time
 from contextlib import closing
 
-from evaluation.cooperation.tcp_proxy import FAIR, Proxy, Weather
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
 from tests.chaos import stepped_clock
 from tests.chaos.chaos_site import HOUR_S, ROUTER, SECOND, SERVER, ChaosSite
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
+from tests.tcp_proxy import FAIR, Proxy, Weather
 
 YEAR_S = 365 * 24 * HOUR_S
 DAY_NS = 24 * HOUR_S * 10**9

@@ -22,7 +22,6 @@ from agents.delivery.uplink_thread import UplinkThread
 from agents.localisation.filters.belief import PoseBelief
 from agents.presence import PATIENCE, Presence, find_namesake
 from agents.sampling import Samples
-from evaluation.cooperation.tcp_proxy import Proxy, Weather
 from mapserver.config import ServerConfig
 from mapserver.journal.location import JournalLocation
 from mapserver.server import Server
@@ -36,6 +35,7 @@ from protocol.wire.owners import ANSWER_S
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.commands.agent import _claim_name, _open
 from sitegrid.process.children import wait_until
+from tests.tcp_proxy import Proxy, Weather
 from tests.unit.agents.drives import made_up_samples
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)

@@ -22,7 +22,6 @@ import numpy as np
 from agents.config import load_agent
 from agents.estimation import calibration_file
 from agents.estimation.calibration import Calibration
-from evaluation.positions.log_truth import read_log_truth
 from mapserver.config import ServerConfig
 from mapserver.journal.archive import FOLDER as ARCHIVE
 from mapserver.journal.archive import next_file
@@ -50,6 +49,7 @@ from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.messages import SampleBatch
 from protocol.wire.offer_codec import decode_offer, encode_offer
 from sim.config import load_sim
+from sitegrid.logs.log_truth import read_log_truth
 from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml
 from tests.fuzz.messages import messages
 from tests.fuzz.mutations import files, texts

@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.postgres.server import USER, as_user, binaries
+from tests.postgres_server import USER, as_user, binaries
 
 DATABASE = "postgres:"  # how its image is called
 SCRIPTS = "/docker-entrypoint-initdb.d/"

@@ -18,10 +18,10 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from benchmarks.postgres.server import binaries
 from protocol.wire.session import free_endpoint
 from sitegrid.process.children import Child, Children, ProcessError
 from tests.integration.compose_database import DATABASE, DatabaseServer
+from tests.postgres_server import binaries
 
 NOT_HERE = ("", "PATH", "NUMBA_CACHE_DIR")  # in an empty folder each service would compile the kernels anew
 _ENV = re.compile(r"^ENV (?P<pairs>(?:.*\\\n)*.*)$", re.MULTILINE)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from evaluation.audit import AuditResult, audit_store
 from mapserver.config import ServerConfig
 from protocol.site.site_file import load_site
 from sim.config import SimConfig, resolve, write_configs
 from sitegrid import Client, connect
 from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.proof.delivery import AuditResult, audit_store
 
 READY_S = 120.0  # a first start in a new folder compiles kernels
 LAG_S = 4.0  # of the smoother: most drives here are shorter than its usual lag, and tests wait for samples

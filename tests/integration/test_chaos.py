@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 
 from agents.delivery.spool import Spool, SpoolConfig
-from evaluation.cooperation.tcp_proxy import FAIR, Proxy, Weather
 from protocol.machine.samples import empty
 from sitegrid.process.children import wait_until
 from tests.chaos import __main__ as command
@@ -36,6 +35,7 @@ from tests.chaos.disk_shim import build
 from tests.chaos.outcome import Console, FaultOutcome, longest_pause, table
 from tests.chaos.recordings import make
 from tests.chaos.scenario import FaultRun
+from tests.tcp_proxy import FAIR, Proxy, Weather
 
 
 @pytest.fixture

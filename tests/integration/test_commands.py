@@ -100,7 +100,7 @@ def test_plot_ends_after_as_many_pictures_as_were_asked_for(site_run: SiteRun, t
 
 def test_demo_prints_one_object_with_its_proof(tmp_path: Path, husky_data: Path):
     words = ("--seconds", 40, "--speed", 8, "--machines", 3, "--seed", 7, "--out", tmp_path, "--data", husky_data)
-    manifest = Path("evaluation/logs/rl_test1_husky/log.toml").absolute()
+    manifest = Path("lab/logs/rl_test1_husky/log.toml").absolute()
     demo = sitegrid("demo", "--headless", "--json", *words, "--log", manifest, timeout_s=170)
     assert demo.returncode == 0, demo.stderr
     result = last_json(demo.stdout)

@@ -9,13 +9,13 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from benchmarks.postgres.server import cluster_folder
 from protocol.site.site_file import load_site
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid import connect
 from sitegrid.process.children import Child, Children, wait_until
 from tests.integration import compose_run
 from tests.integration.compose_database import DatabaseServer
+from tests.postgres_server import cluster_folder
 from tests.takeover.senders import Sender
 from tests.takeover.site import verdict
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.campaign.experiment import Runner
-from evaluation.campaign.figures import Report
-from evaluation.cooperation import experiment, live, plots
-from evaluation.cooperation.experiment import QUICK, Outcome
-from evaluation.cooperation.processes import Processes
+from lab.campaign.experiment import Runner
+from lab.cooperation import experiment, live, plots
+from lab.cooperation.experiment import QUICK, Outcome
+from lab.cooperation.processes import Processes
 from protocol.errors import SitegridError
 from sitegrid.process.lifetime import plain
+from sitegrid.proof.figures import Report
 
 STORED = Path(__file__).parent / "cooperation_quick.json"
 # By the time that a decision is made, which differs from run to run; points of percent.

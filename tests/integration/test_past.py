@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.measure import START_NS
-from benchmarks.merge_work import BATCH, batches, samples_of
+from lab.speed.measure import START_NS
+from lab.speed.merge_work import BATCH, batches, samples_of
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.journal.location import JOURNAL_FILE

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import merge_restart
-from benchmarks.merge_work import batches
+from lab.speed import merge_restart
+from lab.speed.merge_work import batches
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import LAST_NS, Correction

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.postgres import server
-from benchmarks.postgres.server import Database
 from sitegrid import connect
 from sitegrid.process.children import Children, wait_until
+from tests import postgres_server as server
+from tests.postgres_server import Database
 from tests.takeover.site import FENCED, READY_S, SITE, TakeOverSite, cut_answer, kill, round_of, stop, terminate
 
 pytestmark = pytest.mark.processes

@@ -10,8 +10,8 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from benchmarks.postgres.server import cluster
 from sitegrid.process.children import Children
+from tests.postgres_server import cluster
 from tests.takeover.site import FAULTS, TakeOverSite, round_of
 
 

@@ -16,8 +16,6 @@ from typing import Any
 
 import psycopg
 
-from benchmarks.postgres.server import Cluster, Database
-from evaluation.cooperation.tcp_proxy import FAIR, Proxy, Weather
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Admission
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -25,7 +23,9 @@ from protocol.site.site_config import SiteConfig, site_toml
 from protocol.wire.messages import SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.process.children import Child, Children, wait_until
+from tests.postgres_server import Cluster, Database
 from tests.takeover.senders import BEGIN_NS, Acknowledged, Sender, rows_of
+from tests.tcp_proxy import FAIR, Proxy, Weather
 
 READY_S = 120.0
 ACK_S = 60.0  # for the first acknowledgement after a fault

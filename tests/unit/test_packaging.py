@@ -13,7 +13,7 @@ import pytest
 
 import sitegrid
 
-PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid", "evaluation", "benchmarks")
+PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 
 
 @pytest.mark.parametrize("name", PACKAGES)

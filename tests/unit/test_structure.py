@@ -20,7 +20,7 @@ MOST_OPTIONS = 60
 
 # Contracts of pyproject.toml by their first words, each with an import that breaks it: where it is planted, and what.
 PLANTED = {
-    "Layers: the door": ("evaluation/audit.py", "import sitegrid.client"),
+    "Layers: the laboratory": ("sitegrid/proof/delivery.py", "import lab.physics"),
     "An agent never sees": ("agents/pipeline.py", "import sim.state"),
     "The client needs": ("sitegrid/client.py", "import mapserver.config"),
     "Layers of the map server": ("mapserver/evidence/cells.py", "import mapserver.journal.rows"),
@@ -29,7 +29,7 @@ PLANTED = {
     "Layers of the simulator": ("sim/state.py", "import sim.simulator"),
     "Layers of the protocol": ("protocol/errors.py", "import protocol.wire.keys"),
     "Layers of the command": ("sitegrid/process/logs.py", "import sitegrid.client"),
-    "Layers of the evaluation": ("evaluation/campaign/figures.py", "import evaluation.maps.cases"),
+    "Layers of the laboratory": ("lab/campaign/workers.py", "import lab.maps.cases"),
     "No import runs in a circle": ("protocol/site/geometry.py", "import protocol.wire.messages"),
 }
 # What the functional core must not know, each planted into another of its rooms.

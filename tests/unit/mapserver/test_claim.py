@@ -6,11 +6,11 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 import pytest
 import zenoh
 
-from evaluation.cooperation.tcp_proxy import FAIR, Proxy, Weather
 from mapserver.claim import BETWEEN_S, WriterClaim
 from protocol.errors import LinkError
 from protocol.wire import keys
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from tests.tcp_proxy import FAIR, Proxy, Weather
 from tests.unit.mapserver.data import WAIT_S, wait_for
 
 FIRST, SECOND = "a" * 16, "b" * 16

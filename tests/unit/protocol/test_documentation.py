@@ -8,7 +8,6 @@ from dataclasses import fields
 
 import pytest
 
-from evaluation.positions.log_truth import read_log_truth
 from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.machine.log_folder import open_log
@@ -23,7 +22,8 @@ from protocol.site.site_config import KnownGround
 from protocol.units import _NS, _UNITS
 from protocol.wire import codec
 from protocol.wire.messages import Pose
-from tests.paths import DOCS
+from sitegrid.logs.log_truth import read_log_truth
+from tests.paths import DOCS, ROOT
 
 CALIBRATION = (cal.CalibrationAnswer, cal.MachineCalibration, cal.CorrectedSpan)
 WIRE, LOGS = ((DOCS / name).read_text() for name in ("protocol.md", "log-folders.md"))
@@ -133,7 +133,7 @@ def test_example_of_a_manifest_is_read(tmp_path):
 
 
 def test_example_of_a_log_of_ones_own_is_read(tmp_path):
-    page = (DOCS / "evaluation.md").read_text()
+    page = (ROOT / "lab" / "README.md").read_text()
     _, manifest, truth = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "log.toml").write_text(manifest)
     (tmp_path / "evaluation.toml").write_text(truth)

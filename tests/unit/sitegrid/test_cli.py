@@ -68,7 +68,7 @@ def test_help_imports_only_the_base_install():
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     packages = {name.partition(".")[0] for name in output.split()}
     extras = {"cryptography", "cv2", "filterpy", "matplotlib", "numba", "pyarrow", "pybullet", "pyproj", "rich"}
-    assert not packages & {*extras, *("scipy", "agents", "mapserver", "sim", "evaluation", "benchmarks")}
+    assert not packages & {*extras, *("scipy", "agents", "mapserver", "sim", "lab")}
     assert {"sitegrid", "zenoh"} <= packages
 
 

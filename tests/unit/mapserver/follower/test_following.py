@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.postgres import server
 from mapserver.change import change_log
 from mapserver.follower import following as module
 from mapserver.follower.following import Following
@@ -29,6 +28,7 @@ from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import GroundChange, MapVersion
+from tests import postgres_server as server
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,

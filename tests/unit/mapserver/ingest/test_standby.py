@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from benchmarks.postgres.server import Database
 from mapserver.evidence.grid import Grid
 from mapserver.ingest import standby as module
 from mapserver.ingest.standby import Standby
@@ -19,6 +18,7 @@ from mapserver.journal.location import JournalLocation
 from mapserver.journal.postgres import reader as postgres_reader
 from mapserver.trust.decisions import PERSON, TrustDecision
 from protocol.errors import StoreError
+from tests.postgres_server import Database
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, random_samples, same, wait_for
 
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.postgres.server import Database
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import Store
 from mapserver.journal.history import history_rows
@@ -25,6 +24,7 @@ from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
 from protocol.wire.codec import pack, unpack
 from protocol.wire.messages import Ack, Refused
+from tests.postgres_server import Database
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, incoming, now_ns, random_samples, same, samples
 
 

@@ -15,9 +15,6 @@ from typing import Any
 import psycopg
 import pytest
 
-from benchmarks.postgres import server
-from benchmarks.postgres.server import Cluster, Database
-from evaluation.cooperation.tcp_proxy import Proxy, Weather
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.standby import Standby
@@ -34,7 +31,10 @@ from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import ConfigError, QueryError, Refusal, SitegridError, StoreError
 from protocol.wire.messages import Ack, Refused
+from tests import postgres_server as server
 from tests.pooler import SwappingPooler
+from tests.postgres_server import Cluster, Database
+from tests.tcp_proxy import Proxy, Weather
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, past_of, random_samples, same, wait_for
 
 YEAR_NS = 365 * 86400 * 10**9

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.postgres import server
-from benchmarks.postgres.server import Cluster, Database
 from mapserver.ingest.store import Store
 from mapserver.journal.location import JournalLocation
 from protocol.errors import Refusal
 from protocol.wire.messages import Ack, Refused
+from tests import postgres_server as server
+from tests.postgres_server import Cluster, Database
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, random_samples, same, wait_for
 from tests.unit.mapserver.journal.test_postgres import folded_by, open_store, place, send
 

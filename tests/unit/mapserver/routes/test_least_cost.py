@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from evaluation.routes.reference import graph, least_cost, neighbours
+from lab.routes.reference import graph, least_cost, neighbours
 from mapserver.routes.grid_search import LEAST_COST
 from mapserver.routes.least_cost import Terrain, cost_of, least_cost_line, moves, reaches
 

@@ -28,7 +28,7 @@ from sitegrid.pictures import draw
 from tests.paths import ROOT
 
 MACHINE = load_scenario("paper_site").rigs()[0].machine
-MANIFEST = ROOT / "evaluation/logs/rl_test1_husky/log.toml"
+MANIFEST = ROOT / "lab/logs/rl_test1_husky/log.toml"
 
 
 def parse(*words: object) -> Namespace:

@@ -86,7 +86,7 @@ def test_the_data_of_no_log_are_refused(tmp_path: Path):
 
 def test_a_log_is_replayed_where_it_is_named(tmp_path: Path):
     assert plan_of(tmp_path).log is None
-    manifest = ROOT / "evaluation/logs/rl_test1_husky/log.toml"
+    manifest = ROOT / "lab/logs/rl_test1_husky/log.toml"
     demo = plan_of(tmp_path, "--log", str(manifest), "--data", str(tmp_path))
     assert demo.log.data == tmp_path
     with pytest.raises(ConfigError, match=r"nowhere.toml: no such file"):

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.postgres.server import Database
 from mapserver.ingest.store import Store
 from mapserver.journal.location import JournalLocation
 from protocol.site.site_config import site_toml
 from sitegrid.cli import main
+from tests.postgres_server import Database
 from tests.unit.mapserver.data import CONFIG, SITE, incoming, now_ns, random_samples, same
 
 

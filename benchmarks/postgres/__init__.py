@@ -1,1 +1,0 @@
-"""PostgreSQL servers for benchmarks and tests, and what a journal on them costs."""

@@ -1,1 +1,0 @@
-"""A benchmark that others can enter: recordings with truth, rules, baselines, and the table (docs/benchmark.md)."""

@@ -1,0 +1,58 @@
+"""`sitegrid bench`: a benchmark of maps that others can enter (lab/benchmark.md)."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from sitegrid.options.groups import add_action
+from sitegrid.options.outputs import FOLDER
+from sitegrid.options.values import count
+from sitegrid.process.lifetime import plain, raise_interrupts, say, tell
+from sitegrid.process.progress import Display
+
+HELP = "make the recordings of a benchmark of maps, and score entries"
+EXTRA = "eval"
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    what = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
+    make = add_action(what, "make", "make the recordings, or go on with them")
+    score = add_action(what, "score", "score baselines and entries on the recordings")
+    entries = "folder of an entry: a map or samples for each recording, NAME.csv"
+    score.add_argument("entries", type=Path, nargs="*", metavar="ENTRY", help=entries)
+    for action in (make, score):
+        action.add_argument("--data", type=FOLDER, default="bench-data", help="folder (default %(default)s)")
+        quick = "two short recordings in place of 24, to see that all works"
+        action.add_argument("--quick", action="store_true", help=quick)
+        action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
+
+
+def run(arguments: Namespace) -> int:
+    """Make recordings or score entries."""
+    from lab.benchmark import recordings, scores
+    from lab.campaign.experiment import Runner
+    from lab.campaign.provenance import made_by
+    from lab.campaign.workers import cores
+    from sitegrid.process.tables import table
+
+    raise_interrupts()  # the bar hides the cursor of the terminal
+    edition, processes = recordings.QUICK if arguments.quick else recordings.FULL, arguments.processes or cores()
+    title = {"make": "fleets drive, agents make samples", "score": "maps are compared with the truth"}[arguments.what]
+    kept = arguments.data if arguments.what == "make" else None
+    with Display(title, headless=arguments.json, kept=kept) as display:
+        if arguments.what == "make":
+            rows = recordings.make(Runner(arguments.data, processes, display.show), edition)
+            report = {"edition": recordings.edition_key(edition), "rows": rows}
+        else:
+            report = scores.run(arguments.data, edition, arguments.entries, processes, display.show)
+    if arguments.json:
+        say(plain({"made": made_by(arguments.words), **report}))
+    else:
+        hidden = {"by_recording", *recordings.PARTS}  # what is too wide to be read
+        rows = [{name: value for name, value in row.items() if name not in hidden} for row in plain(report)["rows"]]
+        tell(table(rows))
+        if others := [row["name"] for row in rows if row.get("published") is False]:
+            tell(f"not as published: {', '.join(others)}; lab/benchmark.md says when that is so")
+    return 0

@@ -1,0 +1,176 @@
+"""Recordings of whole fleets, and the samples that each machine's agent makes of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from agents.estimation.ground import EstimationConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
+from lab.campaign.experiment import Experiment, Task
+from lab.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, toml_of
+from lab.ground.lag import all_samples
+from lab.positions.configurations import Configuration
+from protocol.arrays import Table
+from protocol.machine.log_folder import open_log
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Gps, Reading, Torque
+from protocol.site.site_config import SiteConfig
+from sim.recorder import TRACKS_FOLDER
+from sim.scenario.file import load_scenario
+from sim.truth import MAP_FILE, TruthMap
+from sitegrid.logs.sensors import select
+from sitegrid.proof.tracks import LoadTrack, read_load_track
+
+SOURCES = (
+    *("agents", *MACHINES_PROTOCOL),
+    *(f"lab/{part}.py" for part in ("fleet/drives", "ground/lag", "positions/configurations")),
+)
+
+
+@dataclass(frozen=True)
+class FleetDrive(PlannedDrive):
+    """All machines of a scenario on one ground. count: of the machines of its first fleet, 0 as the scenario has it."""
+
+    count: int = 0
+
+    @property
+    def scenario_toml(self) -> str:
+        """The scenario file of this drive."""
+        top = {"base": self.setup.scenario, "world": self.setup.world}
+        if not self.count:
+            return f"{toml_of(top)}\n"
+        first = replace(load_scenario(self.setup.scenario).fleet[0], count=self.count, preset=self.preset)
+        return f"{toml_of(top)}\n\n[[fleet]]\n{toml_of(vars(first))}\n"
+
+    @property
+    def machines(self) -> int:
+        """How many drive."""
+        return self.count or sum(fleet.size for fleet in load_scenario(self.setup.scenario).fleet)
+
+
+def planned(
+    scenario: str, seed: int, seconds: float, count: int = 0, preset: str = "", world: str | None = None
+) -> FleetDrive:
+    """A drive of a scenario with the sensors of a preset, or with those that its file has, in a world or in its own."""
+    preset = preset or load_scenario(scenario).fleet[0].preset
+    return FleetDrive(seed, seconds, preset, Setup(scenario, (), (), (), world=world), count)
+
+
+@dataclass(frozen=True)
+class Agent:
+    """One machine of a drive, by its place among the names.
+
+    calibrates: by its own work; closed_tours: by these as well; first_s: of the recording; bad: see `spoiled`.
+    configuration: its filter and sensors, None for those that it has.
+    """
+
+    index: int
+    calibrates: bool = True
+    closed_tours: bool = False
+    first_s: float = 0.0
+    bad: bool = False
+    configuration: Configuration | None = None
+
+    @property
+    def name(self) -> str:
+        """Short and unique."""
+        first = f"-{self.first_s:g}s" * (self.first_s > 0)
+        return (
+            f"machine{self.index}"
+            + "-plain" * (not self.calibrates)
+            + "-tours" * self.closed_tours
+            + "-bad" * self.bad
+            + first
+            + (f"-{self.configuration.name}" if self.configuration else "")
+        )
+
+
+@dataclass(frozen=True)
+class AgentSamples:
+    """What an agent made of a recording. live: the same samples (n,) at the places that were known at once."""
+
+    samples: Table
+    live: Table
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is true of a drive: its ground, and the tracks of all machines by name."""
+
+    truth: TruthMap
+    tracks: Mapping[str, LoadTrack]
+
+
+@lru_cache(maxsize=4)  # the cases of a drive come one after the other
+def scene(drive: PlannedDrive, cache: Path) -> Scene:
+    """The truth of a recorded drive."""
+    folder = drive.folder(cache)
+    tracks = {
+        logs.name: read_load_track(
+            folder / "truth" / TRACKS_FOLDER / f"{logs.name}.csv", open_log(logs).machine.load_centre_m
+        )
+        for logs in _logs(folder)
+    }
+    return Scene(TruthMap.load(folder / "truth" / MAP_FILE), tracks)
+
+
+def _logs(folder: Path) -> list[Path]:
+    """The log folders of all machines, by name."""
+    return sorted(path for path in (folder / "logs").iterdir() if path.is_dir())
+
+
+# --- in the worker processes -----------------------------------------------------------------------------------------
+
+
+def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
+    """Run one machine's pipeline."""
+    assert task.drive
+    site, machine, readings = _read(_logs(task.drive.folder(cache))[task.variant.index])
+    if task.variant.first_s:
+        end_ns = readings[0].stamp_ns + round(task.variant.first_s * 1e9)
+        readings = tuple(reading for reading in readings if reading.stamp_ns <= end_ns)
+    if task.variant.bad:
+        machine, readings = spoiled(machine, readings)
+    estimation = EstimationConfig(calibrate=task.variant.calibrates, closed_tours=task.variant.closed_tours)
+    options = PipelineConfig(estimation=estimation)
+    if chosen := task.variant.configuration:
+        machine = select(machine, chosen.gps, chosen.imu)
+        options = replace(chosen.options, estimation=estimation)
+    made = all_samples(Pipeline(site, machine, options), readings)
+    return AgentSamples(np.asarray(made.final), np.asarray(made.pending))
+
+
+@lru_cache(maxsize=1)  # the configurations of a lone machine come one after the other
+def _read(folder: Path) -> tuple[SiteConfig, MachineConfig, tuple[Reading, ...]]:
+    """What the agent of a machine may know and read, of its log folder."""
+    log = open_log(folder)
+    return log.site, log.machine, tuple(log.readings())
+
+
+def spoiled(machine: MachineConfig, readings: Iterable[Reading]) -> tuple[MachineConfig, tuple[Reading, ...]]:
+    """A machine and its readings with the faults of the scenario `bad_machine`, on whatever recording.
+
+    That an antenna sits elsewhere than is configured is the same as a configuration that says so of one that does not.
+    """
+    (fault,) = load_scenario("bad_machine").fault
+    off = np.array(fault.antenna_off_m)
+    sensors = tuple(
+        replace(each, mount=replace(each.mount, xyz_m=tuple((each.mount.xyz_m - off).tolist())))
+        if each.kind == Gps.kind
+        else each
+        for each in machine.sensors
+    )
+    scaled = (
+        replace(each, torque_nm=fault.torque_scale * each.torque_nm) if isinstance(each, Torque) else each
+        for each in readings
+    )
+    return replace(machine, sensors=sensors), tuple(scaled)
+
+
+EXPERIMENT = Experiment("fleet", AgentSamples, SOURCES, _samples)

@@ -1,0 +1,220 @@
+"""How right the merged map is: every method on the same samples of every case, against the truth.
+
+Figures are those of the cells that machines truly passed and that the case judges.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from lab.campaign.experiment import Experiment, Runner, Task
+from lab.maps.cases import CASES, CELL_M, MapCase, parking_place
+from lab.maps.methods import METHODS, Layers, in_order, merge_hard, soft_votes
+from lab.maps.samples import LANE_M, SPEED_MPS, MapScene, simulate
+from protocol.arrays import Bools, Ints
+from protocol.site.geometry import CellWindow
+from protocol.site.ground_classes import UNKNOWN, resistance_class, wrong_percent
+from sitegrid.proof.figures import Goal, Report, Row, judge, rounded
+
+SERVER = "soft_votes"
+SOURCES = (
+    "mapserver",
+    "protocol",
+    *(f"lab/maps/{part}.py" for part in ("experiment", "cases", "methods", "samples")),
+)
+RESISTANCE, GRADE = ("resistance",), ("grade_east", "grade_north")
+GRADE_TOLERANCE = 0.01  # [m/m]; a gradient vector that is off by more is wrong
+SHARE = 0.6  # of votes: cells that are surer than this should hardly ever be wrong
+NEAR_M = 4.0  # three standard deviations: what the stated positions of a parked machine reach
+DIGITS = 4  # one cell of the site is 0.0017 %
+# Of a map, in percent of cells; `seconds` is the processor time of the method.
+FIGURES = (
+    "wrong_pct",  # of the known cells
+    "known_pct",  # of the driven cells
+    "changed_wrong_pct",  # of the repaved zone
+    "unchanged_wrong_pct",  # of the rest
+    "near_wrong_pct",  # near a parked machine
+    "share60_wrong_pct",  # of the cells whose leading class has at least SHARE of the votes
+    "share60_cells_pct",  # how many those are
+    "seconds",
+)
+# From three seeds of the prototype; what was reached: lab/results/merge.md.
+GOALS = (
+    Goal({"case": "1x1", "method": SERVER}, "wrong_pct", "<=", 0.40),
+    Goal({"case": "1x4", "method": SERVER}, "wrong_pct", "<=", 0.18),
+    Goal({"case": "4x4", "method": SERVER}, "wrong_pct", "<=", 0.03),
+    Goal({"case": "bad_machine", "method": SERVER}, "wrong_pct", "<=", 0.10),
+    Goal({"case": "parked_bad_machine", "method": SERVER}, "wrong_pct", "<=", 0.20),
+    Goal({"case": "mixed_receivers", "method": SERVER}, "wrong_pct", "<=", 0.05),
+    Goal({"case": "repaved", "passes_after": 1, "method": SERVER}, "changed_wrong_pct", "<=", 1.5),
+    Goal({"case": "repaved", "passes_after": 1, "method": SERVER}, "unchanged_wrong_pct", "<=", 0.2),
+    Goal({"case": "grade_both_ways", "method": SERVER}, "wrong_pct", "<=", 1.0),
+    Goal({"case": "slope_15", "method": SERVER}, "wrong_pct", "<=", 1.0),
+    *(Goal({"case": case, "method": SERVER}, "share60_wrong_pct", "<=", 0.2) for case in ("1x1", "1x4", "4x4")),
+    # Near 1 %, as the paper has it: else the case is not the paper's.
+    Goal({"case": "4x4", "method": "last_write"}, "wrong_pct", ">=", 0.7),
+    Goal({"case": "4x4", "method": "last_write"}, "wrong_pct", "<=", 1.4),
+)
+Output = TypeVar("Output")
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """What came of a task. samples: sent; cells: judged; distrusted: machines that the server excluded.
+
+    methods: FIGURES by method.
+    """
+
+    samples: int
+    cells: int
+    distrusted: list[str]
+    methods: dict[str, Row]
+
+
+@dataclass(frozen=True)
+class Maps:
+    """What the methods make of a scene: layers (rows, columns) by method, and the processor time of each [s].
+
+    distrusted: machines that the server excluded.
+    """
+
+    scene: MapScene
+    layers: dict[str, Layers]
+    seconds: dict[str, float]
+    distrusted: tuple[str, ...]
+
+
+def run(runner: Runner, seeds: Sequence[int], cases: Sequence[MapCase] = CASES) -> tuple[Report, Sequence[MapCase]]:
+    """Simulate, merge and judge all cases with all seeds; returns the cases too, for pictures."""
+    tasks = [Task(case, seed, driven_s(case)) for case in cases for seed in seeds]
+    results = iter(runner.run(EXPERIMENT, tasks))
+    rows = []
+    for case in cases:
+        by_seed = [next(results) for _ in seeds]
+        rows += [summarise(case, method, by_seed) for method in (SERVER, *METHODS)]
+    return {"seeds": list(seeds), "rows": rows, "goals": judge(GOALS, rows)}, cases
+
+
+def driven_s(case: MapCase) -> float:
+    """How long all machines of a case drive, one after the other."""
+    passes = sum(machine.passes for machine in case.machines if not machine.parked)
+    return passes * case.columns * case.rows * CELL_M**2 / LANE_M / SPEED_MPS
+
+
+def summarise(case: MapCase, method: str, results: Sequence[CaseResult]) -> Row:
+    """One row of the table: medians over the seeds, and the best, the worst and every seed.
+
+    distrusted: with how many seeds the server excluded each machine; None of other methods.
+    """
+    by_seed = [result.methods[method] for result in results]
+    wrong = [seed["wrong_pct"] for seed in by_seed if seed["wrong_pct"] is not None]
+    times_distrusted = Counter(name for result in results for name in result.distrusted)
+    row: Row = {
+        "case": case.kind,
+        "passes_after": case.passes_after,
+        "width_m": case.width_m,
+        "method": method,
+        **{name: _median([seed[name] for seed in by_seed]) for name in FIGURES},
+        "wrong_min_pct": min(wrong, default=None),
+        "wrong_max_pct": max(wrong, default=None),
+        "samples": round(float(np.median([result.samples for result in results]))),
+        "cells": round(float(np.median([result.cells for result in results]))),
+        "distrusted": dict(sorted(times_distrusted.items())) if method == SERVER else None,
+        "wrong_by_seed_pct": wrong,
+    }
+    return rounded(row, DIGITS)
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    """Median of the values that are known."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
+
+
+def figures(case: MapCase, scene: MapScene, layers: Layers, seconds: float | None = None) -> Row:
+    """FIGURES of a map; None where one does not apply or nothing was to be judged."""
+    judged = scene.driven & scene.site.judged
+    estimated, true = classes(case, scene, layers)
+
+    def wrong(which: Bools) -> float:
+        return wrong_percent(estimated[judged & which], true[judged & which])
+
+    values = {"wrong_pct": wrong(np.ones_like(judged)), "known_pct": _percent(estimated[judged] != UNKNOWN)}
+    if case.passes_after is not None:
+        values |= {"changed_wrong_pct": wrong(scene.site.repaved), "unchanged_wrong_pct": wrong(~scene.site.repaved)}
+    if any(machine.parked for machine in case.machines):
+        values["near_wrong_pct"] = wrong(near_parked(case))
+    if "confidence" in layers and not case.judges_grade:
+        sure = layers["confidence"] >= SHARE
+        cells = _percent(sure[judged & (estimated != UNKNOWN)])
+        values |= {"share60_wrong_pct": wrong(sure), "share60_cells_pct": cells}
+    known = {name: value for name, value in values.items() if math.isfinite(value)}
+    return {**dict.fromkeys(FIGURES), **known, "seconds": seconds}
+
+
+def classes(case: MapCase, scene: MapScene, layers: Layers) -> tuple[Ints, Ints]:
+    """Class of each cell in a map and in truth (rows, columns); for gradients, 0 is right and 1 is off by too much."""
+    if not case.judges_grade:
+        return resistance_class(layers["resistance"]), resistance_class(scene.site.c_rr_later)
+    east, north = np.moveaxis(scene.site.gradient, -1, 0)
+    off = np.hypot(layers["grade_east"] - east, layers["grade_north"] - north)
+    estimated = np.where(np.isfinite(off), off > GRADE_TOLERANCE, UNKNOWN).astype(np.int64)
+    return estimated, np.zeros_like(estimated)
+
+
+def near_parked(case: MapCase) -> Bools:
+    """Cells (rows, columns) that the stated positions of parked machines reach."""
+    near: Bools = np.zeros((case.rows, case.columns), np.bool_)
+    x_m, y_m = ((np.arange(count) + 0.5) * CELL_M for count in (case.columns, case.rows))
+    east, north = parking_place(case)
+    for machine in case.machines:
+        if machine.parked:
+            near |= np.hypot(x_m - east - machine.offset_m, y_m[:, None] - north) < NEAR_M
+    return near
+
+
+def _percent(which: Bools) -> float:
+    return 100.0 * float(which.mean()) if which.size else math.nan
+
+
+# --- in the worker processes -----------------------------------------------------------------------------------------
+
+
+def solve(case: MapCase, seed: int) -> Maps:
+    """Simulate a case, and merge it with every method."""
+    scene = simulate(case, seed)
+    window = CellWindow(0, 0, case.columns, case.rows)
+    names = GRADE if case.judges_grade else RESISTANCE
+    rows = in_order(delivery.rows for delivery in scene.deliveries)
+    maps, seconds = {}, {}
+    (maps[SERVER], distrusted), seconds[SERVER] = _timed(partial(soft_votes, scene.deliveries, window))
+    for name, method in METHODS.items():
+        maps[name], seconds[name] = _timed(partial(merge_hard, method, rows, names, window))
+    return Maps(scene, maps, seconds, distrusted)
+
+
+def _timed(work: Callable[[], Output]) -> tuple[Output, float]:
+    """What the work returns, and its processor time [s]."""
+    began_s = time.process_time()
+    return work(), time.process_time() - began_s
+
+
+def _judge(task: Task[MapCase], _: Path) -> CaseResult:
+    """Simulate, merge and judge one case."""
+    maps = solve(task.variant, task.seed)
+    times = maps.seconds
+    methods = {name: figures(task.variant, maps.scene, layers, times[name]) for name, layers in maps.layers.items()}
+    cells = int((maps.scene.driven & maps.scene.site.judged).sum())
+    return CaseResult(maps.scene.samples, cells, list(maps.distrusted), methods)
+
+
+EXPERIMENT = Experiment("merge", CaseResult, SOURCES, _judge)

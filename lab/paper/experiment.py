@@ -1,0 +1,288 @@
+"""The paper's tables: positions by sensors, and maps with their wrong cells, beside what the paper reports.
+
+Maps are kept, and compared with the truth anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from lab.campaign.experiment import Runner, replay_task
+from lab.campaign.recordings import PAPER, PlannedDrive
+from lab.fleet import drives
+from lab.fleet.drives import scene
+from lab.maps.uncertainty import Believed, coverage_pct, forecast_row, layers_forecast, pooled
+from lab.paper import days, maps
+from lab.paper.days import SecondDay, day_rows
+from lab.paper.drives import MACHINES, QUICK, RECOMMENDED, MapSource, Plan
+from lab.paper.maps import AS_TRUE, FORECASTS, KINDS, PAPERS, SERVED, Fleet, MadeMaps, MapKind
+from lab.paper.tensor import write_tensor
+from lab.positions import table
+from lab.positions.configurations import Configuration
+from lab.positions.published import PLOTTING, POSITIONS, REMARKS, Published
+from lab.positions.table import ScoredRun
+from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
+from protocol.errors import SitegridError
+from protocol.site.ground_classes import resistance_class
+from sitegrid.proof.figures import Goal, Report, Row, half_width, judge, rounded
+from sitegrid.proof.map_score import driven_cells, pooled_by_border, region_of, score, score_driven, true_layers
+
+LEAST_S = 60.0  # of a recording: a heading is known after some seconds, calibration needs ground that is driven again
+PLACES = ("rmse_x_m", "rmse_y_m", "net_m")
+# Of truly driven cells, and of all that were plotted, as the paper counts them.
+DRIVEN = ("wrong_resistance_pct", "wrong_grade_pct", "known_pct", "cells")
+PLOTTED = ("plotted_wrong_resistance_pct", "plotted_wrong_grade_pct", "plotted_cells")
+WITH_INTERVAL = ("net_m", *DRIVEN[:2], *PLOTTED[:2])
+DIGITS = 4
+
+_MAP = {"table": "maps", "filter": "ukf", "gps": 2, "imu": 1, "profile": "default", "merge": "soft_votes"}
+_ORACLE = {**_MAP, "scenario": PAPER.scenario, "preset": PAPER.preset, "values": "oracle"}
+_SERVED = {**_MAP, "preset": "dgps", "machines": MACHINES, "values": "estimated", "calibration": "server"}
+GOALS = (
+    *(Goal({**_ORACLE, "machines": 1}, figure, "<=", 0.4) for figure in DRIVEN[:2]),
+    *(Goal({**_ORACLE, "machines": MACHINES}, figure, "<=", 0.1) for figure in DRIVEN[:2]),
+    Goal({**_SERVED, "scenario": "loading"}, DRIVEN[0], "<=", 1.0),
+    Goal({**_SERVED, "scenario": PAPER.scenario}, DRIVEN[0], "<=", 1.8),
+    Goal({**_SERVED, "scenario": PAPER.scenario}, "above_true_pct", "<=", 0.3),
+    *(Goal({**_SERVED, "scenario": name}, DRIVEN[1], "<=", 0.15) for name in ("loading", PAPER.scenario)),
+    *(Goal({**_SERVED, "scenario": name}, "known_pct", ">=", 98.0) for name in ("loading", PAPER.scenario)),
+)
+
+CALIBRATED = (Goal({"method": SERVED.merge}, "calibration_error", "<=", 0.02),)
+DEVIATIONS = {"resistance_std": ("resistance",), "grade_std": ("grade_east", "grade_north")}  # of which layers
+COVERED = (
+    *(Goal({"layer": layer}, "coverage_pct", ">=", 90.0) for layer in DEVIATIONS),
+    *(Goal({"layer": layer}, "coverage_pct", "<=", 98.0) for layer in DEVIATIONS),
+)
+
+
+@dataclass(frozen=True)
+class MapOutcome:
+    """The maps of one source with one seed."""
+
+    source: MapSource
+    drive: PlannedDrive
+    made: MadeMaps
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """What pictures and files are made of."""
+
+    plan: Plan
+    positions: Mapping[Configuration, Sequence[ScoredRun]]
+    maps: Sequence[MapOutcome]
+
+    def all_of(self, source: MapSource) -> list[MapOutcome]:
+        """The maps of a source, seed by seed."""
+        return [each for each in self.maps if each.source == source]
+
+
+def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
+    """Record, replay, plot and judge; a row per configuration of either table. SitegridError where drives are short."""
+    if plan.seconds < LEAST_S:
+        raise SitegridError(f"seconds: {plan.seconds:g} is too short; maps need drives of {LEAST_S:g} s or more")
+    outcomes = Outcomes(plan, _positions(runner, plan), _maps(runner, plan))
+    rows = [position_row(plan, each, runs) for each, runs in outcomes.positions.items()]
+    for source in plan.sources:
+        figures = {kind: [_figures(each, kind, runner) for each in outcomes.all_of(source)] for kind in KINDS}
+        rows += [map_row(source, kind, of_kind, figures[AS_TRUE]) for kind, of_kind in figures.items()]
+    fleets = [source for source in plan.sources if source.machines > 1]
+    of_days = [row for source in fleets for row in _days(runner, plan, source)]
+    forecasts = [row for source in fleets for row in forecast_rows(source, outcomes, runner)]
+    coverage = [row for source in fleets for row in coverage_rows(source, outcomes, runner)]
+    judged = (GOALS, rows), (CALIBRATED, forecasts), (COVERED, coverage), (days.GOALS, of_days)
+    report: Report = {
+        "seeds": list(plan.seeds),
+        "seconds": plan.seconds,
+        "gps_error": table.gps_error(PlannedDrive(plan.seeds[0], plan.seconds, PAPER.preset, plan.setup)),
+        "rows": rows,
+        "forecasts": forecasts,
+        "coverage": coverage,
+        "days": of_days,
+        "goals": [] if plan == QUICK else [row for goals, those in judged for row in judge(goals, those)],
+        "contradictions": contradictions(),
+        "remarks": list(REMARKS),
+    }
+    return report, outcomes
+
+
+def write_map(outcomes: Outcomes, runner: Runner, path: Path) -> None:
+    """Write the map that the paper plots, by its own method with the sensors that it recommends, of the first seed."""
+    theirs = replace(RECOMMENDED, profile="paper")
+    outcome = next(each for each in outcomes.maps if each.source.machines == 1 and each.source.configuration == theirs)
+    write_tensor(path, outcome.made.layers_of(PAPERS), scene(outcome.drive, runner.cache).truth)
+
+
+def _positions(runner: Runner, plan: Plan) -> dict[Configuration, list[ScoredRun]]:
+    """Tables 1 and 2, by the replays of `eval localisation`."""
+    planned = [PlannedDrive(seed, plan.seconds, PAPER.preset, plan.setup) for seed in plan.seeds]
+    rows = [table.as_recorded(row, planned[0]) for row in plan.positions]
+    runs = iter(runner.run(table.EXPERIMENT, [replay_task(row, drive) for drive in planned for row in rows]))
+    by_drive = [{row: next(runs) for row in rows} for _ in planned]
+    return {row: [each[row] for each in by_drive] for row in rows}
+
+
+def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
+    """The maps of Table 3, and those of fleets."""
+    pairs = [(source, seed) for seed in plan.seeds for source in plan.sources]
+    runner.run(drives.EXPERIMENT, [task for source, seed in pairs for task in source.runs(seed, plan)])
+    made = runner.run(maps.EXPERIMENT, [source.maps(seed, plan) for source, seed in pairs])
+    return [
+        MapOutcome(source, source.drive(seed, plan), each) for (source, seed), each in zip(pairs, made, strict=True)
+    ]
+
+
+def _days(runner: Runner, plan: Plan, source: MapSource) -> list[Row]:
+    """Rows of two days, of the same machines and of others; none of one seed alone, after which nobody comes."""
+    drives_of = [source.drive(seed, plan) for seed in plan.seeds]
+    kinds: dict[str, list[tuple[PlannedDrive | None, PlannedDrive]]] = {
+        "the same": [(None, drive) for drive in drives_of[1:]],
+        "others": [*pairwise(drives_of)],
+    }
+    rows = []
+    for who, pairs in kinds.items():
+        tasks = [replay_task(SecondDay(Fleet(source.agents), first), second) for first, second in pairs]
+        rows += day_rows({**_of(source), "second_day": who}, runner.run(days.EXPERIMENT, tasks)) if tasks else []
+    return rows
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+def position_row(plan: Plan, row: Configuration, runs: Sequence[ScoredRun]) -> Row:
+    """One row of Tables 1 and 2: means over the seeds."""
+    figures = [{name: getattr(run, name) for name in (*PLACES, "us_per_second")} for run in runs]
+    named = {"table": "positions", "scenario": plan.setup.scenario, "preset": PAPER.preset, **_sensors(row)}
+    nothing = dict.fromkeys(("values", "calibration", "merge"))
+    return _row({**named, **nothing, "machines": 1}, figures, POSITIONS.get(row.group))
+
+
+def map_row(source: MapSource, kind: MapKind, figures: Sequence[Row], true_figures: Sequence[Row]) -> Row:
+    """One row of Table 3: means over the seeds. true_figures: of the same samples with true zeros and scales."""
+    named = {"table": "maps", "scenario": source.scenario, "preset": source.preset, **_sensors(source.configuration)}
+    published = PLOTTING.get(source.configuration.group) if source.machines == 1 else None
+    row = _row({**named, **vars(kind), "machines": source.machines}, figures, published)
+    if kind == SERVED:
+        pairs = zip(figures, true_figures, strict=True)
+        above = [ours[DRIVEN[0]] - true[DRIVEN[0]] for ours, true in pairs]
+        row["above_true_pct"] = round(max(0.0, float(np.mean(above))), DIGITS)
+    row["by_border"] = rounded(pooled_by_border([each["by_border"] for each in figures]), DIGITS)
+    return row
+
+
+def _sensors(row: Configuration) -> Row:
+    return {"filter": row.filter, "gps": row.gps, "imu": row.imu, "profile": row.profile}
+
+
+def _row(named: Row, figures: Sequence[Row], published: Published | None) -> Row:
+    """Means over the seeds, half-widths of their intervals, and what the paper reports; None where there is nothing."""
+    by_seed: dict[str, Floats] = {
+        name: np.array([each[name] for each in figures], float)
+        for name in (*PLACES, *DRIVEN, *PLOTTED, "us_per_second")
+        if name in figures[0]
+    }
+    means = {name: float(by_seed[name].mean()) if name in by_seed else None for name in (*PLACES, *DRIVEN, *PLOTTED)}
+    cost = round(float(by_seed["us_per_second"].mean())) if "us_per_second" in by_seed else None
+    row = {
+        **named,
+        **means,
+        "us_per_second": cost,
+        "above_true_pct": None,
+        "ci95": {name: half_width(by_seed[name]) for name in WITH_INTERVAL if name in by_seed},
+        "paper": asdict(published) if published else None,
+        "by_border": [],
+        "by_seed": {name: by_seed[name].tolist() for name in WITH_INTERVAL if name in by_seed},
+    }
+    return rounded(row, DIGITS)
+
+
+def _figures(outcome: MapOutcome, kind: MapKind, runner: Runner) -> Row:
+    """Figures of one map of one seed; its errors are of the places where samples were put."""
+    true = scene(outcome.drive, runner.cache)
+    region, truth = region_of(true.truth, outcome.made.layers_of(kind)), true_layers(true.truth)
+    driven = score_driven(region, truth, [track.place_m for track in true.tracks.values()])
+    everywhere = score(region, truth)
+    east, north = outcome.made.errors_m(kind)
+    return {
+        **dict(zip(PLACES, (east, north, float(np.hypot(east, north))), strict=True)),
+        **asdict(driven),
+        **{f"plotted_{name}": value for name, value in asdict(everywhere).items()},
+    }
+
+
+# --- how far maps are believed ---------------------------------------------------------------------------------------
+
+
+def forecast_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list[Row]:
+    """How likely classes are said to be, by the server and by others of the same samples, over truly driven cells."""
+    believed: dict[str, list[Believed]] = {name: [] for name in (SERVED.merge, *FORECASTS)}
+    for outcome in outcomes.all_of(source):
+        true, made = _driven(outcome, runner), outcome.made
+        said = {
+            SERVED.merge: layers_forecast(made.layers_of(SERVED)),
+            **{name: made.forecast(name) for name in FORECASTS},
+        }
+        for name, forecast in said.items():
+            believed[name].append(forecast.judged(true.kind, true.driven))
+    return [forecast_row({**_of(source), "method": name}, pooled(parts)) for name, parts in believed.items()]
+
+
+def coverage_rows(source: MapSource, outcomes: Outcomes, runner: Runner) -> list[Row]:
+    """How often errors lie within the 95 % interval of the deviations that the server states, over driven cells."""
+    errors: dict[str, list[AnyArray]] = {name: [] for name in DEVIATIONS}
+    stated: dict[str, list[AnyArray]] = {name: [] for name in DEVIATIONS}
+    for outcome in outcomes.all_of(source):
+        true, layers = _driven(outcome, runner), outcome.made.layers_of(SERVED)
+        for deviation, of_layers in DEVIATIONS.items():
+            for name in of_layers:
+                errors[deviation].append((layers[name] - true.layers[name])[true.driven])
+                stated[deviation].append(layers[deviation][true.driven])
+    return [
+        {**_of(source), "layer": name, "coverage_pct": round(coverage_pct(*map(np.concatenate, pair)), DIGITS)}
+        for name, pair in {name: (errors[name], stated[name]) for name in DEVIATIONS}.items()
+    ]
+
+
+@dataclass(frozen=True)
+class TrueCells:
+    """Truth of the cells (rows, columns) of a recording: layers, class, and whether a load centre passed."""
+
+    layers: Mapping[str, Floats32]
+    kind: Ints
+    driven: Bools
+
+
+def _driven(outcome: MapOutcome, runner: Runner) -> TrueCells:
+    true = scene(outcome.drive, runner.cache)
+    layers = true_layers(true.truth)
+    passed = driven_cells(region_of(true.truth, {}), [track.place_m for track in true.tracks.values()])
+    return TrueCells(layers, resistance_class(layers["resistance"]), passed)
+
+
+def _of(source: MapSource) -> Row:
+    return {"scenario": source.scenario, "preset": source.preset, "machines": source.machines}
+
+
+# --- where the paper does not fit together ---------------------------------------------------------------------------
+
+
+def contradictions() -> list[Row]:
+    """Rows of the paper whose net error is not that of their x and y."""
+    tables = (("Tables 1 and 2", POSITIONS), ("Table 3", PLOTTING))
+    return [
+        {
+            "where": where,
+            "group": f"{group[0].upper()} {group[1]} GPS {group[2]} IMU",
+            "net_m": published.net_m,
+            "net_of_parts_m": round(published.net_of_parts_m, DIGITS),
+        }
+        for where, groups in tables
+        for group, published in groups.items()
+        if not published.is_consistent
+    ]

@@ -1,0 +1,70 @@
+"""The configurations of the paper's table: filter, sensors, profile, and how each becomes options of the pipeline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from agents.localisation.localiser import LocalisationConfig
+from agents.positioning import PipelineConfig
+from lab.positions.published import POSITIONS, Group
+
+FILTERS = ("ekf", "ukf")
+PROFILES = ("paper", "default")
+SENSORS = ((0, 1), (1, 1), (1, 2), (1, 3), (2, 1), (2, 2), (2, 3), (3, 3), (3, 1))  # GPS, IMU; the last is ours
+HEADLINE = ((1, 1), (2, 1), (3, 1))
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """One row of the table: filter, number of GPS receivers and IMUs, profile.
+
+    machine_share: share of the slow GPS errors' variance that the receivers have in common; None: as it was recorded.
+    """
+
+    filter: str
+    gps: int
+    imu: int
+    profile: str
+    machine_share: float | None = None
+
+    @property
+    def name(self) -> str:
+        """A name for files."""
+        share = "" if self.machine_share is None else f"-{self.machine_share:g}shared"
+        return f"{self.filter}-{self.profile}-{self.gps}gps-{self.imu}imu{share}"
+
+    @property
+    def group(self) -> Group:
+        """As the paper groups them."""
+        return self.filter, self.gps, self.imu
+
+    @property
+    def sensors(self) -> tuple[int, int, float | None]:
+        """Number of GPS receivers and of IMUs, and what the receivers share."""
+        return self.gps, self.imu, self.machine_share
+
+    @property
+    def options(self) -> PipelineConfig:
+        """The pipeline's."""
+        return PipelineConfig(localisation=LocalisationConfig(filter=self.filter, profile=self.profile))
+
+    @property
+    def published_net_m(self) -> float | None:
+        """Net RMSE [m] that the paper reports, with either profile; None where it has no such row."""
+        published = POSITIONS.get(self.group)
+        return published.net_m if published else None
+
+
+def configurations(
+    sensors: Sequence[tuple[int, int]] = SENSORS, shares: Sequence[float | None] = (None,)
+) -> list[Configuration]:
+    """All rows of the table: both filters and both profiles with each set of sensors, share by share."""
+    return [
+        Configuration(f, gps, imu, p, share)
+        for share in shares
+        for gps, imu in sensors
+        if gps or share == shares[0]  # without a receiver there is nothing to share
+        for p in PROFILES
+        for f in FILTERS
+    ]

@@ -1,0 +1,199 @@
+"""Figures of one recording: roads against what was driven, ledger and losses against the truth, repairs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lab.fleet.cases import Rows
+from lab.fleet.drives import FleetDrive, Scene
+from lab.fleet.solving import calibrated, of_machine
+from lab.roads.truth import TrueTrack, TrueTraffic, true_tracks, true_traffic
+from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
+from mapserver.evidence.grid import Grid
+from mapserver.fleet.correction import corrected
+from mapserver.roads.ledger import Ledgers
+from mapserver.roads.loss import SIGMA_90, Losses, losses
+from mapserver.roads.network import network
+from mapserver.roads.segments import Segments, segments
+from mapserver.roads.skeleton import Skeletons
+from mapserver.roads.tally import PER_M, Tally
+from mapserver.roads.worklist import TIE_SHARE, ranked
+from protocol.arrays import Bools, Floats
+from protocol.site.geometry import CellWindow
+
+TARGET = 0.02
+NEAR_M = 3.0  # of a road
+SPACING_M = 0.5  # of points on roads that are looked at
+LEAST_PASSES = 1.5  # true ones, for a segment to be judged
+TOP = 10
+SHARE_OFF = 0.1  # of metres that go in one direction: more is the wrong direction
+DAY_NS = 86_400_000_000_000
+STEP_M = 0.02  # in a tenth of a second: a machine that moves
+EVERYWHERE = CellWindow(-20_000, -20_000, 40_000, 40_000)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Corrected samples of all machines, and the truth."""
+
+    rows: Rows
+    tracks: Mapping[str, TrueTrack]
+    start_ns: int
+    end_ns: int
+
+    @classmethod
+    def of_drive(cls, drive: FleetDrive, rows: Rows, scene: Scene, cache: Path) -> Recorded:
+        """What was recorded, with the corrections that the server's solver makes of it."""
+        solved, config = calibrated(rows), FoldConfig()
+        right = {name: corrected(table, of_machine(solved, name)) for name, table in rows.items()}
+        right = {name: table[is_foldable(table, config)] for name, table in right.items()}
+        tracks = true_tracks(drive, scene, cache)
+        stamps = np.concatenate([track.stamp_ns for track in tracks.values()])
+        return cls(right, tracks, int(stamps.min()), int(stamps.max()))
+
+    @property
+    def half_ns(self) -> int:
+        """Half of it."""
+        return (self.start_ns + self.end_ns) // 2
+
+    def part(self, from_ns: int = 0, to_ns: int = 2**62, machines: Collection[str] = ()) -> Rows:
+        """Samples of a time, and of some machines."""
+        return {
+            name: rows[(rows["stamp_ns"] >= from_ns) & (rows["stamp_ns"] < to_ns)]
+            for name, rows in self.rows.items()
+            if not machines or name in machines
+        }
+
+
+def grid_of(rows: Rows) -> Grid:
+    """The evidence that a server would have."""
+    grid = Grid(1.0, FoldConfig())
+    for name, table in rows.items():
+        grid.fold(table, name)
+    return grid
+
+
+def roads(rows: Rows) -> Segments:
+    """The roads that a server would have."""
+    grid = grid_of(rows)
+    blocks = grid.blocks_in(EVERYWHERE)
+    pages = dict(zip(blocks, grid.pages(blocks), strict=True))
+    return segments(network(Skeletons(1.0).skeleton(pages)))
+
+
+def tally_of(rows: Rows) -> Tally:
+    """What drove."""
+    out = Tally()
+    for name, table in rows.items():
+        out.add(table, np.full(len(table), name_hash(name), np.uint64))
+    return out
+
+
+def road_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
+    """Percent of what was driven that is near a road, of roads that nobody drove, of length that keeps its name."""
+    driven = np.concatenate([track.place_m[track.step_m > STEP_M] for track in recorded.tracks.values()])
+    lines = np.concatenate([_dense(whole.line(i)) for i in range(len(whole.ids))])
+    off_m, _ = cKDTree(lines).query(driven)
+    beyond_m, _ = cKDTree(driven).query(lines)
+    halves = [roads(recorded.part(*span)) for span in ((0, recorded.half_ns), (recorded.half_ns,))]
+    names = sorted(recorded.rows)
+    fleets = [roads(recorded.part(machines=some)) for some in (names[::2], names[1::2])]
+    return {
+        "km": float(whole.length_m.sum() / 1000),
+        "driven_pct": 100.0 * float((off_m < NEAR_M).mean()),
+        "false_pct": 100.0 * float((beyond_m > NEAR_M).mean()),
+        "kept_half_pct": min(_kept(part, whole) for part in halves),
+        "kept_machines_pct": min(_kept(part, whole) for part in fleets),
+    }
+
+
+def kept_after(recorded: Recorded, later: Recorded, whole: Segments) -> float:
+    """Percent of the length of roads that keeps its names once another day is in the map, with other ground."""
+    names = recorded.rows.keys() | later.rows.keys()
+    after_ns = DAY_NS + recorded.start_ns - later.start_ns
+    both = {}
+    for name in sorted(names):
+        own, next_day = (each.rows.get(name) for each in (recorded, later))
+        parts = [] if own is None else [own]
+        if next_day is not None:
+            moved = next_day.copy()
+            moved["stamp_ns"] += after_ns
+            parts.append(moved)
+        both[name] = np.concatenate(parts)
+    return _kept(whole, roads(both))
+
+
+def _dense(line: Floats) -> Floats:
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    at = np.arange(0.0, along[-1], SPACING_M)
+    return np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _kept(part: Segments, whole: Segments) -> float:
+    """Percent of the length of a part's roads that has its names in the whole map too."""
+    names = set(whole.ids)
+    kept = np.array([name in names for name in part.ids])
+    return 100.0 * float(part.length_m[kept].sum() / part.length_m.sum())
+
+
+def traffic_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
+    """Passes, resistance and losses of segments against the truth."""
+    ledgers, tally = Ledgers(whole), tally_of(recorded.rows)
+    ledger = ledgers.ledger(tally.table(), tally.slot_ns)
+    known, true = losses(ledger, whole, TARGET), true_traffic(recorded.tracks.values(), ledgers, TARGET)
+    metres = ledger.totals()["metres"] / PER_M
+    judged: Bools = true.metres.sum(axis=1) > LEAST_PASSES * whole.length_m
+    ratio = metres.sum(axis=1)[judged] / true.metres.sum(axis=1)[judged]
+    share, right = (each[judged, 0] / each[judged].sum(axis=1) for each in (metres, true.metres))
+    measured = judged & np.isfinite(known.c_rr) & np.isfinite(true.c_rr)
+    off = (known.c_rr - true.c_rr)[measured]
+    off_ground = (known.c_rr / true.ground_c_rr - 1)[measured]
+    return {
+        "segments": int(judged.sum()),
+        "passes_pct": 100.0 * float((np.abs(ratio - 1) < 0.1).mean()),
+        "direction_pct": 100.0 * float((np.abs(share - right) < SHARE_OFF).mean()),
+        "c_pct": 100.0 * float(np.sqrt(np.mean((off / true.c_rr[measured]) ** 2))),
+        "c_ground_pct": 100.0 * float(np.sqrt(np.mean(off_ground**2))),
+        "c_median_pct": 100.0 * float(np.median(np.abs(off / true.c_rr[measured]))),
+        "inside_pct": 100.0 * float((np.abs(off) <= SIGMA_90 * known.c_std[measured]).mean()),
+        **_list_figures(known, true, judged),
+    }
+
+
+def _list_figures(known: Losses, true: TrueTraffic, judged: Bools) -> dict[str, float]:
+    """Order and sum of losses.
+
+    tau: with ties in the truth and the list; tau_ranks: the list's ties are its ranks; tau_plain: with ties in the
+    truth alone; tau_plain_most: that of the true losses themselves, as nothing without ties can be in order with what
+    has.
+    """
+    own, right = known.work_j[judged], true.work_j[judged]
+    best, listed = np.argsort(-right)[:TOP], np.argsort(-own, kind="stable")[:TOP]
+    own_tie, tie = (TIE_SHARE * work.max(initial=0.0) for work in (own, right))
+    ranks, shown = np.full(len(judged), np.inf), ranked(known)
+    ranks[shown.order] = shown.rank
+    place = -np.minimum(ranks, len(ranks) + 1)[judged]  # those that are not in the list are the last ones, alike
+    return {
+        "tau": kendall(own, right, own_tie, tie),
+        "tau_ranks": kendall(place, right, 0.0, tie),
+        "tau_plain": kendall(own, right, 0.0, tie),
+        "tau_plain_most": kendall(right, right, 0.0, tie),
+        "top_pct": 100.0 * float(right[listed].sum() / max(right[best].sum(), 1e-9)),
+        "total_pct": 100.0 * float(own.sum() / max(right.sum(), 1e-9) - 1),
+    }
+
+
+def kendall(one: Floats, other: Floats, one_tie: float, other_tie: float) -> float:
+    """Kendall's tau-b of two orders, in which values that differ by less are ties."""
+    i, j = np.triu_indices(len(one), 1)
+    signs = []
+    for values, tie in ((one, one_tie), (other, other_tie)):
+        difference = values[i] - values[j]
+        signs.append(np.where(np.abs(difference) < tie, 0.0, np.sign(difference)))
+    pairs = np.sqrt((signs[0] != 0).sum() * float((signs[1] != 0).sum()))
+    return float((signs[0] * signs[1]).sum() / max(pairs, 1.0))

@@ -1,0 +1,108 @@
+"""What machines drove from stop to stop, or once around a closed tour, and what that took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from lab.fleet.drives import FleetDrive, Scene
+from protocol.arrays import Floats, Ints, Table
+from protocol.machine.log_folder import open_log
+from protocol.queries.routing import MACHINES, RouteMachine
+from sim.recorder import TRACKS_FOLDER
+from sim.scenario.file import load_scenario
+from sim.truth import WORK
+from sitegrid.proof.tracks import LoadTrack
+
+LEAST_M = 100.0  # a shorter drive between two stops is manoeuvring
+STANDING_MPS = 0.05
+POINT_M = 1.0  # between points of a line: nearer ones, where a machine all but stands, have no direction
+BACK_M, ALIGNED = 3.0, 0.7  # a tour is closed where its begin is so near, and the cosine of headings above
+
+
+@dataclass(frozen=True)
+class Leg:
+    """One drive. line_m (k, 2): of the load centre. machine: with the mass that its samples state.
+
+    stops: whether it stood before and after. energy_j: what the engine did; time_s: what it took.
+    """
+
+    line_m: Floats
+    machine: RouteMachine
+    stops: tuple[bool, bool]
+    energy_j: float
+    time_s: float
+
+    @property
+    def length_m(self) -> float:
+        """Of the line."""
+        return float(np.hypot(*np.diff(self.line_m, axis=0).T).sum())
+
+
+def legs_of(drive: FleetDrive, scene: Scene, samples: dict[str, Table], cache: Path) -> list[Leg]:
+    """All complete legs of a recording, of machines that drive ahead."""
+    legs = []
+    for fleet in load_scenario(drive.setup.scenario).fleet:
+        for name, track in scene.tracks.items():
+            if name.startswith(fleet.name):
+                table = np.genfromtxt(
+                    drive.folder(cache) / "truth" / TRACKS_FOLDER / f"{name}.csv", delimiter=",", names=True
+                )
+                kind = replace(MACHINES["truck" if "truck" in name else "loader"], speed_mps=fleet.drive_mps)
+                described_kg = open_log(drive.folder(cache) / "logs" / name).machine.mass_kg
+                for begin, end, stops in _spans(table, track):
+                    mass_kg = _stated_kg(samples[name], track.stamp_ns[[begin, end]], described_kg)
+                    legs.append(_leg(table, track, begin, end, replace(kind, mass_kg=mass_kg), stops))
+    return legs
+
+
+def _leg(table: Table, track: LoadTrack, begin: int, end: int, machine: RouteMachine, stops: tuple[bool, bool]) -> Leg:
+    own = slice(begin, end + 1)
+    driven_m = track.driven_m[own]
+    at_m = np.linspace(driven_m[0], driven_m[-1], 1 + round((driven_m[-1] - driven_m[0]) / POINT_M))
+    line = np.stack([np.interp(at_m, driven_m, axis) for axis in track.place_m[own].T], axis=1)
+    energy_j = float(table[WORK][end] - table[WORK][begin])
+    return Leg(line, machine, stops, energy_j, float(track.stamp_ns[end] - track.stamp_ns[begin]) * 1e-9)
+
+
+def _spans(table: Table, track: LoadTrack) -> Iterator[tuple[int, int, tuple[bool, bool]]]:
+    """First and last instant of each leg, and whether the machine stood there."""
+    speed = table["speed"]
+    moves = np.abs(speed) > STANDING_MPS
+    edges = np.flatnonzero(np.diff(moves.astype(int))) + 1
+    bounds = [0, *edges.tolist(), len(moves)]
+    for begin, end in pairwise(bounds):
+        if not moves[begin] or (speed[begin:end] < -STANDING_MPS).any():
+            continue
+        if begin > 0 and end < len(moves):
+            if track.driven_m[end] - track.driven_m[begin - 1] >= LEAST_M:
+                yield begin - 1, end, (True, True)
+        else:
+            yield from ((lap, then, (False, False)) for lap, then in _laps(track, begin, end))
+
+
+def _laps(track: LoadTrack, begin: int, end: int) -> Iterator[tuple[int, int]]:
+    """Whole turns of a closed tour, one after another, from where it is at full speed on."""
+    first = int(np.searchsorted(track.driven_m, track.driven_m[begin] + LEAST_M))
+    while first < end:
+        on = np.arange(first, end)
+        far = on[track.driven_m[on] - track.driven_m[first] > LEAST_M]
+        off_m = np.hypot(*(track.place_m[far] - track.place_m[first]).T)
+        near = far[(off_m < BACK_M) & (np.cos(track.yaw_rad[far] - track.yaw_rad[first]) > ALIGNED)]
+        if not near.size:
+            return
+        again = near[: 1 + int(np.argmax(np.diff(near, append=end + 2) > 1))]  # the first time that it comes by
+        last = int(again[np.hypot(*(track.place_m[again] - track.place_m[first]).T).argmin()])
+        yield first, last
+        first = last
+
+
+def _stated_kg(samples: Table, span_ns: Ints, described_kg: float) -> float:
+    """Median of the mass that samples of a time state; where none does, what the machine is described with."""
+    own = samples["mass_kg"][(samples["stamp_ns"] >= span_ns[0]) & (samples["stamp_ns"] <= span_ns[1])]
+    known = own[np.isfinite(own)]
+    return float(np.median(known)) if known.size else described_kg

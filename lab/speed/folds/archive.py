@@ -1,0 +1,156 @@
+"""How long `sitegrid fold` takes for an archive: one thread, two threads, processes, a Dask cluster, one with deaths.
+
+Each variant is the whole command, in turn, started by `python -m lab.speed.folds.archive VARIANT ARCHIVE STORE`; the
+archive was just written, so that its files are in the system's cache. Hashes of the snapshots are compared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any, cast
+
+from distributed import Client, LocalCluster
+from distributed.chaos import KillWorker
+from distributed.diagnostics.plugin import SchedulerPlugin
+
+from lab.speed.measure import Report, in_child, machine
+from lab.speed.merge_restart import SITE
+from lab.speed.merge_work import BATCH, batches
+from mapserver.journal.archive import HOUR_NS, write_file
+from mapserver.journal.rows import JournalRow
+
+STORE = "0123456789abcdef"
+WORKERS = 2
+KILL_S = 20.0  # mean life of a worker, where workers die: a task takes five to ten
+GOAL = 1.6  # times as fast as one thread, with two processes
+VARIANTS = ("thread", "threads", "jobs", "dask", "graceful", "segfault")
+
+
+def run(samples: int, runs: int) -> Report:
+    """Fold an archive of so many samples, in hourly files of ten machines' work.
+
+    Rows: wall and processor time (medians; of all processes), `faster`: how many times as fast as one thread, the hash
+    of the map, and how many workers died. Variants: one thread, two threads of one process, two processes, two workers
+    of a Dask cluster on this host, and these while `distributed.chaos.KillWorker` ends them, in order or by a segfault.
+    """
+    with tempfile.TemporaryDirectory() as path:
+        folder = Path(path)
+        _say(f"an archive of {samples} samples is written")
+        _write(folder / "archive", samples)
+        taken: dict[str, list[Report]] = {name: [] for name in VARIANTS}
+        for number in range(runs):
+            for name, reports in taken.items():
+                _say(f"it is folded: {name}, run {number + 1} of {runs}")
+                out = folder / f"{name}-{number}"
+                reports.append(in_child("lab.speed.folds.archive", name, str(folder / "archive"), str(out)))
+    one_s = statistics.median(report["wall_s"] for report in taken["thread"])
+    rows = [_row(name, reports, one_s) for name, reports in taken.items()]
+    if len({row["hash"] for row in rows}) != 1:
+        raise RuntimeError(f"the maps differ: {rows}")
+    return {"benchmark": "archive", "samples": samples, "runs": runs, **machine(), "goal": GOAL, "rows": rows}
+
+
+def _row(name: str, reports: list[Report], one_s: float) -> dict[str, Any]:
+    wall_s, cpu_s = (statistics.median(report[key] for report in reports) for key in ("wall_s", "cpu_s"))
+    hashes = {report["hash"] for report in reports}
+    return {
+        "variant": name,
+        "wall_s": round(wall_s, 1),
+        "cpu_s": round(cpu_s, 1),
+        "faster": round(one_s / wall_s, 2),
+        "peak_mb": round(max(report["peak_mb"] for report in reports)),
+        "deaths": sum(report["deaths"] for report in reports),
+        "hash": " ".join(sorted(hashes)),
+    }
+
+
+def _write(folder: Path, samples: int) -> None:
+    """Write an archive: hours of reception, each when its last sample was stamped."""
+    hour: list[tuple[JournalRow, int]] = []
+    for row in _rows(samples):
+        if hour and row.received_ns // HOUR_NS != hour[0][1] // HOUR_NS:
+            write_file(folder, STORE, SITE, iter(hour))
+            hour = []
+        hour.append((row, row.received_ns))
+    write_file(folder, STORE, SITE, iter(hour))
+
+
+def _rows(samples: int) -> Iterator[JournalRow]:
+    sent: Counter[str] = Counter()
+    for number, (name, batch) in enumerate(islice(batches(), max(1, samples // BATCH)), start=1):
+        yield JournalRow(number, name, 1, sent[name] + 1, batch, int(batch["stamp_ns"][-1]))
+        sent[name] += len(batch)
+
+
+def fold_timed(variant: str, archive: Path, out: Path) -> Report:
+    """Fold as one variant does it."""
+    if variant == "thread":
+        os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])  # which a fold respects
+    deaths = Deaths()
+    with _words(variant, deaths) as words:
+        command = [sys.executable, "-m", "sitegrid.cli", "fold", str(archive), "--out", str(out), "--json", *words]
+        start_s = time.perf_counter()
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=Path(__file__).parents[2])  # noqa: S603
+        wall_s = time.perf_counter() - start_s
+    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    (snapshot,) = out.glob("snapshot-*.npz")
+    return {
+        "wall_s": wall_s,
+        "cpu_s": sum(each.ru_utime + each.ru_stime for each in usage),
+        "peak_mb": max(each.ru_maxrss for each in usage) * 1024 / 1e6,
+        "deaths": deaths.count,
+        "hash": hashlib.sha256(snapshot.read_bytes()).hexdigest()[:16],
+    }
+
+
+class Deaths(SchedulerPlugin):
+    """Counts workers that leave a scheduler, but for those that are asked to in the end."""
+
+    def __init__(self) -> None:
+        self.count, self.ended = 0, False
+
+    def remove_worker(self, *_: object, **__: object) -> None:
+        """As the scheduler calls it."""
+        self.count += not self.ended
+
+
+@contextmanager
+def _words(variant: str, deaths: Deaths) -> Iterator[list[str]]:
+    """Options of a variant, and the cluster that they name."""
+    if variant in ("thread", "threads"):
+        yield []
+    elif variant == "jobs":
+        yield ["--jobs", str(WORKERS)]
+    else:
+        clusters, clients, killers = cast("tuple[Any, Any, Any]", (LocalCluster, Client, KillWorker))  # without types
+        options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
+        with clusters(n_workers=WORKERS, threads_per_worker=1, **options) as cluster:
+            cluster.scheduler.add_plugin(deaths)
+            cluster.adapt(minimum=WORKERS, maximum=WORKERS, interval="1 s")  # a nanny may end with its worker
+            if variant != "dask":
+                with clients(cluster) as client:
+                    client.register_plugin(killers(KILL_S, variant))
+            yield ["--engine", cluster.scheduler_address.replace("tcp://", "dask://")]
+            deaths.ended = True
+
+
+def _say(what: str) -> None:
+    print(f"archive: {what}", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    print(json.dumps(fold_timed(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))))

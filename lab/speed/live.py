@@ -1,0 +1,137 @@
+"""Processor time that a map server at work takes per second of the site's time, by what it does.
+
+Ten machines send a batch each second. The server's own objects run here: writer, audit, search for changes, snapshots.
+Only the clock is not theirs: a second of the site's time passes as soon as the work of the one before is done, so that
+what comes now and then (judging, snapshots) is measured once and divided by the time between two of them.
+"""
+
+from __future__ import annotations
+
+import queue
+import statistics
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+from lab.speed.measure import START_NS, Report, machine
+from lab.speed.merge_work import BATCH, Batches, batches, samples_of, seconds_of
+from mapserver.config import ServerConfig
+from mapserver.evidence.grid import warm_up
+from mapserver.fleet.correction import UNCORRECTED
+from mapserver.ingest.backlog import GROUP_BATCHES
+from mapserver.ingest.store import Incoming, Store
+from mapserver.ingest.writer import Writer
+from mapserver.journal.location import JournalLocation
+from mapserver.trust.auditor import Auditor
+from mapserver.upkeep.jobs import Audit, ChangeSearch
+from protocol.site.site_config import SiteConfig
+from protocol.wire.codec import encode_batch
+from protocol.wire.messages import Ack, Refused, SampleBatch
+
+SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()
+GOALS = {"look": 10.0, "sum": 60.0}
+ANSWERED_S = 60.0
+
+
+def run(hours: float, seconds: float) -> Report:
+    """Measure after so many hours of work, over so many seconds of the site's time.
+
+    Rows: thread, and its milliseconds of processor time per second of the site's time: writer, which decodes batches,
+    commits and answers; fold, on the same thread, of what waits at each read; look for changes, with what the writer
+    does for it; audit, which follows the journal and judges; snapshot, of both threads that make it; sum of all.
+    """
+    warm_up(CONFIG.fold)
+    with tempfile.TemporaryDirectory() as folder:
+        figures = _measured(Path(folder), hours, max(1, round(seconds)))
+    figures["sum"] = sum(figures.values())
+    rows = [{"thread": name, "cpu_ms_per_s": round(ms, 3), "goal": GOALS.get(name)} for name, ms in figures.items()]
+    return {"benchmark": "live", "hours": hours, "seconds": seconds, **machine(), "rows": rows}
+
+
+def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:
+    # no snapshot of its own accord
+    config = replace(CONFIG, store=replace(CONFIG.store, snapshot_s=1e6, archive_after_h=0.0))
+    writer = Writer(Store(JournalLocation(folder), SITE, config, lambda: START_NS))
+    reader = JournalLocation(folder).reader()
+    try:
+        link, work = Link(writer), batches()
+        before = list(islice(work, samples_of(hours) // BATCH))
+        link.send(before)
+        audit = Audit(writer, reader, lambda *_: None, lambda: (UNCORRECTED, {}), threading.Event())
+        search = ChangeSearch(writer, reader, lambda _: None, threading.Event())
+        audit.run()
+        search.run()
+        ms = _each_second(link, audit, search, islice(seconds_of(work), seconds))
+        ms["audit"] += _own_ms(_judging(before)) / CONFIG.trust.judge_s
+        ms["snapshot"] = link.cpu_ms(lambda: _snapshot(writer), own=True) / CONFIG.store.snapshot_s
+        return ms
+    finally:
+        reader.close()
+        writer.close()
+
+
+class Link:
+    """What a writer takes and answers, and the processor time of its thread."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._sent: Counter[str] = Counter()
+
+    def send(self, work: Batches) -> None:
+        """Hand in batches, as many at a time as make a group, and wait until they are answered."""
+        for first in range(0, len(work), GROUP_BATCHES):
+            answers: queue.Queue[Ack | Refused] = queue.Queue()
+            for name, rows in work[first : first + GROUP_BATCHES]:
+                batch = SampleBatch(name, 1, self._sent[name] + 1, rows, SITE.frame)
+                self._sent[name] += len(rows)
+                self._writer.submit(Incoming(name, encode_batch(batch)), answers.put)
+            for _ in work[first : first + GROUP_BATCHES]:
+                if not isinstance(answer := answers.get(timeout=ANSWERED_S), Ack):
+                    raise RuntimeError(f"the server refused a batch: {answer}")
+
+    def fold(self) -> None:
+        """Have folded what waits."""
+        self._writer.run(lambda store: store.grid.folded)
+
+    def cpu_ms(self, work: Callable[[], object], *, own: bool = False) -> float:
+        """Milliseconds of the writer's thread while something is done, and with `own` those of this thread."""
+        before_s = self._writer.run(lambda _: time.thread_time())
+        own_ms = _own_ms(work)
+        return (self._writer.run(lambda _: time.thread_time()) - before_s) * 1e3 + own * own_ms
+
+
+def _each_second(link: Link, audit: Audit, search: ChangeSearch, seconds: Iterator[Batches]) -> dict[str, float]:
+    """Means of what is done every second; for audit the median, which leaves out the turn in which it also judges."""
+    ms: dict[str, list[float]] = {"writer": [], "fold": [], "look": [], "audit": []}
+    for second in seconds:
+        ms["writer"].append(link.cpu_ms(lambda: link.send(second)))  # noqa: B023 # called at once
+        ms["fold"].append(link.cpu_ms(link.fold))
+        ms["look"].append(link.cpu_ms(search.run, own=True))
+        ms["audit"].append(link.cpu_ms(audit.run, own=True))
+    means = {name: statistics.fmean(figures) for name, figures in ms.items()}
+    return means | {"audit": statistics.median(ms["audit"])}
+
+
+def _judging(work: Batches) -> Callable[[], object]:
+    auditor = Auditor(SITE.cell_m, CONFIG.fold)
+    for name, rows in work:
+        auditor.add(name, rows)
+    return auditor.verdicts
+
+
+def _snapshot(writer: Writer) -> None:
+    write = writer.run(lambda store: store.snapshot())
+    if write is None:
+        raise RuntimeError("there is nothing new for a snapshot: nothing was measured")
+    write()
+
+
+def _own_ms(work: Callable[[], object]) -> float:
+    start_s = time.thread_time()
+    work()
+    return (time.thread_time() - start_s) * 1e3

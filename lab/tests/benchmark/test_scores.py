@@ -1,0 +1,243 @@
+"""Scores of maps whose worth is known, and the quick edition from nothing to the table."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.benchmark import publish, recordings, scores
+from lab.benchmark.recordings import FULL, PARTS, QUICK, part_hash
+from lab.benchmark.scores import FIGURES, Entry, figures_of, summarise
+from lab.campaign.experiment import Runner
+from lab.fleet.drives import Scene, scene
+from lab.tests.fleet.scenes import made_scene
+from protocol.errors import ConfigError
+from sitegrid import cli
+from sitegrid.process.lifetime import plain
+from sitegrid.proof.map_score import driven_cells, region_of, true_layers
+from tests.arithmetic import ARITHMETIC, arithmetic
+
+PUBLISHED = recordings.published_hashes()
+STORED = Path(__file__).parent / "quick.json"
+
+
+@pytest.fixture(scope="module")
+def true() -> Scene:
+    return made_scene()[1]
+
+
+def layers_of(true: Scene) -> dict[str, np.ndarray]:
+    return {name: values.astype(float) for name, values in true_layers(true.truth).items()}
+
+
+def test_the_truth_is_all_right_and_nothing_is_not(true: Scene):
+    right = figures_of(layers_of(true), true)
+    assert [right[name] for name in FIGURES] == [100.0, 0.0, 0.0, 100.0, 0.0, 0.0, None, None]
+    nothing = figures_of({name: np.full_like(values, np.nan) for name, values in layers_of(true).items()}, true)
+    assert (nothing["right_pct"], nothing["known_pct"]) == (0.0, 0.0)
+    assert np.isnan(nothing["wrong_resistance_pct"])
+
+
+def test_who_leaves_out_cells_is_less_right_and_no_less_wrong(true: Scene):
+    layers = layers_of(true)
+    layers["resistance"][:30] = np.nan
+    figures = figures_of(layers, true)
+    assert figures["right_pct"] == pytest.approx(figures["known_pct"])
+    assert figures["known_pct"] < 90.0
+    assert figures["wrong_resistance_pct"] == 0.0
+
+
+def test_errors_of_values_are_relative_and_of_gradients_in_percent(true: Scene):
+    layers = layers_of(true)
+    layers["resistance"] *= 1.1
+    layers["grade_east"] += 0.02
+    figures = figures_of(layers, true)
+    assert figures["c_rms_pct"] == pytest.approx(10.0, abs=1e-3)
+    assert figures["gradient_rms_pct"] == pytest.approx(2.0 / np.sqrt(2), abs=1e-3)
+
+
+def test_confidence_counts_where_it_is_stated(true: Scene):
+    layers = layers_of(true) | {"confidence": np.full(true.truth.c_rr.shape, 0.9)}
+    assert figures_of(layers, true)["calibration_error"] == pytest.approx(0.1)
+    layers["confidence"][:30] = np.nan
+    assert 0.1 < figures_of(layers, true)["calibration_error"] < 0.5
+    layers["confidence"][:] = np.nan
+    assert figures_of(layers, true)["calibration_error"] is None
+
+
+def test_rows_are_means_over_recordings():
+    one = dict.fromkeys(FIGURES, 2.0) | {"brier": None}
+    row = summarise(Entry("x"), {"a": one, "b": {**one, "right_pct": 4.0}})
+    assert (row["right_pct"], row["brier"], row["by_recording"]) == (3.0, None, {"a": 2.0, "b": 4.0})
+    assert row["ci95"] == pytest.approx(12.706)
+
+
+def test_there_are_24_recordings_on_seeds_that_nothing_else_has():
+    drives = FULL.drives
+    assert len({drive.name for drive in drives}) == 24
+    assert {drive.seed for drive in drives} == set(range(2000, 2008))
+    assert {drive.machines for drive in drives} == {4, 5}
+
+
+def test_hashes_are_of_names_and_contents_and_of_an_archive_s_numbers(tmp_path: Path):
+    logs, truth = tmp_path / "logs", tmp_path / "truth"
+    logs.mkdir()
+    truth.mkdir()
+    (logs / "a").write_text("1")
+    (logs / "b").write_text("2")
+    first = part_hash(tmp_path, "logs")
+    assert first == part_hash(tmp_path, "logs")
+    (logs / "b").rename(logs / "c")
+    assert part_hash(tmp_path, "logs") != first
+    np.savez(truth / "map.npz", a=np.arange(3))
+    whole = part_hash(tmp_path, "truth")
+    np.savez_compressed(truth / "map.npz", a=np.arange(3))
+    assert part_hash(tmp_path, "truth") == whole
+    np.savez(truth / "map.npz", a=np.arange(4))
+    assert part_hash(tmp_path, "truth") != whole
+    (truth / "map.npz").write_bytes(b"PK")
+    assert part_hash(tmp_path, "truth") != whole
+
+
+# --- from nothing to the table ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bench")
+
+
+@pytest.fixture(scope="module")
+def made(data: Path) -> list[dict]:
+    return recordings.make(Runner(data), QUICK)
+
+
+@pytest.mark.slow
+def test_the_quick_edition_has_the_published_hashes_and_the_stored_figures(made, data: Path):
+    """`sitegrid bench score --quick --json` printed the figures; where sums round otherwise samples have other bits."""
+    known = PUBLISHED[recordings.edition_key(QUICK)]
+    assert {row["name"] for row in made} == set(known)
+    if arithmetic() == ARITHMETIC:
+        assert [row["published"] for row in made] == [True] * len(QUICK.drives)
+    assert plain(scores.run(data, QUICK, (), 1)) == json.loads(STORED.read_text())
+
+
+@pytest.mark.slow
+def test_an_entry_of_the_same_samples_is_as_good_as_ours_and_one_of_the_truth_is_best(made, data: Path, tmp_path: Path):
+    ours, best = tmp_path / "ours", tmp_path / "best"
+    for folder in (ours, best):
+        folder.mkdir()
+    for drive in QUICK.drives:
+        (ours / f"{drive.name}.csv").write_bytes((drive.folder(data) / "samples.csv").read_bytes())
+        write_truth(best / f"{drive.name}.csv", scene(drive, data))
+    rows = {row["entry"]: row for row in scores.run(data, QUICK, (ours, best), 1)["rows"]}
+    assert {**rows["ours"], "entry": ""} == {**rows["soft_votes"], "entry": ""}
+    assert (rows["best"]["right_pct"], next(iter(rows))) == (100.0, "best")
+    filled, known = rows["soft_votes_filled"], rows["soft_votes"]
+    assert filled["known_pct"] > known["known_pct"]
+    assert filled["right_pct"] > known["right_pct"]
+    assert filled["brier"] is None
+
+
+def write_truth(path: Path, true: Scene) -> None:
+    region = region_of(true.truth, {})
+    passed = driven_cells(region, [track.place_m for track in true.tracks.values()])
+    lines = ["x_m,y_m,resistance,grade_east,grade_north"]
+    for row, column in zip(*passed.nonzero(), strict=True):
+        values = [layer[row, column] for layer in true_layers(true.truth).values()]
+        lines.append(",".join(map(str, [region.x_m[column], region.y_m[row], *values])))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_without_recordings_one_line_says_what_to_do(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"`sitegrid bench make --quick --data .*` makes it"):
+        scores.run(tmp_path, QUICK, (), 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["truth/tracks/loader-1.csv", "truth/truth_map.npz", "samples.csv"])
+def test_a_recording_that_was_cut_is_not_scored_on(made, data: Path, part: str):
+    path = QUICK.drives[0].folder(data) / part
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    try:
+        with pytest.raises(ConfigError, match="is not what was made; delete the folder"):
+            scores.run(data, QUICK, (), 1)
+        if part != "samples.csv":  # which are written again
+            with pytest.raises(ConfigError, match="truth: is not what was made"):
+                recordings.make(Runner(data), QUICK)
+    finally:
+        path.write_bytes(whole)
+
+
+@pytest.mark.slow
+def test_entries_are_looked_at_before_anything_is_scored(made, data: Path, tmp_path: Path):
+    def entry(name: str) -> Path:
+        folder = tmp_path / name
+        folder.mkdir(parents=True)
+        for drive in QUICK.drives:
+            (folder / f"{drive.name}.csv").write_text("x_m,y_m,resistance,grade_east,grade_north\n5,5,0.02,0,0\n")
+        return folder
+
+    none, cut = tmp_path / "none", entry("cut")
+    (cut / f"{QUICK.drives[1].name}.csv").unlink()
+    for folders, problem in (
+        ([entry("a/mine"), entry("b/mine")], "'mine' stands in the table already; rename it"),
+        ([entry("soft_votes")], "'soft_votes' stands in the table already; rename it"),
+        ([entry("two\nlines")], "cannot be printed; rename it"),
+        ([none], "is no folder"),
+        ([cut], "an entry has one for each recording"),
+    ):
+        with pytest.raises(ConfigError, match=problem):
+            scores.run(data, QUICK, folders, 1)
+
+
+def test_shorter_recordings_have_names_of_their_own():
+    assert not {drive.name for drive in FULL.drives} & {drive.name for drive in QUICK.drives}
+
+
+@pytest.mark.slow
+def test_the_command_makes_and_scores(made, data: Path, capsys: pytest.CaptureFixture[str]):
+    words = ["--data", str(data), "--quick", "--processes", "1", "--json"]
+    assert cli.main(["bench", "make", *words]) == 0
+    assert [row["name"] for row in json.loads(capsys.readouterr().out)["rows"]] == [d.name for d in QUICK.drives]
+    assert cli.main(["bench", "score", *words]) == 0
+    assert {row["entry"] for row in json.loads(capsys.readouterr().out)["rows"]} == {
+        *("last_write", "mean", "median", "kalman", "soft_votes", "soft_votes_filled")
+    }
+    assert cli.main(["bench", "score", str(data / "nobody"), *words]) == 1
+    assert "nobody: is no folder" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_recording_that_differs_from_the_published_one_is_seen(made, data: Path, monkeypatch, capsys):
+    changed = {
+        key: {name: {**each, "samples.csv": "0"} for name, each in rows.items()} for key, rows in published().items()
+    }
+    monkeypatch.setattr(recordings, "published_hashes", lambda: changed)
+    assert [row["published"] for row in recordings.make(Runner(data), QUICK)] == [False, False]
+    assert cli.main(["bench", "make", "--data", str(data), "--quick", "--processes", "1"]) == 0
+    said = "not as published: paper_site-2000-60s, loading-2000-60s; lab/benchmark.md says when that is so"
+    assert said in capsys.readouterr().out
+    monkeypatch.setattr(recordings, "published_hashes", dict)
+    assert [row["published"] for row in recordings.make(Runner(data), replace(QUICK))] == [None, None]
+
+
+@pytest.mark.slow
+def test_what_was_made_can_be_published(made, monkeypatch, tmp_path: Path):
+    report = tmp_path / "made.json"
+    report.write_text(json.dumps({"edition": recordings.edition_key(QUICK), "rows": plain(made)}))
+    hashes = tmp_path / "hashes.json"
+    hashes.write_text('{"other": {}}')
+    monkeypatch.setattr(publish, "HASHES", hashes)
+    monkeypatch.setattr(recordings, "HASHES", hashes)
+    assert publish.main([str(report)]) == 0
+    key = recordings.edition_key(QUICK)
+    own = {row["name"]: {part: row[part] for part in PARTS} for row in made}
+    assert json.loads(hashes.read_text()) == {"other": {}, key: own}
+
+
+def published() -> dict:
+    return json.loads(recordings.HASHES.read_text())

@@ -1,0 +1,134 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from lab.campaign.pages import NOT_MEASURED, filled, main, text_of
+from protocol.errors import ConfigError
+
+RESULTS = Path(__file__).parents[4] / "docs" / "results"
+MADE = {"command": "sitegrid eval roads --json", "commit": "1234abcd", "date": "2026-11-23", "processor_min": 61.5}
+REPORT = {
+    "made": MADE,
+    "seeds": [1000, 1001],
+    "rows": [
+        {"case": "haul_road", "tau": 0.912345678, "km": 12.0, "kept": None, "by_seed": [{"tau": 0.9}, {"tau": 0.93}]},
+        {"case": "repairs", "seen": 88.0, "by_seed": [{"looks": 3}, {"looks": 4}]},
+    ],
+    "ways": [{"case": "way_even", "maps": 50}],
+    "maps": [
+        {"machines": 1, "merge": None, "net": 1.25, "ci95": {"net": 0.5}, "paper": {"net": 2.0}, "met": True},
+        {"machines": 4, "merge": "mean", "net": None, "ci95": {"net": 0.5}, "paper": None, "met": False},
+    ],
+    "goals": [
+        {"row": "haul_road", "name": "tau", "goal": ">= 0.85", "value": 0.912345678, "met": True},
+        {"row": "repairs", "name": "seen", "goal": ">= 90", "value": 88.0, "met": False},
+    ],
+}
+
+
+def page(table: str, content: str = "old\n") -> str:
+    return f"Before\n<!-- table: roads.json {table} -->\n{content}<!-- end -->\nbehind\n"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "roads.json").write_text(json.dumps(REPORT))
+    return tmp_path
+
+
+def test_goals_stand_with_what_each_seed_gave_and_misses_in_bold(folder):
+    assert filled(page("goals"), folder).splitlines() == [
+        "Before",
+        "<!-- table: roads.json goals -->",
+        "| row | figure | goal | measured | seeds 1000, 1001 |",
+        "| --- | --- | --- | --- | --- |",
+        "| haul_road | `tau` | >= 0.85 | 0.91235 | 0.9, 0.93 |",
+        "| repairs | `seen` | >= 90 | **88** |  |",
+        "<!-- end -->",
+        "behind",
+    ]
+
+
+def test_a_row_has_all_its_figures(folder):
+    lines = filled(page("repairs"), folder).splitlines()
+    assert lines[2] == "| repairs | all | 1000 | 1001 |"
+    assert lines[4:6] == ["| `seen` | 88 |  |  |", "| `looks` |  | 3 | 4 |"]
+    assert "| `maps` | 50 |" in filled(page("way_even"), folder)
+
+
+def test_a_report_says_where_it_comes_from(folder):
+    assert filled(page("made"), folder).splitlines()[2:5] == [
+        "| command | commit | date | seeds | minutes of processor time, of what was not kept |",
+        "| --- | --- | --- | --- | --- |",
+        "| `sitegrid eval roads --json` | 1234abcd | 2026-11-23 | 1000, 1001 | 61.5 |",
+    ]
+    (folder / "roads.json").write_text(json.dumps({**REPORT, "seeds": [3, 4, 5]}))
+    assert "| 2026-11-23 | 3 to 5 |" in filled(page("made"), folder)
+
+
+def test_rows_stand_with_their_plain_values(folder):
+    lines = filled(page("maps"), folder).splitlines()
+    assert lines[2] == "| `machines` | `merge` | `net` | `met` |"
+    assert lines[4:6] == ["| 1 |  | 1.25 +- 0.5 | yes |", "| 4 | mean |  | no |"]
+
+
+def test_a_page_chooses_rows_and_columns(folder):
+    lines = filled(page("maps machines=1 merge=-: net paper.net"), folder).splitlines()
+    assert lines[2:6] == ["| `net` | `paper.net` |", "| --- | --- |", "| 1.25 +- 0.5 | 2 |", "<!-- end -->"]
+    assert "|  |  |" in filled(page("maps machines=4: net paper.net"), folder)
+
+
+@pytest.mark.parametrize(
+    ("table", "problem"),
+    [("maps machines=2", "no row with machines=2"), ("maps: nett", "rows without the column `nett`")],
+)
+def test_rows_and_columns_that_are_not_there_are_named(folder, table: str, problem: str):
+    with pytest.raises(ConfigError, match=problem):
+        filled(page(table), folder)
+
+
+def test_goals_of_rows_that_are_no_cases_have_no_seeds(tmp_path):
+    goal = {"row": "ukf 2", "name": "net_m", "goal": "<= 1", "value": None, "met": False}
+    (tmp_path / "roads.json").write_text(json.dumps({"rows": [{"net_m": None}], "goals": [goal]}))
+    lines = filled(page("goals"), tmp_path).splitlines()
+    assert lines[2:5:2] == ["| row | figure | goal | measured |", "| ukf 2 | `net_m` | <= 1 | **not known** |"]
+
+
+def test_filling_twice_is_filling_once(folder):
+    text = page("goals") + page("haul_road")
+    once = filled(text, folder)
+    assert filled(once, folder) == once
+
+
+def test_what_was_not_measured_is_said(tmp_path):
+    assert NOT_MEASURED in filled(page("goals"), tmp_path)
+
+
+def test_an_unknown_table_is_named_with_the_known_ones(folder):
+    known = "made, goals, haul_road, repairs, way_even, rows, ways, maps"
+    with pytest.raises(ConfigError, match=f"`haul`; known: {known}"):
+        filled(page("haul"), folder)
+
+
+def test_a_page_is_written_only_where_it_is_another_one(folder, capsys):
+    path = folder / "roads.md"
+    path.write_text(page("goals"))
+    main([str(path)])
+    assert "made again" in capsys.readouterr().out
+    main([str(path)])
+    assert capsys.readouterr().out == ""
+    assert "0.91235" in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(None, ""), (float("nan"), ""), (3, "3"), (123456.7, "123457"), ("a", "a"), (True, "yes")]
+)
+def test_figures_are_short(value, text):
+    assert text_of(value) == text
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*.md")), ids=lambda path: path.name)
+def test_pages_have_the_figures_of_their_reports(path):
+    """Where not: `python -m lab.campaign.pages` and the page."""
+    assert filled(path.read_text(), path.parent) == path.read_text()

@@ -1,0 +1,46 @@
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from lab.campaign.provenance import commit_of, made_by
+from protocol.version import package_version
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        ("eval paper --seeds 12 --out /tmp/x --json", "sitegrid eval paper --seeds 12 --json"),
+        ("eval paper --out=/tmp/x --processes 2 --plots y", "sitegrid eval paper"),
+        ("eval log /home/me/husky --withhold 1/10 --data z", "sitegrid eval log husky --withhold 1/10"),
+    ],
+)
+def test_a_command_lasts_without_the_places_of_one_computer(words: str, command: str):
+    assert made_by(words.split())["command"] == command
+
+
+def test_a_report_has_the_day_and_what_it_cost():
+    made = made_by([])
+    assert re.fullmatch(r"20\d\d-\d\d-\d\d", made["date"])
+    assert 0.0 < made["processor_min"] < 60.0
+
+
+def git(folder: Path, *words: str) -> str:
+    named = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+    return subprocess.run(["git", "-C", folder, *named, *words], check=True, capture_output=True, text=True).stdout
+
+
+def test_the_commit_says_where_files_are_others(tmp_path: Path):
+    git(tmp_path, "init")
+    (tmp_path / "a.py").write_text("1")
+    git(tmp_path, "add", "a.py")
+    git(tmp_path, "commit", "-m", "a")
+    commit = git(tmp_path, "rev-parse", "--short=8", "HEAD").strip()
+    assert commit_of(tmp_path) == commit
+    (tmp_path / "a.py").write_text("2")
+    assert commit_of(tmp_path) == f"{commit}-dirty"
+
+
+def test_without_a_repository_there_is_the_version(tmp_path: Path):
+    assert commit_of(tmp_path) == package_version()

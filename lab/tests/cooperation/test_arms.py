@@ -1,0 +1,87 @@
+"""Arms: what their links are like, and what is wrong with a spoiled machine."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.campaign.recordings import make
+from lab.cooperation.arms import ALWAYS, BAD, LOST, SLOW, STANDALONE, Arm, arms, logs_of
+from lab.cooperation.drives import TWO
+from protocol.machine.log_folder import open_log
+from protocol.machine.readings import Gps, Torque
+from protocol.site.site_config import Projection
+from sim.sensors.presets import load_preset
+from tests.tcp_proxy import FAIR
+
+SECONDS = 30.0
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+def arm(spoiled: str = "") -> Arm:
+    return Arm("two", TWO, 2, SECONDS, 8.0, spoiled=spoiled, world="fast")
+
+
+def readings(cache: Path, scratch: Path, spoiled: str) -> tuple:
+    drive = arm(spoiled).drive(1)
+    make(drive, cache)
+    logs = dict(logs_of(arm(spoiled), drive, cache, scratch))
+    assert list(logs) == ["loader-1", "loader-2"]
+    assert logs["loader-1"].is_relative_to(cache)
+    log = open_log(logs["loader-2"])
+    return log.machine, tuple(log.readings()), log.site
+
+
+def test_a_link_is_lost_a_fifth_of_the_time_by_turns():
+    cut = np.array([[LOST.weather(turn, second, 8.0).cut for second in range(3000)] for turn in range(4)])
+    assert cut.mean(axis=1).tolist() == [0.2] * 4
+    assert cut.sum(axis=0).max() == 1  # never two machines at once
+    assert np.diff(np.flatnonzero(np.diff(cut[0].astype(int)) == 1)).tolist() == [300] * 9
+
+
+def test_a_slow_link_is_as_much_faster_as_the_replay():
+    assert SLOW.weather(0, 5.0, 1.0).bytes_per_s == 37_500.0
+    assert SLOW.weather(0, 5.0, 8.0).bytes_per_s == 300_000.0
+    assert ALWAYS.weather(3, 1e4, 8.0) == FAIR
+
+
+def test_every_arm_has_a_name_of_its_own_and_no_more_machines_than_its_recording():
+    everything = arms(1200.0)
+    assert len({each.name for each in everything}) == len(everything)
+    for each in everything:
+        drive = each.drive(0)
+        assert each.names(drive) == drive.machines[: each.machines]
+        assert each.machines <= len(drive.machines)
+
+
+def test_arms_share_recordings():
+    folders = {each.drive(0).folder(Path()) for each in arms(1200.0)}
+    assert len(folders) == 5  # alone, two, eight, repaved, mixed
+
+
+@pytest.mark.slow
+def test_a_bad_machine_reads_another_torque_and_believes_its_antennas_elsewhere(cache: Path, tmp_path: Path):
+    good, right, _ = readings(cache, tmp_path, "")
+    bad, wrong, _ = readings(cache, tmp_path, BAD)
+    torques = [[r.torque_nm for r in each if isinstance(r, Torque)] for each in (right, wrong)]
+    assert torques[1] == pytest.approx(np.multiply(torques[0], 1.6))
+    assert good.sensor("gps-1").mount.xyz_m != bad.sensor("gps-1").mount.xyz_m
+
+
+@pytest.mark.slow
+def test_standalone_receivers_are_further_off_and_say_so(cache: Path, tmp_path: Path):
+    _, right, site = readings(cache, tmp_path, "")
+    machine, wrong, _ = readings(cache, tmp_path, STANDALONE)
+    noise = load_preset("standalone").gps
+    fixes = [[r for r in each if isinstance(r, Gps)] for each in (right, wrong)]
+    assert [r.stamp_ns for r in fixes[0]] == [r.stamp_ns for r in fixes[1]]
+    places = [np.array([Projection(site).to_map(r.lat_deg, r.lon_deg, r.height_m)[:2] for r in each]) for each in fixes]
+    assert np.hypot(*(places[1] - places[0]).T).mean() > 3.0
+    assert fixes[1][0].var_e_m2 == pytest.approx(noise.drift_std_m**2 + noise.white_std_m**2)
+    assert machine.sensor("gps-1").drift_time_s == noise.drift_time_s
+    others = [[r for r in each if not isinstance(r, Gps)] for each in (right, wrong)]
+    assert others[0] == others[1]

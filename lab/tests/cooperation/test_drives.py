@@ -1,0 +1,68 @@
+"""What is driven: tours that one machine drives in turn as several drive them at once."""
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.cooperation.drives import (
+    EIGHT,
+    FOUR,
+    MIXED,
+    ONE,
+    REPAVED,
+    TOURS,
+    TWO,
+    corners,
+    length_m,
+    lines,
+    planned,
+)
+from sim.config import SimConfig, resolve
+
+
+@pytest.mark.parametrize("crews", [ONE, TWO, FOUR, EIGHT, MIXED])
+def test_every_crew_can_drive_its_tours(crews, tmp_path: Path):
+    drive = planned(3, 100.0, crews, "fast", repaves=True)
+    path = tmp_path / "scenario.toml"
+    path.write_text(drive.scenario_toml)
+    scenario = resolve(SimConfig(scenario=str(path), seed=3, seconds=100.0))
+    assert scenario.machine_names == drive.machines
+    assert scenario.world == "fast"
+    assert [change.at_s for change in scenario.change] == [50.0] * len(REPAVED)
+
+
+def test_a_lone_machine_drives_what_all_others_would_and_no_more():
+    alone = length_m(tuple(TOURS))
+    assert alone == pytest.approx(sum(length_m((name,)) for name in TOURS), rel=0.001)
+    (whole,) = planned(0, 1.0, ONE, None).tours.values()
+    assert whole == tuple(TOURS)
+    halves = planned(0, 1.0, TWO, None).tours.values()
+    assert sorted(name for half in halves for name in half) == sorted(TOURS)
+
+
+def test_machines_start_far_from_each_other():
+    starts = [np.array(corners((name,))[0]) for name in TOURS]
+    assert min(float(np.hypot(*(a - b))) for a, b in combinations(starts, 2)) > 30.0
+
+
+def test_the_shared_stretch_is_in_every_tour():
+    for leg in lines().values():
+        off_m = np.hypot(leg.points[:, 0] - 96.0, leg.points[:, 1] - 66.0)
+        assert off_m.min() < 0.5
+
+
+def test_machines_of_one_seed_have_the_same_names_alone_and_among_others():
+    assert planned(1, 1.0, ONE, None).machines == planned(1, 1.0, EIGHT, None).machines[:1]
+    assert planned(1, 1.0, MIXED, None).tours == {
+        "loader-1": ("west",),
+        "loader-2": ("south",),
+        "truck-1": ("north",),
+        "truck-2": ("east",),
+    }
+
+
+def test_another_drive_is_another_recording(tmp_path: Path):
+    drives = [planned(1, 10.0, crews, None, repaves=repaves) for crews in (ONE, FOUR) for repaves in (False, True)]
+    assert len({drive.folder(tmp_path) for drive in drives}) == 4

@@ -1,0 +1,172 @@
+"""The comparison of merges: figures of maps that are right or wrong where they are meant to be, rows, the command."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.campaign.experiment import Runner
+from lab.maps import experiment
+from lab.maps.cases import CASES, CaseMachine, MapCase, build_site, select
+from lab.maps.experiment import NEAR_M, CaseResult, figures, near_parked
+from lab.maps.samples import MapScene
+from sitegrid import cli
+
+METHODS = ["soft_votes", "last_write", "mean", "median", "kalman"]
+SMALL = tuple(replace(case, columns=45, rows=30) for case in CASES)
+NONE = dict.fromkeys(experiment.FIGURES)
+FIGURES = {**NONE, "wrong_pct": 1.0, "known_pct": 50.0, "seconds": 1.0}
+
+
+def small(kind: str) -> MapCase:
+    return next(case for case in SMALL if case.kind == kind)
+
+
+def scene_of(kind: str) -> tuple[MapCase, MapScene]:
+    """A small case whose every cell was driven."""
+    site = build_site(small(kind))
+    return small(kind), MapScene((), site, None, np.ones(site.c_rr.shape, bool))
+
+
+def test_a_map_of_the_truth_is_right_and_only_driven_cells_count():
+    case, scene = scene_of("1x1")
+    scene.driven[2:] = False
+    estimated = scene.site.c_rr_later.copy()
+    estimated[10:] = 0.25
+    assert figures(case, scene, {"resistance": estimated}) == {**NONE, "wrong_pct": 0.0, "known_pct": 100.0}
+    estimated[0, :9], estimated[1] = 0.25, np.nan
+    judged = figures(case, scene, {"resistance": estimated})
+    assert (judged["wrong_pct"], judged["known_pct"]) == (pytest.approx(100 * 9 / 45), 50.0)
+
+
+def test_changed_and_unchanged_cells_are_judged_apart_by_how_the_site_was_left():
+    case, scene = scene_of("repaved")
+    judged = figures(case, scene, {"resistance": scene.site.c_rr})
+    assert (judged["changed_wrong_pct"], judged["unchanged_wrong_pct"]) == (100.0, 0.0)
+    assert judged["wrong_pct"] == pytest.approx(100 * scene.site.repaved.mean())
+    left = figures(case, scene, {"resistance": scene.site.c_rr_later})
+    assert left["changed_wrong_pct"] == 0.0
+
+
+def test_of_a_narrow_road_only_the_road_is_judged():
+    case, scene = scene_of("narrow_road")
+    assert figures(case, scene, {"resistance": np.full((30, 45), 0.008)})["wrong_pct"] == 0.0
+    assert figures(case, scene, {"resistance": np.full((30, 45), 0.06)})["wrong_pct"] == 100.0
+
+
+def test_cells_beside_a_parked_machine_are_judged_apart():
+    case, scene = scene_of("parked_bad_machine")
+    near = near_parked(case)
+    assert near.sum() == pytest.approx(np.pi * NEAR_M**2, rel=0.1)
+    assert near[7, 36]  # three metres east of where it truly stands, at (33.75, 7.5)
+    assert not near[7, 32]
+    estimated = np.where(near, 0.06, scene.site.c_rr)
+    assert figures(case, scene, {"resistance": estimated})["near_wrong_pct"] == 100.0
+    assert not near_parked(replace(case, machines=(CaseMachine(),))).any()
+
+
+def test_sure_cells_are_judged_apart():
+    case, scene = scene_of("1x1")
+    estimated, confidence = scene.site.c_rr.copy(), np.full((30, 45), 0.9)
+    estimated[0], confidence[0] = 0.25, 0.59
+    judged = figures(case, scene, {"resistance": estimated, "confidence": confidence})
+    assert judged["share60_wrong_pct"] == 0.0
+    assert judged["share60_cells_pct"] == pytest.approx(100 * 29 / 30)
+    confidence[0] = 0.6
+    assert figures(case, scene, {"resistance": estimated, "confidence": confidence})["share60_wrong_pct"] > 0
+
+
+def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
+    case, scene = scene_of("slope_15")
+    east, north = np.moveaxis(scene.site.gradient, -1, 0)
+    assert figures(case, scene, {"grade_east": east + 0.007, "grade_north": north + 0.007})["wrong_pct"] == 0.0
+    assert figures(case, scene, {"grade_east": east + 0.008, "grade_north": north - 0.008})["wrong_pct"] == 100.0
+    unknown = np.where(np.arange(45) < 9, np.nan, east)
+    assert figures(case, scene, {"grade_east": unknown, "grade_north": north})["known_pct"] == pytest.approx(80)
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_every_case_and_method_has_a_row_with_the_figures_that_apply(tmp_path: Path):
+    report, _ = experiment.run(Runner(tmp_path), (3,), SMALL)
+    assert [(row["case"], row["method"]) for row in report["rows"]] == [(c.kind, m) for c in CASES for m in METHODS]
+    assert report["seeds"] == [3]
+    assert len(report["goals"]) == len(experiment.GOALS)
+    for row in report["rows"]:
+        server = row["method"] == "soft_votes"
+        assert (row["changed_wrong_pct"] is None) == (row["passes_after"] is None) == (row["case"] != "repaved")
+        assert (row["unchanged_wrong_pct"] is None) == (row["case"] != "repaved")
+        assert (row["near_wrong_pct"] is None) == (row["case"] != "parked_bad_machine")
+        assert (row["width_m"] is None) == (row["case"] != "narrow_road")
+        assert (row["share60_cells_pct"] is None) == (not server or row["case"] in ("grade_both_ways", "slope_15"))
+        assert 0 <= row["wrong_min_pct"] <= row["wrong_pct"] <= row["wrong_max_pct"]
+        assert row["known_pct"] > 50
+        assert row["samples"] > row["cells"] > 0
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_rows_are_medians_over_seeds():
+    results = [
+        CaseResult(samples, 8, [], {"mean": {**FIGURES, "wrong_pct": wrong}})
+        for samples, wrong in ((10, 1.0), (30, 4.0), (20, 2.00004))
+    ]
+    row = experiment.summarise(small("1x1"), "mean", results)
+    assert (row["wrong_pct"], row["wrong_min_pct"], row["wrong_max_pct"]) == (2.0, 1.0, 4.0)
+    assert row["wrong_by_seed_pct"] == [1.0, 4.0, 2.0]
+    assert (row["samples"], row["known_pct"], row["near_wrong_pct"], row["distrusted"]) == (20, 50.0, None, None)
+
+
+def test_machines_that_the_server_excluded_are_counted_over_seeds():
+    results = [CaseResult(1, 8, names, {"soft_votes": FIGURES}) for names in (["b"], [], ["b", "a"])]
+    assert experiment.summarise(small("1x1"), "soft_votes", results)["distrusted"] == {"a": 1, "b": 2}
+
+
+def test_each_goal_names_a_figure_and_at_least_one_row():
+    keys = [(case.kind, case.passes_after) for case in CASES]
+    for goal in experiment.GOALS:
+        assert goal.figure in experiment.FIGURES
+        case, passes_after, method = (goal.row.get(name) for name in ("case", "passes_after", "method"))
+        assert method in METHODS
+        assert (case, passes_after) in keys
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_an_unknown_case_is_one_line(capsys: pytest.CaptureFixture[str]):
+    assert cli.main(["eval", "merge", "--cases", "1x1,2x2"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("sitegrid: --cases: `2x2` is not known; known: 1x1, 1x4, 4x4, bad_machine,")
+    assert error.count("\n") == 1
+
+
+def test_options_choose_seeds_and_cases(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    report = {"seeds": [], "rows": [], "goals": []}
+    monkeypatch.setattr(experiment, "run", lambda *_, **options: (asked.append(options), (report, ()))[1])
+    assert cli.main(["eval", "merge", "--seeds", "2", "--first-seed", "7", "--cases", "repaved,1x1"]) == 0
+    assert cli.main(["eval", "merge"]) == 0
+    assert [list(options["seeds"]) for options in asked] == [[7, 8], list(range(12))]
+    assert [options["cases"] for options in asked] == [select(["repaved", "1x1"]), CASES]
+
+
+@pytest.mark.slow
+def test_the_command_runs_from_end_to_end_and_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from lab.maps import cases
+
+    kinds = ("parked_bad_machine", "repaved", "narrow_road", "slope_15")  # each has a picture of its own kind
+    monkeypatch.setattr(cases, "CASES", [small(kind) for kind in kinds])
+    words = ["eval", "merge", "--seeds", "1", "--cases", ",".join(kinds)]
+    words += ["--out", str(tmp_path), "--processes", "1", "--plots", str(tmp_path / "plots"), "--json"]
+    assert cli.main(words) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert len(report["rows"]) == len(kinds) * len(METHODS)
+    pictures = [tmp_path / "plots" / f"{name}.png" for name in ("table", *(small(kind).name for kind in kinds))]
+    assert report["plots"] == [str(path) for path in pictures]
+    assert all(path.stat().st_size > 10_000 for path in pictures)

@@ -1,0 +1,172 @@
+"""The paper's report: rows of made-up figures, and the quick version, whose figures are stored."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.campaign.experiment import Runner
+from lab.paper import experiment
+from lab.paper.drives import ALONE, FLEETS, QUICK, Plan
+from lab.paper.experiment import GOALS, Outcomes, contradictions, map_row, position_row
+from lab.paper.maps import OURS, PAPERS, SERVED
+from lab.paper.report import readable
+from lab.positions.configurations import Configuration
+from lab.tests.positions.test_table import score
+from protocol.errors import SitegridError
+from sitegrid import cli
+from sitegrid.process.lifetime import plain
+from sitegrid.proof.figures import Report
+
+STORED = Path(__file__).parent / "quick.json"
+NO_STORE = {"us_per_second": None}  # what a processor takes is no figure of the method
+
+
+def figures(wrong_pct: float) -> dict:
+    bins = [{"from_m": 0.0, "to_m": None, "cells": 10, "known_pct": 100.0, "wrong_pct": wrong_pct}] * 7
+    places = {"rmse_x_m": 0.6, "rmse_y_m": 0.8, "net_m": 1.0}
+    driven = {"wrong_resistance_pct": wrong_pct, "wrong_grade_pct": 0.5, "known_pct": 99.0, "cells": 100}
+    plotted = {f"plotted_{name}": value * 2 for name, value in driven.items() if name != "known_pct"}
+    return {**places, **driven, **plotted, "by_border": bins}
+
+
+def test_a_row_of_the_papers_own_stands_beside_its_figures():
+    row = map_row(ALONE[4], PAPERS, [figures(1.0), figures(3.0)], ())
+    assert (row["filter"], row["gps"], row["imu"], row["profile"]) == ("ukf", 2, 1, "paper")
+    assert (row["wrong_resistance_pct"], row["plotted_wrong_resistance_pct"]) == (2.0, 4.0)
+    assert row["paper"]["wrong_resistance_pct"] == 0.997
+    assert row["ci95"]["wrong_resistance_pct"] == pytest.approx(12.7062, abs=1e-4)
+    assert row["by_seed"]["wrong_resistance_pct"] == [1.0, 3.0]
+    assert row["by_border"][0] == {"from_m": 0.0, "to_m": None, "cells": 20, "known_pct": 100.0, "wrong_pct": 2.0}
+
+
+def test_estimates_are_compared_with_the_same_samples_corrected_by_the_truth():
+    seeds = [figures(1.0), figures(2.0)]
+    assert map_row(FLEETS[1], SERVED, seeds, [figures(0.5), figures(2.2)])["above_true_pct"] == pytest.approx(0.15)
+    assert map_row(FLEETS[1], SERVED, seeds, [figures(9.0)] * 2)["above_true_pct"] == 0.0
+    row = map_row(FLEETS[1], OURS, seeds, ())
+    assert row["above_true_pct"] is row["paper"] is None
+
+
+def test_rows_of_both_tables_have_the_same_columns():
+    run = score(1.0)
+    position = position_row(QUICK, Configuration("ekf", 1, 1, "paper"), [run, run])
+    assert list(position) == list(map_row(ALONE[0], PAPERS, [figures(1.0)], ()))
+    assert (position["table"], position["net_m"], position["us_per_second"]) == ("positions", 1.0, 100)
+    assert position["paper"]["net_m"] == 3.7363
+    assert position["wrong_resistance_pct"] is None
+
+
+def test_goals_are_of_rows_that_a_full_plan_has():
+    plan = Plan((0,), 1200.0)
+    named = [
+        map_row(source, kind, [figures(1.0)], [figures(1.0)]) for source in plan.sources for kind in (OURS, SERVED)
+    ]
+    for goal in GOALS:
+        assert len([row for row in named if goal.row.items() <= row.items()]) == 1, goal
+
+
+def test_contradictions_of_the_paper_are_named():
+    rows = contradictions()
+    assert [(row["where"], row["group"]) for row in rows] == [
+        ("Tables 1 and 2", "UKF 1 GPS 3 IMU"),
+        ("Table 3", "EKF 1 GPS 1 IMU"),
+    ]
+    assert (rows[1]["net_m"], rows[1]["net_of_parts_m"]) == (4.4444, 4.2761)
+
+
+def test_people_get_a_table_per_kind_of_row_with_the_papers_figures_in_brackets():
+    rows = [
+        position_row(QUICK, Configuration("ukf", 2, 1, "paper"), [score(1.0), score(2.0)]),
+        map_row(ALONE[4], PAPERS, [figures(1.0)], ()),
+    ]
+    shown = readable({"seeds": [1], "rows": rows})
+    assert list(shown) == ["seeds", "positions", "maps"]
+    assert shown["positions"][0]["net [m]"] == "1.50 +- 6.35 (1.7217)"
+    assert (shown["maps"][0]["J_r plotted [%]"], shown["maps"][0]["J_r driven [%]"]) == ("2.00 (0.997)", "1.00")
+
+
+def test_drives_that_are_too_short_are_refused(tmp_path: Path):
+    with pytest.raises(SitegridError, match="59 is too short; maps need drives of 60 s or more"):
+        experiment.run(Runner(tmp_path), replace(QUICK, seconds=59.0))
+
+
+# --- the quick version -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
+    return Runner(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="module")
+def result(runner: Runner) -> tuple[Report, Outcomes]:
+    return experiment.run(runner, QUICK)
+
+
+@pytest.mark.slow
+def test_the_quick_version_has_the_figures_that_are_stored(result):
+    """`sitegrid eval paper --quick --json` printed them."""
+    report = plain(result[0])
+    stored = json.loads(STORED.read_text())
+    assert [{**row, **NO_STORE} for row in report["rows"]] == [{**row, **NO_STORE} for row in stored["rows"]]
+    assert report["remarks"]
+    assert {**report, "rows": [], "remarks": []} == {**stored, "rows": [], "remarks": []}
+
+
+@pytest.mark.slow
+def test_it_goes_on_where_it_was(result, runner: Runner, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("lab.campaign.experiment._work", lambda *_: pytest.fail("does work that is done"))
+    assert plain(experiment.run(runner, QUICK)[0]) == plain(result[0])
+
+
+@pytest.mark.slow
+def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):
+    cv2 = pytest.importorskip("cv2")
+    plots = pytest.importorskip("lab.paper.plots", reason="needs the extra `eval`")
+    paths = plots.draw(*result, runner, tmp_path)
+    maps = ["truth", "maps", "differences", "fleet_maps", "fleet_differences"]
+    assert [p.stem for p in paths] == [*maps, "tracks", "errors", "reliability"]
+    assert all(cv2.imread(str(path)).std() > 10 for path in paths)
+
+
+@pytest.mark.slow
+def test_the_papers_map_is_written_as_a_tensor(result, runner: Runner, tmp_path: Path):
+    experiment.write_map(result[1], runner, tmp_path / "map.npy")
+    made = np.load(tmp_path / "map.npy")
+    assert made.shape == (2, 200, 150, 3)
+    assert 100 < np.isfinite(made[0, ..., 2]).sum() < 1000
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_options_reach_the_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    asked: list[Plan] = []
+    monkeypatch.setattr(experiment, "run", lambda _, plan: (asked.append(plan), ({"rows": []}, None))[1])
+    words = ["eval", "paper", "--json"]
+    for more in (["--seeds", "2", "--first-seed", "1000", "--seconds", "300"], [], ["--quick"]):
+        assert cli.main([*words, *more]) == 0
+    assert asked == [Plan(range(1000, 1002), 300.0), Plan(range(12), 1200.0), QUICK]
+    assert cli.main(["eval", "paper", "--quick", "--seeds", "3"]) == 1
+    error = capsys.readouterr().err
+    assert error == "sitegrid: --quick: has a drive of its own: leave out --seeds, --first-seed and --seconds\n"
+
+
+def test_one_of_the_tables_may_be_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    asked: list[Plan] = []
+    monkeypatch.setattr(experiment, "run", lambda _, plan: (asked.append(plan), ({"rows": []}, None))[1])
+    for tables in ("positions", "maps"):
+        assert cli.main(["eval", "paper", "--json", "--seeds", "2", "--tables", tables]) == 0
+    whole = Plan(range(2), 1200.0)
+    assert asked == [replace(whole, sources=()), replace(whole, positions=())]
+    for more in (["--quick"], ["--tensor", "map.npy"], ["--plots", "plots"]):
+        assert cli.main(["eval", "paper", "--tables", "positions", *more]) == 1
+        assert "leave out --" in capsys.readouterr().err
+
+
+def test_a_tensor_is_a_file_of_numpy(capsys: pytest.CaptureFixture[str]):
+    assert cli.main(["eval", "paper", "--tensor", "map.csv"]) == 1
+    assert "map.npy" in capsys.readouterr().err

@@ -1,0 +1,50 @@
+"""The paper's table: its rows, its figures, and how a row becomes a machine and options."""
+
+import pytest
+
+from lab.campaign.recordings import PlannedDrive
+from lab.positions import published
+from lab.positions.configurations import Configuration
+from sitegrid.logs import configurations as table
+from sitegrid.logs.sensors import select
+
+
+def used(machine):
+    return [s.name for s in machine.sensors if s.use]
+
+
+def test_the_table_has_every_configuration_of_the_paper_in_both_profiles_and_one_more():
+    rows = table.configurations()
+    assert len(rows) == len(set(rows)) == len(table.SENSORS) * len(table.FILTERS) * len(table.PROFILES) == 36
+    assert {(r.filter, r.gps, r.imu) for r in rows} == set(published.POSITIONS) | {("ekf", 3, 1), ("ukf", 3, 1)}
+    assert len(published.POSITIONS) == 16
+    assert {(r.gps, r.imu) for r in table.configurations(table.HEADLINE)} == {(1, 1), (2, 1), (3, 1)}
+    assert Configuration("ukf", 3, 1, "paper").published_net_m is None
+
+
+def test_shares_repeat_the_rows_that_have_receivers_the_first_share_first():
+    rows = table.configurations(shares=(0.0, 0.5))
+    assert len(rows) == len(set(rows)) == len({row.name for row in rows}) == 36 + 32
+    assert [row.machine_share for row in rows] == [0.0] * 36 + [0.5] * 32
+    assert {row.gps for row in rows[36:]} == {1, 2, 3}
+    assert {row.machine_share for row in table.configurations()} == {None}
+
+
+def test_sensors_of_a_row_are_in_use_and_no_others():
+    machine = PlannedDrive(0, 1.0).machine
+    rest = {"torque", "wheels", "articulation"}
+    assert set(used(select(machine, 2, 1))) == rest | {"imu-3", "attitude-3", "gps-1", "gps-2"}
+    assert set(used(select(machine, 0, 3))) == rest | {f"{k}-{i}" for k in ("imu", "attitude") for i in (1, 3, 4)}
+    assert used(select(machine)) == used(machine)
+
+
+def test_more_receivers_than_there_are_is_refused():
+    with pytest.raises(table.UnsupportedError, match="3 GPS receivers, not 4"):
+        select(PlannedDrive(0, 1.0).machine, gps=4)
+
+
+@pytest.mark.parametrize("filter_", table.FILTERS)
+@pytest.mark.parametrize("profile", table.PROFILES)
+def test_filter_and_profile_reach_the_pipeline(filter_: str, profile: str):
+    options = Configuration(filter_, 1, 1, profile).options
+    assert (options.localisation.filter, options.localisation.profile) == (filter_, profile)

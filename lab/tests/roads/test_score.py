@@ -1,0 +1,127 @@
+"""Figures of roads on data whose result is known, and recordings that can be loaded."""
+
+import numpy as np
+import pytest
+from scipy.stats import kendalltau
+
+from lab.roads import experiment
+from lab.roads.drives import BAD, planned
+from lab.roads.score import Recorded, kendall, kept_after, roads
+from protocol.errors import ConfigError
+from sim.scenario.file import load_scenario
+from sitegrid.proof.figures import judge
+from tests.unit.mapserver.roads.drives import along, passes
+
+
+def test_tau_without_ties_is_that_of_the_library():
+    draw = np.random.default_rng(3)
+    one = draw.random(40)
+    other = one + draw.normal(0, 0.3, 40)
+    assert kendall(one, other, 0.0, 0.0) == pytest.approx(kendalltau(one, other).statistic)
+
+
+def test_tau_with_ties_on_both_sides():
+    right = np.array([10.0, 9.9, 5.0, 5.1, 0.0, 0.1])
+    assert kendall(right, right[[1, 0, 3, 2, 5, 4]], 0.5, 0.5) == 1.0
+    assert kendall(right, -right, 0.5, 0.5) == -1.0
+    assert kendall(np.zeros(3), np.arange(3.0), 0.5, 0.5) == 0.0
+
+
+def test_an_order_without_ties_is_never_all_in_order_with_one_that_has_them():
+    right = np.array([10.0, 9.9, 5.0, 5.1, 0.0, 0.1])  # 3 of 15 pairs are ties
+    assert kendall(right, right, 0.0, 0.5) == pytest.approx(np.sqrt(12 / 15))
+
+
+@pytest.mark.parametrize("scenario", ["haul_road", "paper_site"])
+def test_patches_are_drawn_from_the_seed(tmp_path, scenario):
+    drives = [planned(scenario, seed, 90.0, repairs=True) for seed in (3, 3, 4)]
+    texts = [drive.scenario_toml for drive in drives]
+    assert texts[0] == texts[1] != texts[2]
+    file = tmp_path / "scenario.toml"
+    file.write_text(texts[0])
+    made, plain = load_scenario(str(file)), load_scenario(scenario)
+    assert len(made.ground.zone) > len(plain.ground.zone) + 5
+    assert (made.ground.ramp, made.route, made.fleet) == (plain.ground.ramp, plain.route, plain.fleet)
+    bad = {zone.outline for zone in made.ground.zone if zone.soil in BAD}
+    assert made.change
+    assert all(change.at_s == 45.0 and change.outline in bad for change in made.change)
+    assert "change" not in planned(scenario, 3, 90.0).scenario_toml
+
+
+def test_rows_sum_repairs_and_take_medians_of_the_rest():
+    seed = {
+        "repairs": 4,
+        "seen_2": 3,
+        "seen_3": 4,
+        "looks": 100,
+        "cells": 40.0,
+        "cells_changed": 10.0,
+        "cells_since": 30.0,
+        "false_alarms": 0,
+        "saved_j": 9.0,
+        "true_saved_j": 10.0,
+    }
+    row = experiment.summarise(experiment.CASES[3], [seed, {**seed, "seen_2": 1, "false_alarms": 1}])
+    assert (row["repairs"], row["seen_2_pct"], row["seen_3_pct"]) == (8, 50.0, 100.0)
+    assert (row["false_per_1000"], row["saved_pct"]) == (5.0, -10.0)
+    assert (row["cells_changed_pct"], row["cells_since_pct"]) == (25.0, 75.0)
+    plain = experiment.summarise(experiment.CASES[0], [{"c_pct": 3.0}, {"c_pct": 9.0}, {"c_pct": 4.0}])
+    assert plain["c_pct"] == 4.0
+    assert len(plain["by_seed"]) == 3
+    assert judge(experiment.GOALS[:1], [plain])[0]["met"]
+
+
+def test_cases_are_chosen_by_name_and_others_refused():
+    assert [case.name for case in experiment.select(["repairs", "haul_road"])] == ["haul_road", "repairs"]
+    assert experiment.select([]) == experiment.CASES
+    with pytest.raises(ConfigError, match="`haul` is not known; known: haul_road"):
+        experiment.select(["haul"])
+
+
+def test_names_are_those_of_the_day_before_where_the_same_roads_are_driven():
+    line, elsewhere = along([(10, 10), (210, 60)]), along([(10, 300), (210, 330)])
+
+    def recorded(place, seed):
+        return Recorded({"a": passes(place, 4, seed=seed)}, {}, 0, 1)
+
+    first = recorded(line, 1)
+    whole = roads(first.rows)
+    assert kept_after(first, recorded(line, 2), whole) > 95
+    assert kept_after(first, recorded(elsewhere, 2), whole) == 100.0
+    assert first.rows["a"]["stamp_ns"].max() < 1_770_000_000 * 10**9  # nothing was moved in place
+
+
+def test_a_day_after_is_judged_with_the_next_seed_and_what_is_judged_is_kept(tmp_path, monkeypatch):
+    """Which tasks there are; recordings and agents are not made here."""
+    asked = []
+
+    class Runner:
+        cache = tmp_path
+
+        def run(self, what, tasks):
+            asked.extend((what.name, task.variant.name, task.seed, getattr(task.variant, "other", 0)) for task in tasks)
+            return [experiment.Judged({"c_pct": 1.0}) for _ in tasks]
+
+    monkeypatch.setattr(experiment, "GOALS", experiment.GOALS[:1])
+    report, _ = experiment.run(Runner(), [4, 5, 6], 90.0, experiment.CASES[:1])
+    assert [each for each in asked if each[0] == "roads"] == [
+        ("roads", "haul_road", 4, 5),
+        ("roads", "haul_road", 5, 6),
+        ("roads", "haul_road", 6, 4),
+    ]
+    assert report["rows"][0]["c_pct"] == 1.0
+    tasks = [
+        experiment.replay_task(experiment.Judging(experiment.CASES[0], 90.0, other), planned("haul_road", 4, 90.0))
+        for other in (5, None)
+    ]
+    names = {experiment.EXPERIMENT.file(task, tmp_path).name for task in tasks}
+    assert len(names) == 2
+
+
+def test_seeds_far_beyond_a_goal_are_named():
+    goals = [goal for goal in experiment.GOALS if goal.figure in ("c_pct", "tau", "top_pct", "total_pct")]
+    good = {"c_pct": 11.9, "tau": 0.78, "top_pct": 95.6, "total_pct": -11.0}
+    bad = {"c_pct": 12.1, "tau": 0.77, "top_pct": 95.4, "total_pct": -12.5}
+    table = [{"case": "haul_road", "by_seed": [good, bad]}]
+    named = experiment.beyond(goals, table, [7, 8])
+    assert {(row["name"], row["seed"], row["value"]) for row in named} == {(name, 8, bad[name]) for name in bad}

@@ -1,0 +1,78 @@
+"""Legs of tracks that are made up: from stop to stop, once around, and what is none."""
+
+import numpy as np
+import pytest
+
+from lab.routes.drives import drives_of
+from lab.routes.legs import Leg, _laps, _spans, _stated_kg
+from protocol.machine.samples import empty
+from protocol.queries.routing import RouteMachine
+from sitegrid.proof.tracks import LoadTrack
+
+HZ = 10
+
+
+def track(speed, heading):
+    """Of a machine that is driven so, at 10 Hz."""
+    step = np.asarray(speed) / HZ
+    place = np.cumsum(step[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    stamps = np.arange(len(step)) * 10**8
+    table = np.zeros(len(step), [("speed", "f8")])
+    table["speed"] = speed
+    return table, LoadTrack(stamps, place, np.unwrap(heading), np.zeros((len(step), 2)), np.cumsum(np.abs(step)))
+
+
+def test_a_leg_is_from_stop_to_stop_ahead_and_long():
+    drives = [(5.0, 300), (0.0, 50), (5.0, 400), (0.0, 50), (-5.0, 400), (0.0, 20), (5.0, 100), (0.0, 20), (5.0, 300)]
+    speed = np.concatenate([np.full(n, v) for v, n in drives])
+    table, course = track(speed, np.zeros(len(speed)))
+    ((begin, end, stops),) = _spans(table, course)
+    assert stops == (True, True)
+    assert course.driven_m[end] - course.driven_m[begin] == pytest.approx(200)
+    assert table["speed"][begin] == table["speed"][end] == 0.0
+
+
+def test_a_tour_without_stops_is_cut_into_whole_turns():
+    around = 2 * np.pi * 50
+    speed = np.full(round(3.5 * around / 5 * HZ), 5.0)
+    table, course = track(speed, np.arange(len(speed)) * 5 / HZ / 50)
+    laps = list(_spans(table, course))
+    assert len(laps) == 3
+    for (begin, end, stops), (following, _, _) in zip(laps, [*laps[1:], (laps[-1][1], 0, 0)], strict=True):
+        assert stops == (False, False)
+        assert course.driven_m[end] - course.driven_m[begin] == pytest.approx(around, abs=1.0)
+        assert end == following
+    straight = track(speed, np.zeros(len(speed)))[1]
+    assert list(_laps(straight, 0, len(speed))) == []
+
+
+def test_a_line_that_is_crossed_is_no_turn():
+    """A figure of eight comes by its begin once at a right angle, which does not close it."""
+    angle = np.linspace(0, 2 * np.pi, 4000)
+    place = 100 * np.stack([np.sin(angle), np.sin(2 * angle)], axis=1)
+    along = np.diff(place, axis=0)
+    twice = np.concatenate([along, along, along])
+    speed = np.hypot(*twice.T) * HZ
+    _, course = track(speed, np.arctan2(twice[:, 1], twice[:, 0]))
+    laps = list(_laps(course, 0, len(speed)))
+    whole = np.hypot(*along.T).sum()
+    assert [course.driven_m[end] - course.driven_m[begin] for begin, end in laps] == pytest.approx([whole] * 2, abs=2.0)
+
+
+def test_the_mass_is_what_samples_of_the_leg_state():
+    rows = empty(5)
+    rows["stamp_ns"], rows["mass_kg"] = np.arange(5), [1e4, 2e4, np.nan, 3e4, 9e4]
+    assert _stated_kg(rows, np.array([1, 3]), 5e3) == 2.5e4
+    assert _stated_kg(rows, np.array([2, 2]), 5e3) == 5e3
+
+
+def test_legs_over_one_line_with_one_load_are_one_drive():
+    x = np.arange(400.0)
+    there = np.stack([x, 0 * x], axis=1)
+    truck, empty_truck = RouteMachine(mass_kg=44_000.0), RouteMachine(mass_kg=22_000.0)
+
+    def leg(line, machine=truck):
+        return Leg(line, machine, (True, True), 1.0, 1.0)
+
+    legs = [leg(there), leg(there + 2.0), leg(there[::-1]), leg(there, empty_truck), leg(there[:200]), leg(there - 1.0)]
+    assert drives_of(legs) == [0, 0, 1, 2, 3, 0]

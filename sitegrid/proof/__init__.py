@@ -1,0 +1,1 @@
+"""Scores of what was simulated: samples delivered, maps and positions against the truth."""

@@ -1,0 +1,170 @@
+"""How right a map is: the paper's J, the share of known cells whose class differs from the truth.
+
+Wrong cells are counted by their distance from the nearest border between two kinds of ground, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from mapserver.pictures.plotter import NamedLayers
+from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
+from protocol.queries.answers import MapVersion, Region
+from protocol.site.geometry import CellWindow
+from protocol.site.ground_classes import UNKNOWN, resistance_class, slope_class, wrong_percent
+from sim.truth import TruthMap
+from sitegrid.proof.figures import Row
+
+EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # of the bins of distances; the last bin is open
+TRACK_STEP_M = 0.1  # between two points of a track that is compared with cells
+
+
+@dataclass(frozen=True)
+class MapScore:
+    """Known cells, and the percentage of them that are wrong (NaN where none is known)."""
+
+    cells: int
+    wrong_resistance_pct: float
+    wrong_grade_pct: float
+
+
+@dataclass(frozen=True)
+class DrivenScore:
+    """Cells that a load centre truly passed, which of them the map knows [%], and which of those are wrong [%].
+
+    by_border: see `by_border_distance`.
+    """
+
+    cells: int
+    known_pct: float
+    wrong_resistance_pct: float
+    wrong_grade_pct: float
+    by_border: list[Row]
+
+
+def window_of(truth: TruthMap) -> CellWindow:
+    """The cells of a true map."""
+    rows, columns = truth.c_rr.shape
+    return CellWindow(round(truth.west_m / truth.cell_m), round(truth.south_m / truth.cell_m), columns, rows)
+
+
+def region_of(truth: TruthMap, layers: Mapping[str, AnyArray]) -> Region:
+    """Layers of the cells of a true map, as an answer of a map server has them."""
+    rows, columns = truth.c_rr.shape
+    x_m, y_m = (
+        np.asarray(corner_m + (np.arange(n) + 0.5) * truth.cell_m, np.float64)
+        for corner_m, n in ((truth.west_m, columns), (truth.south_m, rows))
+    )
+    shown = {name: np.asarray(values, np.float32) for name, values in layers.items()}
+    return Region(x_m, y_m, truth.cell_m, shown, MapVersion("", 0, 0), 0)
+
+
+def true_layers(truth: TruthMap) -> dict[str, Floats32]:
+    """The layers of a true map by their names."""
+    return {"resistance": truth.c_rr, "grade_east": truth.grade_east, "grade_north": truth.grade_north}
+
+
+def score(region: Region, truth: NamedLayers) -> MapScore:
+    """Compare a map with true layers of the same cells (resistance, grade_east, grade_north)."""
+    (resistance, slope), (true, true_slope) = _classes(region), _classes(truth)
+    cells = int((resistance != UNKNOWN).sum())
+    return MapScore(cells, wrong_percent(resistance, true), wrong_percent(slope, true_slope))
+
+
+def score_driven(region: Region, truth: NamedLayers, tracks_m: Iterable[Floats]) -> DrivenScore:
+    """Compare a map with true layers of the same cells where machines truly were.
+
+    Cells that are known but were never passed, because a position was wrong, do not count. tracks_m: true places
+    (n, 2) of each machine's load centre, as `lab.ground.truth.read_load_track` has them.
+    """
+    (resistance, slope), (true, true_slope) = _classes(region), _classes(truth)
+    driven = driven_cells(region, tracks_m) & (true != UNKNOWN)
+    estimated, true_there = resistance[driven], true[driven]
+    return DrivenScore(
+        cells=int(driven.sum()),
+        known_pct=_known_percent(estimated),
+        wrong_resistance_pct=wrong_percent(estimated, true_there),
+        wrong_grade_pct=wrong_percent(slope[driven], true_slope[driven]),
+        by_border=by_border_distance(estimated, true_there, border_distance(true, region.cell_m)[driven]),
+    )
+
+
+def driven_cells(region: Region, tracks_m: Iterable[Floats]) -> Bools:
+    """Which cells (rows, columns) of a region any of the tracks (n, 2) passes."""
+    passed: Bools = np.zeros((len(region.y_m), len(region.x_m)), np.bool_)
+    corner = np.array([region.bounds.west_m, region.bounds.south_m])
+    for track_m in tracks_m:
+        column, row = np.floor((_dense(track_m) - corner) / region.cell_m + 1e-9).astype(int).T
+        inside = (row >= 0) & (row < passed.shape[0]) & (column >= 0) & (column < passed.shape[1])
+        passed[row[inside], column[inside]] = True
+    return passed
+
+
+def by_border_distance(estimated: Ints, true: Ints, border_m: Floats) -> list[Row]:
+    """Count known and wrong cells (k,) by their distance from the nearest border, in bins from_m to to_m (None: open).
+
+    cells: with a truth. known_pct: share of them that is known. wrong_pct: share of the known ones that is wrong.
+    """
+    estimated, true, border_m = (values[true != UNKNOWN] for values in (estimated, true, border_m))
+    which = np.digitize(border_m, EDGES_M) - 1
+    bins = []
+    for i, (low, high) in enumerate(zip(EDGES_M, (*EDGES_M[1:], None), strict=True)):
+        here = which == i
+        wrong = wrong_percent(estimated[here], true[here])
+        counts = {"cells": int(here.sum()), "known_pct": _known_percent(estimated[here]), "wrong_pct": wrong}
+        bins.append({"from_m": low, "to_m": high, **counts})
+    return bins
+
+
+def pooled_by_border(seeds: Sequence[Sequence[Row]]) -> list[Row]:
+    """Bins of distances (`by_border_distance`) of several seeds in one: all cells, and which of the known are wrong."""
+    return [_pooled(bins) for bins in zip(*seeds, strict=True)]
+
+
+def _pooled(bins: Sequence[Row]) -> Row:
+    known = np.array([row["cells"] * row["known_pct"] / 100 if row["cells"] else 0.0 for row in bins])
+    wrong = np.array([row["wrong_pct"] if n else 0.0 for row, n in zip(bins, known, strict=True)])
+    cells = sum(row["cells"] for row in bins)
+    return {
+        "from_m": bins[0]["from_m"],
+        "to_m": bins[0]["to_m"],
+        "cells": cells,
+        "known_pct": 100 * float(known.sum()) / cells if cells else np.nan,
+        "wrong_pct": float((known * wrong).sum() / known.sum()) if known.sum() else np.nan,
+    }
+
+
+def border_distance(classes: Ints, cell_m: float) -> Floats:
+    """Distance [m] of the cells' centres (rows, columns) from the nearest cell of another class.
+
+    Cells of class UNKNOWN border on nothing; infinite where there is no other class.
+    """
+    distance = np.full(classes.shape, np.inf)
+    for kind in np.unique(classes[classes != UNKNOWN]).tolist():
+        others = (classes != kind) & (classes != UNKNOWN)
+        if others.any():
+            here = classes == kind
+            distance[here] = (distance_transform_edt(~others)[here] - 0.5) * cell_m  # to its edge, not to its centre
+    return distance
+
+
+def _classes(layers: Region | NamedLayers) -> tuple[Ints, Ints]:
+    """Classes of resistance and of slope."""
+    return resistance_class(layers["resistance"]), slope_class(layers["grade_east"], layers["grade_north"])
+
+
+def _known_percent(classes: Ints) -> float:
+    return 100.0 * float((classes != UNKNOWN).mean()) if classes.size else np.nan
+
+
+def _dense(track_m: Floats) -> Floats:
+    """A track (n, 2) with points at most TRACK_STEP_M apart."""
+    if len(track_m) < 2:
+        return track_m
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(track_m, axis=0).T))])
+    at = np.linspace(0.0, driven[-1], int(driven[-1] / TRACK_STEP_M) + 2)
+    return np.stack([np.interp(at, driven, column) for column in track_m.T], axis=-1)

@@ -1,0 +1,154 @@
+"""Replay and score on beliefs whose errors are known."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.holdout import Holdout, HoldoutConfig
+from agents.localisation.filters.belief import PoseBelief
+from agents.pipeline import Pipeline, PoseSource
+from agents.positioning import PipelineConfig, Positioning
+from protocol.machine.readings import Articulation, Reading
+from sim.config import SimConfig
+from sim.simulator import Simulator
+from sitegrid.logs.replay import STEP_NS, Trace, Track, covered, replay, score
+from sitegrid.proof.tracks import Truth
+
+START_NS = 1_767_225_600_000_000_000
+
+
+def trace_of(error_m: Sequence[tuple[float, float]], std_m: float = 1.0, before: int = 0) -> tuple[Trace, Truth]:
+    """One belief per step beside a truth that drives east with 1 m/s, after steps without one."""
+    n = len(error_m)
+    stamps = START_NS + (np.arange(before + n + 1)) * STEP_NS
+    true = np.stack([np.arange(before + n + 1) * 0.1, np.zeros(before + n + 1)], axis=1)
+    believed = true[before + 1 :] + np.array(error_m)
+    covariance = np.broadcast_to(np.eye(2) * std_m**2, (n, 2, 2))
+    trace = Trace(stamps[before + 1 :], believed, covariance, np.zeros(n), START_NS, int(stamps[-1]), cpu_s=0.01)
+    return trace, Truth(stamps, true)
+
+
+class Scripted:
+    """Stands in for the pipeline: has a pose from the second reading on, at the reading's own stamp."""
+
+    def __init__(self) -> None:
+        self.spans: list[list[Reading]] = []
+        self.pose: PoseBelief | None = None
+
+    def step(self, readings: list[Reading]) -> None:
+        self.spans.append(readings)
+        if len(self.spans) > 1 and readings:
+            self.pose = PoseBelief(readings[-1].stamp_ns, 1.0, 2.0, 0.0, 0.0, np.eye(2))
+
+
+def test_errors_per_axis_and_their_net():
+    result = score(*trace_of([(3.0, 0.0), (0.0, 4.0)]))
+    squares = (result.rmse_x_m**2, result.rmse_y_m**2, result.net_m**2)
+    assert squares == pytest.approx((4.5, 8.0, 12.5))
+    assert (result.max_m, result.nees) == pytest.approx((4.0, 12.5))
+    assert result.coverage95 == 0.0
+    assert result.us_per_second == pytest.approx(0.01e6 / 0.2)
+
+
+def test_coverage_and_nees_follow_the_stated_sigma():
+    errors = [tuple(e) for e in np.random.default_rng(3).standard_normal((5000, 2))]
+    honest, vain = (score(*trace_of(errors, std)) for std in (1.0, 0.5))
+    assert honest.coverage95 == pytest.approx(0.95, abs=0.01)
+    assert honest.nees_low < honest.nees < honest.nees_high
+    assert vain.coverage95 < 0.6
+    assert vain.nees == pytest.approx(8.0, rel=0.05)
+
+
+def test_time_without_a_pose_is_stated_and_not_counted_as_error():
+    result = score(*trace_of([(1.0, 0.0)] * 30, before=10))
+    assert result.covered == pytest.approx(0.75)
+    assert result.net_m == pytest.approx(1.0)
+
+
+def poses_at(times_s: Sequence[float], seconds: float) -> Trace:
+    """Poses at these times of readings that last so long."""
+    stamps, n = START_NS + np.round(np.array(times_s) * 1e9).astype(np.int64), len(times_s)
+    return Trace(
+        stamps, np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros(n), START_NS, START_NS + round(seconds * 1e9), 0.0
+    )
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 1.0, 5.0, 7.3, 10.0])
+def test_a_slow_log_is_covered_wholly_at_its_own_rate(rate_hz: float):
+    times = np.arange(200) / rate_hz
+    assert covered(poses_at(times, times[-1])) == pytest.approx(1.0)
+    jittered = np.sort(times + np.random.default_rng(5).uniform(-0.4, 0.4, 200) / rate_hz)
+    assert covered(poses_at(jittered[1:], jittered[-1])) > 0.99
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 10.0])
+def test_a_hole_in_a_slow_log_is_not_covered(rate_hz: float):
+    times = [t for t in np.arange(0, 100, 1 / rate_hz) if not 40 < t < 60]
+    assert covered(poses_at(times, times[-1])) == pytest.approx(0.8, abs=2 / rate_hz / 100)
+    assert covered(poses_at([t for t in times if t >= 60], 100.0)) == pytest.approx(0.4, abs=2 / rate_hz / 100)
+
+
+def test_poses_that_end_early_cover_no_more():
+    assert covered(poses_at(np.arange(0, 50, 0.2), 100.0)) == pytest.approx(0.5, abs=0.01)
+    assert covered(poses_at([], 100.0)) == 0.0
+    assert covered(poses_at([30.0], 100.0)) == pytest.approx(0.002)
+
+
+def test_smoothed_poses_are_judged_at_their_own_stamps():
+    trace, truth = trace_of([(3.0, 0.0)] * 40, std_m=2.0)
+    every = slice(None, None, 10)
+    off_m = np.array([(0.0, 1.0)] * 4)
+    smoothed = Track(
+        trace.stamp_ns[every],
+        trace.position_m[every] - (3.0, 0.0) + off_m,
+        trace.covariance_m2[every] / 4,
+        trace.heading_rad[every],
+    )
+    result = score(replace(trace, smoothed=smoothed), truth)
+    assert (result.net_m, result.nees) == pytest.approx((3.0, 2.25))
+    assert (result.smoothed_net_m, result.smoothed_nees, result.smoothed_coverage95) == pytest.approx((1.0, 1.0, 1.0))
+    assert math.isnan(score(trace, truth).smoothed_net_m)
+
+
+def test_a_replay_of_nothing_has_no_pose_and_no_error_but_nan():
+    core: Any = Scripted()
+    trace, truth = trace_of([(0.0, 0.0)])
+    result = score(replace(replay(core, []), first_ns=trace.first_ns, last_ns=trace.last_ns), truth)
+    assert result.covered == 0.0
+    assert all(math.isnan(v) for v in (result.net_m, result.max_m, result.nees, result.coverage95))
+
+
+def test_a_belief_is_taken_once_per_step_with_nothing_that_came_later():
+    readings = [Articulation("joint", START_NS + i * STEP_NS // 4, 0.0) for i in range(12)]
+    pipeline: Any = Scripted()
+    trace = replay(pipeline, readings)
+    assert [len(span) for span in pipeline.spans] == [4, 4, 4]
+    assert trace.stamp_ns.tolist() == [readings[7].stamp_ns, readings[11].stamp_ns]
+    assert trace.covariance_m2.shape == (2, 2, 2)
+    assert trace.seconds == pytest.approx(0.275)
+
+
+@pytest.mark.slow
+def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipeline():
+    simulator = Simulator(SimConfig(world="fast", machines=1, seed=3, seconds=16.0), bundle_ms=1000)
+    readings = [r for _ in range(simulator.bundles or 0) for r in simulator.advance()["loader-1"]]
+    site, machine = simulator.site, simulator.machines[0]
+    traces, judged = [], []
+    for kind in (Pipeline, Positioning):
+        core: PoseSource = kind(site, machine, PipelineConfig())
+        holdout = Holdout(site, machine, HoldoutConfig(), settle_s=5.0)
+        traces.append(replay(core, readings, holdout))
+        judged.append(holdout.report())
+    whole, half = traces
+    assert len(whole.stamp_ns) > 50
+    assert judged[0] == judged[1]
+    assert judged[0]["fixes"]
+    assert not len(whole.smoothed.stamp_ns)
+    assert np.diff(half.smoothed.stamp_ns[:-1]).min() > 0.9e9
+    assert len(half.smoothed.stamp_ns) >= 10
+    for name in ("stamp_ns", "position_m", "covariance_m2"):
+        assert getattr(whole, name).tobytes() == getattr(half, name).tobytes()

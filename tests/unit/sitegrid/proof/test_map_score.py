@@ -1,0 +1,98 @@
+"""Maps against the truth: all known cells, and those where machines truly drove."""
+
+import numpy as np
+import pytest
+
+from protocol.queries.answers import Region
+from protocol.site.ground_classes import SLOPE_LIMIT, UNKNOWN
+from sitegrid.proof.map_score import by_border_distance, driven_cells, score, score_driven
+from tests.unit.records import version
+
+NAN = np.nan
+
+
+def region(resistance, east=0.0, north=0.0, west_m: float = 100.0) -> Region:
+    """Slopes are unknown where the resistance is."""
+    values = np.array(resistance, np.float32)
+    slopes = (np.where(np.isfinite(values), np.float32(slope), np.float32(NAN)) for slope in (east, north))
+    layers = dict(zip(("resistance", "grade_east", "grade_north"), (values, *slopes), strict=True))
+    rows, columns = values.shape
+    return Region(west_m + np.arange(columns) + 0.5, np.arange(rows) + 0.5, 1.0, layers, version=version(1), stamp_ns=1)
+
+
+TRUE = region([[0.04, 0.04, 0.04, 0.06, 0.06, 0.06]] * 2)
+NOTHING = region([[NAN] * 6] * 2)
+ROW_0 = [np.array([[100.5, 0.5], [105.5, 0.5]])]
+
+
+def test_wrong_cells_are_counted_among_the_known():
+    estimated = region([[0.008, 0.02, 0.04], [0.25, 0.06, NAN]], [[0.0] * 3, [0.3, 0.0, 0.0]], [[0.0] * 3, [0, 0.3, 0]])
+    truth = region(
+        [[0.012, 0.02, 0.06], [0.25, 0.06, 0.008]], [[0.0] * 3, [0.3, 0.3, 0.0]], [[0.0, 0.3, 0.0], [0.0] * 3]
+    )
+    result = score(estimated, truth)
+    assert result.cells == 5
+    assert result.wrong_resistance_pct == pytest.approx(20.0)  # 0.04 is dry dirt, 0.06 wet dirt
+    assert result.wrong_grade_pct == pytest.approx(20.0)  # a slope missed; one turned round is still a slope
+
+
+def test_a_perfect_map_scores_zero_and_an_unknown_one_has_no_score():
+    here = region([[0.008, 0.25]], [[0.2, 0.0]], [[0.0, -0.2]])
+    result, unknown = score(here, here), score(NOTHING, TRUE)
+    assert (result.cells, result.wrong_resistance_pct, result.wrong_grade_pct) == (2, 0.0, 0.0)
+    assert unknown.cells == 0
+    assert np.isnan([unknown.wrong_resistance_pct, unknown.wrong_grade_pct]).all()
+
+
+@pytest.mark.parametrize(("share", "wrong"), [(0.99, 100.0), (1.01, 0.0)])
+def test_slope_begins_at_the_papers_limit(share, wrong):
+    estimated, truth = region([[0.02]], SLOPE_LIMIT * share), region([[0.02]], 0.27)
+    assert score(estimated, truth).wrong_grade_pct == wrong
+    assert score_driven(estimated, truth, ROW_0).wrong_grade_pct == wrong
+
+
+def test_a_track_passes_cells_between_its_points():
+    passed = driven_cells(NOTHING, [np.array([[100.5, 0.5], [103.5, 0.5], [103.5, 1.5]])])
+    assert passed.tolist() == [[True, True, True, True, False, False], [False, False, False, True, False, False]]
+
+
+def test_tracks_beyond_the_region_are_cut_and_those_of_all_machines_count():
+    tracks = [np.array([[98.0, 0.5], [101.5, 0.5]]), np.array([[105.5, 1.5]]), np.empty((0, 2))]
+    passed = driven_cells(NOTHING, tracks)
+    assert passed.sum() == 3
+    assert passed[1, 5]
+
+
+def test_only_cells_that_were_truly_driven_count():
+    """Row 1 was never driven: its wrong cells are the position's fault."""
+    result = score_driven(region([[0.04, 0.04, 0.06, 0.06, NAN, 0.06], [0.25] * 6]), TRUE, ROW_0)
+    assert (result.cells, result.wrong_grade_pct) == (6, 0.0)
+    assert result.known_pct == pytest.approx(100 * 5 / 6)
+    assert result.wrong_resistance_pct == pytest.approx(100 * 1 / 5)
+    near, far = result.by_border[0], result.by_border[-1]
+    assert near == {"from_m": 0, "to_m": 1, "cells": 2, "known_pct": 100, "wrong_pct": 50}
+    assert [part["cells"] for part in result.by_border] == [2, 2, 2, 0, 0, 0, 0]
+    assert result.by_border[1]["known_pct"] == 50.0
+    assert far["to_m"] is None
+    assert np.isnan(far["wrong_pct"])
+
+
+def test_a_site_that_nobody_drove_has_no_score():
+    result = score_driven(TRUE, TRUE, [])
+    assert result.cells == 0
+    assert np.isnan([result.known_pct, result.wrong_resistance_pct]).all()
+
+
+def test_cells_without_truth_do_not_count():
+    estimated, truth = region([[0.04, 0.06, 0.06]]), region([[0.04, 0.04, NAN]])
+    whole, driven = score(estimated, truth), score_driven(estimated, truth, ROW_0)
+    assert (whole.wrong_resistance_pct, whole.wrong_grade_pct) == (50.0, 0.0)
+    assert (driven.cells, driven.wrong_resistance_pct) == (2, 50.0)
+    assert driven.by_border[-1]["cells"] == 2  # what is not known is no border
+
+
+def test_distance_counts_from_the_lower_edge_of_a_bin():
+    estimated, true = np.array([1, 1, UNKNOWN]), np.array([1, 2, 2])
+    parts = by_border_distance(estimated, true, np.array([0.99, 1.0, np.inf]))
+    assert [part["cells"] for part in parts] == [1, 1, 0, 0, 0, 0, 1]
+    assert (parts[0]["wrong_pct"], parts[1]["wrong_pct"], parts[6]["known_pct"]) == (0.0, 100.0, 0.0)
