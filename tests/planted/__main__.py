@@ -1,0 +1,128 @@
+"""`python -m tests.planted`: plants faults in the product, one after the other, and shows which the tests catch.
+
+    python -m tests.planted run [FOLDER] --out OUT [--common FOLDER]    plant them in a checkout; goes on where it was
+    python -m tests.planted compare BEFORE AFTER                        two of these, side by side
+
+60 faults are written by hand (`faults.toml`), 200 drawn by --seed over functions that FOLDER and --common both have.
+One run of the suite with coverage by test says which tests a fault is given to; they stop at the first that fails.
+What survives is given to the tests of `make nightly` that run its lines.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import accumulate
+from pathlib import Path
+from queue import SimpleQueue
+
+from tests.paths import ROOT
+from tests.planted.faults import Fault, drawn, written
+from tests.planted.suite import Suite, trial
+
+NO_PLACE, SURVIVED = "no place", "survived"
+MOST_S = 300.0  # of tests, as long as they took in the run with coverage, that one fault is given to
+
+
+def run(suite: Suite, faults: Sequence[Fault], processes: int, most_s: float) -> dict[str, dict[str, str]]:
+    """What became of each fault; kept line by line in `results.jsonl`."""
+    suite.folder.mkdir(parents=True, exist_ok=True)
+    suite.measure(processes)
+    kept = suite.folder / "results.jsonl"
+    results = {row["name"]: row for row in map(json.loads, kept.read_text().splitlines())} if kept.exists() else {}
+    waiting = [fault for fault in faults if fault.name not in results]
+    trees = SimpleQueue[Path]()
+    for number in range(processes):
+        trees.put(suite.copy(number))
+
+    def work(fault: Fault) -> dict[str, str]:
+        tree = trees.get()
+        try:
+            return judged(suite, fault, tree, most_s)
+        finally:
+            trees.put(tree)
+
+    with ThreadPoolExecutor(processes) as pool, kept.open("a") as file:
+        for number, row in enumerate(pool.map(work, waiting), len(results) + 1):
+            results[row["name"]] = row
+            print(json.dumps(row), file=file, flush=True)
+            print(f"{number} of {len(faults)}  {row['tier']:8}  {row['name']}: {row['what']}  {row['by']}", flush=True)
+    return results
+
+
+def judged(suite: Suite, fault: Fault, tree: Path, most_s: float) -> dict[str, str]:
+    """Which tier catches a fault, and by which test."""
+    row = {"name": fault.name, "what": fault.what, "by": ""}
+    try:
+        tests = suite.tests_of(fault)
+    except KeyError:
+        return {**row, "tier": NO_PLACE}
+    for tier, own in (
+        ("test", [test for test in tests if test not in suite.nightly]),
+        ("nightly", [test for test in tests if test in suite.nightly]),
+    ):
+        ends = accumulate(suite.seconds[test] for test in own)
+        given = [test for test, end in zip(own, ends, strict=True) if end <= most_s or test == own[0]]
+        if given and (by := trial(tree, fault, given)):
+            return {**row, "tier": tier, "by": by}
+    return {**row, "tier": SURVIVED}
+
+
+def compare(before: Path, after: Path) -> tuple[str, int]:
+    """Both columns as a table, and how many faults the first catches and the second does not."""
+    columns = [
+        {row["name"]: row for row in map(json.loads, (folder / "results.jsonl").read_text().splitlines())}
+        for folder in (before, after)
+    ]
+    both = [
+        name
+        for name, row in columns[0].items()
+        if name in columns[1] and NO_PLACE not in (row["tier"], columns[1][name]["tier"])
+    ]
+    pairs = Counter((columns[0][name]["tier"], columns[1][name]["tier"]) for name in both)
+    lines = ["before    after     faults"]
+    lines += [f"{first:8}  {second:8}  {n:6}" for (first, second), n in sorted(pairs.items())]
+    lost = [name for name in both if columns[0][name]["tier"] != SURVIVED and columns[1][name]["tier"] == SURVIVED]
+    lines += [f"lost: {name}: {columns[0][name]['what']}, caught before by {columns[0][name]['by']}" for name in lost]
+    lines += [
+        f"survives: {name}: {columns[1][name]['what']}"
+        for name in both
+        if columns[1][name]["tier"] == SURVIVED and name not in lost
+    ]
+    return "\n".join(lines), len(lost)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Plant faults, or compare what became of them. Exit code 1: a fault is lost, or survives."""
+    parser = argparse.ArgumentParser(prog="python -m tests.planted", description="Plant faults, see which tests catch.")
+    what = parser.add_subparsers(required=True, dest="what")
+    planting = what.add_parser("run", help="plant faults in a checkout")
+    planting.add_argument("folder", type=Path, nargs="?", default=ROOT)
+    planting.add_argument("--common", type=Path, help="a checkout that must have the functions, too")
+    planting.add_argument("--out", type=Path, default=Path("planted-output"))
+    planting.add_argument("--seed", type=int, default=1000)
+    planting.add_argument("--drawn", type=int, default=200, help="how many are drawn (%(default)s)")
+    planting.add_argument("--processes", type=int, default=2)
+    planting.add_argument("--seconds", type=float, default=MOST_S, help="of tests that one fault is given to")
+    comparing = what.add_parser("compare", help="two runs side by side")
+    comparing.add_argument("before", type=Path)
+    comparing.add_argument("after", type=Path)
+    options = parser.parse_args(words)
+    if options.what == "compare":
+        table, lost = compare(options.before, options.after)
+        print(table)
+        return int(lost > 0)
+    root, common = options.folder.resolve(), (options.common or options.folder).resolve()
+    faults = [*written(), *drawn(root, common, options.drawn, options.seed)]
+    results = run(Suite(root, options.out.resolve()), faults, options.processes, options.seconds)
+    tiers = Counter(results[fault.name]["tier"] for fault in faults)
+    print(", ".join(f"{tier} {n}" for tier, n in tiers.most_common()))
+    return int(tiers[SURVIVED] > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
