@@ -5,8 +5,8 @@ BIN := $(VENV)/bin
 SIZE_demo := 340 MB to load, 1.2 GB on disk
 SIZE_dev := 670 MB to load, 2.4 GB on disk
 
-# make quick: unit tests that are not slow, in about a minute.
-.PHONY: venv demo quick test check chaos fuzz soak bench
+# make quick: unit tests that are not slow, in about a minute. make test: the proof. make nightly: what takes longer.
+.PHONY: venv demo quick test nightly check chaos fuzz soak bench
 
 venv: $(VENV)/.dev
 
@@ -29,10 +29,14 @@ $(VENV)/.%: pyproject.toml constraints.txt
 	@touch $@ $(if $(filter dev,$*),$(VENV)/.demo)
 
 quick: venv
-	$(BIN)/python -m pytest --quiet --numprocesses auto -m "not slow and not processes" tests/unit
+	$(BIN)/python -m pytest --quiet --numprocesses auto -m "not slow and not processes and not nightly" tests/unit
 
 test: venv
-	$(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal
+	$(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal --durations 15 -m "not nightly" tests
+
+nightly: venv
+	$(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal -m nightly tests
+	$(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal lab/tests
 
 check: venv
 	$(BIN)/ruff check .
