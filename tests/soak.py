@@ -33,13 +33,13 @@ from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.client import Client, connect
 from sitegrid.process.children import Child, Children
+from tests.patience import PATIENCE_S
 
 START_NS = 1_767_225_600_000_000_000
 SITE_TOML = 'name = "soak"\norigin_lat_deg = 49.01\norigin_lon_deg = 8.4\n'
 BATCH_S, RATE_HZ = 4.0, 2.5  # of a machine: one batch so often, so many samples a second (5 m/s, one each 2 m)
 ASK_S, PAST_S, LOOK_S = 10.0, 100.0, 60.0  # site time between two questions, two about the past, two looks
 MOST_GROWTH_PCT = 5.0
-READY_S = 120.0  # a first start in a new folder compiles kernels
 
 
 @dataclass(frozen=True)
@@ -135,10 +135,10 @@ def soak(folder: Path, minutes: float, speed: float, machines: int) -> Soak:
     site, endpoint = load_site(folder / "site.toml"), free_endpoint()
     with Children(folder) as children:
         router = children.start("router", "router", "--listen", endpoint)
-        router.expect("ready", READY_S)
+        router.expect("ready", PATIENCE_S)
         files = ("--site-file", folder / "site.toml", "--store", folder / "store")
         server = children.start("server", "server", "--endpoint", endpoint, *files)
-        server.expect("ready", READY_S)
+        server.expect("ready", PATIENCE_S)
         over = threading.Event()
         asker = threading.Thread(target=_ask, args=(endpoint, speed, over))
         asker.start()
@@ -173,7 +173,7 @@ def _drive(site: SiteConfig, endpoint: str, watched: tuple[Child, Child], run: t
 def _send(session: zenoh.Session, key: str, payload: bytes) -> None:
     """Send until it is acknowledged."""
     while True:
-        for reply in session.get(key, payload=payload, timeout=10.0):
+        for reply in session.get(key, payload=payload, timeout=60.0):
             if reply.ok is not None and isinstance(decode_reply(reply.ok.payload.to_bytes()), Ack):
                 return
 

@@ -9,10 +9,10 @@ from mapserver.config import ServerConfig
 from protocol.site.site_file import load_site
 from sim.config import SimConfig, resolve, write_configs
 from sitegrid import Client, connect
-from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.process.children import Child, Children
 from sitegrid.proof.delivery import AuditResult, audit_store
+from tests.patience import PATIENCE_S, until
 
-READY_S = 120.0  # a first start in a new folder compiles kernels
 LAG_S = 4.0  # of the smoother: most drives here are shorter than its usual lag, and tests wait for samples
 
 
@@ -37,13 +37,13 @@ class SiteRun:
 
     def start_router(self) -> Child:
         router = self.children.start("router", "router", "--listen", self.endpoint)
-        router.expect("ready", READY_S)
+        router.expect("ready", PATIENCE_S)
         return router
 
     def start_server(self, *options: str) -> Child:
         words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--store", self.folder / "store")
         server = self.children.start("server", "server", *words, *options)
-        server.expect("ready", READY_S)
+        server.expect("ready", PATIENCE_S)
         return server
 
     def start_agent(self, config: Path) -> Child:
@@ -51,7 +51,7 @@ class SiteRun:
         files = ("--spool", self.folder / f"{name}.db", "--audit", self.folder / f"{name}.audit")
         where = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--config", config)
         self.agents[name] = self.children.start(name, "agent", *where, *files, "--json")
-        self.agents[name].expect("ready", READY_S)
+        self.agents[name].expect("ready", PATIENCE_S)
         return self.agents[name]
 
     def start_agents(self) -> None:
@@ -75,10 +75,10 @@ class SiteRun:
         return connect(self.endpoint, self.site)
 
     def wait_merged(self, client: Client, samples: int) -> None:
-        wait_until(lambda: client.info().samples_merged >= samples, READY_S, f"{samples} samples merged")
+        until(lambda: client.info().samples_merged >= samples, f"{samples} samples merged")
 
     def end_of_agents(self) -> dict[str, dict]:
-        return {name: agent.expect("ended", 90.0)["ended"] for name, agent in self.agents.items()}
+        return {name: agent.expect("ended", PATIENCE_S)["ended"] for name, agent in self.agents.items()}
 
     def delivered(self) -> dict[str, dict]:
         """The agents' reports at their end; all has been delivered."""
@@ -99,4 +99,4 @@ class SiteRun:
 def kill(child: Child) -> None:
     """End a process without a chance to tidy up."""
     child.send(signal.SIGKILL)
-    child.wait(10.0)
+    child.wait(PATIENCE_S)

@@ -16,8 +16,9 @@ from protocol.wire import keys
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid import Client, connect
-from sitegrid.process.children import Children, wait_until
+from sitegrid.process.children import Children
 from tests.integration.site_run import SiteRun, kill  # beside this file
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
@@ -42,7 +43,7 @@ def asking() -> Iterator[Callable[[Client], Future[MapInfo]]]:
 
             asker._session = _Noted(asker._session, noted)  # type: ignore[assignment]
             answer = pool.submit(client.info)
-            assert out.wait(10.0)
+            assert out.wait(PATIENCE_S)
             return answer
 
         yield ask
@@ -68,7 +69,7 @@ def test_a_server_that_is_restarted_in_between_answers_later(site: SiteRun, aski
     site.start_router()
     kill(site.start_server())
     with site.connect() as client:
-        wait_until(lambda: raw(client, 5.0) == [], 20.0, "nobody answers, at once")
+        until(lambda: raw(client, 5.0) == [], "nobody answers, at once")
         answer = asking(client)
         site.start_server()
         assert answer.result(20.0).site.name == site.site
@@ -103,7 +104,7 @@ def test_a_server_that_hangs_is_no_answer_in_time(site: SiteRun):
         began_s = time.monotonic()
         with pytest.raises(LinkError, match="did not answer in time"):
             client.info()
-        assert 1.0 <= time.monotonic() - began_s < 3.0
+        assert time.monotonic() - began_s >= 1.0
         assert set(raw(client, 0.5)) == {b"Timeout"}, "of Zenoh itself, no map"
         server.send(signal.SIGCONT)
         assert client.info().site.name == site.site

@@ -30,9 +30,10 @@ from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sim.simulator import START_NS
 from sitegrid.process.children import Child, Children
-from tests.integration.site_run import READY_S, SiteRun, kill
+from tests.integration.site_run import SiteRun, kill
 from tests.integration.test_evidence import Senders
 from tests.journals import history_beside
+from tests.patience import PATIENCE_S
 from tests.reference.correction import in_numpy
 from tests.unit.mapserver.data import same, same_evidence
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
@@ -83,7 +84,7 @@ def by_person(machine: str) -> Corrections:
 
 def run(*words: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "sitegrid.cli", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=READY_S, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
 
 def sample_bytes(journal: Path) -> dict[tuple[str, int], bytes]:

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sitegrid.process.children import wait_until
 from tests.integration.site_run import SiteRun  # beside this file
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
@@ -67,7 +67,7 @@ def test_query_and_plot_answer_people_and_machines(mapped: SiteRun, tmp_path: Pa
     assert last_json(drawn.stdout) == {"picture": str(picture), "drawn": 1, "difference": difference}
     assert cv2.imread(str(picture)) is not None
     assert cv2.imread(difference) is not None
-    late = sitegrid("query", *where, "--after", 10**6, "info", timeout_s=60)
+    late = sitegrid("query", *where, "--after", 10**6, "info", timeout_s=PATIENCE_S)
     assert (late.returncode, late.stdout) == (1, "")
     assert "is not merged after" in late.stderr
 
@@ -79,13 +79,13 @@ def test_plot_follows_machines_live(site_run: SiteRun, tmp_path: Path):
     out = tmp_path / "live.png"
     words = ("--endpoint", site_run.endpoint, "--out", out, "--follow", "--every", 0.5, "--json")
     plot = site_run.children.start("plot", "plot", *words)
-    wait_until(out.exists, 40.0, "first picture")
+    until(out.exists, "first picture")
     first = out.read_bytes()
     site_run.start_sim()
-    wait_until(lambda: out.read_bytes() != first, 60.0, "a picture of more than there was at first")
+    until(lambda: out.read_bytes() != first, "a picture of more than there was at first")
     plot.send(signal.SIGTERM)
-    assert plot.expect("picture", 10.0)["drawn"] > 1
-    assert plot.wait(10.0) == 0
+    assert plot.expect("picture", PATIENCE_S)["drawn"] > 1
+    assert plot.wait(PATIENCE_S) == 0
 
 
 def test_plot_ends_after_as_many_pictures_as_were_asked_for(site_run: SiteRun, tmp_path: Path):
@@ -93,15 +93,15 @@ def test_plot_ends_after_as_many_pictures_as_were_asked_for(site_run: SiteRun, t
     site_run.start_server()
     words = ("--endpoint", site_run.endpoint, "--out", tmp_path / "live.png", "--follow", "--every", 0.1)
     plot = site_run.children.start("plot", "plot", *words, "--pictures", 3, "--json")
-    assert plot.expect("picture", 60.0)["drawn"] == 3
-    assert plot.wait(10.0) == 0
+    assert plot.expect("picture", PATIENCE_S)["drawn"] == 3
+    assert plot.wait(PATIENCE_S) == 0
     site_run.end_of_agents()
 
 
 def test_demo_prints_one_object_with_its_proof(tmp_path: Path, husky_data: Path):
     words = ("--seconds", 40, "--speed", 8, "--machines", 3, "--seed", 7, "--out", tmp_path, "--data", husky_data)
     manifest = Path("lab/logs/rl_test1_husky/log.toml").absolute()
-    demo = sitegrid("demo", "--headless", "--json", *words, "--log", manifest, timeout_s=170)
+    demo = sitegrid("demo", "--headless", "--json", *words, "--log", manifest, timeout_s=PATIENCE_S)
     assert demo.returncode == 0, demo.stderr
     result = last_json(demo.stdout)
     assert (result["machines"], result["lost"], result["double"], result["seed"]) == (3, 0, 0, 7)
@@ -124,11 +124,11 @@ def test_ctrl_c_ends_everything_that_the_demo_started(tmp_path: Path):
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         picture = tmp_path / "map.png"
-        wait_until(picture.exists, 60.0, "machines drive")
+        until(picture.exists, "machines drive")
         started = children_of(demo.pid)
         assert len(started) == 4, "router, server, simulator, agent"
         demo.send_signal(signal.SIGINT)
-        _, errors = demo.communicate(timeout=30)
+        _, errors = demo.communicate(timeout=PATIENCE_S)
     finally:
         demo.kill()
         demo.wait()
@@ -147,11 +147,11 @@ def test_on_a_terminal_the_page_of_the_demo_stays_until_ctrl_c(tmp_path: Path):
             while not (stays := re.search(rb"stays at (http://\S+)/ until Ctrl-C", shown)):
                 shown += os.read(terminal, 4096)
             started = children_of(demo.pid)
-            with urllib.request.urlopen(f"{stays[1].decode()}/api/v1/sites/paper/info", timeout=20) as answer:
+            with urllib.request.urlopen(f"{stays[1].decode()}/api/v1/sites/paper/info", timeout=PATIENCE_S) as answer:
                 assert json.load(answer)["samples_merged"] > 0
             assert b"A site on this host: router, map server" in shown
             demo.send_signal(signal.SIGINT)
-            assert demo.wait(30) == 0
+            assert demo.wait(PATIENCE_S) == 0
         finally:
             demo.kill()
             os.close(terminal)

@@ -19,8 +19,9 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import Client
-from sitegrid.process.children import Child, wait_until
-from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
+from sitegrid.process.children import Child
+from tests.integration.site_run import SiteRun, kill  # beside this file
+from tests.patience import until
 
 pytestmark = pytest.mark.processes
 
@@ -100,7 +101,7 @@ def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: Si
         assert resistance(client, minus_ns=before_ns) == pytest.approx(NEW - OLD, rel=0.1)
         spans = client.history(SIZE - 8.5, 20.5, ["resistance"], span_s=3600.0)
         assert [round(span.values["resistance"], 2) for span in spans] == [OLD, OLD, NEW]
-        wait_until(lambda: events and client.changes()[0].cells > 400, READY_S, f"a change of server pid {server.pid}")
+        until(lambda: events and client.changes()[0].cells > 400, f"a change of server pid {server.pid}")
         (change,) = client.changes()
         assert change.resistance_before == pytest.approx(OLD, rel=0.1)
         assert before_ns - HOUR_NS < change.first_ns < START_NS + 4 * HOUR_NS
@@ -114,7 +115,7 @@ def test_a_bad_machine_is_found_left_out_and_stays_so_after_a_kill(site_run: Sit
         good = {name: sweep(i, 0) for i, name in enumerate("abd")}
         senders.send({**good, "c": sweep(9, 0, BAD)})
         senders.send({**{n: sweep(i + 20, 3) for i, n in enumerate("abd")}, "c": sweep(29, 3, BAD)})
-        wait_until(lambda: client.info().distrusted == ("c",), READY_S, f"server pid {server.pid} leaves out c")
+        until(lambda: client.info().distrusted == ("c",), f"server pid {server.pid} leaves out c")
         (machine,) = [machine for machine in client.machines() if machine.name == "c"]
         assert (machine.trusted, machine.by) == (False, "audit")
         assert "gain" in machine.reason

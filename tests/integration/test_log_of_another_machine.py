@@ -11,6 +11,7 @@ from protocol.wire.session import free_endpoint
 from sitegrid.process.children import Children
 from tests.integration.site_run import SiteRun  # beside this file
 from tests.integration.test_commands import sitegrid
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.processes
 
@@ -88,7 +89,7 @@ def test_a_log_in_metres_is_located_and_mapped_where_the_machine_was(site_run: S
     server = site_run.start_server()
     words = ("--endpoint", site_run.endpoint, "--driver", "replay", "--log", tmp_path, "--speed", "0", "--json")
     files = ("--spool", tmp_path / "robot.db", "--audit", tmp_path / "robot.audit")
-    report = children.start("robot", "agent", *words, *files).expect("ended", 60.0)["ended"]
+    report = children.start("robot", "agent", *words, *files).expect("ended", PATIENCE_S)["ended"]
     assert report["delivered"]
     assert report["samples"] > 200
     counters = report["pipeline"]["counters"]

@@ -17,10 +17,11 @@ from protocol.machine.samples import empty
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_pose
 from protocol.wire.messages import Pose, SampleBatch
-from sitegrid.process.children import Children, wait_until
+from sitegrid.process.children import Children
 from tests.integration.browser_tab import WAIT_MS, Tab, needs_browser
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, START_NS, WebSite
+from tests.patience import PATIENCE_S, until
 from tests.soak import BATCH_S
 
 pytestmark = needs_browser
@@ -292,8 +293,10 @@ def test_an_empty_map_says_what_to_do_and_what_comes_is_in_sight_until_the_view_
 def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
     keys = tmp_path / "keys"
     with Children(tmp_path) as children:
-        children.start("init", "keys", "init", "--site", "soak", "--dir", keys).wait(30)
-        token = children.start("token", "keys", "token", "anna", "--dir", keys, "--json").expect("token", 30)["token"]
+        children.start("init", "keys", "init", "--site", "soak", "--dir", keys).wait(PATIENCE_S)
+        token = children.start("token", "keys", "token", "anna", "--dir", keys, "--json").expect("token", PATIENCE_S)[
+            "token"
+        ]
         web = WebSite(tmp_path, children, "--tokens", keys)
         web.drive(4)
         assert web.get("info").status == 401
@@ -315,8 +318,8 @@ def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
         assert tiles[0].endswith(f"/{{z}}/{{x}}/{{y}}.png?token={token}"), (
             "whoever has a token in addresses needs it there"
         )
-        children.start("revoke", "keys", "token", "anna", "--revoke", "--dir", keys).wait(30)
-        wait_until(lambda: web.get("info", {"token": token}).status == 401, 10, "the token is revoked")
+        children.start("revoke", "keys", "token", "anna", "--revoke", "--dir", keys).wait(PATIENCE_S)
+        until(lambda: web.get("info", {"token": token}).status == 401, "the token is revoked")
         tab.until("sitegrid.state === 'refused'")
         assert "Ask the office" in tab.page.locator("#notice").inner_text()
         tab.close()
@@ -344,7 +347,7 @@ def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
     if npm is None:
         pytest.skip("no npm: axe-core is installed by it")
     command = [npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(tmp_path), "axe-core"]
-    if subprocess.run(command, capture_output=True, timeout=120, check=False).returncode:
+    if subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False).returncode:
         pytest.skip("axe-core cannot be installed here")
     axe = (tmp_path / "node_modules" / "axe-core" / "axe.min.js").read_text()
     for theme in ("light", "dark"):

@@ -22,6 +22,7 @@ from tests.integration.browser_tab import Tab, needs_browser
 from tests.integration.hauling_site import DAY_NS, FIRST_NS, hauling_site
 from tests.integration.site_run import kill
 from tests.integration.web_site import WebSite
+from tests.patience import PATIENCE_S
 
 pytestmark = needs_browser
 PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
@@ -510,7 +511,7 @@ def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
     if npm is None:
         pytest.skip("no npm: axe-core is installed by it")
     command = [npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(tmp_path), "axe-core"]
-    if subprocess.run(command, capture_output=True, timeout=120, check=False).returncode:
+    if subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False).returncode:
         pytest.skip("axe-core cannot be installed here")
     axe = (tmp_path / "node_modules" / "axe-core" / "axe.min.js").read_text()
     for theme in ("light", "dark"):

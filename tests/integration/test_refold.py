@@ -24,16 +24,16 @@ from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid import Client
-from sitegrid.process.children import Child, Children, wait_until
-from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
+from sitegrid.process.children import Child, Children
+from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.integration.test_operation import Sender, end, session_of
+from tests.patience import PATIENCE_S, until
 from tests.reference.correction import in_numpy
 from tests.unit.mapserver.data import same
 
 pytestmark = pytest.mark.processes
 
 ROWS = 3000  # of 100 samples: their fold takes a good part of a second
-PATIENCE_S = 2.0  # longest pause of answers and acknowledgements that is no stall, on a machine that has other work
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_batches_and_queries_are_answered_during_a_refold_and_the_map_is_that_of
     server, config = serve(site), load_site(site.site_file)
     with session_of(site.endpoint) as session, site.connect() as client, site.connect() as other:
         with closing(Sender(session, config, "loader-11", 50)) as sender, paced(lambda: client.point(100, 0)) as asked:
-            wait_until(lambda: sender.watermark > 0 and len(asked) > 1, READY_S, "traffic")
+            until(lambda: sender.watermark > 0 and len(asked) > 1, "traffic")
             for number in (1, 2):
                 acknowledged, answered, began_s = sender.watermark, len(asked), time.monotonic()
                 row = other.distrust(f"loader-{number}", "a test")

@@ -18,6 +18,7 @@ from sitegrid import Client, RouteAnswer
 from sitegrid.process.children import Children
 from tests.integration.hauling_site import hauling_site
 from tests.integration.web_site import NAME, WebSite
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.processes
 Place = tuple[float, float]
@@ -38,7 +39,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
 
 def command(site: WebSite, *words: str) -> subprocess.CompletedProcess[str]:
     begin = (sys.executable, "-m", "sitegrid.cli", "query", "--endpoint", site.endpoint, "--site", NAME)
-    return subprocess.run([*begin, *words], capture_output=True, text=True, check=False, timeout=120)
+    return subprocess.run([*begin, *words], capture_output=True, text=True, check=False, timeout=PATIENCE_S)
 
 
 def numbers(line: tuple[Place, ...]) -> list[str]:
@@ -137,7 +138,7 @@ def test_a_route_of_a_named_machine_is_the_first_thing_that_a_server_is_asked_af
     )
     old = site.server.pid
     site.server.send(signal.SIGKILL)
-    site.server.wait(30)
+    site.server.wait(PATIENCE_S)
     site.server = site.start_server()
     assert site.server.pid != old
     after = site.client.route(LINE, "hauler-1")

@@ -19,6 +19,7 @@ from sim.config import SimConfig
 from sitegrid import MACHINES
 from sitegrid.process.children import Children
 from tests.integration.test_followers import Followed, Sender
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.processes
 
@@ -49,5 +50,5 @@ def test_a_line_of_ten_thousand_places_and_a_way_are_answered_while_samples_come
         assert counters["layers_kept"] > 0
         words = (sys.executable, "-m", "sitegrid.cli", "query", "--endpoint", run.endpoint, "--site", run.site, "way")
         places = ("-35", "-35", "35", "30", "--set", "machine=truck", "--set", "max_grade=1", "--json")
-        said = subprocess.run([*words, *places], capture_output=True, text=True, check=True, timeout=60)
+        said = subprocess.run([*words, *places], capture_output=True, text=True, check=True, timeout=PATIENCE_S)
         assert json.loads(said.stdout)["line"][0] == [-35.0, -35.0]

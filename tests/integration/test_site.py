@@ -11,8 +11,9 @@ from protocol.errors import LinkError, QueryError
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.client import connect
-from sitegrid.process.children import Children, wait_until
+from sitegrid.process.children import Children
 from tests.integration.site_run import SiteRun, kill  # beside this file
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
@@ -107,18 +108,20 @@ def test_two_sites_do_not_mix(tmp_path, children: Children):
 
 
 def test_an_agent_runs_on_without_a_router_and_catches_up(site_run: SiteRun, children: Children, tmp_path):
-    site_run.children.start("record", "sim", "--record", tmp_path / "logs", "--seconds", 30, "--machines", 1).wait(60)
+    site_run.children.start("record", "sim", "--record", tmp_path / "logs", "--seconds", 30, "--machines", 1).wait(
+        PATIENCE_S
+    )
     log, spool = tmp_path / "logs" / "loader-1", tmp_path / "loader-1.db"
     files = ("--spool", spool, "--audit", tmp_path / "loader-1.audit")
     words = ("--endpoint", site_run.endpoint, "--driver", "replay", "--log", log, "--speed", "0")
     agent = children.start("loader-1", "agent", *words, "--site-file", site_run.site_file, *files, "--json")
-    agent.expect("ready", 40.0)
+    agent.expect("ready", PATIENCE_S)
     audit = tmp_path / "loader-1.audit"
-    wait_until(lambda: audit.exists() and audit.read_text().count("\n") > 100, 40.0, "samples recorded offline")
+    until(lambda: audit.exists() and audit.read_text().count("\n") > 100, "samples recorded offline")
     assert agent.code is None
     site_run.start_router()
     server = site_run.start_server()
-    report = agent.expect("ended", 60.0)["ended"]
+    report = agent.expect("ended", PATIENCE_S)["ended"]
     assert report["delivered"]
     assert report["uplink"]["counters"].get("unanswered", 0) > 0, "it noticed that nobody answered"
     server.stop()

@@ -9,7 +9,6 @@ import math
 import signal
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -26,11 +25,12 @@ from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import encode_pose
 from protocol.wire.messages import Pose
-from sitegrid.process.children import Children, wait_until
+from sitegrid.process.children import Children
 from sitegrid.security.certificates import issue, make_authority
 from sitegrid.web import values
 from tests.integration.site_run import kill
-from tests.integration.web_site import NAME, READY_S, Frame, WebSite
+from tests.integration.web_site import NAME, Frame, WebSite
+from tests.patience import PATIENCE_S, until
 from tests.soak import SITE_TOML
 
 pytestmark = pytest.mark.processes
@@ -231,9 +231,7 @@ def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
     again = web.get("point", parameters, If_None_Match=first.headers["etag"])
     assert (again.status, again.body) == (304, b"")
     web.drive(4)
-    wait_until(
-        lambda: web.get("point", parameters, If_None_Match=first.headers["etag"]).status == 200, 10, "another map"
-    )
+    until(lambda: web.get("point", parameters, If_None_Match=first.headers["etag"]).status == 200, "another map")
 
 
 def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: WebSite):
@@ -244,7 +242,7 @@ def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: W
         places = web.get("features/machines").json["features"]
         return [place["properties"]["machine"] for place in places]
 
-    wait_until(lambda: shown() == ["machine-0"], 10, "a pose")
+    until(lambda: shown() == ["machine-0"], "a pose")
     counted = web.get("/metrics").body.decode()
     for reason in ("wrong_machine", "out_of_range"):
         assert f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}' in counted
@@ -256,7 +254,7 @@ def test_slow_headers_and_handshakes_do_not_hold_a_place(web: WebSite, tmp_path:
     (tmp_path / "cert.pem").write_bytes(pair.certificate)
     (tmp_path / "key.pem").write_bytes(pair.key)
     words = ("--endpoint", web.endpoint, "--listen", "0", "--site", NAME, "--tls", tmp_path)
-    url = web.children.start("tls", "web", *words).expect("ready", READY_S)["url"]
+    url = web.children.start("tls", "web", *words).expect("ready", PATIENCE_S)["url"]
     with (
         socket.create_connection(("127.0.0.1", web.port), 30) as slow,
         socket.create_connection(("127.0.0.1", urlsplit(url).port), 30) as silent,
@@ -270,7 +268,7 @@ def test_two_sites_stand_behind_one_address(tmp_path: Path):
         web = WebSite(tmp_path, children, "--site", "pit")
         (tmp_path / "pit.toml").write_text(SITE_TOML.replace('"soak"', '"pit"'))
         words = ("--site-file", tmp_path / "pit.toml", "--store", tmp_path / "pit")
-        children.start("pit", "server", "--endpoint", web.endpoint, *words).expect("ready", READY_S)
+        children.start("pit", "server", "--endpoint", web.endpoint, *words).expect("ready", PATIENCE_S)
         web.drive(4)
         assert [site["name"] for site in web.get("/api/v1/sites").json["sites"]] == [NAME, "pit"]
         assert web.get("info").json["samples_merged"] > 0
@@ -294,11 +292,10 @@ class Page:
         self.socket = open_socket(self.web.live_url(**known), max_size=2**26, compression=None)
         return self.socket
 
-    def take(self, until: tuple[int, int], timeout_s: float = 30.0) -> None:
+    def take(self, until: tuple[int, int]) -> None:
         """Take in what comes until the map is of a version, or a later one."""
-        end_s = time.monotonic() + timeout_s
         while self.version < until or not self.frames:
-            data = self.socket.recv(timeout=max(0.1, end_s - time.monotonic()))
+            data = self.socket.recv(timeout=PATIENCE_S)
             if isinstance(data, bytes):
                 self.take_in(Frame.read(data))
                 self.socket.send(json.dumps({"row": self.version[0], "fact": self.version[1]}))
@@ -356,13 +353,13 @@ def test_a_page_goes_on_after_web_server_map_server_and_trust_were_others(tmp_pa
             page.take((max(tile.row for tile in web.client.tiles().tiles), 0))
             assert page.tiles == newest(web)[0]
             web.server.send(signal.SIGKILL)
-            web.server.wait(10)
+            web.server.wait(PATIENCE_S)
             web.server = web.start_server()
             web.drive(8)
-            page.take((max(tile.row for tile in web.client.tiles().tiles), 0), 60)
+            page.take((max(tile.row for tile in web.client.tiles().tiles), 0))
             assert page.tiles == newest(web)[0]
             trusted = web.client.distrust("machine-1", "test")
-            page.take((trusted.merged, trusted.fact), 60)
+            page.take((trusted.merged, trusted.fact))
             assert page.tiles == newest(web)[0]
             assert page.version >= (trusted.merged, trusted.fact)
 
@@ -380,7 +377,7 @@ def test_what_a_page_says_wrongly_ends_its_connection_alone(web: WebSite):
 
 def _drain(socket: ClientConnection) -> None:
     for _ in range(1000):
-        socket.recv(timeout=10)
+        socket.recv(timeout=PATIENCE_S)
 
 
 def test_pages_that_sleep_cost_no_memory(web: WebSite):
@@ -403,7 +400,7 @@ def test_pages_that_sleep_cost_no_memory(web: WebSite):
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(60)
+            thread.join(PATIENCE_S)
         tiles = newest(web)[0]
         assert all(page.tiles == tiles for page in pages)
         assert rss() < before + 40e6, "what sleeps costs no memory"

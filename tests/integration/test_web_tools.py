@@ -21,8 +21,9 @@ from protocol.site.ground_classes import BOUNDARIES, ZONES
 from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
 from sitegrid.client import Client
-from sitegrid.process.children import Children, wait_until
+from sitegrid.process.children import Children
 from tests.integration.web_site import NAME, WebSite
+from tests.patience import PATIENCE_S, until
 
 pytestmark = [
     pytest.mark.processes,
@@ -49,8 +50,8 @@ def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
         site = WebSite(folder, children)
         site.drive(60)
         journalled = site.client.info().journalled
-        wait_until(lambda: f'-{journalled}-0"' in site.get("xyz/resistance.json").headers["etag"], 30, "the newest map")
-        wait_until(lambda: "bounds" in site.get("xyz/resistance.json").json, 30, "a look at what is folded")
+        until(lambda: f'-{journalled}-0"' in site.get("xyz/resistance.json").headers["etag"], "the newest map")
+        until(lambda: "bounds" in site.get("xyz/resistance.json").json, "a look at what is folded")
         yield site
 
 
@@ -192,7 +193,7 @@ def test_a_fuzzer_that_reads_the_description_makes_nothing_fail(web: WebSite, tm
     ]
     url = f"{web.url}api/v1/openapi.json"
     command = [sys.executable, "-m", "schemathesis.cli", "run", url, *options]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     counts = web.get("/metrics").body.decode()
     assert 'event="status_500"' not in counts
