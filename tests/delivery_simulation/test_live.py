@@ -291,8 +291,7 @@ def test_pose_and_health_stay_live_while_a_machine_catches_up(
     decoders = {"pose": decode_pose, "health": decode_health}
     for kind, decode in decoders.items():
         key = f"sitegrid/{SITE.name}/machine/*/{kind}"
-        take = lambda s, k=kind, d=decode: received.update({k: bool(d(s.payload.to_bytes()))})  # noqa: E731
-        listener.declare_subscriber(key, take)
+        listener.declare_subscriber(key, lambda s, k=kind, d=decode: received.update([k] * bool(d(s.payload.to_bytes()))))
     session = opened(slow_link)
     presence = Presence(session, SITE.name, "loader-1")
     with server_at(endpoint, tmp_path / "store"), uplink_of(session, tmp_path / "spool.db", 20_000) as spool:
