@@ -72,7 +72,7 @@ class SiteRun:
         return self.children.start("sim", "sim", *place, *words, *truth, "--json")
 
     def connect(self) -> Client:
-        return connect(self.endpoint, self.site)
+        return connect(self.endpoint, self.site, timeout_s=PATIENCE_S)
 
     def wait_merged(self, client: Client, samples: int) -> None:
         until(lambda: client.info().samples_merged >= samples, f"{samples} samples merged")

@@ -54,7 +54,7 @@ class WebSite:
         self.driven_s = 0.0
         self.session = open_session(SessionConfig(self.endpoint))
         children.callback(self.session.close)
-        self.client: Client = children.enter_context(connect(self.endpoint, NAME))
+        self.client: Client = children.enter_context(connect(self.endpoint, NAME, timeout_s=PATIENCE_S))
 
     def start_server(self) -> Child:
         files = ("--site-file", self.folder / "site.toml", "--config", self.folder / "server.toml")
