@@ -198,6 +198,7 @@ def test_a_bad_query_is_refused_counted_and_named(probe: Probe, selector: str):
     assert probe.server.code is None, probe.where
 
 
+@pytest.mark.nightly
 def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children: Children, tmp_path):
     """The server's site is smaller than the agent's: what lies beyond it is refused, the way back in arrives."""
     sim = SimConfig(machines=1, seconds=60, speed=10, seed=3, world="fast")

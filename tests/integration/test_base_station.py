@@ -22,7 +22,7 @@ from sitegrid.process.children import Child, Children
 from tests.integration.site_run import SiteRun
 from tests.patience import PATIENCE_S, until
 
-pytestmark = [pytest.mark.processes, pytest.mark.slow]
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 SIM = SimConfig(scenario="base_station", machines=1, seed=3, world="fast", seconds=600.0, speed=6.0)
 
 

@@ -26,6 +26,8 @@ from tests.chaos.recordings import make
 from tests.chaos.scenario import FaultRun
 from tests.patience import PATIENCE_S, until
 
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
+
 
 @pytest.fixture
 def library(tmp_path: Path) -> Path:
@@ -39,7 +41,6 @@ def scenario(folder: Path, **options) -> FaultRun:
     return FaultRun(folder=folder, console=Console(line=lambda *_, **__: None), seed=3, **values)
 
 
-@pytest.mark.processes
 def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
     recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=40)
     outcome = site_faults.kills(scenario(tmp_path / "run", recordings=recordings, strikes=4, seconds=2.0))
@@ -54,7 +55,6 @@ def test_kills_of_agents_server_and_router_lose_nothing(tmp_path):
     assert not any(Path(f"/proc/{pid}").exists() for pid in outcome.pids)
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize("fault", [pending_faults.window, pending_faults.parked])
 def test_samples_that_wait_for_the_smoother_outlive_kills_and_silence(tmp_path, fault):
     recordings = make(tmp_path / "recordings", machines=2, seed=3)
@@ -72,24 +72,20 @@ def harmless(tmp_path: Path, fault: Callable[[FaultRun], FaultOutcome]) -> Fault
     return outcome
 
 
-@pytest.mark.processes
 def test_a_second_map_server_takes_nothing_from_the_first(tmp_path):
     assert harmless(tmp_path, store_faults.second_server).declared == 0
 
 
-@pytest.mark.processes
 def test_the_year_2099_shifts_no_clock_and_blocks_no_spool(tmp_path):
     outcome = harmless(tmp_path, store_faults.far_future)
     assert outcome.declared == outcome.notes["quarantined"] > 0
 
 
-@pytest.mark.processes
 def test_the_archive_goes_on_after_a_wrong_clock(tmp_path):
     outcome = harmless(tmp_path, store_faults.archive_clock)
     assert (outcome.declared, outcome.notes["archived"] > 0) == (0, True)
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize("fault", [damage_faults.wal_flip, damage_faults.restored_store])
 def test_what_damage_takes_is_declared_and_named(tmp_path, fault):
     recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=80)
@@ -99,7 +95,6 @@ def test_what_damage_takes_is_declared_and_named(tmp_path, fault):
     assert outcome.recorded == outcome.merged + outcome.declared
 
 
-@pytest.mark.processes
 def test_agents_name_a_damaged_calibration_and_go_on(tmp_path):
     recordings = make(tmp_path / "recordings", machines=1, seed=3, seconds=40)
     outcome = damage_faults.calibration_flip(scenario(tmp_path / "run", recordings=recordings, seconds=1.0))
@@ -107,7 +102,6 @@ def test_agents_name_a_damaged_calibration_and_go_on(tmp_path):
     assert outcome.count > 1000
 
 
-@pytest.mark.processes
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 def test_readers_that_sleep_cost_machines_nothing(tmp_path):
     recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=60)
@@ -121,7 +115,6 @@ def test_readers_that_sleep_cost_machines_nothing(tmp_path):
     assert outcome.answer_s_max > 0
 
 
-@pytest.mark.processes
 @pytest.mark.skipif(sys.platform != "linux", reason="LD_PRELOAD")
 def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
     outcome = disk_faults.power(scenario(tmp_path / "run", strikes=40))
@@ -129,28 +122,24 @@ def test_power_cuts_lose_nothing_that_was_promised(tmp_path, library):
     assert outcome.recorded == outcome.merged > 1000
 
 
-@pytest.mark.processes
 @pytest.mark.parametrize("what", ["spool", "store"])
 def test_power_cuts_find_a_file_that_is_not_synced_at_every_commit(tmp_path, library, what):
     operations = disk_faults.trace(library, tmp_path / "run", what, 3, "careless")
     assert disk_faults.cut(operations, what, 20, random.Random(1)).lost > 0
 
 
-@pytest.mark.processes
 def test_power_cuts_find_a_mark_that_is_written_before_its_commit(tmp_path, library):
     operations = disk_faults.trace(library, tmp_path / "run", "store", 3, "hasty")
     outcome = disk_faults.cut(operations, "store", 60, random.Random(1))
     assert any("false alarm" in problem for problem in outcome.problems)
 
 
-@pytest.mark.processes
 def test_writes_that_fail_one_after_the_other_lose_nothing(tmp_path, library):
     outcome = disk_faults.writes(scenario(tmp_path / "run", scale=0.05))
     assert (outcome.lost, outcome.double, outcome.problems) == (0, 0, [])
     assert outcome.count > 10
 
 
-@pytest.mark.processes
 def test_an_interrupted_suite_ends_everything(tmp_path):
     work = tmp_path / "work"
     words = [sys.executable, "-X", "faulthandler", "-m", "tests.chaos", "--faults", "freezes", "--keep", str(work)]

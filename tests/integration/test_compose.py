@@ -15,7 +15,7 @@ from sitegrid.process.children import Children
 from tests.integration import compose_run
 from tests.patience import PATIENCE_S, until
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 
 
 def known_machines(client: Client) -> set[str]:

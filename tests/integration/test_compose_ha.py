@@ -20,7 +20,7 @@ from tests.postgres_server import cluster_folder
 from tests.takeover.senders import Sender
 from tests.takeover.site import verdict
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 SERVERS = ("server-a", "server-b")
 REPLACED = 3  # exit code of a server that another one took over from
 ROWS = "SELECT row, record FROM sitegrid.journal ORDER BY row"

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +17,7 @@ from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import Client
 from sitegrid.process.children import Child
+from tests.command_lines import said
 from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.patience import until
 
@@ -81,11 +79,7 @@ def resistance(client: Client, **when: Any) -> float:
 
 def command(site_run: SiteRun, *words: str) -> Any:
     where = ("--endpoint", site_run.endpoint, "--site", site_run.site, "--json")
-    process = subprocess.run(
-        [sys.executable, "-m", "sitegrid.cli", words[0], *where, *words[1:]], capture_output=True, text=True, timeout=60
-    )
-    assert process.returncode == 0, process.stderr
-    return json.loads(process.stdout.splitlines()[-1])
+    return said(words[0], *where, *words[1:]).json
 
 
 def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: SiteRun, server: Child):
@@ -109,6 +103,7 @@ def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: Si
     assert command(site_run, "query", "changes")["changes"][0]["id"] == change.id
 
 
+@pytest.mark.nightly
 def test_a_bad_machine_is_found_left_out_and_stays_so_after_a_kill(site_run: SiteRun, server: Child, tmp_path: Path):
     with site_run.connect() as client:
         senders = Senders(site_run, client)

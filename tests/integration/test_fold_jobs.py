@@ -88,7 +88,7 @@ def evidence(out: Path) -> list[Path]:
     return list(out.with_name(f"{out.name}.part").glob("work/evidence-*"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_processes_make_the_same_store(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
     seen: set[int] = set()
     out = tmp_path / "out"
@@ -102,7 +102,7 @@ def test_processes_make_the_same_store(archive: Path, expected: dict[str, str], 
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_fold_that_is_killed_goes_on(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     with started(archive, "--out", out, "--jobs", 2) as fold:
@@ -122,7 +122,7 @@ def test_a_fold_that_is_killed_goes_on(archive: Path, expected: dict[str, str], 
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_processes_that_are_killed_are_replaced(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     with started(archive, "--out", out, "--jobs", 2) as fold:
@@ -135,6 +135,7 @@ def test_processes_that_are_killed_are_replaced(archive: Path, expected: dict[st
     assert contents(out) == expected
 
 
+@pytest.mark.nightly
 def test_a_damaged_file_in_the_middle_ends_the_fold_and_leaves_nothing(archive: Path, tmp_path: Path, capsys) -> None:
     shutil.copytree(archive, tmp_path / "archive")
     damaged = sorted((tmp_path / "archive").iterdir())[5]
@@ -181,7 +182,7 @@ def test_a_cluster_makes_the_same_store(archive: Path, expected: dict[str, str],
     assert contents(tmp_path / "out") == expected
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("mode", ["graceful", "segfault"])
 def test_a_cluster_whose_workers_die_makes_the_same_store(
     archive: Path, expected: dict[str, str], tmp_path: Path, dask, mode: str
@@ -202,7 +203,7 @@ def test_a_cluster_whose_workers_die_makes_the_same_store(
     assert died, "workers died during a fold"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_that_loses_all_its_workers_is_named(
     archive: Path, tmp_path: Path, dask, monkeypatch, capsys
 ) -> None:
@@ -218,7 +219,7 @@ def test_a_cluster_that_loses_all_its_workers_is_named(
     assert error.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_scheduler_that_dies_is_named_and_the_fold_goes_on_without_it(
     archive: Path, expected: dict[str, str], tmp_path: Path
 ) -> None:

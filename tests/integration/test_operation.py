@@ -6,12 +6,10 @@ import contextlib
 import json
 import signal
 import threading
-import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +30,7 @@ from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid.process.children import Child, Children
+from tests.command_lines import said
 from tests.integration.site_run import SiteRun  # beside this file
 from tests.patience import PATIENCE_S, until
 
@@ -98,6 +97,7 @@ def committed(store: Path) -> dict[str, int]:
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 def test_a_router_with_many_sessions_ends_in_time(site: SiteRun):
     router = site.start_router()
     with contextlib.ExitStack() as opened:
@@ -140,6 +140,7 @@ def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committe
     assert all(marks[s.machine] >= s.watermark for s in sent), "what was acknowledged is on disk"
 
 
+@pytest.mark.nightly
 def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: SiteRun, children: Children):
     store, old = site.folder / "store", load_site(site.site_file)
     old_rows(store, old)
@@ -157,6 +158,7 @@ def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: Site
     assert committed(store) == {"old": 50_000}
 
 
+@pytest.mark.nightly
 def test_a_server_that_waits_for_a_router_ends_in_time(site: SiteRun, children: Children):
     words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "store", "--verbose")
     server = children.start("server", "server", *words)
@@ -199,6 +201,7 @@ def test_an_agent_with_a_full_spool_and_no_router_ends_in_time(site: SiteRun):
     assert depth(spool) == 100_000
 
 
+@pytest.mark.nightly
 def test_an_agent_in_the_middle_of_an_exchange_with_a_dead_server_ends_in_time(site: SiteRun):
     site.start_router()
     fill(site.folder / "spool.db", 1000)
@@ -231,6 +234,7 @@ def paused(child: Child) -> Iterator[None]:
         child.send(signal.SIGCONT)
 
 
+@pytest.mark.nightly
 def test_a_simulator_whose_router_hangs_ends_in_time(site: SiteRun):
     router = site.start_router()
     agent, _ = start_agent(site)
@@ -241,29 +245,13 @@ def test_a_simulator_whose_router_hangs_ends_in_time(site: SiteRun):
         end(sim)
 
 
-def wait_until_still(file: Path, still_s: float = 0.5) -> None:
-    seen: list[tuple[int, float]] = []
-
-    def is_still() -> bool:
-        seen.append((file.stat().st_mtime_ns, time.monotonic()))
-        since_s = next(at_s for mtime, at_s in seen if mtime == seen[-1][0])
-        return seen[-1][1] - since_s > still_s
-
-    until(is_still, f"{file.name} is drawn no more")
-
-
-def test_plot_and_query_that_follow_end_in_time_also_while_the_server_hangs(site: SiteRun, children: Children):
+@pytest.mark.nightly
+def test_a_query_that_follows_ends_in_time_also_while_the_server_hangs(site: SiteRun, children: Children):
     site.start_router()
     server = site.start_server()
-    where = ("--endpoint", site.endpoint, "--site", site.site)
-    picture = site.folder / "live.png"
-    plot = children.start("plot", "plot", *where, "--follow", "--every", 0.05, "--out", picture)
-    query = children.start("query", "query", *where, "changes", "--follow")
-    until(picture.exists, "first picture")
+    query = children.start("query", "query", "--endpoint", site.endpoint, "--site", site.site, "changes", "--follow")
     wait_for_handlers(query)
     with paused(server):
-        wait_until_still(picture)  # it asks, and gets no answer
-        end(plot)
         end(query)
 
 
@@ -296,20 +284,14 @@ def test_the_server_tells_prometheus_of_itself_and_of_the_agents(site: SiteRun):
     end(server)
 
 
-def test_without_being_asked_the_server_listens_nowhere(site: SiteRun):
+def test_a_server_listens_nowhere_unasked_and_logs_one_json_object_per_line(site: SiteRun):
     site.start_router()
-    server = site.children.start(
-        "server", "server", *("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "s")
-    )
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "s", "--verbose")
+    server = site.children.start("server", "server", *words)
     assert "metrics" not in server.expect("ready", PATIENCE_S)
     sockets = {link.readlink().name for link in Path(f"/proc/{server.pid}/fd").iterdir() if link.is_symlink()}
     listening = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     assert not [row for row in listening if row[3] == "0A" and f"socket:[{row[9]}]" in sockets]
-
-
-def test_what_a_server_logs_is_one_json_object_per_line(site: SiteRun):
-    site.start_router()
-    server = site.start_server("--verbose")
     with session_of(site.endpoint) as session:
         batch = SampleBatch("loader-1", 7, 1, drive(1, seed=1), 'a "frame"\n')
         list(session.get(keys.ingest(site.site, "loader-1"), payload=encode_batch(batch), timeout=60.0))
@@ -322,34 +304,27 @@ def test_what_a_server_logs_is_one_json_object_per_line(site: SiteRun):
     assert '"frame"' in refused["problem"] or "frame" in refused["problem"]
 
 
-def run_doctor(capsys: Any, *words: object) -> tuple[int, dict[str, dict[str, str]]]:
-    from sitegrid.cli import main
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    code = main(["doctor", "--json", *map(str, words)])
-    for number, handler in before.items():
-        signal.signal(number, handler)
-    return code, {f["check"]: f for f in json.loads(capsys.readouterr().out.splitlines()[-1])["findings"]}
+def run_doctor(*words: object) -> tuple[int, dict[str, dict[str, str]]]:
+    answer = said("doctor", "--json", *words)
+    return answer.code, {one["check"]: one for one in json.loads(answer.out.splitlines()[-1])["findings"]}
 
 
 @pytest.fixture
-def guarded(tmp_path: Path, children: Children, capsys) -> Callable[..., tuple[int, dict[str, dict[str, str]]]]:
+def guarded(tmp_path: Path, children: Children) -> Callable[..., tuple[int, dict[str, dict[str, str]]]]:
     """A site with keys; asks the doctor with the keys of one name."""
     pytest.importorskip("cryptography")
-    from sitegrid.cli import main
-
     folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
-    assert main(["keys", "init", "--dir", str(folder)]) == 0
+    assert said("keys", "init", "--dir", folder).code == 0
     for name, role in {"loader-1": "machine", "guest": "visitor", "sim": "sim", "gone": "machine"}.items():
-        assert main(["keys", "add", name, "--role", role, "--dir", str(folder)]) == 0
-    assert main(["keys", "revoke", "gone", "--dir", str(folder)]) == 0
+        assert said("keys", "add", name, "--role", role, "--dir", folder).code == 0
+    assert said("keys", "revoke", "gone", "--dir", folder).code == 0
     router = children.start("router", "router", "--keys", folder, "--listen", endpoint)
     router.expect("ready", PATIENCE_S)
     site_file = Path("config/site.toml").absolute()
     files = ("--site-file", site_file, "--store", tmp_path / "store")
     server = children.start("server", "server", "--endpoint", endpoint, "--keys", folder / "server", *files)
     server.expect("ready", PATIENCE_S)
-    return lambda name, *words: run_doctor(capsys, "--endpoint", endpoint, "--keys", folder / name, *words)
+    return lambda name, *words: run_doctor("--endpoint", endpoint, "--keys", folder / name, *words)
 
 
 def test_the_doctor_tells_denials_from_absence(guarded: Callable[..., tuple[int, dict[str, dict[str, str]]]]):

@@ -27,15 +27,6 @@ from tests.soak import BATCH_S
 pytestmark = needs_browser
 
 
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("page")
-    with Children(folder) as children:
-        site = WebSite(folder, children)
-        site.drive(60)
-        yield site
-
-
 @pytest.fixture
 def tab(browser, web: WebSite) -> Iterator[Tab]:
     tab = Tab(browser, web.url).loaded()

@@ -19,7 +19,7 @@ from protocol.queries.roads import WorklistRow
 from protocol.queries.routing import MACHINES
 from sitegrid.process.children import Children
 from tests.integration.browser_tab import Tab, needs_browser
-from tests.integration.hauling_site import DAY_NS, FIRST_NS, hauling_site
+from tests.integration.hauling_site import DAY_NS, FIRST_NS
 from tests.integration.site_run import kill
 from tests.integration.web_site import WebSite
 from tests.patience import PATIENCE_S
@@ -29,11 +29,9 @@ PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch":
 QUIET = "document.querySelector('#panel .asking') === null"
 
 
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("page-roads")
-    with Children(folder) as children:
-        yield hauling_site(folder, children)
+@pytest.fixture
+def web(hauling: WebSite) -> WebSite:
+    return hauling
 
 
 @pytest.fixture

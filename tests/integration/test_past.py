@@ -70,6 +70,7 @@ def is_fold_from_the_start(client: Client, sent: Sent, stamp_ns: int, without: s
 
 
 @pytest.mark.processes
+@pytest.mark.nightly
 def test_the_past_of_a_server_killed_in_mid_checkpoint_and_after_a_distrust(tmp_path: Path):
     sent = filled_journal(tmp_path / "store")
     (tmp_path / "site.toml").write_text("\n".join(toml_lines(asdict(SITE))))

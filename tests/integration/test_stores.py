@@ -17,6 +17,7 @@ from sitegrid.process.children import Children
 from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.patience import until
 
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 SOME = 20  # samples
 
 
@@ -46,7 +47,6 @@ def _samples(client: Client) -> dict[str, int]:
     return {name: counts.samples for name, counts in client.info().machines.items()}
 
 
-@pytest.mark.processes
 def test_a_run_goes_on_in_a_store_that_was_folded_from_the_first(site_run: SiteRun, capsys: pytest.CaptureFixture[str]):
     first = cut_short(site_run)
     (site_run.folder / "store").rename(site_run.folder / "old")
@@ -62,7 +62,6 @@ def test_a_run_goes_on_in_a_store_that_was_folded_from_the_first(site_run: SiteR
     assert sum(counts.samples for counts in info.machines.values()) == sum(r["samples"] for r in reports.values())
 
 
-@pytest.mark.processes
 def test_a_run_goes_on_in_a_store_that_a_person_accepts_and_what_it_lacks_is_counted(site_run: SiteRun):
     first = cut_short(site_run)
     shutil.move(site_run.folder / "store", site_run.folder / "gone")

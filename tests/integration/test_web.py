@@ -9,7 +9,6 @@ import math
 import signal
 import socket
 import threading
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -34,15 +33,6 @@ from tests.patience import PATIENCE_S, until
 from tests.soak import SITE_TOML
 
 pytestmark = pytest.mark.processes
-
-
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("web")
-    with Children(folder) as children:
-        site = WebSite(folder, children)
-        site.drive(40)
-        yield site
 
 
 def driven_place(web: WebSite) -> tuple[float, float]:
@@ -248,6 +238,7 @@ def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: W
         assert f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}' in counted
 
 
+@pytest.mark.nightly
 def test_slow_headers_and_handshakes_do_not_hold_a_place(web: WebSite, tmp_path: Path):
     now = datetime.now(UTC)
     pair = issue(make_authority(NAME, now, now + timedelta(1)), "web", now, now + timedelta(1), ("127.0.0.1",))
@@ -263,6 +254,7 @@ def test_slow_headers_and_handshakes_do_not_hold_a_place(web: WebSite, tmp_path:
         assert slow.recv(1000) == silent.recv(1000) == b""
 
 
+@pytest.mark.nightly
 def test_two_sites_stand_behind_one_address(tmp_path: Path):
     with Children(tmp_path) as children:
         web = WebSite(tmp_path, children, "--site", "pit")
@@ -380,6 +372,7 @@ def _drain(socket: ClientConnection) -> None:
         socket.recv(timeout=PATIENCE_S)
 
 
+@pytest.mark.nightly
 def test_pages_that_sleep_cost_no_memory(web: WebSite):
     def rss() -> int:
         return int(Path(f"/proc/{web.web.pid}/statm").read_text().split()[1]) * 4096

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,22 +12,17 @@ from protocol.queries.routing import MACHINES
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
-from sitegrid.process.children import Children
 from sitegrid.web import values
-from tests.integration.hauling_site import DAY_NS, DAYS, FIRST_NS, hauling_site
+from tests.integration.hauling_site import DAY_NS, DAYS, FIRST_NS
 from tests.integration.web_site import NAME, WebSite
 
 pytestmark = pytest.mark.processes
 LINE = ((20.0, 10.0), (90.0, 10.0), (150.0, 12.5))
 
 
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("roads")
-    with Children(folder) as children:
-        site = hauling_site(folder, children)
-        assert all(child.pid for child in (site.server, site.web))
-        yield site
+@pytest.fixture
+def web(hauling: WebSite) -> WebSite:
+    return hauling
 
 
 def text_of(line: tuple[tuple[float, float], ...]) -> str:
