@@ -1,4 +1,4 @@
-"""The soak in short; the hour is `python -m tests.soak --minutes 60 --speed 30`."""
+"""The soak in short; all of it is `make soak`."""
 
 from __future__ import annotations
 
