@@ -31,6 +31,17 @@ COMPOSE = ("tests/integration/test_compose.py", "tests/integration/test_compose_
 FOLD = ("tests/integration/test_fold_jobs.py", "tests/unit/sitegrid/refold")
 TAKEOVER = ("tests/integration/test_takeover.py",)
 FOLLOWERS = ("tests/integration/test_followers.py",)
+SPEED = (
+    "merge --runs 1 --samples 50000",
+    "ingest --runs 1 --samples 5000",
+    "fleet --machines 50 --seconds 10 --hours 0.5",
+    "live --seconds 20 --hours 0.5",
+    "query --hours 0.5 --queries 20",
+    "restart --samples 1000000 --hours 0.5",
+    "filter --runs 1 --steps 300",
+    "sim --runs 1 --seconds 5",
+    "archive --samples 1000000",
+)
 OTHERS = tuple(word for path in (*COMPOSE, *FOLD, *TAKEOVER, *FOLLOWERS) for word in ("--ignore", path))
 
 
@@ -53,15 +64,20 @@ class PartOutcome:
     commit: str
 
 
+def loads(*lines: str) -> tuple[tuple[str, ...], ...]:
+    """Loads of the laboratory, in sizes that show that they work; their figures are for larger ones."""
+    return tuple(("lab", "speed", *line.split()) for line in lines)
+
+
 PARTS = (
     Part("tests", 300, ((*TESTS, "-m", "nightly", "tests", *OTHERS),)),
     Part("chaos", 330, (("tests.chaos", "--json", "--seconds", "240"),)),
     Part("takeover", 180, ((*TESTS, *TAKEOVER), ("tests.takeover", "--count", "12"))),
     Part("compose", 180, ((*TESTS, *COMPOSE),)),
     Part("fold", 270, ((*TESTS, "-m", "nightly", *FOLD),)),
-    Part("followers", 90, ((*TESTS, *FOLLOWERS),)),
-    Part("lab", 360, ((*TESTS, "lab/tests"),)),
-    Part("speed", 210, (("lab", "speed"),)),
+    Part("followers", 120, ((*TESTS, *FOLLOWERS), *loads("followers --machines 20 --seconds 5 --hours 0.2 --runs 1"))),
+    Part("lab", 330, ((*TESTS, "lab/tests"),)),
+    Part("speed", 210, loads(*SPEED)),
     Part("soak", 780, (("tests.soak",),)),
 )
 WEEKLY = (
