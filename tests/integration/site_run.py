@@ -37,9 +37,9 @@ class SiteRun:
         return self.folder / "site.toml"
 
     def start_router(self) -> Child:
-        router = self.children.start("router", "router", "--listen", self.endpoint)
-        router.expect("ready", PATIENCE_S)
-        return router
+        self.router = self.children.start("router", "router", "--listen", self.endpoint)
+        self.router.expect("ready", PATIENCE_S)
+        return self.router
 
     def start_server(self, *options: str) -> Child:
         words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--store", self.folder / "store")

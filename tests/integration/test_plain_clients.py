@@ -32,7 +32,7 @@ from tests.patience import PATIENCE_S, until
 pytestmark = pytest.mark.processes
 
 SENDER = ROOT / "tests" / "clients" / "plain_sender.py"
-SITE, SAMPLES, KILLS = "lot", 1200, 8
+SITE, SAMPLES, KILLS = "lot", 1200, 5
 MACHINES = ("digger-1", "digger-2")
 SAMPLE = struct.Struct(f"{plain_sender.ROW}fff")  # and a calibration, none, and a mass, NaN, as nothing is stated
 HEAD = struct.Struct("<qqQqB")
