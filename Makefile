@@ -2,11 +2,13 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
+TESTS := $(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal
 SIZE_demo := 340 MB to load, 1.2 GB on disk
 SIZE_dev := 670 MB to load, 2.4 GB on disk
 
-# make quick: unit tests that are not slow, in about a minute.
-.PHONY: venv demo quick test check chaos fuzz soak bench
+# make quick: unit tests that are not slow, in about a minute. make test: the proof. make nightly, make weekly: what
+# takes longer (CONTRIBUTING.md).
+.PHONY: venv demo quick test nightly weekly check chaos fuzz soak bench
 
 venv: $(VENV)/.dev
 
@@ -29,16 +31,23 @@ $(VENV)/.%: pyproject.toml constraints.txt
 	@touch $@ $(if $(filter dev,$*),$(VENV)/.demo)
 
 quick: venv
-	$(BIN)/python -m pytest --quiet --numprocesses auto -m "not slow and not processes" tests/unit
+	$(TESTS) -m "not slow and not processes and not nightly" tests/unit
 
 test: venv
-	$(BIN)/python -m pytest --quiet --numprocesses auto --dist worksteal
+	$(TESTS) --durations 15 -m "not nightly" --ignore tests/house tests
+
+nightly: venv
+	$(BIN)/python -m tests.nightly
+
+weekly: venv
+	$(BIN)/python -m tests.nightly --weekly
 
 check: venv
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m pytest --quiet tests/house
 
 chaos: venv
 	$(BIN)/python -m tests.chaos
@@ -47,7 +56,7 @@ fuzz: venv
 	$(BIN)/python -m tests.fuzz --seconds 300
 
 soak: venv
-	$(BIN)/python -m tests.soak --minutes 60 --speed 30
+	$(BIN)/python -m tests.soak
 
 bench: venv
 	$(BIN)/python -m lab.speed merge

@@ -7,9 +7,11 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy starts them: small matrices, and tests side by side
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each process that a test starts compiles all sources
 
+import fcntl
 import signal
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -33,6 +35,25 @@ settings.load_profile("repeatable")
 def root() -> Path:
     """The project's root."""
     return ROOT
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled_kernels() -> None:
+    """Compile Numba's kernels, or read them from their cache: once on a fresh clone, and no single test pays for it."""
+    from mapserver.change.detection import ChangeConfig, cuts
+    from mapserver.config import ServerConfig
+    from mapserver.server import warm_up
+    from sim.worlds.fast import FastWorld
+    from tests.unit.mapserver.data import NOW_NS, folded, samples
+    from tests.unit.sim.planes import LOADER, idle, placed, plane
+
+    with (ROOT / "pyproject.toml").open("rb") as locked:
+        fcntl.flock(locked, fcntl.LOCK_EX)  # of several processes of tests, one compiles and the others wait
+        warm_up(ServerConfig())
+        (pages,) = folded(samples(2, stamp_ns=[NOW_NS, NOW_NS + 10**12], c_rr=[0.01, 0.3])).pages([(0, 0)])
+        cuts(pages, ChangeConfig())
+        with placed(FastWorld, plane(0), LOADER) as world:
+            idle(world, 0.01)
 
 
 @pytest.fixture(scope="session")
@@ -83,28 +104,42 @@ def _signals_are_put_back() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-# `make quick` leaves out what takes longer than about half a second of processor time, quietly run. Processor time
-# doubles on a loaded machine, and a library's first use costs some: what takes far longer is named, and fails nothing.
-MOST_CPU_S = 4.0
+# Processor time is reported and fails nothing: it doubles on a loaded machine, and a library's first use costs some.
+MOST_CPU_S = 4.0  # of a test that is not marked; `make quick` leaves out what takes longer than about half a second
+CPU_S = "cpu_s"
+OF_WORKERS = pytest.StashKey[float]()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Note a test that takes long and does not say so."""
+    """Note the processor time of each test."""
     began_s = _cpu_s()
     outcome = yield
-    taken_s = _cpu_s() - began_s
-    if taken_s > MOST_CPU_S and not any(item.iter_markers("slow")) and not any(item.iter_markers("processes")):
-        item.user_properties.append(("cpu_s", taken_s))
+    item.user_properties.append((CPU_S, round(_cpu_s() - began_s, 2)))
     return outcome
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Name the tests that took long and do not say so."""
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tell the process that started this one what all took, fixtures as well."""
+    if (output := getattr(session.config, "workeroutput", None)) is not None:
+        output[CPU_S] = _cpu_s()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Add what a process of pytest-xdist took."""
+    taken_s = getattr(node, "workeroutput", {}).get(CPU_S, 0.0)  # none of one that crashed
+    node.config.stash[OF_WORKERS] = node.config.stash.get(OF_WORKERS, 0.0) + taken_s
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Print what all took, and name the tests that took long and do not say so."""
     for report in terminalreporter.stats.get("passed", []):
-        for name, taken_s in report.user_properties:
-            if name == "cpu_s":
-                terminalreporter.line(f"{report.nodeid} took {taken_s:.1f} s of processor time: mark it slow")
+        taken_s = dict(report.user_properties).get(CPU_S, 0.0)
+        if taken_s > MOST_CPU_S and not {"slow", "processes", "nightly"} & report.keywords.keys():
+            terminalreporter.line(f"{report.nodeid} took {taken_s:.1f} s of processor time: mark it slow")
+    minutes, seconds = divmod(round(_cpu_s() + config.stash.get(OF_WORKERS, 0.0)), 60)
+    terminalreporter.line(f"processor time {minutes}:{seconds:02}")
 
 
 def _cpu_s() -> float:

@@ -1,6 +1,6 @@
-"""Soak: an hour of a site at work, compressed in time, against a real map server; its memory has to stay flat.
+"""Soak: hours of a site at work, compressed in time, against a real map server; its memory has to stay flat.
 
-python -m tests.soak --minutes 60 --speed 30
+python -m tests.soak: six hours in twelve minutes.
 
 Machines drive laps and send batches of 4 s, stamped as in that hour; visitors ask for the map all along.
 """
@@ -33,13 +33,13 @@ from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.client import Client, connect
 from sitegrid.process.children import Child, Children
+from tests.patience import PATIENCE_S
 
 START_NS = 1_767_225_600_000_000_000
 SITE_TOML = 'name = "soak"\norigin_lat_deg = 49.01\norigin_lon_deg = 8.4\n'
 BATCH_S, RATE_HZ = 4.0, 2.5  # of a machine: one batch so often, so many samples a second (5 m/s, one each 2 m)
 ASK_S, PAST_S, LOOK_S = 10.0, 100.0, 60.0  # site time between two questions, two about the past, two looks
 MOST_GROWTH_PCT = 5.0
-READY_S = 120.0  # a first start in a new folder compiles kernels
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class SoakMachine:
 def main(words: Sequence[str] | None = None) -> int:
     """Run a soak and print its table; 1 where the memory grows."""
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0, help="site time (default %(default)s)")
+    parser.add_argument("--minutes", type=float, default=360.0, help="site time (default %(default)s)")
     parser.add_argument("--speed", type=float, default=30.0, help="times real time (default %(default)s)")
     parser.add_argument("--machines", type=int, default=10, help="default %(default)s")
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
@@ -135,10 +135,10 @@ def soak(folder: Path, minutes: float, speed: float, machines: int) -> Soak:
     site, endpoint = load_site(folder / "site.toml"), free_endpoint()
     with Children(folder) as children:
         router = children.start("router", "router", "--listen", endpoint)
-        router.expect("ready", READY_S)
+        router.expect("ready", PATIENCE_S)
         files = ("--site-file", folder / "site.toml", "--store", folder / "store")
         server = children.start("server", "server", "--endpoint", endpoint, *files)
-        server.expect("ready", READY_S)
+        server.expect("ready", PATIENCE_S)
         over = threading.Event()
         asker = threading.Thread(target=_ask, args=(endpoint, speed, over))
         asker.start()
@@ -173,7 +173,7 @@ def _drive(site: SiteConfig, endpoint: str, watched: tuple[Child, Child], run: t
 def _send(session: zenoh.Session, key: str, payload: bytes) -> None:
     """Send until it is acknowledged."""
     while True:
-        for reply in session.get(key, payload=payload, timeout=10.0):
+        for reply in session.get(key, payload=payload, timeout=60.0):
             if reply.ok is not None and isinstance(decode_reply(reply.ok.payload.to_bytes()), Ack):
                 return
 

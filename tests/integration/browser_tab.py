@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.patience import PATIENCE_S
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 NO_BROWSER = "no Chromium: install it, for example with `apt-get install chromium`"
 needs_browser = [pytest.mark.processes, pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)]
-WAIT_MS = 20_000
+WAIT_MS = 1000 * PATIENCE_S
 NOBODY = "http://nobody.invalid/**"
 
 
@@ -52,9 +56,9 @@ class Tab:
     def js(self, expression: str) -> Any:
         return self.page.evaluate(expression)
 
-    def until(self, expression: str, timeout_ms: float = WAIT_MS) -> None:
+    def until(self, expression: str) -> None:
         """Wait until an expression holds; the page's own rules forbid the browser's way to wait."""
-        for _ in range(int(timeout_ms / 50)):
+        for _ in range(int(WAIT_MS / 50)):
             if self.js(expression):
                 return
             self.page.wait_for_timeout(50)
@@ -70,5 +74,32 @@ class Tab:
         left, top = self.js(f"sitegrid.view.toScreen({x_m}, {y_m})")
         return left, top
 
+    def serious_faults(self, axe: str) -> list[Any]:
+        """What axe finds of a page that came without its own rules for scripts."""
+        self.page.wait_for_timeout(400)  # its transitions
+        self.page.evaluate(axe)
+        found = "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
+        return [fault for fault in self.page.evaluate(found) if fault[1] in ("serious", "critical")]
+
     def close(self) -> None:
         self.context.close()
+
+
+def watched(browser: Any, url: str) -> Iterator[Tab]:
+    """A tab for one test, which then complained of nothing and asked nobody else."""
+    tab = Tab(browser, url).loaded()
+    yield tab
+    assert tab.complaints == []
+    assert all(asked.startswith((url, "data:")) for asked in tab.asked), "nobody else was asked"
+    tab.close()
+
+
+def axe_script(folder: Path) -> str:
+    """axe-core, which npm installs; the test is skipped where it cannot."""
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("no npm: axe-core is installed by it")
+    command = [npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(folder), "axe-core"]
+    if subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False).returncode:
+        pytest.skip("axe-core cannot be installed here")
+    return (folder / "node_modules" / "axe-core" / "axe.min.js").read_text()

@@ -12,12 +12,32 @@ from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.process.children import Children
 from tests.integration.browser_tab import launched
+from tests.integration.hauling_site import hauling_site
 from tests.integration.site_run import SiteRun  # beside this file
+from tests.integration.web_site import WebSite
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     yield from launched()
+
+
+@pytest.fixture(scope="session")
+def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
+    """A site on the web where machines drove for a minute: for tests that read, and leave it as it was or driven on."""
+    folder = tmp_path_factory.mktemp("web")
+    with Children(folder) as started:
+        site = WebSite(folder, started)
+        site.drive(60)
+        yield site
+
+
+@pytest.fixture(scope="session")
+def hauling(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
+    """A site on the web whose roads haulers drove for four days; tests leave it as it was."""
+    folder = tmp_path_factory.mktemp("hauling")
+    with Children(folder) as started:
+        yield hauling_site(folder, started)
 
 
 @pytest.fixture

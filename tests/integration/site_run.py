@@ -9,10 +9,10 @@ from mapserver.config import ServerConfig
 from protocol.site.site_file import load_site
 from sim.config import SimConfig, resolve, write_configs
 from sitegrid import Client, connect
-from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.process.children import Child, Children
 from sitegrid.proof.delivery import AuditResult, audit_store
+from tests.patience import PATIENCE_S, until
 
-READY_S = 120.0  # a first start in a new folder compiles kernels
 LAG_S = 4.0  # of the smoother: most drives here are shorter than its usual lag, and tests wait for samples
 
 
@@ -27,8 +27,9 @@ class SiteRun:
         self.site = resolve(sim).site.name
         self.configs = write_configs(sim, folder)
         for config in self.configs:
-            with config.open("a", encoding="utf-8") as text:
-                text.write(f"\n[pipeline.localisation]\nlag_s = {lag_s}\n")
+            text = config.read_text(encoding="utf-8")
+            text = f"linger_s = {PATIENCE_S}\n{text}\n[pipeline.localisation]\nlag_s = {lag_s}\n"
+            config.write_text(text, encoding="utf-8")
         self.agents: dict[str, Child] = {}
 
     @property
@@ -36,22 +37,22 @@ class SiteRun:
         return self.folder / "site.toml"
 
     def start_router(self) -> Child:
-        router = self.children.start("router", "router", "--listen", self.endpoint)
-        router.expect("ready", READY_S)
-        return router
+        self.router = self.children.start("router", "router", "--listen", self.endpoint)
+        self.router.expect("ready", PATIENCE_S)
+        return self.router
 
     def start_server(self, *options: str) -> Child:
         words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--store", self.folder / "store")
-        server = self.children.start("server", "server", *words, *options)
-        server.expect("ready", READY_S)
-        return server
+        self.server = self.children.start("server", "server", *words, *options)
+        self.server.expect("ready", PATIENCE_S)
+        return self.server
 
     def start_agent(self, config: Path) -> Child:
         name = config.stem
         files = ("--spool", self.folder / f"{name}.db", "--audit", self.folder / f"{name}.audit")
         where = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--config", config)
         self.agents[name] = self.children.start(name, "agent", *where, *files, "--json")
-        self.agents[name].expect("ready", READY_S)
+        self.agents[name].expect("ready", PATIENCE_S)
         return self.agents[name]
 
     def start_agents(self) -> None:
@@ -64,21 +65,20 @@ class SiteRun:
         self.start_agents()
         return router, server, self.start_sim()
 
-    def start_sim(self) -> Child:
+    def start_sim(self, *options: str | Path) -> Child:
         names = ("seconds", "speed", "machines", "seed", "world")
         words = [w for name in names for w in (f"--{name}", getattr(self.sim, name))]
-        truth = ("--truth", self.folder / "truth")
         place = ("--endpoint", self.endpoint, "--site", self.site)
-        return self.children.start("sim", "sim", *place, *words, *truth, "--json")
+        return self.children.start("sim", "sim", *place, *words, *options, "--json")
 
     def connect(self) -> Client:
-        return connect(self.endpoint, self.site)
+        return connect(self.endpoint, self.site, timeout_s=PATIENCE_S)
 
     def wait_merged(self, client: Client, samples: int) -> None:
-        wait_until(lambda: client.info().samples_merged >= samples, READY_S, f"{samples} samples merged")
+        until(lambda: client.info().samples_merged >= samples, f"{samples} samples merged")
 
     def end_of_agents(self) -> dict[str, dict]:
-        return {name: agent.expect("ended", 90.0)["ended"] for name, agent in self.agents.items()}
+        return {name: agent.expect("ended", PATIENCE_S)["ended"] for name, agent in self.agents.items()}
 
     def delivered(self) -> dict[str, dict]:
         """The agents' reports at their end; all has been delivered."""
@@ -90,13 +90,8 @@ class SiteRun:
         audits = {path.stem: self.folder / f"{path.stem}.audit" for path in self.configs}
         return audit_store(audits, self.folder / "store", load_site(self.site_file), ServerConfig())
 
-    def audit_without_loss(self) -> AuditResult:
-        result = self.audit()
-        assert (result.lost, result.double, result.unrecorded) == (0, 0, 0)
-        return result
-
 
 def kill(child: Child) -> None:
     """End a process without a chance to tidy up."""
     child.send(signal.SIGKILL)
-    child.wait(10.0)
+    child.wait(PATIENCE_S)

@@ -20,8 +20,9 @@ from protocol.wire.codec import MAX_BATCH_BYTES, decode_health, decode_reply, en
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
-from sitegrid.process.children import Children, wait_until
-from tests.integration.site_run import READY_S, SiteRun  # beside this file
+from sitegrid.process.children import Children
+from tests.integration.site_run import SiteRun  # beside this file
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
@@ -47,7 +48,7 @@ class Probe:
 
     def send(self, payload: bytes | None, key: str = "") -> Ack | Refused:
         key = key or keys.ingest(self.site.name, MACHINE)
-        answers = [reply.ok for reply in self.session.get(key, payload=payload, timeout=READY_S)]
+        answers = [reply.ok for reply in self.session.get(key, payload=payload, timeout=60.0)]
         assert [ok is not None for ok in answers] == [True], f"one answer is expected: {self.where}"
         return decode_reply(answers[0].payload.to_bytes())
 
@@ -185,7 +186,7 @@ BAD_QUERIES = {
 @pytest.mark.parametrize("selector", BAD_QUERIES)
 def test_a_bad_query_is_refused_counted_and_named(probe: Probe, selector: str):
     before = probe.client.info()
-    replies = list(probe.session.get(f"sitegrid/{probe.site.name}/{selector}", timeout=READY_S))
+    replies = list(probe.session.get(f"sitegrid/{probe.site.name}/{selector}", timeout=60.0))
     assert [reply.err is not None for reply in replies] == [True], probe.where
     error = decode_error(replies[0].err.payload.to_bytes())
     assert error.reason == BAD_QUERIES[selector], f"{error}: {probe.where}"
@@ -197,6 +198,7 @@ def test_a_bad_query_is_refused_counted_and_named(probe: Probe, selector: str):
     assert probe.server.code is None, probe.where
 
 
+@pytest.mark.nightly
 def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children: Children, tmp_path):
     """The server's site is smaller than the agent's: what lies beyond it is refused, the way back in arrives."""
     sim = SimConfig(machines=1, seconds=60, speed=10, seed=3, world="fast")
@@ -205,7 +207,7 @@ def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children:
     lines = [line for line in wide.splitlines() if not line.startswith("extent_m")]
     router = run.start_router()
     # Where the machine drives is known from a first look: half of what it sees lies within the median.
-    children.start("record", "sim", "--record", tmp_path / "logs", *words(sim)).wait(60)
+    children.start("record", "sim", "--record", tmp_path / "logs", *words(sim)).wait(PATIENCE_S)
     extent_m = middle_of(tmp_path / "logs" / "loader-1", run)
     run.site_file.write_text("\n".join([f"extent_m = {extent_m}", *lines]) + "\n")
     server = run.start_server()
@@ -216,14 +218,12 @@ def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children:
     agent = run.start_agent(run.configs[0])
     run.start_sim()
     where = f"router {router.pid}, server {server.pid}, agent {agent.pid}"
-    report = agent.expect("ended", 90.0)["ended"]
+    report = agent.expect("ended", PATIENCE_S)["ended"]
     quarantined = report["spool"]["put_aside"]
     assert report["delivered"], where
     assert 0 < quarantined < report["samples"], where
     assert report["uplink"]["counters"]["refused_outside_site"] >= quarantined, where
-    wait_until(
-        lambda: decode_health(reports[-1]).values["spool"]["put_aside"] == quarantined, READY_S, "health says so"
-    )
+    until(lambda: decode_health(reports[-1]).values["spool"]["put_aside"] == quarantined, "health says so")
     session.close()
     with run.connect() as client:
         info = client.info()

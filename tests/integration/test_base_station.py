@@ -18,10 +18,11 @@ from protocol.wire.messages import SiteCorrection
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid import connect
-from sitegrid.process.children import Child, Children, wait_until
-from tests.integration.site_run import READY_S, SiteRun
+from sitegrid.process.children import Child, Children
+from tests.integration.site_run import SiteRun
+from tests.patience import PATIENCE_S, until
 
-pytestmark = [pytest.mark.processes, pytest.mark.slow]
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 SIM = SimConfig(scenario="base_station", machines=1, seed=3, world="fast", seconds=600.0, speed=6.0)
 
 
@@ -31,7 +32,7 @@ class BaseRun(SiteRun):
     def start_base(self) -> Child:
         words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--config", self.folder / "base-1.toml")
         base = self.children.start("base-1", "agent", *words, "--json")
-        base.expect("ready", READY_S)
+        base.expect("ready", PATIENCE_S)
         return base
 
     def start_sim(self) -> Child:
@@ -84,7 +85,7 @@ def test_machine_uses_a_base_until_that_is_killed(site: BaseRun) -> None:
     site.start_agents()
     with watching(site) as (health, said):
         site.start_sim()
-        wait_until(lambda: bool(of_base(health).get("used")), 60.0, "corrections used")
+        until(lambda: bool(of_base(health).get("used")), "corrections used")
         assert of_base(health)["age_s"] < 5.0
         assert health["base-1"]["role"] == "base"
         assert health["base-1"]["base"]["counters"]["corrections"] > 0
@@ -92,10 +93,10 @@ def test_machine_uses_a_base_until_that_is_killed(site: BaseRun) -> None:
         stamps = [message.correction.stamp_ns for message in said]
         assert stamps == sorted(set(stamps))
         base.send(signal.SIGKILL)
-        wait_until(lambda: "s old" in of_base(health).get("why_not", ""), 60.0, "the silence noticed")
+        until(lambda: "s old" in of_base(health).get("why_not", ""), "the silence noticed")
         assert of_base(health)["used"] is False
         again = site.start_base()
-        wait_until(lambda: bool(of_base(health).get("used")), 60.0, "corrections used again")
+        until(lambda: bool(of_base(health).get("used")), "corrections used again")
         again.stop()
 
 
@@ -104,6 +105,6 @@ def test_second_base_of_a_name_does_not_start(site: BaseRun) -> None:
     site.start_base()
     words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--config", site.folder / "base-1.toml")
     second = site.children.start("second", "agent", *words, "--json")
-    wait_until(lambda: second.code is not None, READY_S, "the second base ended")
+    until(lambda: second.code is not None, "the second base ended")
     assert second.code == 1
     assert "runs already" in (site.folder / "second.log").read_text(encoding="utf-8")

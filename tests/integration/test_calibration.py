@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -30,7 +27,8 @@ from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sim.simulator import START_NS
 from sitegrid.process.children import Child, Children
-from tests.integration.site_run import READY_S, SiteRun, kill
+from tests.command_lines import said
+from tests.integration.site_run import SiteRun, kill
 from tests.integration.test_evidence import Senders
 from tests.journals import history_beside
 from tests.reference.correction import in_numpy
@@ -81,11 +79,6 @@ def by_person(machine: str) -> Corrections:
     return Corrections([Correction(machine, 0, LAST_NS, ZERO, 0.0, 0.0, ())])
 
 
-def run(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "sitegrid.cli", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=READY_S, check=False)
-
-
 def sample_bytes(journal: Path) -> dict[tuple[str, int], bytes]:
     with SqliteReader(journal) as reader:
         return {(row.machine, row.first_seq): row.rows.tobytes() for row in history_rows(history_beside(reader))}
@@ -96,9 +89,7 @@ def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
     with site.connect() as client:
         client.info(after=Senders(site, client).send(DRIVES))
         before = client.region((0, 0, 120, 60), ("resistance",))
-        answered = run("calibrate", "--endpoint", site.endpoint, "--site", site.site, "--json")
-        assert answered.returncode == 0, answered.stderr
-        answer = json.loads(answered.stdout)
+        answer = said("calibrate", "--endpoint", site.endpoint, "--site", site.site, "--json").json
         assert [row["by"] for row in answer["machines"]] == ["solver"] * 3
         assert answer["machines"][0]["zero"] == pytest.approx(0.008, abs=0.003)
         info = client.info()
@@ -113,14 +104,15 @@ def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
     with stored(folder / "store", site) as store:
         corrections, live = store.facts.corrections, store.grid
     assert same(live, folded(site, corrections, DRIVES))
-    again = run("fold", folder / "store", "--site-file", site.site_file, "--out", folder / "again", "--json")
-    assert again.returncode == 0, again.stderr
+    again = said("fold", folder / "store", "--site-file", site.site_file, "--out", folder / "again", "--json")
+    assert again.code == 0, again.err
     assert sample_bytes(folder / "again" / JOURNAL_FILE) == sample_bytes(folder / "store" / JOURNAL_FILE)
     with stored(folder / "again", site) as store:
         assert same(store.grid, live)
         assert store.facts.corrections == corrections
 
 
+@pytest.mark.nightly
 def test_two_servers_with_the_same_facts_have_the_same_map_however_the_samples_came(site: SiteRun):
     """One corrects at the beginning, live, the other all in the end, in one refold."""
     grids = []
@@ -169,6 +161,7 @@ def with_an_old_snapshot(site: SiteRun, server: Child) -> None:
     old.write_bytes(kept)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("accident", [killed_with_a_fact_on_disk, with_an_old_snapshot])
 def test_after_an_accident_the_next_start_has_the_fact_in_its_map(
     site: SiteRun, accident: Callable[[SiteRun, Child], None]
@@ -187,6 +180,7 @@ def test_after_an_accident_the_next_start_has_the_fact_in_its_map(
         assert same(store.grid, folded(site, by_person("a"), DRIVES))
 
 
+@pytest.mark.nightly
 def test_a_fact_of_a_newer_version_keeps_the_server_from_starting_in_one_line(site: SiteRun):
     server = serve(site)
     with site.connect() as client:
@@ -197,15 +191,16 @@ def test_a_fact_of_a_newer_version_keeps_the_server_from_starting_in_one_line(si
     with closing(SqliteJournal(path, config.name, config.frame)) as journal:
         journal.append_event("calibration", 1, decision.body() | {"version": 2})
     words = ("--site-file", site.site_file, "--store", site.folder / "store")
-    refused = run("server", "--endpoint", site.endpoint, *words)
-    assert refused.returncode == 1
-    (line,) = refused.stderr.strip().splitlines()
+    refused = said("server", "--endpoint", site.endpoint, *words)
+    assert refused.code == 1
+    (line,) = refused.err.strip().splitlines()
     assert "version 2, by a newer version of this program; this one knows version 1; open it with that" in line
-    assert run("fold", site.folder / "store", "--out", site.folder / "new").returncode == 1
+    assert said("fold", site.folder / "store", "--out", site.folder / "new").code == 1
     with closing(sqlite3.connect(path)) as database:
         assert database.execute("SELECT COUNT(*) FROM events").fetchone() == (1,), "it is still there"
 
 
+@pytest.mark.nightly
 def test_the_map_of_an_archive_and_its_facts_is_the_live_one(site: SiteRun):
     pytest.importorskip("pyarrow.parquet")
     (site.folder / "server.toml").write_text(ASKED.replace("0.0", "0.000001"))
@@ -217,12 +212,13 @@ def test_the_map_of_an_archive_and_its_facts_is_the_live_one(site: SiteRun):
     server.stop()
     with stored(folder / "store", site) as store:
         live = store.grid
-    archived = run("fold", folder / "store", "--site-file", site.site_file, "--out", folder / "of-store")
-    assert archived.returncode == 0, archived.stderr
+    archived = said("fold", folder / "store", "--site-file", site.site_file, "--out", folder / "of-store")
+    assert archived.code == 0, archived.err
     with stored(folder / "of-store", site) as store:
         assert same_evidence(store.grid, live)
 
 
+@pytest.mark.nightly
 def test_an_agent_that_accepts_offers_takes_the_server_s_and_states_it(tmp_path: Path, children: Children):
     """It comes with the first acknowledgement of samples, and counts at a standstill or at the end of a tour."""
     sim = SimConfig(machines=2, seconds=160, speed=10, seed=3, world="fast")

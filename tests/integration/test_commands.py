@@ -10,100 +10,59 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from sitegrid.process.children import wait_until
-from tests.integration.site_run import SiteRun  # beside this file
+from sim.config import SimConfig
+from sim.recorder import write_truth
+from sim.simulator import Simulator
+from tests.command_lines import said
+from tests.integration.web_site import NAME, WebSite
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
 
-def sitegrid(*words: object, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "sitegrid.cli", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
-
-
-def last_json(text: str) -> dict:
-    return json.loads(text.strip().splitlines()[-1])
-
-
-@pytest.fixture
-def mapped(site_run: SiteRun) -> SiteRun:
-    """A site with a map, its server still running."""
-    site_run.start()
-    site_run.end_of_agents()
-    return site_run
-
-
-def test_query_and_plot_answer_people_and_machines(mapped: SiteRun, tmp_path: Path):
-    where = ("--endpoint", mapped.endpoint, "--site", "paper")
-    info = last_json(sitegrid("query", *where, "--json", "info").stdout)
-    assert info["machines"].keys() == {"loader-1", "loader-2", "loader-3"}
-    with mapped.connect() as client:
-        region = client.region((0, 0, 200, 150), ["resistance"])
+def test_query_and_plot_answer_people_and_machines(web: WebSite, tmp_path: Path):
+    where = ("--endpoint", web.endpoint, "--site", NAME)
+    assert said("query", *where, "--json", "info").json["machines"].keys() == {"machine-0", "machine-1", "machine-2"}
+    region = web.client.region((0, 0, 200, 150), ["resistance"])
     row, column = np.argwhere(np.isfinite(region["resistance"]))[0]
     x, y = region.x_m[column], region.y_m[row]
-    point = last_json(sitegrid("query", *where, "--json", "point", x, y).stdout)
+    point = said("query", *where, "--json", "point", x, y).json
     assert point["resistance"] == pytest.approx(float(region["resistance"][row, column]))
-    only = last_json(sitegrid("query", *where, "--json", "--layers", "visits", "point", x, y).stdout)
+    only = said("query", *where, "--json", "--layers", "visits", "point", x, y).json
     assert "visits" in only
     assert "resistance" not in only
-    people = sitegrid("query", *where, "point", x, y)
-    assert "resistance " in people.stdout
-    nowhere = sitegrid("query", *where, "point", -500, -500)
-    assert "unknown" in nowhere.stdout
+    assert "resistance " in said("query", *where, "point", x, y).out
+    assert "unknown" in said("query", *where, "point", -500, -500).out
     saved = tmp_path / "region.npz"
-    cells = last_json(sitegrid("query", *where, "--json", "region", 0, 0, 200, 150, "--out", saved).stdout)
+    cells = said("query", *where, "--json", "region", 0, 0, 200, 150, "--out", saved).json
     assert cells["columns"] == 200
     assert np.load(saved)["resistance"].shape == (150, 200)
     assert cells["layers"]["resistance"]["known"] == int(np.isfinite(region["resistance"]).sum())
-    picture, truth = tmp_path / "map.png", mapped.folder / "truth" / "truth_map.npz"
-    drawn = sitegrid("plot", *where, "--out", picture, "--truth", truth, "--bounds", 0, 0, 200, 150, "--json")
-    difference = str(tmp_path / "map-difference.png")
-    assert last_json(drawn.stdout) == {"picture": str(picture), "drawn": 1, "difference": difference}
-    assert cv2.imread(str(picture)) is not None
-    assert cv2.imread(difference) is not None
-    late = sitegrid("query", *where, "--after", 10**6, "info", timeout_s=60)
-    assert (late.returncode, late.stdout) == (1, "")
-    assert "is not merged after" in late.stderr
 
 
-def test_plot_follows_machines_live(site_run: SiteRun, tmp_path: Path):
-    site_run.start_router()
-    site_run.start_server()
-    site_run.start_agents()
-    out = tmp_path / "live.png"
-    words = ("--endpoint", site_run.endpoint, "--out", out, "--follow", "--every", 0.5, "--json")
-    plot = site_run.children.start("plot", "plot", *words)
-    wait_until(out.exists, 40.0, "first picture")
-    first = out.read_bytes()
-    site_run.start_sim()
-    wait_until(lambda: out.read_bytes() != first, 60.0, "a picture of more than there was at first")
-    plot.send(signal.SIGTERM)
-    assert plot.expect("picture", 10.0)["drawn"] > 1
-    assert plot.wait(10.0) == 0
+def test_plot_draws_the_map_and_how_it_differs_from_the_truth(web: WebSite, tmp_path: Path):
+    with closing(Simulator(SimConfig(machines=1, seconds=1, world="fast"))) as simulator:
+        write_truth(tmp_path, simulator)
+    words = ("--truth", tmp_path / "truth_map.npz", "--bounds", 0, 0, 200, 150, "--json")
+    where = ("--endpoint", web.endpoint, "--site", NAME)
+    drawn = said("plot", *where, "--out", tmp_path / "map.png", *words).json
+    assert drawn["picture"] == str(tmp_path / "map.png")
+    assert drawn["difference"] == str(tmp_path / "map-difference.png")
+    assert all(cv2.imread(drawn[name]) is not None for name in ("picture", "difference"))
 
 
-def test_plot_ends_after_as_many_pictures_as_were_asked_for(site_run: SiteRun, tmp_path: Path):
-    site_run.start_router()
-    site_run.start_server()
-    words = ("--endpoint", site_run.endpoint, "--out", tmp_path / "live.png", "--follow", "--every", 0.1)
-    plot = site_run.children.start("plot", "plot", *words, "--pictures", 3, "--json")
-    assert plot.expect("picture", 60.0)["drawn"] == 3
-    assert plot.wait(10.0) == 0
-    site_run.end_of_agents()
-
-
+@pytest.mark.nightly
 def test_demo_prints_one_object_with_its_proof(tmp_path: Path, husky_data: Path):
     words = ("--seconds", 40, "--speed", 8, "--machines", 3, "--seed", 7, "--out", tmp_path, "--data", husky_data)
     manifest = Path("lab/logs/rl_test1_husky/log.toml").absolute()
-    demo = sitegrid("demo", "--headless", "--json", *words, "--log", manifest, timeout_s=170)
-    assert demo.returncode == 0, demo.stderr
-    result = last_json(demo.stdout)
+    result = said("demo", "--headless", "--json", *words, "--log", manifest).json
     assert (result["machines"], result["lost"], result["double"], result["seed"]) == (3, 0, 0, 7)
     assert result["samples_recorded"] == result["samples_merged"] > 300
     assert result["cells"] > 500
@@ -118,17 +77,18 @@ def test_demo_prints_one_object_with_its_proof(tmp_path: Path, husky_data: Path)
     assert log["withheld_rms_m"] < 2.0
 
 
+@pytest.mark.nightly
 def test_ctrl_c_ends_everything_that_the_demo_started(tmp_path: Path):
     words = ["demo", "--headless", "--machines", "1", "--json", "--out", str(tmp_path)]
     command = [sys.executable, "-m", "sitegrid.cli", *words]
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         picture = tmp_path / "map.png"
-        wait_until(picture.exists, 60.0, "machines drive")
+        until(picture.exists, "machines drive")
         started = children_of(demo.pid)
         assert len(started) == 4, "router, server, simulator, agent"
         demo.send_signal(signal.SIGINT)
-        _, errors = demo.communicate(timeout=30)
+        _, errors = demo.communicate(timeout=PATIENCE_S)
     finally:
         demo.kill()
         demo.wait()
@@ -147,11 +107,11 @@ def test_on_a_terminal_the_page_of_the_demo_stays_until_ctrl_c(tmp_path: Path):
             while not (stays := re.search(rb"stays at (http://\S+)/ until Ctrl-C", shown)):
                 shown += os.read(terminal, 4096)
             started = children_of(demo.pid)
-            with urllib.request.urlopen(f"{stays[1].decode()}/api/v1/sites/paper/info", timeout=20) as answer:
+            with urllib.request.urlopen(f"{stays[1].decode()}/api/v1/sites/paper/info", timeout=PATIENCE_S) as answer:
                 assert json.load(answer)["samples_merged"] > 0
             assert b"A site on this host: router, map server" in shown
             demo.send_signal(signal.SIGINT)
-            assert demo.wait(30) == 0
+            assert demo.wait(PATIENCE_S) == 0
         finally:
             demo.kill()
             os.close(terminal)
@@ -172,26 +132,20 @@ def is_alive(pid: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize(
-    ("words", "problem"),
-    [
-        (("query", "--endpoint", "tcp/127.0.0.1:9", "info"), "start one with `sitegrid router`"),
-        (("server", "--site-file", "none.toml", "--store", "x"), "none.toml: no such file"),
+def test_wrong_usage_exits_with_2():
+    for words in (("query", "point", "north", "1"), ("plot", "--bounds", "0"), ("fly",)):
+        assert said(*words).code == 2
+
+
+def test_what_is_missing_is_one_line_that_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    for words, problem in (
         (("agent", "--spool", "x.db"), "see config/agent.toml"),
         (("agent", "--spool", "x.db", "--driver", "replay"), "--driver replay needs --log"),
-        (("sim", "--machines", "0"), "machines: 0 is not between"),
-        (("demo", "--machines", "0"), "machines: 0 is not between"),
-    ],
-)
-def test_errors_are_one_line_that_says_what_to_do(words: tuple[str, ...], problem: str, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    process = sitegrid(*words)
-    assert process.returncode == 1
-    assert problem in process.stderr
-    assert len(process.stderr.strip().splitlines()) == 1
-
-
-def test_wrong_usage_exits_with_2():
-    assert sitegrid("query", "point", "north", "1").returncode == 2
-    assert sitegrid("plot", "--every", "0").returncode == 2
-    assert sitegrid("fly").returncode == 2
+        (("sim", "--machines", 0), "machines: 0 is not between"),
+        (("demo", "--machines", 0), "machines: 0 is not between"),
+    ):
+        refused = said(*words)
+        assert refused.code == 1
+        assert problem in refused.err
+        assert len(refused.err.strip().splitlines()) == 1

@@ -11,11 +11,11 @@ import pytest
 
 from protocol.errors import SitegridError
 from sitegrid import Client, connect
-from sitegrid.process.children import Children, wait_until
+from sitegrid.process.children import Children
 from tests.integration import compose_run
+from tests.patience import PATIENCE_S, until
 
-pytestmark = pytest.mark.processes
-SERVED_S = 100.0
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 
 
 def known_machines(client: Client) -> set[str]:
@@ -42,11 +42,13 @@ def test_all_services_of_compose_start_in_order_are_healthy_and_draw_a_map(
     assert sorted(order) == sorted(services)
     with connect(f"tcp/127.0.0.1:{run.ports['7447']}", "paper") as client:
         machines = {"loader-1", "loader-2", "loader-3"}
-        wait_until(lambda: known_machines(client) == machines, SERVED_S, "samples of every machine merged")
-        wait_until(lambda: client.info().cells > 0, SERVED_S, "cells known")
-    with urllib.request.urlopen(f"http://127.0.0.1:{run.ports['9464']}/metrics", timeout=10) as answer:
+        until(lambda: known_machines(client) == machines, "samples of every machine merged")
+        until(lambda: client.info().cells > 0, "cells known")
+    with urllib.request.urlopen(f"http://127.0.0.1:{run.ports['9464']}/metrics", timeout=PATIENCE_S) as answer:
         text = answer.read().decode()
-    with urllib.request.urlopen(f"http://127.0.0.1:{run.ports['8080']}/api/v1/sites/paper/info", timeout=10) as answer:
+    with urllib.request.urlopen(
+        f"http://127.0.0.1:{run.ports['8080']}/api/v1/sites/paper/info", timeout=PATIENCE_S
+    ) as answer:
         assert json.load(answer)["cells"] > 0
     assert all(f'sitegrid_machine_samples_total{{machine="{name}"}}' in text for name in machines)
     checked = [name for name, service in services.items() if "healthcheck" in service]

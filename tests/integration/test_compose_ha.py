@@ -12,17 +12,17 @@ import pytest
 from protocol.site.site_file import load_site
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid import connect
-from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.process.children import Child, Children
 from tests.integration import compose_run
 from tests.integration.compose_database import DatabaseServer
+from tests.patience import PATIENCE_S, until
 from tests.postgres_server import cluster_folder
 from tests.takeover.senders import Sender
 from tests.takeover.site import verdict
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 SERVERS = ("server-a", "server-b")
 REPLACED = 3  # exit code of a server that another one took over from
-READY_S, ACK_S = 120.0, 60.0
 ROWS = "SELECT row, record FROM sitegrid.journal ORDER BY row"
 
 
@@ -63,7 +63,7 @@ class HighlyAvailable:
         def new(one: Sender) -> list[float]:
             return [ack.at_s for ack in one.acknowledged[before[one.machine] :] if ack.epoch > beyond]
 
-        wait_until(lambda: all(len(new(one)) >= count for one in self.senders), ACK_S, f"batches beyond epoch {beyond}")
+        until(lambda: all(len(new(one)) >= count for one in self.senders), f"batches beyond epoch {beyond}")
         return min(new(one)[0] for one in self.senders)
 
     def epoch(self) -> int:
@@ -91,12 +91,10 @@ def test_profile_ha_survives_its_writer_and_its_primary_and_its_follower_answers
     assert len(set(pids.values())) == len(services), f"a process each: {pids}"
 
     # Two servers that started at once on a new database: one serves, the other waits.
-    wait_until(
-        lambda: len(site.which("ready")) == 1 and len(site.which("standby")) >= 1, READY_S, "one serves, one waits"
-    )
+    until(lambda: len(site.which("ready")) == 1 and len(site.which("standby")) >= 1, "one serves, one waits")
     follower = run.started["follower"]
     assert isinstance(follower, Child)
-    assert follower.expect("ready", READY_S)["name"] == "follower"
+    assert follower.expect("ready", PATIENCE_S)["name"] == "follower"
     assert all(run.check(name) for name, service in services.items() if "healthcheck" in service)
     site.send()
     site.wait_for_acknowledgements()
@@ -109,17 +107,17 @@ def test_profile_ha_survives_its_writer_and_its_primary_and_its_follower_answers
         epoch, began_s = site.epoch(), time.time()
         site.server(writer).send(signal.SIGKILL)
         took_s = site.wait_for_acknowledgements(beyond=epoch) - began_s
-        wait_until(lambda: other in site.which("ready"), READY_S, "the other one serves")
-        assert site.server(writer).wait(10.0) == -signal.SIGKILL
+        until(lambda: other in site.which("ready"), "the other one serves")
+        assert site.server(writer).wait(PATIENCE_S) == -signal.SIGKILL
         run.start_again(writer)
-        wait_until(lambda: writer in site.which("standby"), READY_S, "the one that was killed waits now")
+        until(lambda: writer in site.which("standby"), "the one that was killed waits now")
 
         epoch, began_s = site.epoch(), time.time()
         primary, replica = run.started["db-a"], run.started["db-b"]
         assert isinstance(primary, DatabaseServer)
         assert isinstance(replica, DatabaseServer)
         primary.send(signal.SIGKILL)
-        primary.wait(10.0)
+        primary.wait(PATIENCE_S)
         assert services["db-a"]["restart"] == "no", "it has to stay away"
         replica.do("pg_ctl", "promote", "-w", "-D", replica.data)
         with site.database("5433") as db:
@@ -131,19 +129,18 @@ def test_profile_ha_survives_its_writer_and_its_primary_and_its_follower_answers
             sender.end()
         row = max(ack.row for one in site.senders for ack in one.acknowledged)
         assert client.info(after=row).epoch == site.epoch()
-        wait_until(lambda: client.info().replica == "none", ACK_S, "the server sees that its database is alone")
+        until(lambda: client.info().replica == "none", "the server sees that its database is alone")
 
         def follower_has_all() -> bool:
             client.point(1.0, 1.0)
             return (client.origin.follower, client.origin.behind_rows) == ("follower", 0)
 
-        wait_until(follower_has_all, ACK_S, "the follower answers, and lacks nothing")
+        until(follower_has_all, "the follower answers, and lacks nothing")
     with site.database("5433") as db:
         result = verdict(tmp_path, [one.machine for one in site.senders], db.execute(ROWS).fetchall())
     print(f"writer killed: {took_s:.2f} s; primary killed: {promoted_s:.2f} s; {result}; {pids}")
     assert result.is_clean, result
     assert result.acknowledged > 80
-    assert promoted_s < 15.0
     codes = run.down()
     assert codes.pop("db-a") == -signal.SIGKILL
     replaced = [name for name in SERVERS if codes[name] == REPLACED]

@@ -15,6 +15,7 @@ from lab.cooperation.processes import Processes
 from protocol.errors import SitegridError
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
+from tests.patience import PATIENCE_S
 
 STORED = Path(__file__).parent / "cooperation_quick.json"
 # By the time that a decision is made, which differs from run to run; points of percent.
@@ -88,7 +89,7 @@ def test_a_process_that_does_not_start_says_why_in_one_line(tmp_path: Path):
         with pytest.raises(
             SitegridError, match=r"^server: ended with \d+ .* `ready`; its last word: .*none.toml"
         ) as error:
-            server.expect("ready", 60.0)
+            server.expect("ready", PATIENCE_S)
     assert "\n" not in str(error.value)
     with pytest.raises(ProcessLookupError):
         os.kill(server.pid, 0)

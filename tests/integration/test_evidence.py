@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,8 +16,10 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid import Client
-from sitegrid.process.children import Child, wait_until
-from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
+from sitegrid.process.children import Child
+from tests.command_lines import said
+from tests.integration.site_run import SiteRun, kill  # beside this file
+from tests.patience import until
 
 pytestmark = pytest.mark.processes
 
@@ -80,11 +79,7 @@ def resistance(client: Client, **when: Any) -> float:
 
 def command(site_run: SiteRun, *words: str) -> Any:
     where = ("--endpoint", site_run.endpoint, "--site", site_run.site, "--json")
-    process = subprocess.run(
-        [sys.executable, "-m", "sitegrid.cli", words[0], *where, *words[1:]], capture_output=True, text=True, timeout=60
-    )
-    assert process.returncode == 0, process.stderr
-    return json.loads(process.stdout.splitlines()[-1])
+    return said(words[0], *where, *words[1:]).json
 
 
 def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: SiteRun, server: Child):
@@ -100,7 +95,7 @@ def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: Si
         assert resistance(client, minus_ns=before_ns) == pytest.approx(NEW - OLD, rel=0.1)
         spans = client.history(SIZE - 8.5, 20.5, ["resistance"], span_s=3600.0)
         assert [round(span.values["resistance"], 2) for span in spans] == [OLD, OLD, NEW]
-        wait_until(lambda: events and client.changes()[0].cells > 400, READY_S, f"a change of server pid {server.pid}")
+        until(lambda: events and client.changes()[0].cells > 400, f"a change of server pid {server.pid}")
         (change,) = client.changes()
         assert change.resistance_before == pytest.approx(OLD, rel=0.1)
         assert before_ns - HOUR_NS < change.first_ns < START_NS + 4 * HOUR_NS
@@ -108,13 +103,14 @@ def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: Si
     assert command(site_run, "query", "changes")["changes"][0]["id"] == change.id
 
 
+@pytest.mark.nightly
 def test_a_bad_machine_is_found_left_out_and_stays_so_after_a_kill(site_run: SiteRun, server: Child, tmp_path: Path):
     with site_run.connect() as client:
         senders = Senders(site_run, client)
         good = {name: sweep(i, 0) for i, name in enumerate("abd")}
         senders.send({**good, "c": sweep(9, 0, BAD)})
         senders.send({**{n: sweep(i + 20, 3) for i, n in enumerate("abd")}, "c": sweep(29, 3, BAD)})
-        wait_until(lambda: client.info().distrusted == ("c",), READY_S, f"server pid {server.pid} leaves out c")
+        until(lambda: client.info().distrusted == ("c",), f"server pid {server.pid} leaves out c")
         (machine,) = [machine for machine in client.machines() if machine.name == "c"]
         assert (machine.trusted, machine.by) == (False, "audit")
         assert "gain" in machine.reason

@@ -19,15 +19,15 @@ from mapserver.journal.archive import write_file
 from mapserver.journal.rows import JournalRow
 from protocol.site.site_config import SiteConfig
 from sitegrid.cli import main
-from sitegrid.process.children import wait_until
 from sitegrid.refold import cluster as clusters
 from sitegrid.refold.cluster import Cluster
+from tests.patience import PATIENCE_S, until
 from tests.unit.sitegrid.refold.archives import SITE, STORE, T0, S, samples
 
 pytest.importorskip("pyarrow.parquet")
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.processes
-FILES, WAIT_S = 12, 120.0
+FILES = 12
 MOST_FOLDS = 8  # until a worker dies in one
 # The command with smaller tasks, so that there are many of them.
 FOLD = (
@@ -88,12 +88,12 @@ def evidence(out: Path) -> list[Path]:
     return list(out.with_name(f"{out.name}.part").glob("work/evidence-*"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_processes_make_the_same_store(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
     seen: set[int] = set()
     out = tmp_path / "out"
     with started(archive, "--out", out, "--jobs", 2) as fold:
-        wait_until(lambda: fold.poll() is not None or not seen.update(children_of(fold.pid)), WAIT_S, "a look")
+        until(lambda: fold.poll() is not None or not seen.update(children_of(fold.pid)), "a look")
         while fold.poll() is None:
             seen |= children_of(fold.pid)
     assert fold.returncode == 0
@@ -102,39 +102,40 @@ def test_processes_make_the_same_store(archive: Path, expected: dict[str, str], 
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_fold_that_is_killed_goes_on(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     with started(archive, "--out", out, "--jobs", 2) as fold:
-        wait_until(lambda: len(evidence(out)) >= 3, WAIT_S, "some tasks")
+        until(lambda: len(evidence(out)) >= 3, "some tasks")
         workers = children_of(fold.pid)
         fold.kill()
     assert workers
-    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers), WAIT_S, "the end of its processes")
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers), "the end of its processes")
     assert not out.exists()
     before = {path: path.stat().st_ino for path in evidence(out)}
     assert 3 <= len(before) < FILES
     with started(archive, "--out", out, "--jobs", 2) as fold:
-        wait_until(lambda: len(evidence(out)) > len(before), WAIT_S, "more tasks")
+        until(lambda: len(evidence(out)) > len(before), "more tasks")
         assert {path: path.stat().st_ino for path in before} == before, "what was done is not done again"
-        assert fold.wait(WAIT_S) == 0
+        assert fold.wait(PATIENCE_S) == 0
     assert contents(out) == expected
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_processes_that_are_killed_are_replaced(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     with started(archive, "--out", out, "--jobs", 2) as fold:
-        wait_until(lambda: len(evidence(out)) >= 2, WAIT_S, "some tasks")
+        until(lambda: len(evidence(out)) >= 2, "some tasks")
         killed = children_of(fold.pid)
         for pid in killed:
             os.kill(pid, signal.SIGKILL)
-        assert fold.wait(WAIT_S) == 0
+        assert fold.wait(PATIENCE_S) == 0
     assert killed
     assert contents(out) == expected
 
 
+@pytest.mark.nightly
 def test_a_damaged_file_in_the_middle_ends_the_fold_and_leaves_nothing(archive: Path, tmp_path: Path, capsys) -> None:
     shutil.copytree(archive, tmp_path / "archive")
     damaged = sorted((tmp_path / "archive").iterdir())[5]
@@ -181,7 +182,7 @@ def test_a_cluster_makes_the_same_store(archive: Path, expected: dict[str, str],
     assert contents(tmp_path / "out") == expected
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("mode", ["graceful", "segfault"])
 def test_a_cluster_whose_workers_die_makes_the_same_store(
     archive: Path, expected: dict[str, str], tmp_path: Path, dask, mode: str
@@ -202,7 +203,7 @@ def test_a_cluster_whose_workers_die_makes_the_same_store(
     assert died, "workers died during a fold"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_that_loses_all_its_workers_is_named(
     archive: Path, tmp_path: Path, dask, monkeypatch, capsys
 ) -> None:
@@ -218,7 +219,7 @@ def test_a_cluster_that_loses_all_its_workers_is_named(
     assert error.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_scheduler_that_dies_is_named_and_the_fold_goes_on_without_it(
     archive: Path, expected: dict[str, str], tmp_path: Path
 ) -> None:
@@ -230,20 +231,20 @@ def test_a_scheduler_that_dies_is_named_and_the_fold_goes_on_without_it(
     worker += ["--scheduler-file", str(port_file), "--nthreads", "1", "--local-directory", str(tmp_path / "scratch")]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([*command, "--scheduler-file", str(port_file)], **quiet) as scheduler:
-        wait_until(port_file.exists, WAIT_S, "a scheduler")
+        until(port_file.exists, "a scheduler")
         place = json.loads(port_file.read_text())["address"].replace("tcp://", "dask://")
         with subprocess.Popen([*worker, "--death-timeout", "20"], **quiet) as one:
             words = ["fold", str(archive), "--out", str(out), "--engine", place]
             code = FOLD.replace("engine import Processes", "cluster import Cluster")
             with subprocess.Popen([sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True) as fold:
-                wait_until(lambda: len(evidence(out)) >= 2 or fold.poll() is not None, WAIT_S, "some tasks")
+                until(lambda: len(evidence(out)) >= 2 or fold.poll() is not None, "some tasks")
                 scheduler.kill()
-                _, error = fold.communicate(timeout=WAIT_S)
+                _, error = fold.communicate(timeout=PATIENCE_S)
             one.terminate()
     assert fold.returncode == 1
     assert "is gone; what is done is kept in" in error
     assert error.count("\n") == 1
     assert evidence(out)
     with started(archive, "--out", out, "--jobs", 2) as again:
-        assert again.wait(WAIT_S) == 0
+        assert again.wait(PATIENCE_S) == 0
     assert contents(out) == expected

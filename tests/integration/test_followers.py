@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,26 +25,28 @@ from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid import Client
-from sitegrid.process.children import Child, Children, wait_until
-from tests.integration.site_run import READY_S, SiteRun, kill
+from sitegrid.process.children import Child, Children
+from tests.command_lines import said
+from tests.integration.site_run import SiteRun, kill
+from tests.patience import PATIENCE_S, until
 from tests.unit.mapserver.data import random_samples
 
 pytestmark = pytest.mark.processes
 
 WHOLE = "bounds=-80,-80,80,80;layers=resistance,grade_east,visits,age_s,resistance_filled,grade_filled_std"
+SIM = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
 QUIET = "[store]\narchive_after_h = 0.0\n[trust]\nexclude = false\n[calibration]\nautomatic = false\n"
 
 
 class Followed(SiteRun):
     """Router and server with followers, and a session that sends samples."""
 
-    def start_follower(self, name: str, *options: str | Path, ready: bool = True) -> Child:
+    def start_follower(self, name: str, *, ready: bool = True) -> Child:
         words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--name", name)
         config = ("--config", self.folder / "server.toml")
-        where = () if "--copy" in options else ("--store", self.folder / "store")
-        child = self.children.start(name, "follow", *words, *config, *where, *options)
+        child = self.children.start(name, "follow", *words, *config, "--store", self.folder / "store")
         if ready:
-            assert child.expect("ready", READY_S)["name"] == name
+            assert child.expect("ready", PATIENCE_S)["name"] == name
         return child
 
     def serve(self) -> Child:
@@ -70,24 +70,23 @@ class Sender:
         key = keys.ingest(self._site.name, machine)
 
         def is_answered() -> bool:  # nobody may be known to a router yet that has just been joined
-            replies[:] = self.session.get(key, payload=batch, timeout=20.0)
+            replies[:] = self.session.get(key, payload=batch, timeout=60.0)
             return bool(replies)
 
-        wait_until(is_answered, 10.0, "the server takes batches")
+        until(is_answered, "the server takes batches")
         ack = decode_reply(replies[0].ok.payload.to_bytes())
         assert isinstance(ack, Ack)
         return ack.row
 
     def ask(self, key: str, parameters: str) -> zenoh.Sample:
-        (reply,) = self.session.get(f"{key}?{parameters}", timeout=20.0)
+        (reply,) = self.session.get(f"{key}?{parameters}", timeout=60.0)
         assert reply.ok is not None, reply.err.payload.to_bytes()
         return reply.ok
 
 
 @pytest.fixture
 def run(tmp_path: Path, children: Children) -> Followed:
-    sim = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
-    site = Followed(tmp_path, children, free_endpoint(), sim)
+    site = Followed(tmp_path, children, free_endpoint(), SIM)
     site.start_router()
     return site
 
@@ -127,7 +126,7 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
     server = run.serve()
     for machine in "abcabc":
         sender.send(machine)
-    near, far = run.start_follower("near"), run.start_follower("far", "--copy", run.folder / "copy")  # of the journal
+    near, far = run.start_follower("near"), run.start_follower("far")
     followers = [near, far]
     pids = f"server pid {server.pid}, followers pids {[one.pid for one in followers]}"
     with run.connect() as client:
@@ -135,11 +134,10 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
         def all_equal(row: int) -> None:
             version = client.info(after=row)
             for name in ("near", "far"):
-                wait_until(
+                until(
                     lambda name=name: (
                         version_of(client, sender, run, name) == MapVersion(version.store, version.merged, version.fact)
                     ),
-                    20.0,
                     f"{name} follows; {pids}",
                 )
             maps = [region(sender, run, name, row) for name in ("", "near", "far")]
@@ -206,21 +204,18 @@ def test_each_query_is_worked_by_one_process_and_by_another_while_one_dies(run: 
         name = origins[victim]
         child, other = (near, "far") if name == "near" else (far, "near")
         child.send(signal.SIGSTOP)
-        got: list[float] = []
+        got: list[object] = []
 
         def ask() -> None:
-            began_s = time.monotonic()
-            victim.point(1.0, 1.0)
-            got.append(time.monotonic() - began_s)
+            got.append(victim.point(1.0, 1.0))
 
         thread = threading.Thread(target=ask)
         thread.start()
         thread.join(0.3)
         assert not got, pids  # it is held by a process that does nothing
         kill(child)
-        thread.join(20.0)
+        thread.join(PATIENCE_S)
         assert got, pids
-        assert got[0] < 4.0, pids
         assert victim.origin.follower == other, pids
         for client in clients:
             client.point(1.0, 1.0)
@@ -230,17 +225,16 @@ def test_each_query_is_worked_by_one_process_and_by_another_while_one_dies(run: 
             client.close()
 
 
+@pytest.mark.nightly
 def test_the_map_is_read_while_the_server_is_away_and_after_it_is_back(run: Followed, sender: Sender):
     server = run.serve()
     row = sender.send()
     follower = run.start_follower("near")
     with run.connect() as client:
         kill(server)
-        began_s = time.monotonic()
         point = client.point(1.0, 1.0, after=row)
         assert point.version.row == row
         assert client.info().server.pid == follower.pid
-        assert time.monotonic() - began_s < 5.0
         with pytest.raises(LinkError, match="no map server"):
             Client(client.session, run.endpoint, run.site, timeout_s=0.5).machines()
         again = run.serve()
@@ -248,68 +242,73 @@ def test_the_map_is_read_while_the_server_is_away_and_after_it_is_back(run: Foll
         assert later > row, f"server pid {again.pid}, follower pid {follower.pid}"
         # What it lacks within its second the server is asked for: `after` means what it always meant.
         assert client.point(1.0, 1.0, after=later).version.row >= later
-        wait_until(lambda: client.point(1.0, 1.0, after=later) and client.origin.follower == "near", 10.0, "followed")
+        until(lambda: client.point(1.0, 1.0, after=later) and client.origin.follower == "near", "followed")
 
 
-def test_a_follower_that_lacks_a_row_refuses_and_the_server_is_asked(run: Followed, sender: Sender):
-    run.serve()
-    sender.send()
-    follower = run.start_follower("near")
-    with run.connect() as client:
+# --- one server and one follower, which tests only ask
+
+
+@dataclass(frozen=True)
+class Quiet:
+    """A site with one row, and one follower that has it."""
+
+    run: Followed
+    sender: Sender
+    row: int
+    follower: Child
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Quiet]:
+    folder = tmp_path_factory.mktemp("quiet")
+    with Children(folder) as children:
+        run = Followed(folder, children, free_endpoint(), SIM)
+        run.start_router()
+        run.serve()
+        sender = Sender(run)
+        with closing(sender.session):
+            yield Quiet(run, sender, sender.send(), run.start_follower("near"))
+
+
+def test_a_follower_that_lacks_a_row_refuses_and_the_server_is_asked(quiet: Quiet):
+    with quiet.run.connect() as client:
         client.point(1.0, 1.0)
         assert client.origin.follower == "near"
-        assert client.origin.behind_s < 5.0
         with pytest.raises(QueryError, match=r"row 99 is not merged after 1\.5 s") as refused:
             client.point(1.0, 1.0, after=99, wait_s=1.5)  # who says so last is the server
         assert refused.value.reason == "after_timeout"
-        assert client.info().counters["refused_query_after_timeout"] == 1, f"follower pid {follower.pid}"
+        assert client.info().counters["refused_query_after_timeout"] == 1, f"follower pid {quiet.follower.pid}"
 
 
-def test_followers_are_listed_with_how_far_behind_they_are(run: Followed, sender: Sender):
-    run.serve()
-    row = sender.send()
-    follower = run.start_follower("near")
-    with run.connect() as client:
+def test_followers_are_listed_with_how_far_behind_they_are(quiet: Quiet):
+    with quiet.run.connect() as client:
         (one,) = client.followers()
-        assert (one.name, one.merged, one.behind_rows) == ("near", row, 0)
-        assert 0 <= one.behind_s < 5
-    words = ("query", "--endpoint", run.endpoint, "--site", run.site, "followers")
-    command = [sys.executable, "-m", "sitegrid.cli", *words]
-    shown = subprocess.run(command, capture_output=True, text=True, timeout=READY_S, check=True).stdout
-    assert shown.startswith(f"near: journal row {row}, 0 rows"), f"follower pid {follower.pid}"
+        assert (one.name, one.merged, one.behind_rows) == ("near", quiet.row, 0)
+        assert one.behind_s >= 0
+    shown = said("query", "--endpoint", quiet.run.endpoint, "--site", quiet.run.site, "followers")
+    assert shown.out.startswith(f"near: journal row {quiet.row}, 0 rows"), f"follower pid {quiet.follower.pid}"
 
 
-def test_a_second_follower_of_a_name_ends_and_says_which_is_the_first(run: Followed, sender: Sender):
-    run.serve()
-    first = run.start_follower("near")
-    second = run.start_follower("near", ready=False)
-    assert second.wait(READY_S) == 1
-    assert first.code is None
-    assert f"another follower has this name, pid {first.pid}" in (run.folder / "near.log").read_text()
+def test_a_second_follower_of_a_name_ends_and_says_which_is_the_first(quiet: Quiet):
+    second = quiet.run.start_follower("near", ready=False)
+    assert second.wait(PATIENCE_S) == 1
+    assert quiet.follower.code is None
+    problem = f"another follower has this name, pid {quiet.follower.pid}"
+    assert problem in (quiet.run.folder / "near.log").read_text()
 
 
-def test_a_follower_of_another_site_ends_with_a_line(run: Followed, tmp_path: Path):
-    run.serve()
-    other = tmp_path / "other.toml"
+def test_a_follower_of_another_site_ends_with_a_line(quiet: Quiet, tmp_path: Path):
+    run, other = quiet.run, tmp_path / "other.toml"
     other.write_text(run.site_file.read_text().replace(f'"{run.site}"', '"elsewhere"'))
-    words = ("--endpoint", run.endpoint, "--site-file", str(other), "--store", str(run.folder / "store"))
-    command = [sys.executable, "-m", "sitegrid.cli", "follow", *words, "--name", "near"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=READY_S, check=False)
-    assert ended.returncode == 1
-    assert "compare the site files" in ended.stderr
-    assert ended.stderr.strip().count("\n") == 0
+    where = ("--endpoint", run.endpoint, "--site-file", other, "--store", run.folder / "store")
+    ended = said("follow", *where, "--name", "near")
+    assert (ended.code, ended.err.strip().count("\n")) == (1, 0)
+    assert "compare the site files" in ended.err
 
 
-def test_answers_say_who_gave_them_and_how_far_behind(run: Followed, sender: Sender):
-    run.serve()
-    sender.send()
-    run.start_follower("near")
-    for key, who in (
-        (keys.map_query(run.site, "point"), ""),
-        (keys.follower_query(run.site, "near", "point"), "near"),
-    ):
-        sample = sender.ask(key, "x=1;y=1")
-        origin = decode_origin(sample.attachment.to_bytes())
+def test_answers_say_who_gave_them_and_how_far_behind(quiet: Quiet):
+    site = quiet.run.site
+    for key, who in ((keys.map_query(site, "point"), ""), (keys.follower_query(site, "near", "point"), "near")):
+        origin = decode_origin(quiet.sender.ask(key, "x=1;y=1").attachment.to_bytes())
         assert (origin.follower, origin.behind_rows) == (who, 0)
-        assert 0 <= origin.behind_s < 5
-    assert np.isfinite(origin.behind_s)
+        assert 0 <= origin.behind_s < np.inf

@@ -9,8 +9,9 @@ import pytest
 
 from protocol.wire.session import free_endpoint
 from sitegrid.process.children import Children
+from tests.command_lines import said
 from tests.integration.site_run import SiteRun  # beside this file
-from tests.integration.test_commands import sitegrid
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.processes
 
@@ -88,7 +89,7 @@ def test_a_log_in_metres_is_located_and_mapped_where_the_machine_was(site_run: S
     server = site_run.start_server()
     words = ("--endpoint", site_run.endpoint, "--driver", "replay", "--log", tmp_path, "--speed", "0", "--json")
     files = ("--spool", tmp_path / "robot.db", "--audit", tmp_path / "robot.audit")
-    report = children.start("robot", "agent", *words, *files).expect("ended", 60.0)["ended"]
+    report = children.start("robot", "agent", *words, *files).expect("ended", PATIENCE_S)["ended"]
     assert report["delivered"]
     assert report["samples"] > 200
     counters = report["pipeline"]["counters"]
@@ -125,8 +126,7 @@ def test_a_log_that_cannot_be_run_is_one_line(tmp_path: Path, old: str, new: str
     assert old in LOG
     (tmp_path / "log.toml").write_text(LOG.replace(old, new, 1))
     words = ("--driver", "replay", "--log", tmp_path, "--spool", tmp_path / "x.db", "--endpoint", free_endpoint())
-    for process in (sitegrid("eval", "log", tmp_path), sitegrid("agent", *words)):
-        assert process.returncode == 1
-        (line,) = [line for line in process.stderr.splitlines() if line.startswith("sitegrid:")]
+    for refused in (said("log", "run", tmp_path), said("agent", *words)):
+        assert refused.code == 1
+        (line,) = [line for line in refused.err.splitlines() if line.startswith("sitegrid:")]
         assert problem in line
-        assert "Traceback" not in process.stderr

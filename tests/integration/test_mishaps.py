@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import termios
-import time
 from pathlib import Path
 
 import pytest
@@ -18,9 +17,10 @@ from protocol.machine.log_folder import open_log
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.door import INTERRUPTED
-from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.process.children import Children
 from tests.command_lines import COMMANDS
-from tests.integration.site_run import READY_S, SiteRun  # beside this file
+from tests.integration.site_run import SiteRun  # beside this file
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
@@ -29,7 +29,7 @@ IMPORTS = (1, 100, 350)
 LINES = {command.words[0]: command.line({"endpoint": "none"}) for command in reversed(COMMANDS)} | {
     "agent": ["agent", "--spool", "x.db"],
     "demo": ["demo", "--machines", "0"],
-    "eval": ["eval", "log", "missing"],
+    "log": ["log", "run", "missing"],
     "router": ["router", "--listen", "none"],
 }
 # One process for all: it has loaded nothing, and each fork begins as the command does.
@@ -66,10 +66,11 @@ def site(tmp_path: Path, children: Children) -> SiteRun:
     return SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
 
 
+@pytest.mark.nightly
 def test_ctrl_c_while_a_command_loads_ends_it_without_a_word(tmp_path: Path):
     cases = [(left, line) for line in LINES.values() for left in IMPORTS]
     words = [sys.executable, "-c", FORKS, repr(cases)]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     interrupted = dict.fromkeys(LINES, 0)
     for i, ((left, words), status) in enumerate(zip(cases, json.loads(done.stdout), strict=True)):
         said = (tmp_path / f"{i}.err").read_text()
@@ -103,25 +104,16 @@ def test_a_reader_that_leaves_a_pipe_is_no_error(site: SiteRun):
         assert shell.stderr == ""
 
 
-@pytest.mark.parametrize("what", ["router", "server", "agent"])
-def test_a_terminal_that_is_closed_ends_a_process_in_order(site: SiteRun, tmp_path: Path, what: str):
-    child = start(site, what)
-    begin_s = time.monotonic()
-    child.send(signal.SIGHUP)
-    assert child.wait(10.0) == 0
-    assert time.monotonic() - begin_s < 3.0
-    assert '"signal": "SIGHUP"' in (tmp_path / f"{child.name}.log").read_text()
-    if what == "server":
-        assert not (site.folder / "store" / "journal.db-wal").exists(), "closed, not cut off"
+def test_a_terminal_that_is_closed_ends_a_process_in_order(site: SiteRun, tmp_path: Path):
+    router, server = site.start_router(), site.start_server()
+    for child in (site.start_agent(site.configs[0]), server, router):
+        child.send(signal.SIGHUP)
+        assert child.wait(PATIENCE_S) == 0
+        assert '"signal": "SIGHUP"' in (tmp_path / f"{child.name}.log").read_text()
+    assert not (site.folder / "store" / "journal.db-wal").exists(), "closed, not cut off"
 
 
-def start(site: SiteRun, what: str) -> Child:
-    router = site.start_router()
-    if what == "router":
-        return router
-    return site.start_server() if what == "server" else site.start_agent(site.configs[0])
-
-
+@pytest.mark.nightly
 def test_nohup_keeps_a_process(tmp_path: Path):
     endpoint = free_endpoint()
     command = ["nohup", *sitegrid("router", "--listen", endpoint)]
@@ -133,19 +125,20 @@ def test_nohup_keeps_a_process(tmp_path: Path):
             assert b"already in use" in again.stderr, "the first one goes on"
             assert router.poll() is None
             router.send_signal(signal.SIGTERM)
-            assert router.wait(10.0) == 0
+            assert router.wait(PATIENCE_S) == 0
         finally:
             router.kill()
 
 
+@pytest.mark.nightly
 def test_a_demo_whose_terminal_is_closed_leaves_nothing(tmp_path: Path):
     words = ("demo", "--headless", "--machines", 1, "--world", "fast", "--out", tmp_path / "out")
     with subprocess.Popen(sitegrid(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo:
         try:
-            wait_until(lambda: len(children_of(demo.pid)) >= 2, READY_S, "router and server")
+            until(lambda: len(children_of(demo.pid)) >= 2, "router and server")
             started = children_of(demo.pid)
             demo.send_signal(signal.SIGHUP)
-            _, errors = demo.communicate(timeout=40)
+            _, errors = demo.communicate(timeout=PATIENCE_S)
         finally:
             demo.kill()
     assert "SIGHUP" in errors
@@ -157,6 +150,7 @@ def children_of(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
+@pytest.mark.nightly
 def test_a_recording_outlives_its_terminal(tmp_path: Path):
     """SIGHUP, and a terminal that takes no word any more: the bar, the result."""
     ours, theirs = os.openpty()
@@ -170,7 +164,7 @@ def test_a_recording_outlives_its_terminal(tmp_path: Path):
             while said.count(b"recording") < 3:  # drawn again, as something was recorded
                 said += os.read(ours, 1000)
             os.close(ours)
-            assert sim.wait(30.0) == 0
+            assert sim.wait(PATIENCE_S) == 0
         finally:
             sim.kill()
     assert len(list(open_log(tmp_path / "logs" / "loader-1").readings())) > 50

@@ -6,12 +6,10 @@ import contextlib
 import json
 import signal
 import threading
-import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,12 +29,14 @@ from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
-from sitegrid.process.children import Child, Children, wait_until
-from tests.integration.site_run import READY_S, SiteRun  # beside this file
+from sitegrid.process.children import Child, Children
+from tests.command_lines import said
+from tests.integration.site_run import SiteRun  # beside this file
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
-END_S = 3.0
+END_S = 25.0  # ten times what it gives itself; what it must not wait for, Zenoh's replies and links, takes 30
 NOW_NS = 1_767_225_600_000_000_000
 
 
@@ -46,12 +46,9 @@ def site(tmp_path: Path, children: Children) -> SiteRun:
 
 
 def end(child: Child) -> None:
-    """Ask it to end; it has to have ended, in peace, in time."""
-    begin_s = time.monotonic()
+    """Ask it to end; it has to end in peace, whatever it waits for."""
     child.send(signal.SIGTERM)
-    assert child.wait(END_S + 5) == 0
-    took_s = time.monotonic() - begin_s
-    assert took_s < END_S, f"{child.name} took {took_s:.1f} s to end"
+    assert child.wait(END_S) == 0
 
 
 def session_of(endpoint: str) -> closing[zenoh.Session]:
@@ -100,6 +97,7 @@ def committed(store: Path) -> dict[str, int]:
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 def test_a_router_with_many_sessions_ends_in_time(site: SiteRun):
     router = site.start_router()
     with contextlib.ExitStack() as opened:
@@ -128,10 +126,10 @@ def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committe
     old_rows(site.folder / "store", config)
     site.start_router()
     server = site.start_server("--config", str(options))
-    wait_until((site.folder / "store" / "archive").exists, READY_S, "the archive is begun")
+    until((site.folder / "store" / "archive").exists, "the archive is begun")
     with session_of(site.endpoint) as session, contextlib.ExitStack() as senders:
         sent = [senders.enter_context(closing(Sender(session, config, f"machine{'x' * i}"))) for i in range(3)]
-        wait_until(lambda: min(s.watermark for s in sent) > 1000, READY_S, "samples taken")
+        until(lambda: min(s.watermark for s in sent) > 1000, "samples taken")
         asked = f"sitegrid/{site.site}/map/region?bounds=0,0,200,200;as_of={NOW_NS + 10**11}"
         questions = [session.get(asked, timeout=3.0) for _ in range(8)]
         end(server)
@@ -142,6 +140,7 @@ def test_a_server_that_folds_answers_and_archives_ends_in_time_with_all_committe
     assert all(marks[s.machine] >= s.watermark for s in sent), "what was acknowledged is on disk"
 
 
+@pytest.mark.nightly
 def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: SiteRun, children: Children):
     store, old = site.folder / "store", load_site(site.site_file)
     old_rows(store, old)
@@ -153,12 +152,13 @@ def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: Site
     site.start_router()
     words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", store)
     server = children.start("server", "server", *words)
-    wait_until(lambda: (store / "journal.db-wal").exists(), READY_S, "the store is opened")
+    until(lambda: (store / "journal.db-wal").exists(), "the store is opened")
     end(server)
     assert not server.lines(), "it was not ready yet"
     assert committed(store) == {"old": 50_000}
 
 
+@pytest.mark.nightly
 def test_a_server_that_waits_for_a_router_ends_in_time(site: SiteRun, children: Children):
     words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "store", "--verbose")
     server = children.start("server", "server", *words)
@@ -173,7 +173,7 @@ def wait_for_handlers(child: Child) -> None:
         status = dict(line.split(":", 1) for line in Path(f"/proc/{child.pid}/status").read_text().splitlines())
         return bool(int(status["SigCgt"], 16) >> (signal.SIGTERM - 1) & 1)
 
-    wait_until(catches, READY_S, f"{child.name} catches SIGTERM")
+    until(catches, f"{child.name} catches SIGTERM")
 
 
 def start_agent(site: SiteRun, *options: object) -> tuple[Child, Path]:
@@ -196,11 +196,12 @@ def depth(spool: Path) -> int:
 def test_an_agent_with_a_full_spool_and_no_router_ends_in_time(site: SiteRun):
     fill(site.folder / "spool.db", 100_000)
     agent, spool = start_agent(site)
-    agent.expect("ready", READY_S)
+    agent.expect("ready", PATIENCE_S)
     end(agent)
     assert depth(spool) == 100_000
 
 
+@pytest.mark.nightly
 def test_an_agent_in_the_middle_of_an_exchange_with_a_dead_server_ends_in_time(site: SiteRun):
     site.start_router()
     fill(site.folder / "spool.db", 1000)
@@ -214,8 +215,8 @@ def test_an_agent_in_the_middle_of_an_exchange_with_a_dead_server_ends_in_time(s
     with session_of(site.endpoint) as session:
         queryable = session.declare_queryable(keys.ingest_all(site.site), never_answer)
         agent, spool = start_agent(site)
-        agent.expect("ready", READY_S)
-        assert asked.wait(READY_S)
+        agent.expect("ready", PATIENCE_S)
+        assert asked.wait(PATIENCE_S)
         end(agent)
         for query in kept:
             query.drop()
@@ -233,39 +234,24 @@ def paused(child: Child) -> Iterator[None]:
         child.send(signal.SIGCONT)
 
 
+@pytest.mark.nightly
 def test_a_simulator_whose_router_hangs_ends_in_time(site: SiteRun):
     router = site.start_router()
     agent, _ = start_agent(site)
-    agent.expect("ready", READY_S)
+    agent.expect("ready", PATIENCE_S)
     sim = site.start_sim()
-    sim.expect("simulated_s", READY_S)
+    sim.expect("simulated_s", PATIENCE_S)
     with paused(router):
         end(sim)
 
 
-def wait_until_still(file: Path, still_s: float = 0.5) -> None:
-    seen: list[tuple[int, float]] = []
-
-    def is_still() -> bool:
-        seen.append((file.stat().st_mtime_ns, time.monotonic()))
-        since_s = next(at_s for mtime, at_s in seen if mtime == seen[-1][0])
-        return seen[-1][1] - since_s > still_s
-
-    wait_until(is_still, READY_S, f"{file.name} is drawn no more")
-
-
-def test_plot_and_query_that_follow_end_in_time_also_while_the_server_hangs(site: SiteRun, children: Children):
+@pytest.mark.nightly
+def test_a_query_that_follows_ends_in_time_also_while_the_server_hangs(site: SiteRun, children: Children):
     site.start_router()
     server = site.start_server()
-    where = ("--endpoint", site.endpoint, "--site", site.site)
-    picture = site.folder / "live.png"
-    plot = children.start("plot", "plot", *where, "--follow", "--every", 0.05, "--out", picture)
-    query = children.start("query", "query", *where, "changes", "--follow")
-    wait_until(picture.exists, READY_S, "first picture")
+    query = children.start("query", "query", "--endpoint", site.endpoint, "--site", site.site, "changes", "--follow")
     wait_for_handlers(query)
     with paused(server):
-        wait_until_still(picture)  # it asks, and gets no answer
-        end(plot)
         end(query)
 
 
@@ -274,7 +260,7 @@ def test_plot_and_query_that_follow_end_in_time_also_while_the_server_hangs(site
 
 def scrape(url: str) -> dict[str, float]:
     """Metrics by name, of the machines' those of the only one."""
-    with urllib.request.urlopen(url, timeout=10) as answer:
+    with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:
         families = text_string_to_metric_families(answer.read().decode())
     return {sample.name: sample.value for family in families for sample in family.samples}
 
@@ -283,13 +269,13 @@ def test_the_server_tells_prometheus_of_itself_and_of_the_agents(site: SiteRun):
     site.start_router()
     words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "store")
     server = site.children.start("server", "server", *words, "--metrics", "0")
-    url = server.expect("ready", READY_S)["metrics"]
+    url = server.expect("ready", PATIENCE_S)["metrics"]
     assert url.startswith("http://127.0.0.1:")
     fill(site.folder / "spool.db", 500)
     agent, _ = start_agent(site)
-    agent.expect("ready", READY_S)
-    wait_until(lambda: scrape(url).get("sitegrid_machine_samples_total") == 500, READY_S, "samples counted")
-    wait_until(lambda: scrape(url).get("sitegrid_agent_spool_samples") == 0, READY_S, "health received")
+    agent.expect("ready", PATIENCE_S)
+    until(lambda: scrape(url).get("sitegrid_machine_samples_total") == 500, "samples counted")
+    until(lambda: scrape(url).get("sitegrid_agent_spool_samples") == 0, "health received")
     metrics = scrape(url)
     assert metrics["sitegrid_map_samples"] == 500
     assert metrics["sitegrid_journal_rows"] == metrics["sitegrid_merged_rows"] > 0
@@ -298,23 +284,17 @@ def test_the_server_tells_prometheus_of_itself_and_of_the_agents(site: SiteRun):
     end(server)
 
 
-def test_without_being_asked_the_server_listens_nowhere(site: SiteRun):
+def test_a_server_listens_nowhere_unasked_and_logs_one_json_object_per_line(site: SiteRun):
     site.start_router()
-    server = site.children.start(
-        "server", "server", *("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "s")
-    )
-    assert "metrics" not in server.expect("ready", READY_S)
+    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "s", "--verbose")
+    server = site.children.start("server", "server", *words)
+    assert "metrics" not in server.expect("ready", PATIENCE_S)
     sockets = {link.readlink().name for link in Path(f"/proc/{server.pid}/fd").iterdir() if link.is_symlink()}
     listening = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     assert not [row for row in listening if row[3] == "0A" and f"socket:[{row[9]}]" in sockets]
-
-
-def test_what_a_server_logs_is_one_json_object_per_line(site: SiteRun):
-    site.start_router()
-    server = site.start_server("--verbose")
     with session_of(site.endpoint) as session:
         batch = SampleBatch("loader-1", 7, 1, drive(1, seed=1), 'a "frame"\n')
-        list(session.get(keys.ingest(site.site, "loader-1"), payload=encode_batch(batch), timeout=10.0))
+        list(session.get(keys.ingest(site.site, "loader-1"), payload=encode_batch(batch), timeout=60.0))
     end(server)
     lines = (site.folder / "server.log").read_text().splitlines()
     events = [json.loads(line) for line in lines if line.startswith("{")]
@@ -324,34 +304,27 @@ def test_what_a_server_logs_is_one_json_object_per_line(site: SiteRun):
     assert '"frame"' in refused["problem"] or "frame" in refused["problem"]
 
 
-def run_doctor(capsys: Any, *words: object) -> tuple[int, dict[str, dict[str, str]]]:
-    from sitegrid.cli import main
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    code = main(["doctor", "--json", *map(str, words)])
-    for number, handler in before.items():
-        signal.signal(number, handler)
-    return code, {f["check"]: f for f in json.loads(capsys.readouterr().out.splitlines()[-1])["findings"]}
+def run_doctor(*words: object) -> tuple[int, dict[str, dict[str, str]]]:
+    answer = said("doctor", "--json", *words)
+    return answer.code, {one["check"]: one for one in json.loads(answer.out.splitlines()[-1])["findings"]}
 
 
 @pytest.fixture
-def guarded(tmp_path: Path, children: Children, capsys) -> Callable[..., tuple[int, dict[str, dict[str, str]]]]:
+def guarded(tmp_path: Path, children: Children) -> Callable[..., tuple[int, dict[str, dict[str, str]]]]:
     """A site with keys; asks the doctor with the keys of one name."""
     pytest.importorskip("cryptography")
-    from sitegrid.cli import main
-
     folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
-    assert main(["keys", "init", "--dir", str(folder)]) == 0
+    assert said("keys", "init", "--dir", folder).code == 0
     for name, role in {"loader-1": "machine", "guest": "visitor", "sim": "sim", "gone": "machine"}.items():
-        assert main(["keys", "add", name, "--role", role, "--dir", str(folder)]) == 0
-    assert main(["keys", "revoke", "gone", "--dir", str(folder)]) == 0
+        assert said("keys", "add", name, "--role", role, "--dir", folder).code == 0
+    assert said("keys", "revoke", "gone", "--dir", folder).code == 0
     router = children.start("router", "router", "--keys", folder, "--listen", endpoint)
-    router.expect("ready", READY_S)
+    router.expect("ready", PATIENCE_S)
     site_file = Path("config/site.toml").absolute()
     files = ("--site-file", site_file, "--store", tmp_path / "store")
     server = children.start("server", "server", "--endpoint", endpoint, "--keys", folder / "server", *files)
-    server.expect("ready", READY_S)
-    return lambda name, *words: run_doctor(capsys, "--endpoint", endpoint, "--keys", folder / name, *words)
+    server.expect("ready", PATIENCE_S)
+    return lambda name, *words: run_doctor("--endpoint", endpoint, "--keys", folder / name, *words)
 
 
 def test_the_doctor_tells_denials_from_absence(guarded: Callable[..., tuple[int, dict[str, dict[str, str]]]]):

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,31 +14,19 @@ from protocol.machine.samples import empty
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_pose
 from protocol.wire.messages import Pose, SampleBatch
-from sitegrid.process.children import Children, wait_until
-from tests.integration.browser_tab import WAIT_MS, Tab, needs_browser
+from sitegrid.process.children import Children
+from tests.integration.browser_tab import WAIT_MS, Tab, axe_script, needs_browser, watched
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, START_NS, WebSite
+from tests.patience import PATIENCE_S, until
 from tests.soak import BATCH_S
 
 pytestmark = needs_browser
 
 
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("page")
-    with Children(folder) as children:
-        site = WebSite(folder, children)
-        site.drive(60)
-        yield site
-
-
 @pytest.fixture
 def tab(browser, web: WebSite) -> Iterator[Tab]:
-    tab = Tab(browser, web.url).loaded()
-    yield tab
-    assert tab.complaints == []
-    assert all(url.startswith((web.url, "data:")) for url in tab.asked), "nobody else was asked"
-    tab.close()
+    yield from watched(browser, web.url)
 
 
 def known_place(web: WebSite) -> tuple[float, float]:
@@ -113,6 +98,7 @@ def test_the_slider_shows_the_map_of_its_time(tab: Tab, web: WebSite):
     tab.until("sitegrid.time.at === null && sitegrid.time.map === null")
 
 
+@pytest.mark.nightly
 def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab, web: WebSite):
     tab.page.keyboard.press("c")
     tab.until("sitegrid.time.mode === 'beside' && sitegrid.time.otherMap !== null")
@@ -141,6 +127,7 @@ def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab, web: Web
     tab.until("sitegrid.time.mode === 'one'")
 
 
+@pytest.mark.nightly
 def test_play_back_runs_to_now(tab: Tab):
     tab.page.locator("#play").click()
     tab.until("sitegrid.time.playing !== 0 && sitegrid.time.at !== null")
@@ -150,6 +137,7 @@ def test_play_back_runs_to_now(tab: Tab):
     tab.until("sitegrid.time.at === null")
 
 
+@pytest.mark.nightly
 def test_layers_palettes_and_fading_cost_no_traffic(tab: Tab):
     tab.page.wait_for_timeout(500)
     before = len(tab.asked)
@@ -162,6 +150,7 @@ def test_layers_palettes_and_fading_cost_no_traffic(tab: Tab):
     assert "dry concrete" in tab.page.locator("#legend").inner_text()
 
 
+@pytest.mark.nightly
 def test_the_keyboard_alone_is_enough(tab: Tab):
     tab.page.keyboard.press("Tab")
     assert tab.js("document.activeElement.className") == "skip"
@@ -188,6 +177,7 @@ def test_the_keyboard_alone_is_enough(tab: Tab):
     assert {"map", "fit", "link", "theme", "play", "slider", "compare", "live"} <= seen
 
 
+@pytest.mark.nightly
 def test_a_link_holds_view_layer_and_time(tab: Tab, browser):
     tab.page.keyboard.press("2")
     tab.page.mouse.wheel(0, -400)
@@ -202,6 +192,7 @@ def test_a_link_holds_view_layer_and_time(tab: Tab, browser):
     other.close()
 
 
+@pytest.mark.nightly
 def test_a_phone_shows_map_legend_and_panel(browser, web: WebSite):
     tab = Tab(browser, web.url, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True).loaded()
     for name in ("#map", "#legend", "#time", "#slider"):
@@ -223,6 +214,7 @@ def test_a_phone_shows_map_legend_and_panel(browser, web: WebSite):
     tab.close()
 
 
+@pytest.mark.nightly
 def test_dark_is_dark_and_is_kept(browser, web: WebSite):
     tab = Tab(browser, web.url, color_scheme="dark").loaded()
     assert tab.js("document.documentElement.dataset.theme") == "dark"
@@ -234,16 +226,17 @@ def test_dark_is_dark_and_is_kept(browser, web: WebSite):
     tab.close()
 
 
+@pytest.mark.nightly
 def test_a_server_that_is_gone_is_named_and_comes_back(browser, web: WebSite):
     tab = Tab(browser, web.url).loaded()
     kill(web.server)
-    tab.until("document.getElementById('notice').textContent.includes('No map server answers')", 40_000)
+    tab.until("document.getElementById('notice').textContent.includes('No map server answers')")
     assert tab.js("sitegrid.map.tiles.size") > 0, "what it said last stays"
     tab.page.keyboard.press("[")
     tab.until("document.getElementById('notice').textContent.includes('map of that time could not be read')")
     assert tab.js("[sitegrid.time.at, sitegrid.time.map, sitegrid.time.playing]") == [None, None, 0]
     web.server = web.start_server()
-    tab.until("sitegrid.state === 'live' && document.getElementById('notice').hidden", 40_000)
+    tab.until("sitegrid.state === 'live' && document.getElementById('notice').hidden")
     tab.close()
 
 
@@ -252,6 +245,7 @@ def seen(tab: Tab, *places: tuple[float, float]) -> bool:
     return all(260 < x < 1280 and 0 < y < 720 for x, y in (tab.pixel_of(*place) for place in places))
 
 
+@pytest.mark.nightly
 def test_an_empty_map_says_what_to_do_and_what_comes_is_in_sight_until_the_view_is_moved(browser, tmp_path: Path):
     with Children(tmp_path) as children:
         web = WebSite(tmp_path, children)
@@ -292,8 +286,10 @@ def test_an_empty_map_says_what_to_do_and_what_comes_is_in_sight_until_the_view_
 def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
     keys = tmp_path / "keys"
     with Children(tmp_path) as children:
-        children.start("init", "keys", "init", "--site", "soak", "--dir", keys).wait(30)
-        token = children.start("token", "keys", "token", "anna", "--dir", keys, "--json").expect("token", 30)["token"]
+        children.start("init", "keys", "init", "--site", "soak", "--dir", keys).wait(PATIENCE_S)
+        token = children.start("token", "keys", "token", "anna", "--dir", keys, "--json").expect("token", PATIENCE_S)[
+            "token"
+        ]
         web = WebSite(tmp_path, children, "--tokens", keys)
         web.drive(4)
         assert web.get("info").status == 401
@@ -315,13 +311,14 @@ def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
         assert tiles[0].endswith(f"/{{z}}/{{x}}/{{y}}.png?token={token}"), (
             "whoever has a token in addresses needs it there"
         )
-        children.start("revoke", "keys", "token", "anna", "--revoke", "--dir", keys).wait(30)
-        wait_until(lambda: web.get("info", {"token": token}).status == 401, 10, "the token is revoked")
+        children.start("revoke", "keys", "token", "anna", "--revoke", "--dir", keys).wait(PATIENCE_S)
+        until(lambda: web.get("info", {"token": token}).status == 401, "the token is revoked")
         tab.until("sitegrid.state === 'refused'")
         assert "Ask the office" in tab.page.locator("#notice").inner_text()
         tab.close()
 
 
+@pytest.mark.nightly
 def test_a_picture_of_the_site_lies_beneath_the_map(tab: Tab, tmp_path: Path):
     picture, world = tmp_path / "site.png", tmp_path / "site.pgw"
     assert cv2.imwrite(str(picture), np.full((30, 40, 3), (0, 0, 255), np.uint8))
@@ -339,25 +336,14 @@ def test_a_picture_of_the_site_lies_beneath_the_map(tab: Tab, tmp_path: Path):
     assert abs(north[0] - north[2]) < 20, "north of it there is none"
 
 
+@pytest.mark.nightly
 def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip("no npm: axe-core is installed by it")
-    command = [npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(tmp_path), "axe-core"]
-    if subprocess.run(command, capture_output=True, timeout=120, check=False).returncode:
-        pytest.skip("axe-core cannot be installed here")
-    axe = (tmp_path / "node_modules" / "axe-core" / "axe.min.js").read_text()
+    axe = axe_script(tmp_path)
     for theme in ("light", "dark"):
         tab = Tab(browser, f"{web.url}?theme={theme}", bypass_csp=True).loaded()
         tab.page.mouse.click(*tab.pixel_of(*known_place(web)))
         tab.page.locator("#panel .big b").wait_for(timeout=WAIT_MS)
-        tab.page.wait_for_timeout(400)
-        tab.page.evaluate(axe)
-        faults = tab.page.evaluate(
-            "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
-        )
-        serious = [violation for violation in faults if violation[1] in ("serious", "critical")]
-        assert not serious, json.dumps(serious, indent=1)
+        assert tab.serious_faults(axe) == []
         tab.close()
 
 
@@ -385,6 +371,7 @@ class Sweeper:
         return encode_batch(batch)
 
 
+@pytest.mark.nightly
 def test_changed_ground_is_outlined_and_says_what_it_was(browser, tmp_path: Path):
     with Children(tmp_path) as children:
         web = WebSite(tmp_path, children)

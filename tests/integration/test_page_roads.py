@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,8 +15,8 @@ import pytest
 from protocol.queries.roads import WorklistRow
 from protocol.queries.routing import MACHINES
 from sitegrid.process.children import Children
-from tests.integration.browser_tab import Tab, needs_browser
-from tests.integration.hauling_site import DAY_NS, FIRST_NS, hauling_site
+from tests.integration.browser_tab import Tab, axe_script, needs_browser, watched
+from tests.integration.hauling_site import DAY_NS, FIRST_NS
 from tests.integration.site_run import kill
 from tests.integration.web_site import WebSite
 
@@ -28,20 +25,14 @@ PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch":
 QUIET = "document.querySelector('#panel .asking') === null"
 
 
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("page-roads")
-    with Children(folder) as children:
-        yield hauling_site(folder, children)
+@pytest.fixture
+def web(hauling: WebSite) -> WebSite:
+    return hauling
 
 
 @pytest.fixture
 def tab(browser, web: WebSite) -> Iterator[Tab]:
-    tab = Tab(browser, web.url).loaded()
-    yield tab
-    assert tab.complaints == []
-    assert all(url.startswith((web.url, "data:")) for url in tab.asked), "nobody else was asked"
-    tab.close()
+    yield from watched(browser, web.url)
 
 
 def opened(tab: Tab, key: str = "w") -> Any:
@@ -97,6 +88,7 @@ def test_the_ten_stretches_that_cost_most_stand_in_their_order_with_reasons(tab:
     assert "5.0 % → 3.0 %" in repaired
 
 
+@pytest.mark.nightly
 def test_a_mass_that_nobody_stated_is_called_a_guess(tab: Tab, web: WebSite):
     panel = opened(tab)
     assert not any(row.segment.guessed for row in listed(web))
@@ -120,6 +112,7 @@ def answers(tab: Tab, resource: str, body: Any, status: int = 200) -> None:
     tab.page.route(f"**/{resource}?**", lambda route: route.fulfill(status=status, json=body))
 
 
+@pytest.mark.nightly
 def test_resting_on_a_row_lights_its_stretch_on_the_map(tab: Tab, web: WebSite):
     opened(tab)
     row = listed(web)[2]
@@ -149,6 +142,7 @@ def test_a_click_on_a_row_flies_to_its_stretch_beside_the_panel(tab: Tab, web: W
         assert 60 < top < 720
 
 
+@pytest.mark.nightly
 def test_keys_alone_find_a_stretch_and_fly_to_it(tab: Tab, web: WebSite):
     tab.page.locator("#open-work").focus()
     tab.page.keyboard.press("Enter")
@@ -170,6 +164,7 @@ def test_keys_alone_find_a_stretch_and_fly_to_it(tab: Tab, web: WebSite):
     assert tab.page.locator("#panel").is_hidden()
 
 
+@pytest.mark.nightly
 def test_a_click_on_a_stretch_finds_its_row(tab: Tab, web: WebSite):
     opened(tab)
     row = listed(web)[4]
@@ -179,6 +174,7 @@ def test_a_click_on_a_stretch_finds_its_row(tab: Tab, web: WebSite):
     tab.until("sitegrid.panel === 'why'")
 
 
+@pytest.mark.nightly
 def test_the_target_is_chosen_and_a_link_keeps_it(tab: Tab, browser, web: WebSite):
     panel = opened(tab)
     tab.page.locator("#target").fill("5")
@@ -201,6 +197,7 @@ def test_the_target_is_chosen_and_a_link_keeps_it(tab: Tab, browser, web: WebSit
     assert tab.js("sitegrid.work.target") == 0.29, "what is no target is not asked"
 
 
+@pytest.mark.nightly
 def test_the_list_is_of_the_time_that_is_shown(tab: Tab, web: WebSite):
     panel = opened(tab)
     assert panel.locator(".stretch.short").count() > 0
@@ -213,6 +210,7 @@ def test_the_list_is_of_the_time_that_is_shown(tab: Tab, web: WebSite):
     assert panel.locator(".stretch.short").count() == 0, "the repair came later"
 
 
+@pytest.mark.nightly
 def test_an_empty_map_has_no_roads_and_says_so(browser, tmp_path: Path):
     with Children(tmp_path) as children:
         web = WebSite(tmp_path, children)
@@ -270,6 +268,7 @@ def test_a_line_on_the_map_says_what_its_drive_costs(tab: Tab, web: WebSite):
     assert "Click two places or more" in panel.inner_text()
 
 
+@pytest.mark.nightly
 def test_the_profile_tells_each_place_by_pointer_and_keys(tab: Tab):
     opened(tab, "r")
     set_places(tab, (20, 10), (20, 40), (60, 70))
@@ -295,6 +294,7 @@ def test_the_profile_tells_each_place_by_pointer_and_keys(tab: Tab):
     tab.until("sitegrid.route.at === null")
 
 
+@pytest.mark.nightly
 def test_there_and_back_cost_different_things(tab: Tab, web: WebSite):
     opened(tab, "r")
     set_places(tab, (20, 10), (150, 10))
@@ -329,6 +329,7 @@ def test_the_cheapest_line_between_two_clicks_is_beside_the_straight_one(tab: Ta
     assert "The straight line costs the same." in panel.inner_text()
 
 
+@pytest.mark.nightly
 def test_a_straight_line_is_compared_at_the_same_price_of_unknown_ground(tab: Tab, web: WebSite):
     panel = opened(tab, "r")
     tab.page.locator("#drive-cheapest").click()
@@ -345,6 +346,7 @@ def test_a_straight_line_is_compared_at_the_same_price_of_unknown_ground(tab: Ta
 
 
 @pytest.mark.parametrize("cheapest", [False, True])
+@pytest.mark.nightly
 def test_a_link_opens_the_same_drive(tab: Tab, browser, cheapest: bool):
     panel = opened(tab, "r")
     if cheapest:
@@ -363,6 +365,7 @@ def test_a_link_opens_the_same_drive(tab: Tab, browser, cheapest: bool):
     other.close()
 
 
+@pytest.mark.nightly
 def test_places_are_set_with_the_keyboard(tab: Tab):
     opened(tab, "r")
     tab.page.locator("#map").focus()
@@ -411,6 +414,7 @@ def test_names_from_elsewhere_are_text_and_never_markup(tab: Tab, web: WebSite):
         "panel=elsewhere&cell=a,b",
     ],
 )
+@pytest.mark.nightly
 def test_a_link_that_makes_no_sense_breaks_nothing(browser, web: WebSite, words: str):
     tab = Tab(browser, f"{web.url}?{words}")
     if len(words) > 32_000:
@@ -424,6 +428,7 @@ def test_a_link_that_makes_no_sense_breaks_nothing(browser, web: WebSite, words:
     return tab.close()
 
 
+@pytest.mark.nightly
 def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
     opened(tab, "r")
     held: list[Any] = []
@@ -453,6 +458,7 @@ def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
     assert tab.js("sitegrid.route.answer.line.length") == 3
 
 
+@pytest.mark.nightly
 def test_a_server_that_goes_in_the_middle_is_named_and_the_panel_comes_back(browser, web: WebSite):
     tab = Tab(browser, web.url).loaded()
     opened(tab)
@@ -461,21 +467,22 @@ def test_a_server_that_goes_in_the_middle_is_named_and_the_panel_comes_back(brow
     tab.until(f"sitegrid.panel === 'route' && {QUIET}")
     for place in ((20, 10), (90, 10)):
         tab.page.mouse.click(*tab.pixel_of(*place))
-    tab.until("document.querySelector('#panel .failed') !== null", 40_000)
+    tab.until("document.querySelector('#panel .failed') !== null")
     assert "no map server answers" in tab.page.locator("#panel .failed").inner_text()
     assert tab.page.locator("#machine").is_visible(), "what was chosen stays"
     web.server = web.start_server()
-    tab.until(f"sitegrid.route.answer !== null && {QUIET}", 60_000)
+    tab.until(f"sitegrid.route.answer !== null && {QUIET}")
     port = web.port
     kill(web.web)
     tab.page.keyboard.press("w")
-    tab.until("document.querySelector('#panel .failed') !== null", 40_000)
+    tab.until("document.querySelector('#panel .failed') !== null")
     assert "page's server does not answer" in tab.page.locator("#panel .failed").inner_text()
     web.web = web.start_web(port=port)
-    tab.until(f"sitegrid.panel === 'work' && sitegrid.work.rows.length === 10 && {QUIET}", 60_000)
+    tab.until(f"sitegrid.panel === 'work' && sitegrid.work.rows.length === 10 && {QUIET}")
     tab.close()
 
 
+@pytest.mark.nightly
 def test_a_phone_has_the_list_beneath_the_map_and_shows_what_is_tapped(browser, web: WebSite):
     tab = Tab(browser, web.url, **PHONE).loaded()
     tab.page.locator("#open-work").tap()
@@ -505,24 +512,13 @@ def test_a_phone_has_the_list_beneath_the_map_and_shows_what_is_tapped(browser, 
     tab.close()
 
 
+@pytest.mark.nightly
 def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip("no npm: axe-core is installed by it")
-    command = [npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", str(tmp_path), "axe-core"]
-    if subprocess.run(command, capture_output=True, timeout=120, check=False).returncode:
-        pytest.skip("axe-core cannot be installed here")
-    axe = (tmp_path / "node_modules" / "axe-core" / "axe.min.js").read_text()
+    axe = axe_script(tmp_path)
     for theme in ("light", "dark"):
         for words in ("panel=work", "panel=route&line=20,10;20,60;90,70&cost=energy"):
             tab = Tab(browser, f"{web.url}?theme={theme}&{words}", bypass_csp=True).loaded()
             tab.until(f"sitegrid.panel !== null && {QUIET}")
-            tab.page.wait_for_timeout(400)
-            tab.page.evaluate(axe)
-            faults = tab.page.evaluate(
-                "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
-            )
-            serious = [violation for violation in faults if violation[1] in ("serious", "critical")]
-            assert not serious, json.dumps(serious, indent=1)
+            assert tab.serious_faults(axe) == []
             assert "panel" in parse_qs(urlsplit(tab.page.url).query)
             tab.close()

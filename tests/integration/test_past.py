@@ -27,8 +27,9 @@ from protocol.wire.messages import SampleBatch
 from protocol.wire.session import free_endpoint
 from sitegrid import connect
 from sitegrid.client import Client
-from sitegrid.process.children import Child, Children, wait_until
-from tests.integration.site_run import READY_S, kill
+from sitegrid.process.children import Child, Children
+from tests.integration.site_run import kill
+from tests.patience import PATIENCE_S, until
 
 SITE, CONFIG = SiteConfig("pit", 48.0, 11.0), ServerConfig()
 HOURS = 2.2
@@ -69,6 +70,7 @@ def is_fold_from_the_start(client: Client, sent: Sent, stamp_ns: int, without: s
 
 
 @pytest.mark.processes
+@pytest.mark.nightly
 def test_the_past_of_a_server_killed_in_mid_checkpoint_and_after_a_distrust(tmp_path: Path):
     sent = filled_journal(tmp_path / "store")
     (tmp_path / "site.toml").write_text("\n".join(toml_lines(asdict(SITE))))
@@ -77,19 +79,19 @@ def test_the_past_of_a_server_killed_in_mid_checkpoint_and_after_a_distrust(tmp_
     late_ns, between_ns = START_NS + 2 * HOUR_NS + HOUR_NS // 10, START_NS + HOUR_NS + HOUR_NS // 2
 
     with Children(tmp_path) as children:
-        children.start("router", "router", "--listen", endpoint).expect("ready", READY_S)
+        children.start("router", "router", "--listen", endpoint).expect("ready", PATIENCE_S)
 
         def serve() -> Child:
             files = ("--site-file", tmp_path / "site.toml", "--config", tmp_path / "server.toml")
             server = children.start("server", "server", "--endpoint", endpoint, "--store", tmp_path / "store", *files)
-            server.expect("ready", READY_S)
+            server.expect("ready", PATIENCE_S)
             return server
 
         def made(client: Client, count: int) -> None:
-            wait_until(lambda: client.info().checkpoints.count == count, 60.0, f"{count} checkpoints")
+            until(lambda: client.info().checkpoints.count == count, f"{count} checkpoints")
 
         server = serve()
-        wait_until(lambda: any(folder.glob(".*.part")), READY_S, "a checkpoint in the making")
+        until(lambda: any(folder.glob(".*.part")), "a checkpoint in the making")
         kill(server)
         assert list(folder.glob(".*.part")), "it was killed in the midst of one"
         there = [path.name for path in folder.glob("*.checkpoint")]

@@ -24,16 +24,16 @@ import pytest
 
 from protocol.wire.session import free_endpoint
 from sitegrid import connect
-from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.process.children import Child, Children
 from tests.clients import plain_asker, plain_sender
 from tests.paths import GOLDEN, ROOT
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
 SENDER = ROOT / "tests" / "clients" / "plain_sender.py"
-SITE, SAMPLES, KILLS = "lot", 1200, 8
+SITE, SAMPLES, KILLS = "lot", 1200, 5
 MACHINES = ("digger-1", "digger-2")
-READY_S, DELIVERED_S = 40.0, 120.0
 SAMPLE = struct.Struct(f"{plain_sender.ROW}fff")  # and a calibration, none, and a mass, NaN, as nothing is stated
 HEAD = struct.Struct("<qqQqB")
 
@@ -98,7 +98,7 @@ class Lot:
         process = self.running[name]
         if isinstance(process, Child):
             process.send(9)  # type: ignore[arg-type]
-            process.wait(10.0)
+            process.wait(PATIENCE_S)
         else:
             process.kill()
             process.communicate()
@@ -140,20 +140,18 @@ def test_a_plain_sender_loses_and_doubles_nothing_while_everything_is_killed(tmp
     for name in ("router", "server", *MACHINES):
         lot.start(name)
     store = tmp_path / "store"
-    wait_until(lambda: (store / "journal.db").exists(), READY_S, "the server works")
+    until(lambda: (store / "journal.db").exists(), "the server works")
     for _ in range(KILLS):
         before = progress(tmp_path)
-        wait_until(
-            lambda b=before: progress(tmp_path) != b or all(map(lot.is_over, MACHINES)), DELIVERED_S, "work is done"
-        )
+        until(lambda b=before: progress(tmp_path) != b or all(map(lot.is_over, MACHINES)), "work is done")
         victim = draw.choice(["router", "server", "server", *MACHINES])
         lot.kill(victim)
         lot.start(victim)
     for name in MACHINES:
         process: Any = lot.running[name]
-        said, errors = process.communicate(timeout=DELIVERED_S)
+        said, errors = process.communicate(timeout=PATIENCE_S)
         assert (process.returncode, said, errors) == (0, "done\n", ""), name
-    with connect(lot.endpoint, SITE, timeout_s=30.0) as client:
+    with connect(lot.endpoint, SITE, timeout_s=PATIENCE_S) as client:
         info = client.info()
         compare_answers(client)
     lot.kill("server")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -15,9 +13,9 @@ from protocol.errors import QueryError
 from protocol.queries.places import MAX_PLACES
 from protocol.queries.routing import MACHINES, NamedMachine
 from sitegrid import Client, RouteAnswer
-from sitegrid.process.children import Children
-from tests.integration.hauling_site import hauling_site
+from tests.command_lines import Said, said
 from tests.integration.web_site import NAME, WebSite
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.processes
 Place = tuple[float, float]
@@ -27,18 +25,13 @@ ACROSS = [(90.0, float(y)) for y in range(21)]  # a road, and its edges
 BLOCKED = {"margin": "1", "avoid": ",".join(f"{x:g},{y:g}" for x, y in ACROSS), "unknown": "refuse"}
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("edges")
-    with Children(folder) as children:
-        made = hauling_site(folder, children)
-        assert all(child.pid for child in (made.server, made.web))
-        yield made
+@pytest.fixture
+def site(hauling: WebSite) -> WebSite:
+    return hauling
 
 
-def command(site: WebSite, *words: str) -> subprocess.CompletedProcess[str]:
-    begin = (sys.executable, "-m", "sitegrid.cli", "query", "--endpoint", site.endpoint, "--site", NAME)
-    return subprocess.run([*begin, *words], capture_output=True, text=True, check=False, timeout=120)
+def command(site: WebSite, *words: str) -> Said:
+    return said("query", "--endpoint", site.endpoint, "--site", NAME, *words)
 
 
 def numbers(line: tuple[Place, ...]) -> list[str]:
@@ -48,14 +41,13 @@ def numbers(line: tuple[Place, ...]) -> list[str]:
 def asked(site: WebSite, kind: str, places: tuple[Place, ...], values: dict[str, str]) -> dict[str, str]:
     """What command and HTTP say of a drive that all three refuse; the command's last line alone."""
     settings = [word for name, value in values.items() for word in ("--set", f"{name}={value}")]
-    said = command(site, kind, *numbers(places), *settings)
-    assert said.returncode in (1, 2), said.stdout
-    assert "Traceback" not in said.stderr
+    refused = command(site, kind, *numbers(places), *settings)
+    assert refused.code in (1, 2), refused.out
     text = ";".join(",".join(numbers((place,))) for place in places)
     ends = dict(zip(("from", "to"), text.split(";"), strict=False))
     answer = site.get(kind, {**({"line": text} if kind == "route" else ends), **values})
     assert answer.status in (400, 413, 414), answer.body
-    return {"command": said.stderr.strip().splitlines()[-1], "http": answer.json["detail"]}
+    return {"command": refused.err.strip().splitlines()[-1], "http": answer.json["detail"]}
 
 
 @pytest.mark.parametrize(
@@ -110,9 +102,9 @@ def test_more_places_than_a_line_may_have_are_named(site: WebSite):
     many = tuple((20.0 + 0.01 * i, 10.0) for i in range(MAX_PLACES + 1))
     with pytest.raises(QueryError, match=f"{MAX_PLACES + 1} places"):
         site.client.route(many)
-    said = command(site, "route", *numbers(many))
-    assert said.returncode in (1, 2)
-    assert f"{MAX_PLACES + 1} places" in said.stderr
+    refused = command(site, "route", *numbers(many))
+    assert refused.code in (1, 2)
+    assert f"{MAX_PLACES + 1} places" in refused.err
 
 
 def test_a_way_is_never_dearer_to_drive_than_straight_on(site: WebSite):
@@ -137,7 +129,7 @@ def test_a_route_of_a_named_machine_is_the_first_thing_that_a_server_is_asked_af
     )
     old = site.server.pid
     site.server.send(signal.SIGKILL)
-    site.server.wait(30)
+    site.server.wait(PATIENCE_S)
     site.server = site.start_server()
     assert site.server.pid != old
     after = site.client.route(LINE, "hauler-1")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -18,9 +15,10 @@ from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid import MACHINES
 from sitegrid.process.children import Children
+from tests.command_lines import said
 from tests.integration.test_followers import Followed, Sender
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 
 
 def test_a_line_of_ten_thousand_places_and_a_way_are_answered_while_samples_come_in(tmp_path: Path, children: Children):
@@ -47,7 +45,6 @@ def test_a_line_of_ten_thousand_places_and_a_way_are_answered_while_samples_come
             assert again.totals.energy_j == pytest.approx(way.totals.energy_j)
         counters = client.info().counters
         assert counters["layers_kept"] > 0
-        words = (sys.executable, "-m", "sitegrid.cli", "query", "--endpoint", run.endpoint, "--site", run.site, "way")
-        places = ("-35", "-35", "35", "30", "--set", "machine=truck", "--set", "max_grade=1", "--json")
-        said = subprocess.run([*words, *places], capture_output=True, text=True, check=True, timeout=60)
-        assert json.loads(said.stdout)["line"][0] == [-35.0, -35.0]
+        words = ("query", "--endpoint", run.endpoint, "--site", run.site, "way", -35, -35, 35, 30)
+        way = said(*words, "--set", "machine=truck", "--set", "max_grade=1", "--json").json
+        assert way["line"][0] == [-35.0, -35.0]

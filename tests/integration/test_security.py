@@ -31,15 +31,15 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig, write_configs
 from sitegrid import connect
 from sitegrid.cli import main
-from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.process.children import Child, Children
 from sitegrid.security.access import SPARE_BYTES
 from sitegrid.security.join import reply_check
 from sitegrid.security.signing import Signer
+from tests.patience import PATIENCE_S, until
 
 certificates = pytest.importorskip("sitegrid.security.certificates", reason="cryptography is not installed")
 pytestmark = pytest.mark.processes
 
-READY_S = 120.0  # a first start in a new folder compiles kernels
 SITE = "paper"
 ROLES = {
     "loader-1": "machine",
@@ -63,13 +63,13 @@ class Guarded:
             self.make_keys("add", name, "--role", role)
         self.endpoint = free_endpoint().replace("tcp/", "tls/")
         self.configs = write_configs(SimConfig(machines=1, seed=1, world="fast"), folder)
-        self.site_file = folder / "site.toml"
+        self.folder, self.site_file = folder, folder / "site.toml"
         self.router = children.start("router", "router", "--keys", self.keys, "--listen", self.endpoint)
-        assert self.router.expect("ready", READY_S)["security"] == "mutual TLS"
+        assert self.router.expect("ready", PATIENCE_S)["security"] == "mutual TLS"
         files = ("--site-file", self.site_file, "--store", folder / "store")
         asks = ("--signed", self.keys) if signed else ()
         self.server = children.start("server", "server", *self.network("server"), *files, *asks)
-        self.server.expect("ready", READY_S)
+        self.server.expect("ready", PATIENCE_S)
 
     def make_keys(self, action: str, *words: str) -> None:
         assert main(["keys", action, *words, "--dir", str(self.keys)]) == 0
@@ -87,7 +87,7 @@ class Guarded:
         """The agent of a machine, and the simulator that moves it."""
         files = ("--spool", spool, "--site-file", self.site_file, "--config", self.configs[0])
         agent = self.children.start("agent", "agent", *self.network("loader-1"), *files, "--json")
-        agent.expect("ready", READY_S)
+        agent.expect("ready", PATIENCE_S)
         words = ("--machines", 1, "--seed", 1, "--world", "fast", "--seconds", seconds, "--speed", 10, "--json")
         return agent, self.children.start("sim", "sim", *self.network("sim"), *words)
 
@@ -112,7 +112,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
 
 
 def answers(session: zenoh.Session, key: str, payload: bytes = b"", **options: Any) -> list[bytes]:
-    replies = session.get(key, payload=payload, timeout=20.0, **options)
+    replies = session.get(key, payload=payload, timeout=60.0, **options)
     return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
 
@@ -142,7 +142,7 @@ def put_until(received: list[bytes], payload: bytes, put: Callable[[], object]) 
         put()
         return payload in received
 
-    wait_until(arrived, 10.0, f"{payload!r} received")
+    until(arrived, f"{payload!r} received")
 
 
 # --- who may, can ----------------------------------------------------------------------------------------------------
@@ -156,34 +156,33 @@ def test_a_machine_gets_its_acknowledgements_from_the_map_server(guarded: Guarde
         assert client.info(after=before + 200).journalled == before + 200
 
 
-def test_a_follower_with_keys_copies_the_journal_and_answers_under_its_own_name_alone(guarded: Guarded, tmp_path: Path):
+@pytest.mark.nightly
+def test_a_follower_with_keys_answers_under_its_own_name_alone(guarded: Guarded):
     with guarded.session("loader-1") as session:
         assert is_taken(guarded, session, "loader-1")
-    words = ("--site-file", guarded.site_file, "--copy", tmp_path / "copy")
+    words = ("--site-file", guarded.site_file, "--store", guarded.folder / "store")
     other = guarded.children.start("other", "follow", *guarded.network("reader-1"), *words, "--name", "reader-2")
-    assert other.wait(READY_S) == 1, "the name is that of the keys"
+    assert other.wait(PATIENCE_S) == 1, "the name is that of the keys"
     network = guarded.network("reader-1")
     follower = guarded.children.start("reader-1", "follow", *network, *words, "--name", "reader-1")
-    follower.expect("ready", READY_S)
+    follower.expect("ready", PATIENCE_S)
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "guest") as client:
         row = client.info().journalled
         assert client.point(1.0, 1.0, after=row).version.row == row
         assert client.origin.follower == "reader-1", f"follower pid {follower.pid}"
         assert [one.name for one in client.followers()] == ["reader-1"]
-    for name in ("guest", "loader-1", "boss"):  # rows are for followers
-        with guarded.session(name) as session:
-            assert answers(session, keys.journal(SITE)) == []
     follower.stop()
 
 
+@pytest.mark.nightly
 def test_agent_and_simulator_work_with_keys_as_without(guarded: Guarded, tmp_path: Path):
     agent, sim = guarded.drive(tmp_path / "spool.db", 15)
     with guarded.session("guest") as session, listening(session, keys.poses_all(SITE)) as poses:
-        report = agent.expect("ended", READY_S)["ended"]
-        wait_until(lambda: len(poses) > 5, 5.0, "a visitor sees poses")
+        report = agent.expect("ended", PATIENCE_S)["ended"]
+        until(lambda: len(poses) > 5, "a visitor sees poses")
     assert report["delivered"], f"agent pid {agent.pid}, sim pid {sim.pid}"
     assert report["samples"] > 20
-    assert sim.wait(10.0) == 0
+    assert sim.wait(PATIENCE_S) == 0
 
 
 def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_path: Path, children: Children):
@@ -198,11 +197,11 @@ def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_
             assert decode_reply(reply).reason == "wrong_machine", site.still_works()
         (reply,) = answers(session, key, batch, attachment=mine)
         assert isinstance(decode_reply(reply), Ack)
-        (signed,) = session.get(key, payload=batch, attachment=mine, timeout=READY_S)
+        (signed,) = session.get(key, payload=batch, attachment=mine, timeout=60.0)
         signature = signed.ok.attachment.to_bytes()
         assert reply_check(site.keys / "loader-1")(key, batch, signed.ok.payload.to_bytes(), signature)
     agent, _ = site.drive(tmp_path / "spool.db", 10)
-    report = agent.expect("ended", READY_S)["ended"]
+    report = agent.expect("ended", PATIENCE_S)["ended"]
     assert report["delivered"], f"agent pid {agent.pid}, server pid {site.server.pid}"
     assert report["samples"] > 10
 
@@ -273,11 +272,12 @@ def test_an_expired_certificate_is_refused(guarded: Guarded, tmp_path: Path):
     assert guarded.still_works()
 
 
+@pytest.mark.nightly
 def test_a_link_ends_when_its_certificate_does(guarded: Guarded, tmp_path: Path):
     credentials = with_certificate(guarded, tmp_path / "short", own_authority(guarded), days=2 / 86400)
     with closing(open_session(SessionConfig(guarded.endpoint, credentials=credentials))) as session:
         assert answers(session, keys.map_query(SITE, "info"))
-        wait_until(lambda: not session.info.routers_zid(), 10.0, "link closed")
+        until(lambda: not session.info.routers_zid(), "link closed")
         assert answers(session, keys.map_query(SITE, "info")) == [], guarded.still_works()
 
 
@@ -346,7 +346,7 @@ def as_machine(guarded: Guarded, name: str, mode: str) -> Iterator[zenoh.Session
     for key, value in {**values, "scouting/multicast/enabled": False, "transport/link/tls": tls}.items():
         settings.insert_json5(key, json.dumps(value))
     with closing(zenoh.open(settings)) as session:
-        wait_until(lambda: bool(answers(session, keys.map_query(SITE, "info"))), 10.0, "connected")
+        until(lambda: bool(answers(session, keys.map_query(SITE, "info"))), "connected")
         yield session
 
 
@@ -368,10 +368,10 @@ def test_nobody_shows_presence_in_anothers_name(guarded: Guarded):
         tokens = [loader.liveliness().declare_token(keys.alive(SITE, name)) for name in ("loader-1", "loader-2")]
 
         def present() -> set[str]:
-            replies = guest.liveliness().get(keys.alive_all(SITE), timeout=5.0)
+            replies = guest.liveliness().get(keys.alive_all(SITE), timeout=60.0)
             return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
-        wait_until(lambda: bool(present()), 10.0, "presence seen")
+        until(lambda: bool(present()), "presence seen")
         assert present() == {keys.alive(SITE, "loader-2")}, guarded.still_works()
         for token in tokens:
             token.undeclare()
@@ -469,6 +469,7 @@ def test_oversize_payloads_stay_at_the_router(guarded: Guarded):
             assert huge not in received, guarded.still_works()
 
 
+@pytest.mark.nightly
 def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
     with guarded.session("guest") as guest, guarded.session("loader-1") as loader:
         with listening(guest, keys.poses_all(SITE)) as received:
@@ -481,19 +482,21 @@ def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
         assert received.count(b"flood") <= most, guarded.still_works()
 
 
+@pytest.mark.nightly
 def test_connections_that_say_nothing_delay_no_link(guarded: Guarded, children: Children):
     """At a router of their own: as they end, each pauses its listener for 0.1 s, so 150 keep everybody out for 15 s."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     router = children.start("router", "router", "--keys", guarded.keys, "--listen", endpoint)
-    router.expect("ready", READY_S)
+    router.expect("ready", PATIENCE_S)
     place = tuple(endpoint.removeprefix("tls/").rsplit(":", 1))
     with contextlib.ExitStack() as opened:
-        for _ in range(150):
-            opened.enter_context(socket.create_connection(place, READY_S))
-        began = time.monotonic()
+        silent = [opened.enter_context(socket.create_connection(place, PATIENCE_S)) for _ in range(150)]
         with closing(open_session(dataclasses.replace(guarded.settings("guest"), endpoint=endpoint))):
-            took_s = time.monotonic() - began
-        assert took_s < 2.0, f"router pid {router.pid}"
+            for one in silent:
+                one.setblocking(False)
+                with pytest.raises(BlockingIOError):  # no end of it was waited for: the router still has all of them
+                    one.recv(1)
+        assert router.code is None
 
 
 # --- revoked ---------------------------------------------------------------------------------------------------------
@@ -506,29 +509,30 @@ def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, chil
     with site.session("loader-1") as loader, site.session("loader-2") as other:
         assert is_taken(site, loader, "loader-1")
         site.make_keys("revoke", "loader-1")
-        assert site.router.expect("reloaded", 10.0)["names"] == len(ROLES), f"router pid {site.router.pid}"
-        wait_until(lambda: is_taken(site, other, "loader-2"), 20.0, "others go on")
-        wait_until(lambda: bool(loader.info.routers_zid()), 10.0, "the link is there again")
+        assert site.router.expect("reloaded", PATIENCE_S)["names"] == len(ROLES), f"router pid {site.router.pid}"
+        until(lambda: is_taken(site, other, "loader-2"), "others go on")
+        until(lambda: bool(loader.info.routers_zid()), "the link is there again")
         assert acknowledged(loader, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == []
     site.make_keys("add", "loader-1")
-    site.router.expect("reloaded", 10.0)
+    site.router.expect("reloaded", PATIENCE_S)
     with site.session("loader-1") as repaired:
-        wait_until(lambda: is_taken(site, repaired, "loader-1"), 20.0, "back under the same name")
+        until(lambda: is_taken(site, repaired, "loader-1"), "back under the same name")
     old = SessionConfig(site.endpoint, credentials=load_credentials(stolen))
     with closing(open_session(old)) as session:
         assert answers(session, keys.ingest(SITE, "loader-1"), site.batch("loader-1")) == []
         assert answers(session, keys.map_query(SITE, "info")) == []
 
 
+@pytest.mark.nightly
 def test_a_broken_register_changes_nothing(guarded: Guarded):
     register, log = guarded.keys / "register.toml", guarded.keys.parent / "router.log"
     whole = register.read_bytes()
     register.write_bytes(whole[: len(whole) // 2] + b"[[[")
-    wait_until(lambda: "the rules stay as they were" in log.read_text(), 10.0, "said so")
+    until(lambda: "the rules stay as they were" in log.read_text(), "said so")
     assert guarded.still_works()
     register.write_bytes(whole)
-    assert guarded.router.expect("reloaded", 10.0)["names"] == len(ROLES) + 1, "and the map server"
-    wait_until(lambda: guarded.router.code is None and answers_again(guarded), 10.0, "as before")
+    assert guarded.router.expect("reloaded", PATIENCE_S)["names"] == len(ROLES) + 1, "and the map server"
+    until(lambda: guarded.router.code is None and answers_again(guarded), "as before")
 
 
 def answers_again(guarded: Guarded) -> bool:
@@ -543,13 +547,13 @@ def test_without_keys_the_router_stays_on_this_host(children: Children):
     port = free_endpoint().rpartition(":")[2]
     words = ["router", "--listen", f"tcp/0.0.0.0:{port}"]
     command = [sys.executable, "-m", "sitegrid.cli", *words]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
     assert "--keys" in done.stderr
     assert "--insecure" in done.stderr
     open_router: Child = children.start("open", *words, "--insecure")
-    assert open_router.expect("ready", READY_S)["security"] == "none: open to everyone who gets here"
+    assert open_router.expect("ready", PATIENCE_S)["security"] == "none: open to everyone who gets here"
     assert open_router.stop() == 0
     router = children.start("router", "router", "--listen", f"tcp/127.0.0.1:{port}")
-    assert router.expect("ready", READY_S)["security"] == "none: this host only"
+    assert router.expect("ready", PATIENCE_S)["security"] == "none: this host only"

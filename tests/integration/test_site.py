@@ -1,84 +1,107 @@
-"""The main job, through real processes: machines drive, one site grid grows."""
+"""The main job, through real processes: machines drive, one site grid grows, whoever is killed meanwhile."""
 
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from protocol.errors import LinkError, QueryError
+from protocol.queries.answers import MapInfo, Region
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
-from sitegrid.client import connect
-from sitegrid.process.children import Children, wait_until
+from sitegrid.client import Client
+from sitegrid.process.children import Child, Children
+from sitegrid.proof.delivery import AuditResult
+from tests.command_lines import said
 from tests.integration.site_run import SiteRun, kill  # beside this file
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
 
-def test_several_machines_merge_into_one_grid(site_run: SiteRun):
-    router, server, sim = site_run.start()
-    pids = [child.pid for child in (router, server, sim, *site_run.agents.values())]
-    assert len({*pids, os.getpid()}) == 7
-    with site_run.connect() as client:
-        site_run.wait_merged(client, 50)
-        during = client.info()
-        assert sim.code is None, "the query is answered while machines drive"
-        assert client.point(0.0, 0.0, after=during.journalled).merged >= during.journalled
-        reports = site_run.delivered()
+@dataclass(frozen=True)
+class Kill:
+    """One in mid-run: process ids and what was merged, before it and after the victim was started again."""
+
+    pids: tuple[int, int]
+    merged: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Shift:
+    """What was seen of three machines that drive while server, agent and router are killed in turn."""
+
+    pids: list[int]
+    during: MapInfo
+    kills: dict[str, Kill]
+    info: MapInfo
+    region: Region
+    audit: AuditResult
+
+
+@pytest.fixture(scope="module")
+def shift(tmp_path_factory: pytest.TempPathFactory) -> Shift:
+    folder = tmp_path_factory.mktemp("shift")
+    with Children(folder) as children:
+        sim = SimConfig(machines=3, seconds=0, speed=8, seed=3, world="fast")
+        run = SiteRun(folder, children, free_endpoint(), sim)
+        router, server, driving = run.start()
+        agent = run.agents[run.configs[0].stem]
+        pids = [child.pid for child in (router, server, driving, *run.agents.values())]
+        with run.connect() as client:
+            run.wait_merged(client, 60)
+            during = client.info()
+            assert client.point(0.0, 0.0, after=during.journalled).merged >= during.journalled
+            kills = {
+                "server": killed(client, server, run.start_server),
+                "agent": killed(client, agent, lambda: run.start_agent(run.configs[0]), agent.name),
+                "router": killed(client, router, run.start_router),
+            }
+            driving.send(signal.SIGTERM)  # machines end with it
+            run.delivered()
+            info, region = client.info(), client.region((0, 0, 200, 150), ["resistance", "visits"])
+        assert run.server.stop() == 0
+        return Shift(pids, during, kills, info, region, run.audit())
+
+
+def killed(client: Client, victim: Child, start: Callable[[], Child], machine: str = "") -> Kill:
+    """Kill a process and start it again; samples, of one machine where its agent was killed, come in as before."""
+
+    def merged() -> int:
         info = client.info()
-        region = client.region((0, 0, 200, 150), ["resistance", "visits"])
-    assert set(info.machines) == set(site_run.agents)
-    assert info.samples_merged + info.samples_too_unsure == sum(r["samples"] for r in reports.values())
-    known = np.isfinite(region["resistance"])
+        return info.machines[machine].samples if machine else info.samples_merged
+
+    before = merged()
+    kill(victim)
+    again = start()
+    until(lambda: merged() > before, f"samples after the kill of {victim.name}")
+    return Kill((victim.pid, again.pid), (before, merged()))
+
+
+def test_several_machines_merge_into_one_grid(shift: Shift):
+    assert len({*shift.pids, os.getpid()}) == 7
+    assert len(shift.info.machines) == 3
+    assert shift.info.samples_merged > shift.during.samples_merged >= 60
+    known = np.isfinite(shift.region["resistance"])
     assert known.sum() > 500
-    assert np.nanmax(region["visits"]) >= 1
-    assert np.isnan(region["visits"][~known]).any()
-    server.stop()
-    result = site_run.audit_without_loss()
-    assert result.recorded == result.merged > 300
+    assert np.nanmax(shift.region["visits"]) >= 1
+    assert np.isnan(shift.region["visits"][~known]).any()
 
 
-def test_a_server_killed_in_mid_run_loses_nothing(site_run: SiteRun):
-    _, server, sim = site_run.start()
-    with site_run.connect() as client:
-        site_run.wait_merged(client, 60)
-        kill(server)
-        assert sim.code is None
-        again = site_run.start_server()
-        assert again.pid != server.pid
-        reports = site_run.delivered()
-        site_run.wait_merged(client, 1)
-    assert again.stop() == 0
-    result = site_run.audit_without_loss()
-    assert result.recorded == sum(report["samples"] for report in reports.values())
+@pytest.mark.parametrize("victim", ["server", "agent", "router"])
+def test_a_process_killed_in_mid_run_loses_nothing(shift: Shift, victim: str):
+    kill = shift.kills[victim]
+    assert kill.pids[0] != kill.pids[1]
+    assert kill.merged[0] < kill.merged[1] < shift.info.samples_merged + 1
+    assert (shift.audit.lost, shift.audit.double, shift.audit.unrecorded) == (0, 0, 0)
+    assert shift.audit.recorded == shift.audit.merged > 300
 
 
-def test_an_agent_killed_in_mid_run_loses_nothing_that_it_recorded(site_run: SiteRun):
-    _, server, sim = site_run.start()
-    config = site_run.configs[0]
-    with site_run.connect() as client:
-        site_run.wait_merged(client, 60)
-        kill(site_run.agents[config.stem])
-        assert sim.code is None
-        site_run.start_agent(config)
-        site_run.delivered()
-    server.stop()
-    site_run.audit_without_loss()
-
-
-def test_a_router_killed_in_mid_run_loses_nothing(site_run: SiteRun):
-    router, server, _ = site_run.start()
-    with site_run.connect() as client:
-        site_run.wait_merged(client, 60)
-    kill(router)
-    site_run.start_router()
-    site_run.delivered()
-    server.stop()
-    site_run.audit_without_loss()
-
-
+@pytest.mark.nightly
 def test_two_sites_do_not_mix(tmp_path, children: Children):
     endpoint = free_endpoint()
     runs = []
@@ -107,18 +130,19 @@ def test_two_sites_do_not_mix(tmp_path, children: Children):
 
 
 def test_an_agent_runs_on_without_a_router_and_catches_up(site_run: SiteRun, children: Children, tmp_path):
-    site_run.children.start("record", "sim", "--record", tmp_path / "logs", "--seconds", 30, "--machines", 1).wait(60)
+    recording = ("--record", tmp_path / "logs", "--seconds", 60, "--machines", 1, "--world", "fast")
+    assert said("sim", *recording).code == 0
     log, spool = tmp_path / "logs" / "loader-1", tmp_path / "loader-1.db"
     files = ("--spool", spool, "--audit", tmp_path / "loader-1.audit")
     words = ("--endpoint", site_run.endpoint, "--driver", "replay", "--log", log, "--speed", "0")
     agent = children.start("loader-1", "agent", *words, "--site-file", site_run.site_file, *files, "--json")
-    agent.expect("ready", 40.0)
+    agent.expect("ready", PATIENCE_S)
     audit = tmp_path / "loader-1.audit"
-    wait_until(lambda: audit.exists() and audit.read_text().count("\n") > 100, 40.0, "samples recorded offline")
+    until(lambda: audit.exists() and audit.read_text().count("\n") > 100, "samples recorded offline")
     assert agent.code is None
     site_run.start_router()
     server = site_run.start_server()
-    report = agent.expect("ended", 60.0)["ended"]
+    report = agent.expect("ended", PATIENCE_S)["ended"]
     assert report["delivered"]
     assert report["uplink"]["counters"].get("unanswered", 0) > 0, "it noticed that nobody answered"
     server.stop()
@@ -126,29 +150,3 @@ def test_an_agent_runs_on_without_a_router_and_catches_up(site_run: SiteRun, chi
     result = site_run.audit()
     assert (result.lost, result.double) == (0, 0)
     assert result.recorded > 100
-
-
-def test_queries_that_are_refused_are_counted_and_say_why(site_run: SiteRun):
-    site_run.start_router()
-    site_run.start_server()
-    with site_run.connect() as client:
-        with pytest.raises(QueryError, match="layer `gold` is not known; known: resistance"):
-            client.point(1, 2, ["gold"])
-        with pytest.raises(QueryError, match="is not merged after 0 s") as late:
-            client.info(after=99, wait_s=0)
-        assert late.value.reason == "after_timeout"
-        with pytest.raises(QueryError, match="at most 16000000 are answered"):
-            client.region((0, 0, 1e5, 1e5))
-        counters = client.info().counters
-    assert counters["refused_query_unknown_layer"] == 1
-    assert counters["refused_query_after_timeout"] == 1
-    assert counters["refused_query_too_large"] == 1
-
-
-def test_a_site_without_a_server_says_what_to_do(site_run: SiteRun):
-    site_run.start_router()
-    with (
-        connect(site_run.endpoint, site_run.site, timeout_s=1.0) as client,
-        pytest.raises(LinkError, match="start one with `sitegrid server`"),
-    ):
-        client.info()

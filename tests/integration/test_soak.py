@@ -1,4 +1,4 @@
-"""The soak in short; the hour is `python -m tests.soak --minutes 60 --speed 30`."""
+"""The soak in short; all of it is `make soak`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ def seen(*server_mib: float) -> Soak:
     return Soak(tuple(Look(i + 1.0, 100 * i, mib, 40.0) for i, mib in enumerate(server_mib)), 1000, 0.0)
 
 
+@pytest.mark.nightly
 def test_half_an_hour_of_work_leaves_the_memory_flat(tmp_path: Path):
     result = soak(tmp_path, minutes=30, speed=200, machines=4)
     assert [round(look.minute) for look in result.looks] == list(range(1, 31))

@@ -13,9 +13,11 @@ from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.cli import main
 from sitegrid.client import Client
-from sitegrid.process.children import Children, wait_until
-from tests.integration.site_run import READY_S, SiteRun, kill  # beside this file
+from sitegrid.process.children import Children
+from tests.integration.site_run import SiteRun, kill  # beside this file
+from tests.patience import until
 
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 SOME = 20  # samples
 
 
@@ -31,11 +33,11 @@ def cut_short(site_run: SiteRun) -> str:
     """A site at work, whose server dies once it has taken samples; returns the id of its store."""
     _, server, _ = site_run.start()
     with site_run.connect() as client:
-        wait_until(lambda: len(_samples(client)) == site_run.sim.machines, READY_S, "every machine has samples there")
+        until(lambda: len(_samples(client)) == site_run.sim.machines, "every machine has samples there")
         # An agent sends a batch only after the one before was acknowledged: by then its run is bound to the store.
         first = {name: max(samples, SOME) for name, samples in _samples(client).items()}
         more = "every machine has more of them"
-        wait_until(lambda: all(n > first[name] for name, n in _samples(client).items()), READY_S, more)
+        until(lambda: all(n > first[name] for name, n in _samples(client).items()), more)
     kill(server)
     return JournalLocation(site_run.folder / "store").store_id()
 
@@ -45,7 +47,6 @@ def _samples(client: Client) -> dict[str, int]:
     return {name: counts.samples for name, counts in client.info().machines.items()}
 
 
-@pytest.mark.processes
 def test_a_run_goes_on_in_a_store_that_was_folded_from_the_first(site_run: SiteRun, capsys: pytest.CaptureFixture[str]):
     first = cut_short(site_run)
     (site_run.folder / "store").rename(site_run.folder / "old")
@@ -61,13 +62,12 @@ def test_a_run_goes_on_in_a_store_that_was_folded_from_the_first(site_run: SiteR
     assert sum(counts.samples for counts in info.machines.values()) == sum(r["samples"] for r in reports.values())
 
 
-@pytest.mark.processes
 def test_a_run_goes_on_in_a_store_that_a_person_accepts_and_what_it_lacks_is_counted(site_run: SiteRun):
     first = cut_short(site_run)
     shutil.move(site_run.folder / "store", site_run.folder / "gone")
     site_run.start_server()
     with site_run.connect() as client:
-        wait_until(lambda: client.info().counters.get("refused_other_store", 0) > 0, READY_S, "a machine is refused")
+        until(lambda: client.info().counters.get("refused_other_store", 0) > 0, "a machine is refused")
         assert client.info().machines == {}
         words = ["accept", first, "--reason", "its disk died", "--site", site_run.site, "--endpoint", site_run.endpoint]
         assert main(words) == 0

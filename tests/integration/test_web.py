@@ -9,8 +9,6 @@ import math
 import signal
 import socket
 import threading
-import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -26,23 +24,15 @@ from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import encode_pose
 from protocol.wire.messages import Pose
-from sitegrid.process.children import Children, wait_until
+from sitegrid.process.children import Children
 from sitegrid.security.certificates import issue, make_authority
 from sitegrid.web import values
 from tests.integration.site_run import kill
-from tests.integration.web_site import NAME, READY_S, Frame, WebSite
+from tests.integration.web_site import NAME, Frame, WebSite
+from tests.patience import PATIENCE_S, until
 from tests.soak import SITE_TOML
 
 pytestmark = pytest.mark.processes
-
-
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("web")
-    with Children(folder) as children:
-        site = WebSite(folder, children)
-        site.drive(40)
-        yield site
 
 
 def driven_place(web: WebSite) -> tuple[float, float]:
@@ -164,22 +154,13 @@ def tile_planes(tile) -> bytes:
         ("point", {"x": 1, "y": 1, "layers": "colour"}, 400, "unknown_layer"),
         ("point", {"x": 1, "y": 1, "colour": "red"}, 400, "unknown_parameter"),
         ("point", {"x": 1, "y": 1, "as_of": "yesterday"}, 400, "wrong_type"),
-        ("point", {"x": 1, "y": 1, "as_of": "1890-01-01"}, 400, "out_of_range"),
-        ("region", {"bounds": "0,0,1"}, 400, "missing_field"),
-        ("region", {"bounds": "5,0,1,9"}, 400, "out_of_range"),
         ("region", {"bounds": "0,0,9000,9000"}, 413, "too_large"),
-        ("region", {"polygon": "0,0;1,1"}, 400, "out_of_range"),
         ("region", {"polygon": ";".join(["1,1"] * 1001)}, 413, "too_large"),
-        ("region", {"polygon": "0,0;9,9;9,0;0,9"}, 400, "out_of_range"),
         ("region", {"polygon": "0,0;9,0;0,9", "bounds": "0,0,9,9"}, 400, "out_of_range"),
         ("region", {}, 400, "missing_field"),
-        ("region", {"bounds": "0,0,9,9", "resolution": 1.5}, 400, "out_of_range"),
         ("region", {"bounds": "0,0,9,9", "resolution": 5, "layers": "heading"}, 400, "out_of_range"),
         ("region", {"bounds": "0,0,9,9", "repairs": "yes"}, 400, "out_of_range"),
-        ("points", {}, 400, "missing_field"),
         ("points", {"places": "1,1;2"}, 400, "out_of_range"),
-        ("points", {"places": "1,1;nan,2"}, 400, "not_finite"),
-        ("points", {"places": "1,1", "layers": "colour"}, 400, "unknown_layer"),
         ("point", {"x": 1, "y": 1, "minus": "yesterday"}, 400, "wrong_type"),
         ("region", {"bounds": "0,0,9,9", "format": "xml"}, 400, "out_of_range"),
         ("history", {"x": 0, "y": 0, "span": 0}, 400, "out_of_range"),
@@ -188,7 +169,6 @@ def tile_planes(tile) -> bytes:
         ("nothing", {}, 404, "not_found"),
         ("/api/v1/sites/elsewhere/info", {}, 404, "unknown_site"),
         ("xyz/colour/resistance/30/0/0.png", {}, 400, "out_of_range"),
-        ("xyz/colour/resistance/3/8/0.png", {}, 400, "out_of_range"),
         ("xyz/colour/mud/3/0/0.png", {}, 404, "unknown_layer"),
         ("xyz/red/resistance/3/0/0.png", {}, 400, "out_of_range"),
         ("/../../etc/passwd", {}, 404, "not_found"),
@@ -231,9 +211,7 @@ def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
     again = web.get("point", parameters, If_None_Match=first.headers["etag"])
     assert (again.status, again.body) == (304, b"")
     web.drive(4)
-    wait_until(
-        lambda: web.get("point", parameters, If_None_Match=first.headers["etag"]).status == 200, 10, "another map"
-    )
+    until(lambda: web.get("point", parameters, If_None_Match=first.headers["etag"]).status == 200, "another map")
 
 
 def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: WebSite):
@@ -244,19 +222,20 @@ def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: W
         places = web.get("features/machines").json["features"]
         return [place["properties"]["machine"] for place in places]
 
-    wait_until(lambda: shown() == ["machine-0"], 10, "a pose")
+    until(lambda: shown() == ["machine-0"], "a pose")
     counted = web.get("/metrics").body.decode()
     for reason in ("wrong_machine", "out_of_range"):
         assert f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}' in counted
 
 
+@pytest.mark.nightly
 def test_slow_headers_and_handshakes_do_not_hold_a_place(web: WebSite, tmp_path: Path):
     now = datetime.now(UTC)
     pair = issue(make_authority(NAME, now, now + timedelta(1)), "web", now, now + timedelta(1), ("127.0.0.1",))
     (tmp_path / "cert.pem").write_bytes(pair.certificate)
     (tmp_path / "key.pem").write_bytes(pair.key)
     words = ("--endpoint", web.endpoint, "--listen", "0", "--site", NAME, "--tls", tmp_path)
-    url = web.children.start("tls", "web", *words).expect("ready", READY_S)["url"]
+    url = web.children.start("tls", "web", *words).expect("ready", PATIENCE_S)["url"]
     with (
         socket.create_connection(("127.0.0.1", web.port), 30) as slow,
         socket.create_connection(("127.0.0.1", urlsplit(url).port), 30) as silent,
@@ -265,12 +244,13 @@ def test_slow_headers_and_handshakes_do_not_hold_a_place(web: WebSite, tmp_path:
         assert slow.recv(1000) == silent.recv(1000) == b""
 
 
+@pytest.mark.nightly
 def test_two_sites_stand_behind_one_address(tmp_path: Path):
     with Children(tmp_path) as children:
         web = WebSite(tmp_path, children, "--site", "pit")
         (tmp_path / "pit.toml").write_text(SITE_TOML.replace('"soak"', '"pit"'))
         words = ("--site-file", tmp_path / "pit.toml", "--store", tmp_path / "pit")
-        children.start("pit", "server", "--endpoint", web.endpoint, *words).expect("ready", READY_S)
+        children.start("pit", "server", "--endpoint", web.endpoint, *words).expect("ready", PATIENCE_S)
         web.drive(4)
         assert [site["name"] for site in web.get("/api/v1/sites").json["sites"]] == [NAME, "pit"]
         assert web.get("info").json["samples_merged"] > 0
@@ -294,11 +274,10 @@ class Page:
         self.socket = open_socket(self.web.live_url(**known), max_size=2**26, compression=None)
         return self.socket
 
-    def take(self, until: tuple[int, int], timeout_s: float = 30.0) -> None:
+    def take(self, until: tuple[int, int]) -> None:
         """Take in what comes until the map is of a version, or a later one."""
-        end_s = time.monotonic() + timeout_s
         while self.version < until or not self.frames:
-            data = self.socket.recv(timeout=max(0.1, end_s - time.monotonic()))
+            data = self.socket.recv(timeout=PATIENCE_S)
             if isinstance(data, bytes):
                 self.take_in(Frame.read(data))
                 self.socket.send(json.dumps({"row": self.version[0], "fact": self.version[1]}))
@@ -356,13 +335,13 @@ def test_a_page_goes_on_after_web_server_map_server_and_trust_were_others(tmp_pa
             page.take((max(tile.row for tile in web.client.tiles().tiles), 0))
             assert page.tiles == newest(web)[0]
             web.server.send(signal.SIGKILL)
-            web.server.wait(10)
+            web.server.wait(PATIENCE_S)
             web.server = web.start_server()
             web.drive(8)
-            page.take((max(tile.row for tile in web.client.tiles().tiles), 0), 60)
+            page.take((max(tile.row for tile in web.client.tiles().tiles), 0))
             assert page.tiles == newest(web)[0]
             trusted = web.client.distrust("machine-1", "test")
-            page.take((trusted.merged, trusted.fact), 60)
+            page.take((trusted.merged, trusted.fact))
             assert page.tiles == newest(web)[0]
             assert page.version >= (trusted.merged, trusted.fact)
 
@@ -380,9 +359,10 @@ def test_what_a_page_says_wrongly_ends_its_connection_alone(web: WebSite):
 
 def _drain(socket: ClientConnection) -> None:
     for _ in range(1000):
-        socket.recv(timeout=10)
+        socket.recv(timeout=PATIENCE_S)
 
 
+@pytest.mark.nightly
 def test_pages_that_sleep_cost_no_memory(web: WebSite):
     def rss() -> int:
         return int(Path(f"/proc/{web.web.pid}/statm").read_text().split()[1]) * 4096
@@ -403,7 +383,7 @@ def test_pages_that_sleep_cost_no_memory(web: WebSite):
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(60)
+            thread.join(PATIENCE_S)
         tiles = newest(web)[0]
         assert all(page.tiles == tiles for page in pages)
         assert rss() < before + 40e6, "what sleeps costs no memory"

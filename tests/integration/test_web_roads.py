@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,22 +12,17 @@ from protocol.queries.routing import MACHINES
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
-from sitegrid.process.children import Children
 from sitegrid.web import values
-from tests.integration.hauling_site import DAY_NS, DAYS, FIRST_NS, hauling_site
+from tests.integration.hauling_site import DAY_NS, DAYS, FIRST_NS
 from tests.integration.web_site import NAME, WebSite
 
 pytestmark = pytest.mark.processes
 LINE = ((20.0, 10.0), (90.0, 10.0), (150.0, 12.5))
 
 
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("roads")
-    with Children(folder) as children:
-        site = hauling_site(folder, children)
-        assert all(child.pid for child in (site.server, site.web))
-        yield site
+@pytest.fixture
+def web(hauling: WebSite) -> WebSite:
+    return hauling
 
 
 def text_of(line: tuple[tuple[float, float], ...]) -> str:
@@ -155,37 +149,23 @@ def test_what_nobody_knows_is_null_and_told(web: WebSite):
     ("path", "parameters", "status", "reason", "word"),
     [
         ("worklist", {"target": 0}, 400, "out_of_range", "target"),
-        ("worklist", {"target": "nan"}, 400, "not_finite", "target"),
-        ("worklist", {"efficiency": 1.5}, 400, "out_of_range", "efficiency"),
-        ("worklist", {"limit": 0}, 400, "out_of_range", "limit"),
         ("worklist", {"limit": "2.5"}, 400, "out_of_range", "limit"),
         ("worklist", {"from": "2026-01-02", "to": "2026-01-01"}, 400, "out_of_range", "after"),
         ("worklist", {"machine": "hauler-9"}, 404, "unknown_machine", "hauler-9"),
-        ("worklist", {"colour": "red"}, 400, "unknown_parameter", "colour"),
         ("segments", {"bounds": "9e14,0,9.1e14,5"}, 400, "out_of_range", "off the site"),
-        ("segments", {"bounds": "nan,0,1,5"}, 400, "not_finite", "bounds"),
-        ("segments", {"bounds": "5,0,1,9"}, 400, "out_of_range", "bounds"),
         ("features/segments", {"as_of": "yesterday"}, 400, "wrong_type", "as_of"),
         ("route", {}, 400, "missing_field", "line"),
-        ("route", {"line": "1,1"}, 400, "out_of_range", "line"),
         ("route", {"line": "1,1;1,1"}, 400, "out_of_range", "same"),
-        ("route", {"line": "1,1;nan,2"}, 400, "not_finite", "line"),
-        ("route", {"line": "1,1;inf,2"}, 400, "not_finite", "line"),
         ("route", {"line": "1,1;east,2"}, 400, "wrong_type", "line"),
-        ("route", {"line": "1,1;2"}, 400, "out_of_range", "pairs"),
         ("route", {"line": "0,0;1e14,0"}, 413, "too_large", "km"),
         ("route", {"line": "0,0;9e4,0"}, 400, "out_of_range", "off the site"),
-        ("route", {"line": "20,10;90,10", "mass": 0}, 400, "out_of_range", "mass"),
         ("route", {"line": "20,10;90,10", "mass": "2e6"}, 400, "out_of_range", "mass"),
         ("route", {"line": "20,10;90,10", "efficiency": 1.1}, 400, "out_of_range", "efficiency"),
         ("route", {"line": "20,10;90,10", "machine": "<img src=x>"}, 400, "out_of_range", "machine"),
-        ("route", {"line": "20,10;90,10", "colour": 1}, 400, "unknown_parameter", "colour"),
         ("way", {"from": "20,10"}, 400, "missing_field", "to"),
-        ("way", {"from": "20,10", "to": "20,10"}, 400, "out_of_range", "to"),
         ("way", {"from": "20,10;30,10", "to": "20,10"}, 400, "out_of_range", "from"),
         ("way", {"from": "20,10", "to": "90,10", "cost": "money"}, 400, "out_of_range", "cost"),
         ("way", {"from": "20,40", "to": "90,40", "unknown": "refuse"}, 400, "out_of_range", "unknown ground"),
-        ("way", {"from": "20,10", "to": "90,10", "as_of": "1890-01-01"}, 400, "out_of_range", "as_of"),
     ],
 )
 def test_bad_input_is_one_clear_problem(web: WebSite, path, parameters, status, reason, word):
@@ -214,14 +194,8 @@ def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
 
 def test_everything_is_in_the_description(web: WebSite):
     paths = web.get("/api/v1/openapi.json").json["paths"]
-    for name in (
-        "segments",
-        "worklist",
-        "route",
-        "way",
-        "points",
-        *(f"features/{name}" for name in ("segments", "worklist", "repairs")),
-    ):
+    features = (f"features/{name}" for name in ("segments", "worklist", "repairs"))
+    for name in ("segments", "worklist", "route", "way", "points", *features):
         assert f"/api/v1/sites/{{site}}/{name}" in paths
     route = paths["/api/v1/sites/{site}/route"]["get"]
     kinds = {one["name"]: one["schema"]["type"] for one in route["parameters"]}

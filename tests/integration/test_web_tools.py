@@ -6,7 +6,6 @@ import gzip
 import io
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +20,8 @@ from protocol.site.ground_classes import BOUNDARIES, ZONES
 from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
 from sitegrid.client import Client
-from sitegrid.process.children import Children, wait_until
 from tests.integration.web_site import NAME, WebSite
+from tests.patience import PATIENCE_S, until
 
 pytestmark = [
     pytest.mark.processes,
@@ -42,19 +41,14 @@ TMS = """<GDAL_WMS>
 </GDAL_WMS>"""
 
 
-@pytest.fixture(scope="module")
-def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
-    folder = tmp_path_factory.mktemp("tools")
-    with Children(folder) as children:
-        site = WebSite(folder, children)
-        site.drive(60)
-        journalled = site.client.info().journalled
-        wait_until(lambda: f'-{journalled}-0"' in site.get("xyz/resistance.json").headers["etag"], 30, "the newest map")
-        wait_until(lambda: "bounds" in site.get("xyz/resistance.json").json, 30, "a look at what is folded")
-        yield site
+@pytest.fixture(autouse=True)
+def _newest_map(web: WebSite) -> None:
+    journalled = web.client.info().journalled
+    until(lambda: f'-{journalled}-0"' in web.get("xyz/resistance.json").headers["etag"], "the newest map")
+    until(lambda: "bounds" in web.get("xyz/resistance.json").json, "a look at what is folded")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def projection(web: WebSite) -> Projection:
     return Projection(load_site(web.folder / "site.toml"))
 
@@ -165,34 +159,15 @@ def test_text_is_deflated_for_who_takes_it_and_tiles_are_not_deflated_twice(web:
         assert (answer.status, answer.headers.get("content-encoding")) == (200, None)
 
 
+@pytest.mark.nightly
 def test_a_fuzzer_that_reads_the_description_makes_nothing_fail(web: WebSite, tmp_path: Path):
     """Questions right and wrong, drawn from the API's own description: each answer is one that it promises."""
     checks = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
-    words = [
-        "--checks",
-        checks,
-        "--max-time",
-        "10",
-        "--seed",
-        "1",
-        "--max-examples",
-        "40",
-        "--phases",
-        "coverage,fuzzing",
-    ]
-    options = [
-        *words,
-        "--suppress-health-check",
-        "all",
-        "--generation-database",
-        ":memory:",
-        "--no-color",
-        "--workers",
-        "1",
-    ]
+    drawn = "--max-time 10 --seed 1 --max-examples 40 --phases coverage,fuzzing --generation-database :memory:"
+    options = ["--checks", checks, *drawn.split(), *["--suppress-health-check", "all", "--no-color", "--workers", "1"]]
     url = f"{web.url}api/v1/openapi.json"
     command = [sys.executable, "-m", "schemathesis.cli", "run", url, *options]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     counts = web.get("/metrics").body.decode()
     assert 'event="status_500"' not in counts

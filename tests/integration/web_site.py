@@ -19,9 +19,9 @@ from protocol.wire.messages import Ack
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid import Client, connect
 from sitegrid.process.children import Child, Children
+from tests.patience import PATIENCE_S
 from tests.soak import BATCH_S, SITE_TOML, START_NS, SoakMachine
 
-READY_S = 120.0  # a first start in a new folder compiles kernels
 NAME = "soak"
 
 
@@ -47,26 +47,26 @@ class WebSite:
         (folder / "site.toml").write_text(SITE_TOML)
         # What machines of tests measure is what they sent, whenever the solver looks.
         (folder / "server.toml").write_text("[calibration]\nautomatic = false\n")
-        children.start("router", "router", "--listen", self.endpoint).expect("ready", READY_S)
+        children.start("router", "router", "--listen", self.endpoint).expect("ready", PATIENCE_S)
         self.server = self.start_server()
         self.web = self.start_web(*words)
         self.machines = [SoakMachine(f"machine-{i}", seed=i) for i in range(machines)]
         self.driven_s = 0.0
         self.session = open_session(SessionConfig(self.endpoint))
         children.callback(self.session.close)
-        self.client: Client = children.enter_context(connect(self.endpoint, NAME))
+        self.client: Client = children.enter_context(connect(self.endpoint, NAME, timeout_s=PATIENCE_S))
 
     def start_server(self) -> Child:
         files = ("--site-file", self.folder / "site.toml", "--config", self.folder / "server.toml")
         words = (*files, "--store", self.folder / "store")
         child = self.children.start("server", "server", "--endpoint", self.endpoint, *words)
-        child.expect("ready", READY_S)
+        child.expect("ready", PATIENCE_S)
         return child
 
     def start_web(self, *words: str | Path, port: int = 0) -> Child:
         listen = ("--listen", str(port), "--site", NAME)
         child = self.children.start("web", "web", "--endpoint", self.endpoint, *listen, *words)
-        self.url = child.expect("ready", READY_S)["url"]
+        self.url = child.expect("ready", PATIENCE_S)["url"]
         return child
 
     @property
@@ -80,7 +80,7 @@ class WebSite:
             for machine in self.machines:
                 batch = machine.drive(self.driven_s, self.client.info().site.frame)
                 while True:
-                    replies = self.session.get(keys.ingest(NAME, machine.name), payload=batch, timeout=10.0)
+                    replies = self.session.get(keys.ingest(NAME, machine.name), payload=batch, timeout=60.0)
                     if any(r.ok and isinstance(decode_reply(r.ok.payload.to_bytes()), Ack) for r in replies):
                         break
             self.driven_s += BATCH_S
@@ -97,7 +97,7 @@ class WebSite:
         return self.request("GET", path + query, headers)
 
     def request(self, method: str, target: str, headers: Mapping[str, str] = {}, body: bytes = b"") -> Answer:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         try:
             connection.request(method, target, body or None, {name.replace("_", "-"): v for name, v in headers.items()})
             response = connection.getresponse()

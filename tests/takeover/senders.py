@@ -17,6 +17,7 @@ from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
+from tests.patience import PATIENCE_S
 
 BATCH = 10
 SPOOL = 7
@@ -49,7 +50,7 @@ class Sender(threading.Thread):
 
     def end(self) -> None:
         self._ending.set()
-        self.join(30.0)
+        self.join(PATIENCE_S)
 
     def run(self) -> None:
         with self._audit.open("a") as audit:

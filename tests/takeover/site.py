@@ -22,13 +22,12 @@ from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig, site_toml
 from protocol.wire.messages import SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from sitegrid.process.children import Child, Children, wait_until
+from sitegrid.process.children import Child, Children
+from tests.patience import PATIENCE_S, until
 from tests.postgres_server import Cluster, Database
 from tests.takeover.senders import BEGIN_NS, Acknowledged, Sender, rows_of
 from tests.tcp_proxy import FAIR, Proxy, Weather
 
-READY_S = 120.0
-ACK_S = 60.0  # for the first acknowledgement after a fault
 FENCED = 3
 ROWS, FILL_BATCH = 100, 100  # of a commit, and samples of a row, of what was there before
 SITE = SiteConfig("pit", 48.0, 11.0)
@@ -97,10 +96,10 @@ class TakeOverSite:
                 journal.commit()
 
     def start(self, pause_s: float = 0.02) -> None:
-        self._children.start("router", "router", "--listen", self.endpoint).expect("ready", READY_S)
+        self._children.start("router", "router", "--listen", self.endpoint).expect("ready", PATIENCE_S)
         self.session = self._children.enter_context(open_session(SessionConfig(self.endpoint)))
         self.active = self._server()
-        self.active.child.expect("ready", READY_S)
+        self.active.child.expect("ready", PATIENCE_S)
         for machine in self.machines:
             sender = Sender(self.session, SITE, machine, self.folder / f"{machine}.audit", pause_s)
             self._children.callback(sender.end)
@@ -111,7 +110,7 @@ class TakeOverSite:
     def add_standby(self) -> Server:
         """Have another server wait."""
         self.standby = self._server()
-        self.standby.child.expect("standby", READY_S)
+        self.standby.child.expect("standby", PATIENCE_S)
         return self.standby
 
     def acknowledged(self) -> list[Acknowledged]:
@@ -127,7 +126,7 @@ class TakeOverSite:
             return [ack for ack in self.acknowledged() if ack.epoch > beyond]
 
         before = len(seen()) if not beyond else 0
-        wait_until(lambda: len(seen()) >= before + count, ACK_S, f"{count} acknowledgements beyond epoch {beyond}")
+        until(lambda: len(seen()) >= before + count, f"{count} acknowledgements beyond epoch {beyond}")
         return seen()[0].at_s if beyond else time.time()
 
     def settle(self) -> None:
@@ -138,7 +137,7 @@ class TakeOverSite:
         if self.standby.is_serving():
             self.active, self.standby = self.standby, self.active
         gone = self.standby
-        self.exit_codes[str(gone.child.wait(30.0))] += 1
+        self.exit_codes[str(gone.child.wait(PATIENCE_S))] += 1
         gone.child.stop()
         gone.proxy.__exit__()
         self.add_standby()
@@ -233,7 +232,7 @@ def slow_commit(site: TakeOverSite) -> None:
     blocked = "SELECT pid FROM pg_stat_activity WHERE wait_event_type = 'Lock' AND application_name = 'sitegrid writer'"
     with psycopg.connect(site.database.url) as db:
         db.execute("SELECT * FROM sitegrid.head FOR UPDATE")
-        wait_until(lambda: bool(site.database.sql(blocked)), ACK_S, "a commit waits")
+        until(lambda: bool(site.database.sql(blocked)), "a commit waits")
         time.sleep(2.5)
         site.active.child.send(signal.SIGKILL)
         db.rollback()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tests.paths import DOCS, ROOT
-from tests.unit.test_packaging import PACKAGES
+from tests.structure import PACKAGES
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
 TOP = "|".join((*PACKAGES, "tests", "docs", "config", r"\.ci"))
