@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from lab.campaign.recordings import ROOT
+from lab.campaign.code import ROOT
 from protocol.version import package_version
 from sitegrid.proof.figures import Row
 

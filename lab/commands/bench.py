@@ -43,7 +43,7 @@ def run(arguments: Namespace) -> int:
     with Display(title, headless=arguments.json, kept=kept) as display:
         if arguments.what == "make":
             rows = recordings.make(Runner(arguments.data, processes, display.show), edition)
-            report = {"edition": recordings.edition_key(edition), "rows": rows}
+            report: Report = {"edition": recordings.edition_key(edition), "rows": rows}
         else:
             report = scores.run(arguments.data, edition, arguments.entries, processes, display.show)
     show(arguments, report, _readable)

@@ -59,5 +59,6 @@ def _plan(arguments: Namespace) -> Plan:
     if is_quick(arguments):
         return QUICK
     plan = Plan(seeds_of(arguments), arguments.seconds)
-    without = {"all": {}, "positions": {"sources": ()}, "maps": {"positions": ()}}
-    return replace(plan, **without[arguments.tables])
+    if arguments.tables == "positions":
+        return replace(plan, sources=())
+    return replace(plan, positions=()) if arguments.tables == "maps" else plan

@@ -21,7 +21,7 @@ from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import LAG_S
 from lab.campaign.experiment import Experiment, Runner, Task, replay_task
-from lab.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, track_file
+from lab.campaign.recordings import PlannedDrive, Setup, track_file
 from lab.ground.comparison import Comparison, compare, pool
 from lab.ground.figures import by_border, c_rr_bias, figures, soils
 from lab.ground.truth import TrueGround, true_ground
@@ -37,7 +37,6 @@ PRESETS = {"nominal": ("dgps", False), "calibrated": ("dgps", True), "harsh": ("
 # ground both ways, which is what calibration needs. Runs that are shorter than 600 s settle for the same share of them.
 SETTLE_S, SETTLE_SHARE = 240.0, 0.4
 CHUNK = 5000  # readings that the pipeline gets at a time
-SOURCES = ("agents", *MACHINES_PROTOCOL, "lab/ground/experiment.py")
 DIGITS = 3
 
 
@@ -177,4 +176,4 @@ def _estimate(task: Task[GroundConfiguration], cache: Path) -> PipelineOutput:
     return PipelineOutput(samples, pipeline.health()["withheld"], cpu_s * 1e6 / seconds if seconds else math.nan)
 
 
-EXPERIMENT = Experiment("ground", PipelineOutput, SOURCES, _estimate)
+EXPERIMENT = Experiment("ground", PipelineOutput, _estimate)

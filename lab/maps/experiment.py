@@ -26,11 +26,6 @@ from protocol.site.ground_classes import UNKNOWN, resistance_class, wrong_percen
 from sitegrid.proof.figures import Goal, Report, Row, judge, rounded
 
 SERVER = "soft_votes"
-SOURCES = (
-    "mapserver",
-    "protocol",
-    *(f"lab/maps/{part}.py" for part in ("experiment", "cases", "methods", "samples")),
-)
 RESISTANCE, GRADE = ("resistance",), ("grade_east", "grade_north")
 GRADE_TOLERANCE = 0.01  # [m/m]; a gradient vector that is off by more is wrong
 SHARE = 0.6  # of votes: cells that are surer than this should hardly ever be wrong
@@ -80,28 +75,15 @@ class CaseResult:
     methods: dict[str, Row]
 
 
-@dataclass(frozen=True)
-class Maps:
-    """What the methods make of a scene: layers (rows, columns) by method, and the processor time of each [s].
-
-    distrusted: machines that the server excluded.
-    """
-
-    scene: MapScene
-    layers: dict[str, Layers]
-    seconds: dict[str, float]
-    distrusted: tuple[str, ...]
-
-
-def run(runner: Runner, seeds: Sequence[int], cases: Sequence[MapCase] = CASES) -> tuple[Report, Sequence[MapCase]]:
-    """Simulate, merge and judge all cases with all seeds; returns the cases too, for pictures."""
+def run(runner: Runner, seeds: Sequence[int], cases: Sequence[MapCase] = CASES) -> tuple[Report, list[CaseResult]]:
+    """Simulate, merge and judge all cases with all seeds."""
     tasks = [Task(case, seed, driven_s(case)) for case in cases for seed in seeds]
-    results = iter(runner.run(EXPERIMENT, tasks))
+    results = runner.run(EXPERIMENT, tasks)
     rows = []
-    for case in cases:
-        by_seed = [next(results) for _ in seeds]
+    for i, case in enumerate(cases):
+        by_seed = results[i * len(seeds) : (i + 1) * len(seeds)]
         rows += [summarise(case, method, by_seed) for method in (SERVER, *METHODS)]
-    return {"seeds": list(seeds), "rows": rows, "goals": judge(GOALS, rows)}, cases
+    return {"seeds": list(seeds), "rows": rows, "goals": judge(GOALS, rows)}, results
 
 
 def driven_s(case: MapCase) -> float:
@@ -189,17 +171,17 @@ def _percent(which: Bools) -> float:
 # --- in the worker processes -----------------------------------------------------------------------------------------
 
 
-def solve(case: MapCase, seed: int) -> Maps:
-    """Simulate a case, and merge it with every method."""
-    scene = simulate(case, seed)
-    window = CellWindow(0, 0, case.columns, case.rows)
+def _solve(task: Task[MapCase], _: Path) -> CaseResult:
+    """Simulate a case, merge it with every method, and judge the maps."""
+    case = task.variant
+    scene, window = simulate(case, task.seed), CellWindow(0, 0, case.columns, case.rows)
     names = GRADE if case.judges_grade else RESISTANCE
     rows = in_order(delivery.rows for delivery in scene.deliveries)
-    maps, seconds = {}, {}
-    (maps[SERVER], distrusted), seconds[SERVER] = _timed(partial(soft_votes, scene.deliveries, window))
+    (layers, distrusted), seconds = _timed(partial(soft_votes, scene.deliveries, window))
+    judged = {SERVER: figures(case, scene, layers, seconds)}
     for name, method in METHODS.items():
-        maps[name], seconds[name] = _timed(partial(merge_hard, method, rows, names, window))
-    return Maps(scene, maps, seconds, distrusted)
+        judged[name] = figures(case, scene, *_timed(partial(merge_hard, method, rows, names, window)))
+    return CaseResult(scene.samples, int((scene.driven & scene.site.judged).sum()), list(distrusted), judged)
 
 
 def _timed(work: Callable[[], Output]) -> tuple[Output, float]:
@@ -208,13 +190,4 @@ def _timed(work: Callable[[], Output]) -> tuple[Output, float]:
     return work(), time.process_time() - began_s
 
 
-def _judge(task: Task[MapCase], _: Path) -> CaseResult:
-    """Simulate, merge and judge one case."""
-    maps = solve(task.variant, task.seed)
-    times = maps.seconds
-    methods = {name: figures(task.variant, maps.scene, layers, times[name]) for name, layers in maps.layers.items()}
-    cells = int((maps.scene.driven & maps.scene.site.judged).sum())
-    return CaseResult(maps.scene.samples, cells, list(maps.distrusted), methods)
-
-
-EXPERIMENT = Experiment("merge", CaseResult, SOURCES, _judge)
+EXPERIMENT = Experiment("merge", CaseResult, _solve)

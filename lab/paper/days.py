@@ -18,7 +18,6 @@ from lab.fleet.cases import Rows
 from lab.fleet.drives import Scene, scene
 from lab.fleet.solving import served
 from lab.maps.methods import folded
-from lab.paper import maps
 from lab.paper.maps import Fleet, rmse_m, samples_of
 from protocol.arrays import Bools, Floats
 from sitegrid.proof.figures import Goal, Row, half_width, rounded
@@ -166,4 +165,4 @@ def _day(drive: PlannedDrive, fleet: Fleet, cache: Path) -> Day:
     return Day({names[agent.index]: samples_of(agent, drive, cache).samples for agent in fleet.agents}, true)
 
 
-EXPERIMENT = Experiment("days", Days, (*maps.SOURCES, "lab/paper/days.py", "lab/maps/score.py"), _solve)
+EXPERIMENT = Experiment("days", Days, _solve)

@@ -25,10 +25,11 @@ from lab.paper.tensor import write_tensor
 from lab.positions import table
 from lab.positions.configurations import Configuration
 from lab.positions.published import PLOTTING, POSITIONS, REMARKS, Published
-from lab.positions.table import ScoredRun
+from lab.positions.table import Scores
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from protocol.errors import SitegridError
 from protocol.site.ground_classes import resistance_class
+from sitegrid.logs.replay import Score
 from sitegrid.proof.figures import Goal, Report, Row, half_width, judge, rounded
 from sitegrid.proof.map_score import driven_cells, pooled_by_border, region_of, score, score_driven, true_layers
 
@@ -75,7 +76,7 @@ class Outcomes:
     """What pictures and files are made of."""
 
     plan: Plan
-    positions: Mapping[Configuration, Sequence[ScoredRun]]
+    positions: Scores
     maps: Sequence[MapOutcome]
 
     def all_of(self, source: MapSource) -> list[MapOutcome]:
@@ -119,13 +120,11 @@ def write_map(outcomes: Outcomes, runner: Runner, path: Path) -> None:
     write_tensor(path, outcome.made.layers_of(PAPERS), scene(outcome.drive, runner.cache).truth)
 
 
-def _positions(runner: Runner, plan: Plan) -> dict[Configuration, list[ScoredRun]]:
-    """Tables 1 and 2, by the replays of `eval localisation`."""
+def _positions(runner: Runner, plan: Plan) -> Scores:
+    """Tables 1 and 2, by the replays of `lab positions`."""
     planned = [PlannedDrive(seed, plan.seconds, PAPER.preset, plan.setup) for seed in plan.seeds]
     rows = [table.as_recorded(row, planned[0]) for row in plan.positions]
-    runs = iter(runner.run(table.EXPERIMENT, [replay_task(row, drive) for drive in planned for row in rows]))
-    by_drive = [{row: next(runs) for row in rows} for _ in planned]
-    return {row: [each[row] for each in by_drive] for row in rows}
+    return table.scored(runner, planned, rows)
 
 
 def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
@@ -155,7 +154,7 @@ def _days(runner: Runner, plan: Plan, source: MapSource) -> list[Row]:
 # --- rows ------------------------------------------------------------------------------------------------------------
 
 
-def position_row(plan: Plan, row: Configuration, runs: Sequence[ScoredRun]) -> Row:
+def position_row(plan: Plan, row: Configuration, runs: Sequence[Score]) -> Row:
     """One row of Tables 1 and 2: means over the seeds."""
     figures = [{name: getattr(run, name) for name in (*PLACES, "us_per_second")} for run in runs]
     named = {"table": "positions", "scenario": plan.setup.scenario, "preset": PAPER.preset, **_sensors(row)}

@@ -1,10 +1,7 @@
-"""The ground's table on short recordings, through the command line, and its pictures."""
+"""The ground's table on short recordings."""
 
-import json
 import math
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +9,6 @@ from lab.campaign.experiment import Runner
 from lab.campaign.recordings import Setup
 from lab.ground import experiment
 from lab.ground.experiment import GroundConfiguration
-from sitegrid import cli
 from sitegrid.proof.figures import Report
 
 FAST = Setup("paper_site", ("west", "east"), gps=(1, 2), imu=(3,), world="fast")
@@ -65,35 +61,10 @@ def test_a_machine_has_time_to_settle(seconds, settled):
 
 
 @pytest.mark.slow
-def test_the_command_prints_one_object_and_draws(
-    runner: Runner, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-):
-    cv2 = pytest.importorskip("cv2")
-    pytest.importorskip("matplotlib", reason="needs the extra `eval`")
-    monkeypatch.setattr(experiment, "run", partial(experiment.run, rows=(CALIBRATED, HARSH), setup=FAST))
-    words = ["eval", "ground", "--seeds", "1", "--first-seed", "4", "--seconds", "40", "--out", str(runner.cache)]
-    assert cli.main([*words, "--processes", "1", "--json", "--plots", str(tmp_path)]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert {"rows", "goals", "plots"} <= set(report)
-    assert [Path(p).name for p in report["plots"]] == ["along_seed4.png", "places_seed4.png", "summary.png"]
-    for path in report["plots"]:
-        picture = cv2.imread(path)
-        assert picture.shape[1] > 800
-        assert picture.std() > 10
-    assert cli.main(words) == 0
-    shown = capsys.readouterr().out
-    assert "kalman calibrated" in shown
-    assert "right_class_pct" in shown
-
-
-@pytest.mark.slow
-def test_a_tour_without_samples_still_has_rows_and_pictures(result, runner: Runner, tmp_path: Path):
-    ground_plots = pytest.importorskip("lab.ground.plots", reason="needs the extra `eval`")
-    report, (outcome, _) = result
+def test_a_tour_without_samples_still_has_rows(result, runner: Runner):
+    _, (outcome, _) = result
     nothing = replace(outcome.output, samples=outcome.output.samples[:0])
     silent = experiment.judged(outcome.drive, outcome.row, nothing, runner.cache)
     row = experiment.summarise(CALIBRATED, [silent, silent])
     assert row["cells"] == 0
     assert math.isnan(row["right_class_pct"])
-    assert [p.name for p in ground_plots.draw(report, [silent], runner, tmp_path)] == ["summary.png"]
-    assert ground_plots.draw(report, [], runner, tmp_path) == []
