@@ -6,7 +6,7 @@ import pytest
 from lab.campaign.pages import NOT_MEASURED, filled, main, text_of
 from protocol.errors import ConfigError
 
-RESULTS = Path(__file__).parents[4] / "docs" / "results"
+RESULTS = Path(__file__).parents[2] / "results"
 MADE = {"command": "sitegrid eval roads --json", "commit": "1234abcd", "date": "2026-11-23", "processor_min": 61.5}
 REPORT = {
     "made": MADE,
