@@ -17,13 +17,14 @@ from typing import TypeVar
 import numpy as np
 
 from lab.campaign.experiment import Experiment, Runner, Task
+from lab.campaign.goals import goals
 from lab.maps.cases import CASES, CELL_M, MapCase, parking_place
 from lab.maps.methods import METHODS, Layers, in_order, merge_hard, soft_votes
 from lab.maps.samples import LANE_M, SPEED_MPS, MapScene, simulate
 from protocol.arrays import Bools, Ints
 from protocol.site.geometry import CellWindow
 from protocol.site.ground_classes import UNKNOWN, resistance_class, wrong_percent
-from sitegrid.proof.figures import Goal, Report, Row, judge, rounded
+from sitegrid.proof.figures import Report, Row, judge, rounded
 
 SERVER = "soft_votes"
 RESISTANCE, GRADE = ("resistance",), ("grade_east", "grade_north")
@@ -42,23 +43,7 @@ FIGURES = (
     "share60_cells_pct",  # how many those are
     "seconds",
 )
-# From three seeds of the prototype; what was reached: lab/results/merge.md.
-GOALS = (
-    Goal({"case": "1x1", "method": SERVER}, "wrong_pct", "<=", 0.40),
-    Goal({"case": "1x4", "method": SERVER}, "wrong_pct", "<=", 0.18),
-    Goal({"case": "4x4", "method": SERVER}, "wrong_pct", "<=", 0.03),
-    Goal({"case": "bad_machine", "method": SERVER}, "wrong_pct", "<=", 0.10),
-    Goal({"case": "parked_bad_machine", "method": SERVER}, "wrong_pct", "<=", 0.20),
-    Goal({"case": "mixed_receivers", "method": SERVER}, "wrong_pct", "<=", 0.05),
-    Goal({"case": "repaved", "passes_after": 1, "method": SERVER}, "changed_wrong_pct", "<=", 1.5),
-    Goal({"case": "repaved", "passes_after": 1, "method": SERVER}, "unchanged_wrong_pct", "<=", 0.2),
-    Goal({"case": "grade_both_ways", "method": SERVER}, "wrong_pct", "<=", 1.0),
-    Goal({"case": "slope_15", "method": SERVER}, "wrong_pct", "<=", 1.0),
-    *(Goal({"case": case, "method": SERVER}, "share60_wrong_pct", "<=", 0.2) for case in ("1x1", "1x4", "4x4")),
-    # Near 1 %, as the paper has it: else the case is not the paper's.
-    Goal({"case": "4x4", "method": "last_write"}, "wrong_pct", ">=", 0.7),
-    Goal({"case": "4x4", "method": "last_write"}, "wrong_pct", "<=", 1.4),
-)
+GOALS = goals("maps")
 Output = TypeVar("Output")
 
 

@@ -7,30 +7,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from lab.campaign.experiment import Runner, replay_task
+from lab.campaign.experiment import Runner
+from lab.campaign.goals import goals
 from lab.campaign.recordings import PAPER, PlannedDrive
 from lab.fleet import drives
 from lab.fleet.drives import scene
 from lab.maps.uncertainty import Believed, coverage_pct, forecast_row, layers_forecast, pooled
-from lab.paper import days, maps
-from lab.paper.days import SecondDay, day_rows
-from lab.paper.drives import MACHINES, QUICK, RECOMMENDED, MapSource, Plan
-from lab.paper.maps import AS_TRUE, FORECASTS, KINDS, PAPERS, SERVED, Fleet, MadeMaps, MapKind
+from lab.paper import maps
+from lab.paper.drives import QUICK, RECOMMENDED, MapSource, Plan
+from lab.paper.maps import AS_TRUE, FORECASTS, KINDS, PAPERS, SERVED, MadeMaps, MapKind
 from lab.paper.tensor import write_tensor
 from lab.positions import table
 from lab.positions.configurations import Configuration
-from lab.positions.published import PLOTTING, POSITIONS, REMARKS, Published
+from lab.positions.published import PLOTTING, POSITIONS, Published
 from lab.positions.table import Scores
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from protocol.errors import SitegridError
 from protocol.site.ground_classes import resistance_class
 from sitegrid.logs.replay import Score
-from sitegrid.proof.figures import Goal, Report, Row, half_width, judge, rounded
+from sitegrid.proof.figures import Report, Row, half_width, judge, rounded
 from sitegrid.proof.map_score import driven_cells, pooled_by_border, region_of, score, score_driven, true_layers
 
 LEAST_S = 60.0  # of a recording: a heading is known after some seconds, calibration needs ground that is driven again
@@ -41,25 +40,7 @@ PLOTTED = ("plotted_wrong_resistance_pct", "plotted_wrong_grade_pct", "plotted_c
 WITH_INTERVAL = ("net_m", *DRIVEN[:2], *PLOTTED[:2])
 DIGITS = 4
 
-_MAP = {"table": "maps", "filter": "ukf", "gps": 2, "imu": 1, "profile": "default", "merge": "soft_votes"}
-_ORACLE = {**_MAP, "scenario": PAPER.scenario, "preset": PAPER.preset, "values": "oracle"}
-_SERVED = {**_MAP, "preset": "dgps", "machines": MACHINES, "values": "estimated", "calibration": "server"}
-GOALS = (
-    *(Goal({**_ORACLE, "machines": 1}, figure, "<=", 0.4) for figure in DRIVEN[:2]),
-    *(Goal({**_ORACLE, "machines": MACHINES}, figure, "<=", 0.1) for figure in DRIVEN[:2]),
-    Goal({**_SERVED, "scenario": "loading"}, DRIVEN[0], "<=", 1.0),
-    Goal({**_SERVED, "scenario": PAPER.scenario}, DRIVEN[0], "<=", 1.8),
-    Goal({**_SERVED, "scenario": PAPER.scenario}, "above_true_pct", "<=", 0.3),
-    *(Goal({**_SERVED, "scenario": name}, DRIVEN[1], "<=", 0.15) for name in ("loading", PAPER.scenario)),
-    *(Goal({**_SERVED, "scenario": name}, "known_pct", ">=", 98.0) for name in ("loading", PAPER.scenario)),
-)
-
-CALIBRATED = (Goal({"method": SERVED.merge}, "calibration_error", "<=", 0.02),)
 DEVIATIONS = {"resistance_std": ("resistance",), "grade_std": ("grade_east", "grade_north")}  # of which layers
-COVERED = (
-    *(Goal({"layer": layer}, "coverage_pct", ">=", 90.0) for layer in DEVIATIONS),
-    *(Goal({"layer": layer}, "coverage_pct", "<=", 98.0) for layer in DEVIATIONS),
-)
 
 
 @dataclass(frozen=True)
@@ -94,10 +75,9 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
         figures = {kind: [_figures(each, kind, runner) for each in outcomes.all_of(source)] for kind in KINDS}
         rows += [map_row(source, kind, of_kind, figures[AS_TRUE]) for kind, of_kind in figures.items()]
     fleets = [source for source in plan.sources if source.machines > 1]
-    of_days = [row for source in fleets for row in _days(runner, plan, source)]
     forecasts = [row for source in fleets for row in forecast_rows(source, outcomes, runner)]
     coverage = [row for source in fleets for row in coverage_rows(source, outcomes, runner)]
-    judged = (GOALS, rows), (CALIBRATED, forecasts), (COVERED, coverage), (days.GOALS, of_days)
+    lists = {"paper": rows, "paper_forecasts": forecasts, "paper_coverage": coverage}
     report: Report = {
         "seeds": list(plan.seeds),
         "seconds": plan.seconds,
@@ -105,10 +85,8 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
         "rows": rows,
         "forecasts": forecasts,
         "coverage": coverage,
-        "days": of_days,
-        "goals": [] if plan == QUICK else [row for goals, those in judged for row in judge(goals, those)],
+        "goals": [] if plan == QUICK else [row for name, those in lists.items() for row in judge(goals(name), those)],
         "contradictions": contradictions(),
-        "remarks": list(REMARKS),
     }
     return report, outcomes
 
@@ -135,20 +113,6 @@ def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
     return [
         MapOutcome(source, source.drive(seed, plan), each) for (source, seed), each in zip(pairs, made, strict=True)
     ]
-
-
-def _days(runner: Runner, plan: Plan, source: MapSource) -> list[Row]:
-    """Rows of two days, of the same machines and of others; none of one seed alone, after which nobody comes."""
-    drives_of = [source.drive(seed, plan) for seed in plan.seeds]
-    kinds: dict[str, list[tuple[PlannedDrive | None, PlannedDrive]]] = {
-        "the same": [(None, drive) for drive in drives_of[1:]],
-        "others": [*pairwise(drives_of)],
-    }
-    rows = []
-    for who, pairs in kinds.items():
-        tasks = [replay_task(SecondDay(Fleet(source.agents), first), second) for first, second in pairs]
-        rows += day_rows({**_of(source), "second_day": who}, runner.run(days.EXPERIMENT, tasks)) if tasks else []
-    return rows
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
