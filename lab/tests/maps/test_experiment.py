@@ -1,13 +1,10 @@
 """The comparison of merges: figures of maps that are right or wrong where they are meant to be, and rows."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lab.campaign.experiment import Runner
 from lab.maps import experiment
 from lab.maps.cases import CASES, CaseMachine, MapCase, build_site
 from lab.maps.experiment import NEAR_M, CaseResult, figures, near_parked
@@ -66,17 +63,6 @@ def test_cells_beside_a_parked_machine_are_judged_apart():
     assert not near_parked(replace(case, machines=(CaseMachine(),))).any()
 
 
-def test_sure_cells_are_judged_apart():
-    case, scene = scene_of("1x1")
-    estimated, confidence = scene.site.c_rr.copy(), np.full((30, 45), 0.9)
-    estimated[0], confidence[0] = 0.25, 0.59
-    judged = figures(case, scene, {"resistance": estimated, "confidence": confidence})
-    assert judged["share60_wrong_pct"] == 0.0
-    assert judged["share60_cells_pct"] == pytest.approx(100 * 29 / 30)
-    confidence[0] = 0.6
-    assert figures(case, scene, {"resistance": estimated, "confidence": confidence})["share60_wrong_pct"] > 0
-
-
 def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
     case, scene = scene_of("slope_15")
     east, north = np.moveaxis(scene.site.gradient, -1, 0)
@@ -87,25 +73,6 @@ def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_every_case_and_method_has_a_row_with_the_figures_that_apply(tmp_path: Path):
-    report, _ = experiment.run(Runner(tmp_path), (3,), SMALL)
-    assert [(row["case"], row["method"]) for row in report["rows"]] == [(c.kind, m) for c in CASES for m in METHODS]
-    assert report["seeds"] == [3]
-    assert len(report["goals"]) == len(experiment.GOALS)
-    for row in report["rows"]:
-        server = row["method"] == "soft_votes"
-        assert (row["changed_wrong_pct"] is None) == (row["passes_after"] is None) == (row["case"] != "repaved")
-        assert (row["unchanged_wrong_pct"] is None) == (row["case"] != "repaved")
-        assert (row["near_wrong_pct"] is None) == (row["case"] != "parked_bad_machine")
-        assert (row["width_m"] is None) == (row["case"] != "narrow_road")
-        assert (row["share60_cells_pct"] is None) == (not server or row["case"] in ("grade_both_ways", "slope_15"))
-        assert 0 <= row["wrong_min_pct"] <= row["wrong_pct"] <= row["wrong_max_pct"]
-        assert row["known_pct"] > 50
-        assert row["samples"] > row["cells"] > 0
-    assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
 def test_rows_are_medians_over_seeds():

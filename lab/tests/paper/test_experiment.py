@@ -14,10 +14,8 @@ from lab.paper import experiment
 from lab.paper.drives import ALONE, FLEETS, QUICK, Plan
 from lab.paper.experiment import Outcomes, contradictions, map_row, position_row
 from lab.paper.maps import OURS, PAPERS, SERVED
-from lab.paper.report import readable
 from lab.positions.configurations import Configuration
 from lab.tests.positions.test_table import score
-from protocol.errors import SitegridError
 from sitegrid.door import run
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
@@ -79,22 +77,6 @@ def test_contradictions_of_the_paper_are_named():
     assert (rows[1]["net_m"], rows[1]["net_of_parts_m"]) == (4.4444, 4.2761)
 
 
-def test_people_get_a_table_per_kind_of_row_with_the_papers_figures_in_brackets():
-    rows = [
-        position_row(QUICK, Configuration("ukf", 2, 1, "paper"), [score(1.0), score(2.0)]),
-        map_row(ALONE[4], PAPERS, [figures(1.0)], ()),
-    ]
-    shown = readable({"seeds": [1], "rows": rows})
-    assert list(shown) == ["seeds", "positions", "maps"]
-    assert shown["positions"][0]["net [m]"] == "1.50 +- 6.35 (1.7217)"
-    assert (shown["maps"][0]["J_r plotted [%]"], shown["maps"][0]["J_r driven [%]"]) == ("2.00 (0.997)", "1.00")
-
-
-def test_drives_that_are_too_short_are_refused(tmp_path: Path):
-    with pytest.raises(SitegridError, match="59 is too short; maps need drives of 60 s or more"):
-        experiment.run(Runner(tmp_path), replace(QUICK, seconds=59.0))
-
-
 # --- the quick version -----------------------------------------------------------------------------------------------
 
 
@@ -115,12 +97,6 @@ def test_the_quick_version_has_the_figures_that_are_stored(result):
     stored = json.loads(STORED.read_text())
     assert [{**row, **NO_STORE} for row in report["rows"]] == [{**row, **NO_STORE} for row in stored["rows"]]
     assert {**report, "rows": []} == {**stored, "rows": []}
-
-
-@pytest.mark.slow
-def test_it_goes_on_where_it_was(result, runner: Runner, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("lab.campaign.experiment._work", lambda *_: pytest.fail("does work that is done"))
-    assert plain(experiment.run(runner, QUICK)[0]) == plain(result[0])
 
 
 @pytest.mark.slow
