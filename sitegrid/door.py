@@ -28,7 +28,7 @@ from sitegrid.process.logs import start_logging
 
 INTERRUPTED = 130  # as a shell has it: 128 and the number of SIGINT
 # What needs an extra in some commands only; all else is in the extra of the command (`EXTRA` of its module).
-BESIDE = {"cryptography": "security", "filterpy": "paper", "gtsam": "oracle"}
+BESIDE = {"cryptography": "security", "filterpy": "paper"}
 OURS = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 ADVICE = {
     errno.EACCES: "run this as a user who may, or choose another place",

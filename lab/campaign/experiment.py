@@ -15,7 +15,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lab.campaign.recordings import PlannedDrive, RecordedDrive, code_version, digest, load, make
+from lab.campaign.code import code_version, digest
+from lab.campaign.recordings import PlannedDrive, RecordedDrive, load, make
 from lab.campaign.workers import each
 from protocol.errors import SitegridError, StoreError
 from protocol.files import whole_file
@@ -66,19 +67,20 @@ class Experiment(Generic[Variant, Result]):
     """How tasks become results.
 
     name: folder of the results. result: their class, a dataclass whose fields are arrays or plain values of JSON.
-    sources: code that a result depends on beside its recording, as paths from the project's root. solve: does one
-    task, given the folder of recordings; a function of a module, as workers import it.
+    solve: does one task, given the folder of recordings; a function of a module, as workers import it. A result depends
+    on that module, on what it imports, and on `also`: modules that other processes run.
     """
 
     name: str
     result: type[Result]
-    sources: tuple[str, ...]
     solve: Callable[[Task[Variant], Path], Result]
+    also: tuple[str, ...] = ()
 
     def file(self, task: Task[Variant], cache: Path) -> Path:
         """Where the result of a task is kept."""
         recording = task.drive.folder(cache).name if task.drive else ""
-        return cache / self.name / f"{task.name}-{digest(repr(task), recording, code_version(*self.sources))}.npz"
+        modules = self.solve.__module__, *self.also
+        return cache / self.name / f"{task.name}-{digest(repr(task), recording, code_version(*modules))}.npz"
 
 
 @dataclass(frozen=True)

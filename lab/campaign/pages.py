@@ -1,6 +1,6 @@
 """Tables of result pages, made from the printed reports beside them: nobody types a figure.
 
-    sitegrid eval roads --seeds 8 --first-seed 1000 --json > lab/results/roads.json
+    python -m lab roads --seeds 8 --first-seed 1000 --json > lab/results/roads.json
     python -m lab.campaign.pages lab/results/roads.md
 
 A page says where a table belongs, which report it is of and which table, and ends it with `<!-- end -->`:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from lab.campaign.recordings import ROOT
+from lab.campaign.code import ROOT
 from protocol.version import package_version
 from sitegrid.proof.figures import Row
 
@@ -21,11 +21,11 @@ WITHOUT = ("--data", "--out", "--plots", "--processes", "--tensor")
 
 
 def made_by(words: Sequence[str]) -> Row:
-    """Of a report: `command` (words: what follows `sitegrid`), `commit`, `date` of its printing, and `processor_min`.
+    """Of a report: `command`, `commit`, `date` of printing, and `processor_min`; words: what follows `python -m lab`.
 
-    The latter is of this process and its workers so far: of what was not kept from an earlier run.
+    Minutes are of this process and its workers so far: of what was not kept from an earlier run.
     """
-    command = shlex.join(["sitegrid", *_lasting(words)])
+    command = shlex.join(["python", "-m", "lab", *_lasting(words)])
     used = [resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     minutes = sum(each.ru_utime + each.ru_stime for each in used) / 60
     today = datetime.now(UTC).date().isoformat()

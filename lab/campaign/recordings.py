@@ -5,11 +5,9 @@ What is kept is named by digests of the code and the options that it was made wi
 
 from __future__ import annotations
 
-import ast
-import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lab.campaign.code import code_version, digest
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
@@ -29,14 +28,7 @@ from sitegrid.proof.tracks import Truth, read_track
 
 MACHINE = "loader"
 _scenario = cache(load_scenario)
-ROOT = Path(__file__).parents[2]
-SUFFIXES = (".py", ".toml", ".urdf")  # of sources
-_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-# Of the protocol, what machines and their simulation know: a change of the map's queries leaves recordings as they are.
-MACHINES_PROTOCOL = (
-    *(f"protocol/{folder}" for folder in ("machine", "site", "wire")),
-    *(f"protocol/{module}.py" for module in ("arrays", "config", "errors", "files", "rotations", "units")),
-)
+RECORDER = "sim.recorder"  # the code that recordings depend on
 
 
 @dataclass(frozen=True)
@@ -104,7 +96,7 @@ class PlannedDrive:
 
     def folder(self, cache_dir: Path) -> Path:
         """Where the recording lies; another simulator, another folder."""
-        key = digest(repr(self), self.scenario_toml, code_version("sim", *MACHINES_PROTOCOL))
+        key = digest(repr(self), self.scenario_toml, code_version(RECORDER))
         return cache_dir / f"{self.preset}-seed{self.seed}-{self.seconds:g}s-{key}"
 
 
@@ -150,39 +142,6 @@ def track_file(folder: Path) -> Path:
     return folder / "truth" / "tracks" / f"{MACHINE}.csv"
 
 
-@cache
-def code_version(*names: str) -> str:
-    """Digest of the sources of packages or modules, as paths from the project's root; raises FileNotFoundError.
-
-    Comments, docstrings and layout do not count, so that results outlive what is only said in another way.
-    """
-    files = sorted(path for name in names for path in _sources(ROOT / name))
-    return digest(*(f"{path.relative_to(ROOT)}\n{what_counts(path)}" for path in files))
-
-
-def what_counts(path: Path) -> str:
-    """The text of a source that results depend on: of Python its syntax tree, without docstrings."""
-    text = path.read_text(encoding="utf-8")
-    if path.suffix != ".py":
-        return text
-    tree = ast.parse(text)
-    for node in ast.walk(tree):
-        if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
-            del node.body[0]
-    return ast.dump(tree)
-
-
-def digest(*texts: str) -> str:
-    """Ten hex digits that tell texts apart."""
-    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:10]
-
-
 def toml_of(values: Mapping[str, Any]) -> str:
     """Plain values as TOML keys; None is none."""
     return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items() if value is not None)
-
-
-def _sources(path: Path) -> Iterable[Path]:
-    if path.is_dir():
-        return (inner for inner in path.rglob("*") if inner.suffix in SUFFIXES)
-    return [path]  # reading it raises where it is not there

@@ -1,18 +1,19 @@
-"""`sitegrid bench`: a benchmark of maps that others can enter (lab/benchmark.md)."""
+"""`python -m lab bench`: a benchmark of maps that others can enter (lab/benchmark.md)."""
 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from lab.campaign.command import add_processes, show
 from sitegrid.options.groups import add_action
 from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import count
-from sitegrid.process.lifetime import plain, raise_interrupts, say, tell
+from sitegrid.process.lifetime import raise_interrupts, tell
 from sitegrid.process.progress import Display
+from sitegrid.proof.figures import Report
 
 HELP = "make the recordings of a benchmark of maps, and score entries"
-EXTRA = "eval"
+EXTRA = "lab"
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -26,16 +27,14 @@ def add_options(parser: ArgumentParser) -> None:
         action.add_argument("--data", type=FOLDER, default="bench-data", help="folder (default %(default)s)")
         quick = "two short recordings in place of 24, to see that all works"
         action.add_argument("--quick", action="store_true", help=quick)
-        action.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
+        add_processes(action)
 
 
 def run(arguments: Namespace) -> int:
     """Make recordings or score entries."""
     from lab.benchmark import recordings, scores
     from lab.campaign.experiment import Runner
-    from lab.campaign.provenance import made_by
     from lab.campaign.workers import cores
-    from sitegrid.process.tables import table
 
     raise_interrupts()  # the bar hides the cursor of the terminal
     edition, processes = recordings.QUICK if arguments.quick else recordings.FULL, arguments.processes or cores()
@@ -44,15 +43,19 @@ def run(arguments: Namespace) -> int:
     with Display(title, headless=arguments.json, kept=kept) as display:
         if arguments.what == "make":
             rows = recordings.make(Runner(arguments.data, processes, display.show), edition)
-            report = {"edition": recordings.edition_key(edition), "rows": rows}
+            report: Report = {"edition": recordings.edition_key(edition), "rows": rows}
         else:
             report = scores.run(arguments.data, edition, arguments.entries, processes, display.show)
-    if arguments.json:
-        say(plain({"made": made_by(arguments.words), **report}))
-    else:
-        hidden = {"by_recording", *recordings.PARTS}  # what is too wide to be read
-        rows = [{name: value for name, value in row.items() if name not in hidden} for row in plain(report)["rows"]]
-        tell(table(rows))
-        if others := [row["name"] for row in rows if row.get("published") is False]:
-            tell(f"not as published: {', '.join(others)}; lab/benchmark.md says when that is so")
+    show(arguments, report, _readable)
+    others = [row["name"] for row in report["rows"] if row.get("published") is False]
+    if others and not arguments.json:
+        tell(f"not as published: {', '.join(others)}; lab/benchmark.md says when that is so")
     return 0
+
+
+def _readable(report: Report) -> Report:
+    """Rows without what is too wide to be read."""
+    from lab.benchmark import recordings
+
+    hidden = {"by_recording", *recordings.PARTS}
+    return {"rows": [{name: value for name, value in row.items() if name not in hidden} for row in report["rows"]]}

@@ -38,10 +38,6 @@ STEP_S = 0.05  # of a link's weather, and between two looks at it
 LATE_S = (
     120.0  # beyond the length of a replay: a busy machine, and the time in which an agent waits for its last replies
 )
-SOURCES = (
-    *("agents", "mapserver", "protocol"),
-    *(f"lab/cooperation/{part}.py" for part in ("arms", "drives", "live", "processes", "tcp_proxy")),
-)
 
 
 @dataclass(frozen=True)
@@ -163,4 +159,4 @@ def _solve(task: Task[Arm], cache: Path) -> LiveRun:
     return run(task.variant, task.variant.drive(task.seed), cache)
 
 
-EXPERIMENT = Experiment("cooperation", LiveRun, SOURCES, _solve)
+EXPERIMENT = Experiment("cooperation", LiveRun, _solve, also=("sitegrid.commands.agent", "sitegrid.commands.server"))

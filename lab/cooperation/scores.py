@@ -221,12 +221,4 @@ def spoiled_costs(run: LiveRun, line: Timeline, last: Layers, true: Scene, names
     }
 
 
-SOURCES = (
-    *("agents", "mapserver", "protocol", "lab/fleet"),
-    *(
-        f"lab/cooperation/{part}.py"
-        for part in ("arms", "central", "drives", "live", "maps", "network", "repaved", "scores")
-    ),
-    *(f"lab/{part}.py" for part in ("ground/truth", "maps/methods", "maps/score", "paper/maps")),
-)
-EXPERIMENT = Experiment("cooperation-scores", Scored, SOURCES, _solve)
+EXPERIMENT = Experiment("cooperation-scores", Scored, _solve)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,9 +12,9 @@ import numpy as np
 from agents.estimation.ground import EstimationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
+from agents.sampling import Samples, joined
 from lab.campaign.experiment import Experiment, Task
-from lab.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, toml_of
-from lab.ground.lag import all_samples
+from lab.campaign.recordings import PlannedDrive, Setup, toml_of
 from lab.positions.configurations import Configuration
 from protocol.arrays import Table
 from protocol.machine.log_folder import open_log
@@ -27,10 +27,7 @@ from sim.truth import MAP_FILE, TruthMap
 from sitegrid.logs.sensors import select
 from sitegrid.proof.tracks import LoadTrack, read_load_track
 
-SOURCES = (
-    *("agents", *MACHINES_PROTOCOL),
-    *(f"lab/{part}.py" for part in ("fleet/drives", "ground/lag", "positions/configurations")),
-)
+CHUNK = 5000  # readings that a pipeline gets at a time
 
 
 @dataclass(frozen=True)
@@ -146,6 +143,12 @@ def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
     return AgentSamples(np.asarray(made.final), np.asarray(made.pending))
 
 
+def all_samples(pipeline: Pipeline, readings: Sequence[Reading]) -> Samples:
+    """All samples that a pipeline makes of readings, as they were known at once, and the same ones final."""
+    made = [pipeline.step(readings[i : i + CHUNK]) for i in range(0, len(readings), CHUNK)]
+    return joined([*made, pipeline.finish()])
+
+
 @lru_cache(maxsize=1)  # the configurations of a lone machine come one after the other
 def _read(folder: Path) -> tuple[SiteConfig, MachineConfig, tuple[Reading, ...]]:
     """What the agent of a machine may know and read, of its log folder."""
@@ -173,4 +176,4 @@ def spoiled(machine: MachineConfig, readings: Iterable[Reading]) -> tuple[Machin
     return replace(machine, sensors=sensors), tuple(scaled)
 
 
-EXPERIMENT = Experiment("fleet", AgentSamples, SOURCES, _samples)
+EXPERIMENT = Experiment("fleet", AgentSamples, _samples)

@@ -21,12 +21,13 @@ from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import LAG_S
 from lab.campaign.experiment import Experiment, Runner, Task, replay_task
-from lab.campaign.recordings import MACHINES_PROTOCOL, PlannedDrive, Setup, track_file
+from lab.campaign.goals import goals
+from lab.campaign.recordings import PlannedDrive, Setup, track_file
 from lab.ground.comparison import Comparison, compare, pool
 from lab.ground.figures import by_border, c_rr_bias, figures, soils
 from lab.ground.truth import TrueGround, true_ground
 from protocol.arrays import Table
-from sitegrid.proof.figures import Goal, Report, Row, half_width, judge, rounded
+from sitegrid.proof.figures import Report, Row, half_width, judge, rounded
 from sitegrid.proof.tracks import LoadTrack, read_load_track
 
 LOADING = Setup("loading", ("west", "east", "middle", "yard"), gps=(1, 2), imu=(3,))
@@ -37,7 +38,6 @@ PRESETS = {"nominal": ("dgps", False), "calibrated": ("dgps", True), "harsh": ("
 # ground both ways, which is what calibration needs. Runs that are shorter than 600 s settle for the same share of them.
 SETTLE_S, SETTLE_SHARE = 240.0, 0.4
 CHUNK = 5000  # readings that the pipeline gets at a time
-SOURCES = ("agents", *MACHINES_PROTOCOL, "lab/ground/experiment.py")
 DIGITS = 3
 
 
@@ -61,16 +61,7 @@ class GroundConfiguration:
 
 
 ROWS = tuple(GroundConfiguration(estimator, preset) for estimator in ESTIMATORS for preset in PRESETS)
-GOAL_ROW = GroundConfiguration("kalman", "calibrated")
-GOALS = (  # what was reached: lab/results/ground-estimation.md
-    Goal(vars(GOAL_ROW), "right_class_pct", ">=", 96.0),
-    Goal(vars(GOAL_ROW), "wrong_cells_pct", "<=", 3.5),
-    Goal(vars(GOAL_ROW), "wrong_cells_interior_pct", "<=", 1.0),
-    Goal(vars(GOAL_ROW), "dirt_flat_right_pct", ">=", 97.0),
-    Goal(vars(GOAL_ROW), "grade_bias_deg", "<=", 0.1),
-    Goal(vars(GOAL_ROW), "grade_std_deg", "<=", 0.35),
-    Goal(vars(GOAL_ROW), "wrong_slope_cells_pct", "<=", 0.2),
-)
+GOALS = goals("ground")
 
 
 @dataclass(frozen=True)
@@ -177,4 +168,4 @@ def _estimate(task: Task[GroundConfiguration], cache: Path) -> PipelineOutput:
     return PipelineOutput(samples, pipeline.health()["withheld"], cpu_s * 1e6 / seconds if seconds else math.nan)
 
 
-EXPERIMENT = Experiment("ground", PipelineOutput, SOURCES, _estimate)
+EXPERIMENT = Experiment("ground", PipelineOutput, _estimate)

@@ -17,20 +17,16 @@ from typing import TypeVar
 import numpy as np
 
 from lab.campaign.experiment import Experiment, Runner, Task
+from lab.campaign.goals import goals
 from lab.maps.cases import CASES, CELL_M, MapCase, parking_place
 from lab.maps.methods import METHODS, Layers, in_order, merge_hard, soft_votes
 from lab.maps.samples import LANE_M, SPEED_MPS, MapScene, simulate
 from protocol.arrays import Bools, Ints
 from protocol.site.geometry import CellWindow
 from protocol.site.ground_classes import UNKNOWN, resistance_class, wrong_percent
-from sitegrid.proof.figures import Goal, Report, Row, judge, rounded
+from sitegrid.proof.figures import Report, Row, judge, rounded
 
 SERVER = "soft_votes"
-SOURCES = (
-    "mapserver",
-    "protocol",
-    *(f"lab/maps/{part}.py" for part in ("experiment", "cases", "methods", "samples")),
-)
 RESISTANCE, GRADE = ("resistance",), ("grade_east", "grade_north")
 GRADE_TOLERANCE = 0.01  # [m/m]; a gradient vector that is off by more is wrong
 SHARE = 0.6  # of votes: cells that are surer than this should hardly ever be wrong
@@ -47,23 +43,7 @@ FIGURES = (
     "share60_cells_pct",  # how many those are
     "seconds",
 )
-# From three seeds of the prototype; what was reached: lab/results/merge.md.
-GOALS = (
-    Goal({"case": "1x1", "method": SERVER}, "wrong_pct", "<=", 0.40),
-    Goal({"case": "1x4", "method": SERVER}, "wrong_pct", "<=", 0.18),
-    Goal({"case": "4x4", "method": SERVER}, "wrong_pct", "<=", 0.03),
-    Goal({"case": "bad_machine", "method": SERVER}, "wrong_pct", "<=", 0.10),
-    Goal({"case": "parked_bad_machine", "method": SERVER}, "wrong_pct", "<=", 0.20),
-    Goal({"case": "mixed_receivers", "method": SERVER}, "wrong_pct", "<=", 0.05),
-    Goal({"case": "repaved", "passes_after": 1, "method": SERVER}, "changed_wrong_pct", "<=", 1.5),
-    Goal({"case": "repaved", "passes_after": 1, "method": SERVER}, "unchanged_wrong_pct", "<=", 0.2),
-    Goal({"case": "grade_both_ways", "method": SERVER}, "wrong_pct", "<=", 1.0),
-    Goal({"case": "slope_15", "method": SERVER}, "wrong_pct", "<=", 1.0),
-    *(Goal({"case": case, "method": SERVER}, "share60_wrong_pct", "<=", 0.2) for case in ("1x1", "1x4", "4x4")),
-    # Near 1 %, as the paper has it: else the case is not the paper's.
-    Goal({"case": "4x4", "method": "last_write"}, "wrong_pct", ">=", 0.7),
-    Goal({"case": "4x4", "method": "last_write"}, "wrong_pct", "<=", 1.4),
-)
+GOALS = goals("maps")
 Output = TypeVar("Output")
 
 
@@ -80,28 +60,15 @@ class CaseResult:
     methods: dict[str, Row]
 
 
-@dataclass(frozen=True)
-class Maps:
-    """What the methods make of a scene: layers (rows, columns) by method, and the processor time of each [s].
-
-    distrusted: machines that the server excluded.
-    """
-
-    scene: MapScene
-    layers: dict[str, Layers]
-    seconds: dict[str, float]
-    distrusted: tuple[str, ...]
-
-
-def run(runner: Runner, seeds: Sequence[int], cases: Sequence[MapCase] = CASES) -> tuple[Report, Sequence[MapCase]]:
-    """Simulate, merge and judge all cases with all seeds; returns the cases too, for pictures."""
+def run(runner: Runner, seeds: Sequence[int], cases: Sequence[MapCase] = CASES) -> tuple[Report, list[CaseResult]]:
+    """Simulate, merge and judge all cases with all seeds."""
     tasks = [Task(case, seed, driven_s(case)) for case in cases for seed in seeds]
-    results = iter(runner.run(EXPERIMENT, tasks))
+    results = runner.run(EXPERIMENT, tasks)
     rows = []
-    for case in cases:
-        by_seed = [next(results) for _ in seeds]
+    for i, case in enumerate(cases):
+        by_seed = results[i * len(seeds) : (i + 1) * len(seeds)]
         rows += [summarise(case, method, by_seed) for method in (SERVER, *METHODS)]
-    return {"seeds": list(seeds), "rows": rows, "goals": judge(GOALS, rows)}, cases
+    return {"seeds": list(seeds), "rows": rows, "goals": judge(GOALS, rows)}, results
 
 
 def driven_s(case: MapCase) -> float:
@@ -189,17 +156,17 @@ def _percent(which: Bools) -> float:
 # --- in the worker processes -----------------------------------------------------------------------------------------
 
 
-def solve(case: MapCase, seed: int) -> Maps:
-    """Simulate a case, and merge it with every method."""
-    scene = simulate(case, seed)
-    window = CellWindow(0, 0, case.columns, case.rows)
+def _solve(task: Task[MapCase], _: Path) -> CaseResult:
+    """Simulate a case, merge it with every method, and judge the maps."""
+    case = task.variant
+    scene, window = simulate(case, task.seed), CellWindow(0, 0, case.columns, case.rows)
     names = GRADE if case.judges_grade else RESISTANCE
     rows = in_order(delivery.rows for delivery in scene.deliveries)
-    maps, seconds = {}, {}
-    (maps[SERVER], distrusted), seconds[SERVER] = _timed(partial(soft_votes, scene.deliveries, window))
+    (layers, distrusted), seconds = _timed(partial(soft_votes, scene.deliveries, window))
+    judged = {SERVER: figures(case, scene, layers, seconds)}
     for name, method in METHODS.items():
-        maps[name], seconds[name] = _timed(partial(merge_hard, method, rows, names, window))
-    return Maps(scene, maps, seconds, distrusted)
+        judged[name] = figures(case, scene, *_timed(partial(merge_hard, method, rows, names, window)))
+    return CaseResult(scene.samples, int((scene.driven & scene.site.judged).sum()), list(distrusted), judged)
 
 
 def _timed(work: Callable[[], Output]) -> tuple[Output, float]:
@@ -208,13 +175,4 @@ def _timed(work: Callable[[], Output]) -> tuple[Output, float]:
     return work(), time.process_time() - began_s
 
 
-def _judge(task: Task[MapCase], _: Path) -> CaseResult:
-    """Simulate, merge and judge one case."""
-    maps = solve(task.variant, task.seed)
-    times = maps.seconds
-    methods = {name: figures(task.variant, maps.scene, layers, times[name]) for name, layers in maps.layers.items()}
-    cells = int((maps.scene.driven & maps.scene.site.judged).sum())
-    return CaseResult(maps.scene.samples, cells, list(maps.distrusted), methods)
-
-
-EXPERIMENT = Experiment("merge", CaseResult, SOURCES, _judge)
+EXPERIMENT = Experiment("merge", CaseResult, _solve)

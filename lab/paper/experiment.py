@@ -7,29 +7,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from lab.campaign.experiment import Runner, replay_task
+from lab.campaign.experiment import Runner
+from lab.campaign.goals import goals
 from lab.campaign.recordings import PAPER, PlannedDrive
 from lab.fleet import drives
 from lab.fleet.drives import scene
 from lab.maps.uncertainty import Believed, coverage_pct, forecast_row, layers_forecast, pooled
-from lab.paper import days, maps
-from lab.paper.days import SecondDay, day_rows
-from lab.paper.drives import MACHINES, QUICK, RECOMMENDED, MapSource, Plan
-from lab.paper.maps import AS_TRUE, FORECASTS, KINDS, PAPERS, SERVED, Fleet, MadeMaps, MapKind
+from lab.paper import maps
+from lab.paper.drives import QUICK, RECOMMENDED, MapSource, Plan
+from lab.paper.maps import AS_TRUE, FORECASTS, KINDS, PAPERS, SERVED, MadeMaps, MapKind
 from lab.paper.tensor import write_tensor
 from lab.positions import table
 from lab.positions.configurations import Configuration
-from lab.positions.published import PLOTTING, POSITIONS, REMARKS, Published
-from lab.positions.table import ScoredRun
+from lab.positions.published import PLOTTING, POSITIONS, Published
+from lab.positions.table import Scores
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from protocol.errors import SitegridError
 from protocol.site.ground_classes import resistance_class
-from sitegrid.proof.figures import Goal, Report, Row, half_width, judge, rounded
+from sitegrid.logs.replay import Score
+from sitegrid.proof.figures import Report, Row, half_width, judge, rounded
 from sitegrid.proof.map_score import driven_cells, pooled_by_border, region_of, score, score_driven, true_layers
 
 LEAST_S = 60.0  # of a recording: a heading is known after some seconds, calibration needs ground that is driven again
@@ -40,25 +40,7 @@ PLOTTED = ("plotted_wrong_resistance_pct", "plotted_wrong_grade_pct", "plotted_c
 WITH_INTERVAL = ("net_m", *DRIVEN[:2], *PLOTTED[:2])
 DIGITS = 4
 
-_MAP = {"table": "maps", "filter": "ukf", "gps": 2, "imu": 1, "profile": "default", "merge": "soft_votes"}
-_ORACLE = {**_MAP, "scenario": PAPER.scenario, "preset": PAPER.preset, "values": "oracle"}
-_SERVED = {**_MAP, "preset": "dgps", "machines": MACHINES, "values": "estimated", "calibration": "server"}
-GOALS = (
-    *(Goal({**_ORACLE, "machines": 1}, figure, "<=", 0.4) for figure in DRIVEN[:2]),
-    *(Goal({**_ORACLE, "machines": MACHINES}, figure, "<=", 0.1) for figure in DRIVEN[:2]),
-    Goal({**_SERVED, "scenario": "loading"}, DRIVEN[0], "<=", 1.0),
-    Goal({**_SERVED, "scenario": PAPER.scenario}, DRIVEN[0], "<=", 1.8),
-    Goal({**_SERVED, "scenario": PAPER.scenario}, "above_true_pct", "<=", 0.3),
-    *(Goal({**_SERVED, "scenario": name}, DRIVEN[1], "<=", 0.15) for name in ("loading", PAPER.scenario)),
-    *(Goal({**_SERVED, "scenario": name}, "known_pct", ">=", 98.0) for name in ("loading", PAPER.scenario)),
-)
-
-CALIBRATED = (Goal({"method": SERVED.merge}, "calibration_error", "<=", 0.02),)
 DEVIATIONS = {"resistance_std": ("resistance",), "grade_std": ("grade_east", "grade_north")}  # of which layers
-COVERED = (
-    *(Goal({"layer": layer}, "coverage_pct", ">=", 90.0) for layer in DEVIATIONS),
-    *(Goal({"layer": layer}, "coverage_pct", "<=", 98.0) for layer in DEVIATIONS),
-)
 
 
 @dataclass(frozen=True)
@@ -75,7 +57,7 @@ class Outcomes:
     """What pictures and files are made of."""
 
     plan: Plan
-    positions: Mapping[Configuration, Sequence[ScoredRun]]
+    positions: Scores
     maps: Sequence[MapOutcome]
 
     def all_of(self, source: MapSource) -> list[MapOutcome]:
@@ -93,10 +75,9 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
         figures = {kind: [_figures(each, kind, runner) for each in outcomes.all_of(source)] for kind in KINDS}
         rows += [map_row(source, kind, of_kind, figures[AS_TRUE]) for kind, of_kind in figures.items()]
     fleets = [source for source in plan.sources if source.machines > 1]
-    of_days = [row for source in fleets for row in _days(runner, plan, source)]
     forecasts = [row for source in fleets for row in forecast_rows(source, outcomes, runner)]
     coverage = [row for source in fleets for row in coverage_rows(source, outcomes, runner)]
-    judged = (GOALS, rows), (CALIBRATED, forecasts), (COVERED, coverage), (days.GOALS, of_days)
+    lists = {"paper": rows, "paper_forecasts": forecasts, "paper_coverage": coverage}
     report: Report = {
         "seeds": list(plan.seeds),
         "seconds": plan.seconds,
@@ -104,10 +85,8 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
         "rows": rows,
         "forecasts": forecasts,
         "coverage": coverage,
-        "days": of_days,
-        "goals": [] if plan == QUICK else [row for goals, those in judged for row in judge(goals, those)],
+        "goals": [] if plan == QUICK else [row for name, those in lists.items() for row in judge(goals(name), those)],
         "contradictions": contradictions(),
-        "remarks": list(REMARKS),
     }
     return report, outcomes
 
@@ -119,13 +98,11 @@ def write_map(outcomes: Outcomes, runner: Runner, path: Path) -> None:
     write_tensor(path, outcome.made.layers_of(PAPERS), scene(outcome.drive, runner.cache).truth)
 
 
-def _positions(runner: Runner, plan: Plan) -> dict[Configuration, list[ScoredRun]]:
-    """Tables 1 and 2, by the replays of `eval localisation`."""
+def _positions(runner: Runner, plan: Plan) -> Scores:
+    """Tables 1 and 2, by the replays of `lab positions`."""
     planned = [PlannedDrive(seed, plan.seconds, PAPER.preset, plan.setup) for seed in plan.seeds]
     rows = [table.as_recorded(row, planned[0]) for row in plan.positions]
-    runs = iter(runner.run(table.EXPERIMENT, [replay_task(row, drive) for drive in planned for row in rows]))
-    by_drive = [{row: next(runs) for row in rows} for _ in planned]
-    return {row: [each[row] for each in by_drive] for row in rows}
+    return table.scored(runner, planned, rows)
 
 
 def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
@@ -138,24 +115,10 @@ def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:
     ]
 
 
-def _days(runner: Runner, plan: Plan, source: MapSource) -> list[Row]:
-    """Rows of two days, of the same machines and of others; none of one seed alone, after which nobody comes."""
-    drives_of = [source.drive(seed, plan) for seed in plan.seeds]
-    kinds: dict[str, list[tuple[PlannedDrive | None, PlannedDrive]]] = {
-        "the same": [(None, drive) for drive in drives_of[1:]],
-        "others": [*pairwise(drives_of)],
-    }
-    rows = []
-    for who, pairs in kinds.items():
-        tasks = [replay_task(SecondDay(Fleet(source.agents), first), second) for first, second in pairs]
-        rows += day_rows({**_of(source), "second_day": who}, runner.run(days.EXPERIMENT, tasks)) if tasks else []
-    return rows
-
-
 # --- rows ------------------------------------------------------------------------------------------------------------
 
 
-def position_row(plan: Plan, row: Configuration, runs: Sequence[ScoredRun]) -> Row:
+def position_row(plan: Plan, row: Configuration, runs: Sequence[Score]) -> Row:
     """One row of Tables 1 and 2: means over the seeds."""
     figures = [{name: getattr(run, name) for name in (*PLACES, "us_per_second")} for run in runs]
     named = {"table": "positions", "scenario": plan.setup.scenario, "preset": PAPER.preset, **_sensors(row)}

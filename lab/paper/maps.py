@@ -31,12 +31,6 @@ PLOTTED = ("resistance", "grade_east", "grade_north")  # all that `last_write` h
 LAYERS = (*SERVER_LAYERS, "resistance_class", "resistance_std", "grade_std")
 TRUE_STD = 1e-4  # stated of true values
 FORECASTS = {"last_write": by_frequency, "mean": by_mean}  # beside the server's
-SOURCES = (
-    *("agents", "mapserver", "protocol"),
-    *(f"lab/fleet/{part}.py" for part in ("drives", "solving", "true_errors")),
-    *(f"lab/{part}.py" for part in ("paper/maps", "ground/lag", "positions/configurations")),
-    *(f"lab/maps/{part}.py" for part in ("methods", "uncertainty")),
-)
 
 
 @dataclass(frozen=True)
@@ -181,4 +175,4 @@ def samples_of(agent: Agent, drive: PlannedDrive, cache: Path) -> AgentSamples:
     return read_result(AgentSamples, drives.EXPERIMENT.file(replay_task(agent, drive), cache))
 
 
-EXPERIMENT = Experiment("paper", MadeMaps, SOURCES, _solve)
+EXPERIMENT = Experiment("paper", MadeMaps, _solve)

@@ -1,4 +1,4 @@
-"""What the paper reports, Xiang et al., "Where am I? SLAM for Mobile Machines on A Smart Working Site", and its slips.
+"""What the paper reports, Xiang et al., "Where am I? SLAM for Mobile Machines on A Smart Working Site".
 
 A group is a filter with so many GPS receivers and IMUs; wheel encoders are always there.
 """
@@ -58,55 +58,3 @@ PLOTTING: dict[Group, Published] = {
     ("ukf", 1, 1): Published(2.003, 2.314, 3.0603, 1.482, 1.682),
     ("ukf", 2, 1): Published(1.336, 1.533, 2.0334, 0.997, 1.223),
 }
-
-# Where its text and its tables do not fit together, or leave something out, and what is done here instead.
-REMARKS = (
-    {
-        "about": "EKF and UKF",
-        "paper": "the EKF's errors are 1.4 to 1.9 times the UKF's with the same sensors",
-        "here": "they agree within 0.1 %: within what the state is unsure of, the models are all but linear; a gap so "
-        "large points to other settings of the two, or to an error in one",
-    },
-    {
-        "about": "more IMUs",
-        "paper": "a third IMU makes one receiver worse (2.28 to 2.57 m, 3.30 to 3.77 m)",
-        "here": "more never make it worse by more than its interval: every one of them is independent information",
-    },
-    {
-        "about": "no receiver",
-        "paper": "65 and 75 m",
-        "here": "some metres, where an attitude reference holds the heading; the paper does not say how far it drove, "
-        "nor how its headings err",
-    },
-    {
-        "about": "Gaussian noise of 2 m",
-        "paper": "1.7 m remain of receivers with white noise of 2 m at some hertz",
-        "here": "white noise would average out to some decimetres; receivers of the preset `paper` have a slow part, "
-        "set on seeds 0 to 2 so that one receiver with the paper's filter has the paper's 2.32 m",
-    },
-    {
-        "about": "weights of sigma points",
-        "paper": "lambda / (2 (L + lambda)) for i > 0",
-        "here": "1 / (2 (L + lambda)), the standard form: those of the paper do not add up to 1",
-    },
-    {
-        "about": "lambda = 3 - L",
-        "paper": "negative for 15 states, without a word",
-        "here": "kept, as it is the paper's; a covariance that is none any more starts the filter again, and counts",
-    },
-    {
-        "about": "Table 3 and Tables 1 and 2",
-        "paper": "the same configurations have other errors while plotting (2.03 and 1.72 m): other drives",
-        "here": "the same drives; errors while plotting are those at the samples, of the load centre",
-    },
-    {
-        "about": "J",
-        "paper": "of the cells that were plotted, also those where nobody was; how many there are is not said",
-        "here": "counted so, and over the cells that a load centre truly passed, with the share that is known",
-    },
-    {
-        "about": "the site",
-        "paper": "dimensions, path, speeds, rates of sensors are not given",
-        "here": "200 x 150 m with its five kinds of ground and its slope of 15 degrees, tours in `paper_site`",
-    },
-)

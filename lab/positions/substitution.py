@@ -1,29 +1,27 @@
-"""Recordings with other readings: what an agent would have read on the same drive, had its sensors been others.
+"""Recordings with other fixes: what an agent would have read on the same drive, had its receivers erred otherwise.
 
 The truth that makes them stays in this package; agents get readings and nothing else.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from lab.campaign.recordings import RecordedDrive, track_file
 from protocol.arrays import Floats, Ints
-from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder, Gps, Imu, Reading
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import Gps, Reading
 from protocol.site.site_config import Projection
 from sim.sensors.frames import map_from_base
 from sim.sensors.gps import ReceiverErrors
 from sim.sensors.noise import generator
 from sim.sensors.presets import BASE_RATE_HZ, GpsNoise
 from sim.simulator import START_NS
-from sitegrid.proof.tracks import Truth, interpolate
+from sitegrid.proof.tracks import interpolate
 
 STEP_NS = 1_000_000_000 // BASE_RATE_HZ  # of the simulated world
 
@@ -47,39 +45,6 @@ class TrueMotion:
             interpolate(stamp_ns, self.stamp_ns, self.position_m) + map_from_base(lever, yaw, pitch, roll).T
         )
         return antenna
-
-    def distance_m(self, stamp_ns: Ints) -> Floats:
-        """How far it has moved ahead and to the left, in its own axes, at other instants (m,): (m, 2)."""
-        return self._integral(self.velocity_mps()[:, :2], stamp_ns)
-
-    def sideways_m(self, stamp_ns: Ints) -> Floats:
-        """What sliding sideways has added to its place at other instants (m,), east and north: (m, 2)."""
-        yaw, pitch, roll = self.attitude_rad.T[::-1]
-        sliding = np.stack([np.zeros_like(yaw), self.velocity_mps()[:, 1], np.zeros_like(yaw)])
-        return self._integral(map_from_base(sliding, yaw, pitch, roll).T[:, :2], stamp_ns)
-
-    def velocity_mps(self) -> Floats:
-        """Velocity at its own instants, ahead, left and up in its axes: (n, 3)."""
-        in_map = CubicSpline(self._time_s(self.stamp_ns), self.position_m)(self._time_s(self.stamp_ns), 1)
-        roll, pitch, yaw = self.attitude_rad.T
-        axes = [map_from_base(axis[:, None] * np.ones_like(yaw), yaw, pitch, roll).T for axis in np.eye(3)]
-        return np.stack([(axis * in_map).sum(axis=1) for axis in axes], axis=1)
-
-    def turn_rate_radps(self, stamp_ns: Ints) -> Floats:
-        """Angular rate about its own upright axis at other instants (m,), within the known ones."""
-        angles, time_s = CubicSpline(self._time_s(self.stamp_ns), self.attitude_rad), self._time_s(stamp_ns)
-        roll, pitch, _ = angles(time_s).T
-        _, pitching, turning = angles(time_s, 1).T
-        rate: Floats = turning * np.cos(pitch) * np.cos(roll) - pitching * np.sin(roll)
-        return rate
-
-    def _integral(self, rates: Floats, stamp_ns: Ints) -> Floats:
-        """Integral of rates (n, k) at its own instants, from the first of them on: at other instants (m,), (m, k)."""
-        integral: Floats = CubicSpline(self._time_s(self.stamp_ns), rates).antiderivative()(self._time_s(stamp_ns))
-        return integral
-
-    def _time_s(self, stamp_ns: Ints) -> Floats:
-        return np.asarray(stamp_ns - self.stamp_ns[0], float) * 1e-9
 
 
 @dataclass(frozen=True)
@@ -155,60 +120,3 @@ def with_gps_errors(recording: RecordedDrive, motion: TrueMotion, errors: Mappin
         fixes |= {(name, stamp): Gps(name, stamp, *place, *stated) for stamp, place in rows}
     readings: tuple[Reading, ...] = tuple(fixes.get((r.sensor, r.stamp_ns), r) for r in recording.readings)
     return replace(recording, readings=readings)
-
-
-def without_slow_errors(errors: Mapping[str, GpsErrors]) -> dict[str, GpsErrors]:
-    """Errors of which the white noise alone is left, and stated."""
-    return {
-        name: replace(own, slow_m=np.zeros_like(own.slow_m), stated_m2=np.maximum(own.white_m.var(axis=0), 1e-6))
-        for name, own in errors.items()
-    }
-
-
-def with_true_wheels(recording: RecordedDrive, motion: TrueMotion) -> RecordedDrive:
-    """The recording with encoders on wheels of the nominal radius that never slip, with ticks as fine as can be."""
-    ticks = {s.name: s.ticks_per_rev for s in recording.machine.sensors if s.kind == "encoder"}
-    old = [r for r in recording.readings if isinstance(r, Encoder)]
-    ahead_m = motion.distance_m(np.array([r.stamp_ns for r in old], np.int64))[:, 0].tolist()
-    per_m = 1 / (2 * math.pi * recording.machine.wheel_radius_m)
-    new: dict[Reading, Reading] = {}
-    for r, metres in zip(old, ahead_m, strict=True):
-        mean, half = metres * per_m * ticks[r.sensor], (r.left_ticks - r.right_ticks) / 2
-        new[r] = replace(r, left_ticks=mean + half, right_ticks=mean - half)
-    return replace(recording, readings=tuple(new.get(r, r) for r in recording.readings))
-
-
-def with_true_turn(recording: RecordedDrive, motion: TrueMotion) -> RecordedDrive:
-    """The recording with the true turn rate in the gyros on the rear frame; what else they measure stays."""
-    axes = {
-        s.name: s.mount.frame_from_sensor() for s in recording.machine.sensors if s.kind == "imu" and s.frame == BASE
-    }
-    old = [r for r in recording.readings if isinstance(r, Imu) and r.sensor in axes]
-    rates = motion.turn_rate_radps(np.array([r.stamp_ns for r in old], np.int64)).tolist()
-    new: dict[Reading, Reading] = {}
-    for r, rate in zip(old, rates, strict=True):
-        frame_from_sensor = axes[r.sensor]
-        in_frame = frame_from_sensor @ (r.gyro_x_radps, r.gyro_y_radps, r.gyro_z_radps)
-        in_frame[2] = rate
-        x, y, z = (frame_from_sensor.T @ in_frame).tolist()
-        new[r] = replace(r, gyro_x_radps=x, gyro_y_radps=y, gyro_z_radps=z)
-    return replace(recording, readings=tuple(new.get(r, r) for r in recording.readings))
-
-
-def without_side_slip(recording: RecordedDrive, motion: TrueMotion) -> RecordedDrive:
-    """The drive of a machine that never slid sideways: its true track, and its fixes, less what sliding added.
-
-    No sensor reads a velocity to the side, and the filter takes it for none: here it is none.
-    """
-    projection = Projection(recording.site)
-    old = [r for r in recording.readings if isinstance(r, Gps)]
-    places = np.array([projection.to_map(r.lat_deg, r.lon_deg, r.height_m) for r in old])
-    places[:, :2] -= motion.sideways_m(np.array([r.stamp_ns for r in old], np.int64))
-    moved = projection.to_geodetic_many(*places.T).T.tolist()
-    new: dict[Reading, Reading] = {
-        r: replace(r, lat_deg=lat, lon_deg=lon, height_m=height)
-        for r, (lat, lon, height) in zip(old, moved, strict=True)
-    }
-    truth = recording.truth
-    track = Truth(truth.stamp_ns, truth.position_m - motion.sideways_m(truth.stamp_ns))
-    return replace(recording, readings=tuple(new.get(r, r) for r in recording.readings), truth=track)

@@ -9,67 +9,39 @@ ends.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from agents.positioning import PipelineConfig, Positioning
+from agents.positioning import Positioning
 from lab.campaign.experiment import Experiment, Runner, Task, replay_task
-from lab.campaign.recordings import MACHINES_PROTOCOL, PAPER, PlannedDrive, RecordedDrive, Setup
+from lab.campaign.recordings import PAPER, PlannedDrive, RecordedDrive, Setup
 from lab.positions.configurations import Configuration
 from lab.positions.substitution import gps_errors, true_motion, with_gps_errors
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
-from protocol.machine.readings import Reading
 from sim.sensors.presets import GpsNoise
-from sitegrid.logs.replay import Score, errors, replay, score
+from sitegrid.logs.replay import Score, replay, score
 from sitegrid.logs.sensors import UnsupportedError, select
 from sitegrid.proof.figures import Report, Row, half_width, rounded
 
-TRACE_S = 1.0  # between two points of the curves that plots draw
-SOURCES = (
-    "agents",
-    *MACHINES_PROTOCOL,
-    *(f"lab/positions/{part}.py" for part in ("table", "configurations", "replay", "consistency", "substitution")),
+Scores = Mapping[Configuration, Sequence[Score]]  # of each row those of its drives
+MEANS = (
+    *("rmse_x_m", "rmse_y_m", "net_m", "nees", "coverage95", "covered"),
+    *("smoothed_net_m", "smoothed_nees", "smoothed_coverage95"),
 )
-
-
-@dataclass(frozen=True)
-class ScoredRun(Score):
-    """A score, and the run once per TRACE_S, for plots.
-
-    time_s: (n,); position_m, error_m: (n, 2); std_m: (n,), stated, along the longer axis of the ellipse.
-    """
-
-    time_s: Floats
-    position_m: Floats
-    error_m: Floats
-    std_m: Floats
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """One configuration on one recording."""
-
-    drive: PlannedDrive
-    row: Configuration
-    run: ScoredRun
 
 
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, rows: Sequence[Configuration], setup: Setup = PAPER
-) -> tuple[Report, list[Outcome]]:
+) -> tuple[Report, Scores]:
     """Record, replay and score all configurations with all seeds; `missing`: those that the pipeline cannot run."""
     drives = [PlannedDrive(seed, seconds, setup.preset, setup) for seed in seeds]
-    machine = drives[0].machine
     rows = [as_recorded(row, drives[0]) for row in rows]
-    refusals = {row: _why_not(machine, row) for row in rows}
+    refusals = {row: _why_not(drives[0].machine, row) for row in rows}
     runnable = [row for row, why in refusals.items() if not why]
-    pairs = [(drive, row) for drive in drives for row in runnable]
-    runs = runner.run(EXPERIMENT, [replay_task(row, drive) for drive, row in pairs])
-    outcomes = [Outcome(*pair, run) for pair, run in zip(pairs, runs, strict=True)]
-    scores = {row: [o.run for o in outcomes if o.row == row] for row in runnable}
+    scores = scored(runner, drives, runnable)
     report: Report = {
         "scenario": setup.scenario,
         "gps_error": gps_error(drives[0]),
@@ -79,7 +51,14 @@ def run(
         "ratios": ratios(scores),
         "missing": [{**vars(row), "why": why} for row, why in refusals.items() if why],
     }
-    return report, outcomes
+    return report, scores
+
+
+def scored(runner: Runner, drives: Sequence[PlannedDrive], rows: Sequence[Configuration]) -> Scores:
+    """Replay and score rows on drives; of each row its scores, drive by drive."""
+    runs = iter(runner.run(EXPERIMENT, [replay_task(row, drive) for drive in drives for row in rows]))
+    by_drive = [{row: next(runs) for row in rows} for _ in drives]
+    return {row: [each[row] for each in by_drive] for row in rows}
 
 
 def as_recorded(row: Configuration, drive: PlannedDrive) -> Configuration:
@@ -119,33 +98,21 @@ def _why_not(machine: MachineConfig, row: Configuration) -> str:
 def summarise(row: Configuration, scores: Sequence[Score]) -> Row:
     """One row of the table: means over the seeds; beside their net error, the paper's."""
     net, paper = values(scores, "net_m"), row.published_net_m
-
-    def mean(name: str) -> float:
-        return float(values(scores, name).mean())
-
     summary = {
         **vars(row),
-        "rmse_x_m": mean("rmse_x_m"),
-        "rmse_y_m": mean("rmse_y_m"),
-        "net_m": mean("net_m"),
+        **{name: float(values(scores, name).mean()) for name in MEANS},
         "ci95_m": half_width(net),
         "max_m": float(values(scores, "max_m").max()),
-        "nees": mean("nees"),
         "nees_95": nees_interval(scores),
-        "coverage95": mean("coverage95"),
-        "covered": mean("covered"),
-        "smoothed_net_m": mean("smoothed_net_m"),
-        "smoothed_nees": mean("smoothed_nees"),
-        "smoothed_coverage95": mean("smoothed_coverage95"),
-        "us_per_second": round(mean("us_per_second")),
+        "us_per_second": round(float(values(scores, "us_per_second").mean())),
         "paper_net_m": paper,
-        "difference_m": None if paper is None else mean("net_m") - paper,
+        "difference_m": None if paper is None else float(net.mean()) - paper,
         "net_by_seed_m": net.tolist(),
     }
     return rounded(summary, 4, max_m=3, nees=3, nees_95=3, smoothed_nees=3)
 
 
-def ratios(scores: Mapping[Configuration, Sequence[Score]]) -> list[Row]:
+def ratios(scores: Scores) -> list[Row]:
     """Net errors over others on the same drives: of profiles, filters, receivers, smoothed over live."""
     rows = []
     for row in scores:
@@ -190,31 +157,15 @@ def values(scores: Sequence[Score], name: str) -> Floats:
 # --- in the worker processes -----------------------------------------------------------------------------------------
 
 
-def _replay(task: Task[Configuration], cache: Path) -> ScoredRun:
+def _replay(task: Task[Configuration], cache: Path) -> Score:
     """Run one configuration on one recording."""
-    recording, machine, options, readings = prepared(task, cache)
-    trace = replay(Positioning(recording.site, machine, options), readings)
-    _, pick = np.unique(trace.since_start_s // TRACE_S, return_index=True)
-    variances = np.linalg.eigvalsh(trace.covariance_m2[pick])
-    return ScoredRun(
-        **vars(score(trace, recording.truth)),
-        time_s=trace.since_start_s[pick],
-        position_m=trace.position_m[pick],
-        error_m=errors(trace, recording.truth)[pick],
-        std_m=np.sqrt(variances[:, -1]),
-    )
-
-
-def prepared(
-    task: Task[Configuration], cache: Path
-) -> tuple[RecordedDrive, MachineConfig, PipelineConfig, list[Reading]]:
-    """Recording, machine, options and readings of one configuration on one recording."""
-    recording = _with_share(task, cache)
-    machine, options = select(recording.machine, task.variant.gps, task.variant.imu), task.variant.options
-    if not task.variant.gps:
+    recording, row = _with_share(task, cache), task.variant
+    machine, options = select(recording.machine, row.gps, row.imu), row.options
+    if not row.gps:
         options = replace(options, localisation=replace(options.localisation, start=recording.start))
     in_use = {sensor.name for sensor in machine.sensors if sensor.use}
-    return recording, machine, options, [reading for reading in recording.readings if reading.sensor in in_use]
+    readings = [reading for reading in recording.readings if reading.sensor in in_use]
+    return score(replay(Positioning(recording.site, machine, options), readings), recording.truth)
 
 
 def _with_share(task: Task[Configuration], cache: Path) -> RecordedDrive:
@@ -234,4 +185,4 @@ def _with_share(task: Task[Configuration], cache: Path) -> RecordedDrive:
     )
 
 
-EXPERIMENT = Experiment("localisation", ScoredRun, SOURCES, _replay)
+EXPERIMENT = Experiment("localisation", Score, _replay)

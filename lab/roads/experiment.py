@@ -171,8 +171,7 @@ def _solve(task: Task[Judging], cache: Path) -> Judged:
     return Judged(figures | {"kept_day_pct": kept_after(recorded, later, whole)})
 
 
-SOURCES = ("agents", "mapserver", "protocol", "lab/fleet", "lab/roads")
-EXPERIMENT = Experiment("roads", Judged, SOURCES, _solve)
+EXPERIMENT = Experiment("roads", Judged, _solve)
 
 
 def summarise(case: RoadCase, rows: Sequence[dict[str, float]]) -> Row:

@@ -20,7 +20,7 @@ MOST_OPTIONS = 60
 
 # Contracts of pyproject.toml by their first words, each with an import that breaks it: where it is planted, and what.
 PLANTED = {
-    "Layers: the laboratory": ("sitegrid/proof/delivery.py", "import lab.physics"),
+    "Layers: the laboratory": ("sitegrid/proof/delivery.py", "import lab.paper"),
     "An agent never sees": ("agents/pipeline.py", "import sim.state"),
     "The client needs": ("sitegrid/client.py", "import mapserver.config"),
     "Layers of the map server": ("mapserver/evidence/cells.py", "import mapserver.journal.rows"),

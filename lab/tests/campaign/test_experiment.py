@@ -1,7 +1,6 @@
 """The runner of experiments: results are kept, an interrupted run goes on, and nothing meets results of other code."""
 
 import json
-import re
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -11,10 +10,7 @@ import pytest
 
 from lab.campaign import experiment as module
 from lab.campaign.experiment import Experiment, Runner, Task, read_result, replay_task, write_result
-from lab.campaign.recordings import MACHINES_PROTOCOL, ROOT, PlannedDrive, code_version
-from lab.ground import experiment as ground
-from lab.maps import experiment as maps
-from lab.positions import table
+from lab.campaign.recordings import PlannedDrive
 from protocol.errors import SitegridError
 
 DONE = "done.txt"  # in the cache: names of the tasks that were done, a line each
@@ -45,7 +41,7 @@ def solve(task: Task[Power], cache: Path) -> Numbers:
     return Numbers(task.seed**task.variant.exponent, np.arange(3) ** task.variant.exponent)
 
 
-POWERS = Experiment("powers", Numbers, ("protocol/units.py",), solve)
+POWERS = Experiment("powers", Numbers, solve)
 TASKS = [Task(Power(exponent), seed, 5.0) for seed in (2, 3) for exponent in (1, 2)]
 
 
@@ -88,7 +84,7 @@ def test_every_input_of_a_result_names_another_file(tmp_path: Path, monkeypatch:
     tasks += [replay_task(Power(1), drive), replay_task(Power(1), replace(drive, preset="dgps"))]
     files = {POWERS.file(task, tmp_path) for task in tasks}
     files |= {replace(POWERS, name="others").file(TASKS[0], tmp_path)}
-    files |= {replace(POWERS, sources=("protocol/files.py",)).file(TASKS[0], tmp_path)}
+    files |= {replace(POWERS, also=("mapserver.server",)).file(TASKS[0], tmp_path)}
     monkeypatch.setattr("lab.campaign.recordings.code_version", lambda *_: "another simulator")
     files |= {POWERS.file(tasks[-1], tmp_path)}
     monkeypatch.setattr(module, "code_version", lambda *_: "other code")
@@ -146,23 +142,3 @@ def test_a_result_that_is_damaged_is_named_with_what_to_do(tmp_path: Path):
         path.write_bytes(whole[:cut])
         with pytest.raises(SitegridError, match=r"result.npz: is damaged .*; delete it, and start again"):
             read_result(Numbers, path)
-
-
-@pytest.mark.parametrize("experiment", [table.EXPERIMENT, ground.EXPERIMENT, maps.EXPERIMENT], ids=lambda e: e.name)
-def test_results_depend_on_sources_that_exist_and_on_the_code_that_makes_them(experiment: Experiment):
-    assert code_version(*experiment.sources)  # raises where one of them does not exist
-    own = f"{experiment.solve.__module__.replace('.', '/')}.py"
-    assert own in experiment.sources
-    assert {"agents", *MACHINES_PROTOCOL} <= set(experiment.sources) or {
-        "mapserver",
-        "protocol",
-    } <= set(experiment.sources)
-
-
-def test_machines_know_no_more_of_the_protocol_than_their_results_depend_on():
-    known = tuple(part.removesuffix(".py").replace("/", ".") for part in MACHINES_PROTOCOL)
-    kept = "protocol.disk"  # where an agent keeps what it has not delivered; replays deliver nothing
-    for package in ("agents", "sim"):
-        for source in (ROOT / package).rglob("*.py"):
-            for name in re.findall(r"^\s*from (protocol[\w.]*) import", source.read_text(encoding="utf-8"), re.M):
-                assert name.startswith((*known, kept)), f"{source}: {name}"

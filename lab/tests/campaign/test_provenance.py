@@ -11,9 +11,9 @@ from protocol.version import package_version
 @pytest.mark.parametrize(
     ("words", "command"),
     [
-        ("eval paper --seeds 12 --out /tmp/x --json", "sitegrid eval paper --seeds 12 --json"),
-        ("eval paper --out=/tmp/x --processes 2 --plots y", "sitegrid eval paper"),
-        ("eval log /home/me/husky --withhold 1/10 --data z", "sitegrid eval log husky --withhold 1/10"),
+        ("paper --seeds 12 --out /tmp/x --json", "python -m lab paper --seeds 12 --json"),
+        ("paper --out=/tmp/x --processes 2 --plots y", "python -m lab paper"),
+        ("bench score /home/me/entry --quick --data z", "python -m lab bench score entry --quick"),
     ],
 )
 def test_a_command_lasts_without_the_places_of_one_computer(words: str, command: str):

@@ -1,62 +1,15 @@
-"""The ground's table on short recordings, through the command line, and its pictures."""
+"""The ground's table where there is little or nothing to judge."""
 
-import json
 import math
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from lab.campaign.experiment import Runner
-from lab.campaign.recordings import Setup
+from lab.campaign.recordings import PlannedDrive, make
 from lab.ground import experiment
-from lab.ground.experiment import GroundConfiguration
-from sitegrid import cli
-from sitegrid.proof.figures import Report
-
-FAST = Setup("paper_site", ("west", "east"), gps=(1, 2), imu=(3,), world="fast")
-CALIBRATED, HARSH = GroundConfiguration("kalman", "calibrated"), GroundConfiguration("kalman", "harsh")
-SECONDS = 40.0
-
-
-@pytest.fixture(scope="module")
-def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
-    return Runner(tmp_path_factory.mktemp("cache"))
-
-
-@pytest.fixture(scope="module")
-def result(runner: Runner) -> tuple[Report, list[experiment.GroundOutcome]]:
-    return experiment.run(runner, (4,), SECONDS, (CALIBRATED, HARSH), FAST)
-
-
-@pytest.mark.slow
-def test_every_row_is_judged_on_its_presets_recording(result, runner: Runner):
-    report, outcomes = result
-    assert [(row["estimator"], row["preset"]) for row in report["rows"]] == [
-        ("kalman", "calibrated"),
-        ("kalman", "harsh"),
-    ]
-    assert [outcome.drive.preset for outcome in outcomes] == ["dgps", "harsh"]
-    assert sorted(p.name.split("-")[0] for p in runner.cache.iterdir()) == ["dgps", "ground", "harsh"]
-    for row in report["rows"]:
-        assert row["samples"] > row["judged_samples"] > 20
-        assert row["cells"] > 20
-        assert row["right_class_ci95"] is None  # of a single seed
-        assert len(row["c_rr_bias_by_seed"]) == 1
-    assert report["judged_from_s"] == 16.0
-    assert [goal["name"] for goal in report["goals"]] == [goal.figure for goal in experiment.GOALS]
-    assert {goal["row"] for goal in report["goals"]} == {"kalman calibrated"}
-    assert (outcomes[0].output.samples["stamp_ns"] > 0).all()
-
-
-def test_rows_configure_the_estimator_and_its_calibration():
-    options = {row.name: row.options.estimation for row in experiment.ROWS}
-    assert len(options) == 6
-    assert {(e.estimator, e.calibrate) for e in options.values()} == {
-        (name, calibrate) for name in ("kalman", "rls") for calibrate in (True, False)
-    }
-    assert not options["kalman-nominal"].calibrate
+from lab.ground.experiment import GroundConfiguration, PipelineOutput
+from lab.tests.stored import LOADERS
+from protocol.machine.samples import empty
 
 
 @pytest.mark.parametrize(("seconds", "settled"), [(600.0, 240.0), (1200.0, 240.0), (100.0, 40.0)])
@@ -65,35 +18,10 @@ def test_a_machine_has_time_to_settle(seconds, settled):
 
 
 @pytest.mark.slow
-def test_the_command_prints_one_object_and_draws(
-    runner: Runner, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-):
-    cv2 = pytest.importorskip("cv2")
-    pytest.importorskip("matplotlib", reason="needs the extra `eval`")
-    monkeypatch.setattr(experiment, "run", partial(experiment.run, rows=(CALIBRATED, HARSH), setup=FAST))
-    words = ["eval", "ground", "--seeds", "1", "--first-seed", "4", "--seconds", "40", "--out", str(runner.cache)]
-    assert cli.main([*words, "--processes", "1", "--json", "--plots", str(tmp_path)]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert {"rows", "goals", "plots"} <= set(report)
-    assert [Path(p).name for p in report["plots"]] == ["along_seed4.png", "places_seed4.png", "summary.png"]
-    for path in report["plots"]:
-        picture = cv2.imread(path)
-        assert picture.shape[1] > 800
-        assert picture.std() > 10
-    assert cli.main(words) == 0
-    shown = capsys.readouterr().out
-    assert "kalman calibrated" in shown
-    assert "right_class_pct" in shown
-
-
-@pytest.mark.slow
-def test_a_tour_without_samples_still_has_rows_and_pictures(result, runner: Runner, tmp_path: Path):
-    ground_plots = pytest.importorskip("lab.ground.plots", reason="needs the extra `eval`")
-    report, (outcome, _) = result
-    nothing = replace(outcome.output, samples=outcome.output.samples[:0])
-    silent = experiment.judged(outcome.drive, outcome.row, nothing, runner.cache)
-    row = experiment.summarise(CALIBRATED, [silent, silent])
-    assert row["cells"] == 0
-    assert math.isnan(row["right_class_pct"])
-    assert [p.name for p in ground_plots.draw(report, [silent], runner, tmp_path)] == ["summary.png"]
-    assert ground_plots.draw(report, [], runner, tmp_path) == []
+def test_a_tour_without_samples_still_has_rows(tmp_path: Path):
+    drive, row = PlannedDrive(4, 5.0, "dgps", LOADERS), GroundConfiguration("kalman", "calibrated")
+    make(drive, tmp_path)
+    silent = experiment.judged(drive, row, PipelineOutput(empty(0), {}, 1.0), tmp_path)
+    summary = experiment.summarise(row, [silent, silent])
+    assert summary["cells"] == 0
+    assert math.isnan(summary["right_class_pct"])

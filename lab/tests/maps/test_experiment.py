@@ -1,18 +1,14 @@
-"""The comparison of merges: figures of maps that are right or wrong where they are meant to be, rows, the command."""
+"""The comparison of merges: figures of maps that are right or wrong where they are meant to be, and rows."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lab.campaign.experiment import Runner
 from lab.maps import experiment
-from lab.maps.cases import CASES, CaseMachine, MapCase, build_site, select
+from lab.maps.cases import CASES, CaseMachine, MapCase, build_site
 from lab.maps.experiment import NEAR_M, CaseResult, figures, near_parked
 from lab.maps.samples import MapScene
-from sitegrid import cli
 
 METHODS = ["soft_votes", "last_write", "mean", "median", "kalman"]
 SMALL = tuple(replace(case, columns=45, rows=30) for case in CASES)
@@ -67,17 +63,6 @@ def test_cells_beside_a_parked_machine_are_judged_apart():
     assert not near_parked(replace(case, machines=(CaseMachine(),))).any()
 
 
-def test_sure_cells_are_judged_apart():
-    case, scene = scene_of("1x1")
-    estimated, confidence = scene.site.c_rr.copy(), np.full((30, 45), 0.9)
-    estimated[0], confidence[0] = 0.25, 0.59
-    judged = figures(case, scene, {"resistance": estimated, "confidence": confidence})
-    assert judged["share60_wrong_pct"] == 0.0
-    assert judged["share60_cells_pct"] == pytest.approx(100 * 29 / 30)
-    confidence[0] = 0.6
-    assert figures(case, scene, {"resistance": estimated, "confidence": confidence})["share60_wrong_pct"] > 0
-
-
 def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
     case, scene = scene_of("slope_15")
     east, north = np.moveaxis(scene.site.gradient, -1, 0)
@@ -88,25 +73,6 @@ def test_a_gradient_is_wrong_if_its_vector_is_off_by_more_than_a_percent():
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_every_case_and_method_has_a_row_with_the_figures_that_apply(tmp_path: Path):
-    report, _ = experiment.run(Runner(tmp_path), (3,), SMALL)
-    assert [(row["case"], row["method"]) for row in report["rows"]] == [(c.kind, m) for c in CASES for m in METHODS]
-    assert report["seeds"] == [3]
-    assert len(report["goals"]) == len(experiment.GOALS)
-    for row in report["rows"]:
-        server = row["method"] == "soft_votes"
-        assert (row["changed_wrong_pct"] is None) == (row["passes_after"] is None) == (row["case"] != "repaved")
-        assert (row["unchanged_wrong_pct"] is None) == (row["case"] != "repaved")
-        assert (row["near_wrong_pct"] is None) == (row["case"] != "parked_bad_machine")
-        assert (row["width_m"] is None) == (row["case"] != "narrow_road")
-        assert (row["share60_cells_pct"] is None) == (not server or row["case"] in ("grade_both_ways", "slope_15"))
-        assert 0 <= row["wrong_min_pct"] <= row["wrong_pct"] <= row["wrong_max_pct"]
-        assert row["known_pct"] > 50
-        assert row["samples"] > row["cells"] > 0
-    assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
 def test_rows_are_medians_over_seeds():
@@ -132,41 +98,3 @@ def test_each_goal_names_a_figure_and_at_least_one_row():
         case, passes_after, method = (goal.row.get(name) for name in ("case", "passes_after", "method"))
         assert method in METHODS
         assert (case, passes_after) in keys
-
-
-# --- the command -----------------------------------------------------------------------------------------------------
-
-
-def test_an_unknown_case_is_one_line(capsys: pytest.CaptureFixture[str]):
-    assert cli.main(["eval", "merge", "--cases", "1x1,2x2"]) == 1
-    error = capsys.readouterr().err
-    assert error.startswith("sitegrid: --cases: `2x2` is not known; known: 1x1, 1x4, 4x4, bad_machine,")
-    assert error.count("\n") == 1
-
-
-def test_options_choose_seeds_and_cases(monkeypatch: pytest.MonkeyPatch):
-    asked = []
-    report = {"seeds": [], "rows": [], "goals": []}
-    monkeypatch.setattr(experiment, "run", lambda *_, **options: (asked.append(options), (report, ()))[1])
-    assert cli.main(["eval", "merge", "--seeds", "2", "--first-seed", "7", "--cases", "repaved,1x1"]) == 0
-    assert cli.main(["eval", "merge"]) == 0
-    assert [list(options["seeds"]) for options in asked] == [[7, 8], list(range(12))]
-    assert [options["cases"] for options in asked] == [select(["repaved", "1x1"]), CASES]
-
-
-@pytest.mark.slow
-def test_the_command_runs_from_end_to_end_and_draws(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    from lab.maps import cases
-
-    kinds = ("parked_bad_machine", "repaved", "narrow_road", "slope_15")  # each has a picture of its own kind
-    monkeypatch.setattr(cases, "CASES", [small(kind) for kind in kinds])
-    words = ["eval", "merge", "--seeds", "1", "--cases", ",".join(kinds)]
-    words += ["--out", str(tmp_path), "--processes", "1", "--plots", str(tmp_path / "plots"), "--json"]
-    assert cli.main(words) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert len(report["rows"]) == len(kinds) * len(METHODS)
-    pictures = [tmp_path / "plots" / f"{name}.png" for name in ("table", *(small(kind).name for kind in kinds))]
-    assert report["plots"] == [str(path) for path in pictures]
-    assert all(path.stat().st_size > 10_000 for path in pictures)

@@ -56,14 +56,6 @@ def test_a_kalman_filter_rejects_an_outlier_and_gives_in_to_many():
     assert kalman(hits([0] * 30, [0] * 3 + [9] * 27))[0] == pytest.approx(9.0, abs=0.5)
 
 
-def test_cells_are_filtered_each_on_its_own():
-    draw = np.random.default_rng(0)
-    cell, value = draw.integers(0, 3, 60), draw.normal(0, 3, 60)
-    together = kalman(hits(cell, value))
-    alone = [kalman(hits(np.zeros((cell == i).sum(), int), value[cell == i], cells=1))[0] for i in range(3)]
-    np.testing.assert_allclose(together, alone)
-
-
 @pytest.mark.parametrize("method", [last_write, mean, median, kalman])
 def test_nothing_makes_an_empty_map(method):
     assert np.isnan(method(hits([], []))).all()
@@ -76,17 +68,6 @@ def test_samples_fall_into_the_cell_of_their_stated_position():
     assert result.cell.tolist() == [0, 41]
     assert result.value == pytest.approx([-0.1, -0.1])
     assert hits_of(rows, "grade_east", CellWindow(1, 2, 3, 3)).cell.tolist() == [0]
-
-
-def test_samples_of_all_machines_count_in_the_order_of_their_stamps():
-    early, late = samples([10, 40], [3.5, 3.5], [2.5, 2.5], [0.02, 0.25]), samples([20], [3.5], [2.5], [0.06])
-    rows = methods.in_order([early, late])
-    assert rows["stamp_ns"].tolist() == [10, 20, 40]
-    layers = methods.merge_hard(last_write, rows, ("resistance", "grade_north"), WINDOW)
-    assert layers["resistance"].shape == (18, 20)
-    assert layers["resistance"][2, 3] == pytest.approx(0.25)
-    assert layers["grade_north"][2, 3] == pytest.approx(-0.1)
-    assert np.isfinite(layers["resistance"]).sum() == 1
 
 
 def deliveries():
@@ -106,9 +87,3 @@ def test_the_server_makes_its_own_map():
         np.testing.assert_allclose(result[name][driven], value, atol=2e-4 if name == "resistance" else 1e-3)
     assert (result["confidence"][driven] > 0.9).all()
     assert np.isnan(result["resistance"][10]).all()
-
-
-def test_a_window_is_cut_out_of_the_servers_blocks():
-    whole, part = (soft_votes(deliveries(), window)[0]["resistance"] for window in (WINDOW, CellWindow(12, 15, 6, 3)))
-    assert np.isfinite(part).any()
-    np.testing.assert_array_equal(part, whole[15:18, 12:18])

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab import commands
 from lab.campaign.experiment import Runner
+from lab.campaign.goals import goals
 from lab.paper import experiment
 from lab.paper.drives import ALONE, FLEETS, QUICK, Plan
-from lab.paper.experiment import GOALS, Outcomes, contradictions, map_row, position_row
+from lab.paper.experiment import Outcomes, contradictions, map_row, position_row
 from lab.paper.maps import OURS, PAPERS, SERVED
-from lab.paper.report import readable
 from lab.positions.configurations import Configuration
 from lab.tests.positions.test_table import score
-from protocol.errors import SitegridError
-from sitegrid import cli
+from sitegrid.door import run
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
 
@@ -64,7 +64,7 @@ def test_goals_are_of_rows_that_a_full_plan_has():
     named = [
         map_row(source, kind, [figures(1.0)], [figures(1.0)]) for source in plan.sources for kind in (OURS, SERVED)
     ]
-    for goal in GOALS:
+    for goal in goals("paper"):
         assert len([row for row in named if goal.row.items() <= row.items()]) == 1, goal
 
 
@@ -75,22 +75,6 @@ def test_contradictions_of_the_paper_are_named():
         ("Table 3", "EKF 1 GPS 1 IMU"),
     ]
     assert (rows[1]["net_m"], rows[1]["net_of_parts_m"]) == (4.4444, 4.2761)
-
-
-def test_people_get_a_table_per_kind_of_row_with_the_papers_figures_in_brackets():
-    rows = [
-        position_row(QUICK, Configuration("ukf", 2, 1, "paper"), [score(1.0), score(2.0)]),
-        map_row(ALONE[4], PAPERS, [figures(1.0)], ()),
-    ]
-    shown = readable({"seeds": [1], "rows": rows})
-    assert list(shown) == ["seeds", "positions", "maps"]
-    assert shown["positions"][0]["net [m]"] == "1.50 +- 6.35 (1.7217)"
-    assert (shown["maps"][0]["J_r plotted [%]"], shown["maps"][0]["J_r driven [%]"]) == ("2.00 (0.997)", "1.00")
-
-
-def test_drives_that_are_too_short_are_refused(tmp_path: Path):
-    with pytest.raises(SitegridError, match="59 is too short; maps need drives of 60 s or more"):
-        experiment.run(Runner(tmp_path), replace(QUICK, seconds=59.0))
 
 
 # --- the quick version -----------------------------------------------------------------------------------------------
@@ -108,24 +92,17 @@ def result(runner: Runner) -> tuple[Report, Outcomes]:
 
 @pytest.mark.slow
 def test_the_quick_version_has_the_figures_that_are_stored(result):
-    """`sitegrid eval paper --quick --json` printed them."""
+    """`python -m lab paper --quick --json` printed them."""
     report = plain(result[0])
     stored = json.loads(STORED.read_text())
     assert [{**row, **NO_STORE} for row in report["rows"]] == [{**row, **NO_STORE} for row in stored["rows"]]
-    assert report["remarks"]
-    assert {**report, "rows": [], "remarks": []} == {**stored, "rows": [], "remarks": []}
-
-
-@pytest.mark.slow
-def test_it_goes_on_where_it_was(result, runner: Runner, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("lab.campaign.experiment._work", lambda *_: pytest.fail("does work that is done"))
-    assert plain(experiment.run(runner, QUICK)[0]) == plain(result[0])
+    assert {**report, "rows": []} == {**stored, "rows": []}
 
 
 @pytest.mark.slow
 def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):
     cv2 = pytest.importorskip("cv2")
-    plots = pytest.importorskip("lab.paper.plots", reason="needs the extra `eval`")
+    plots = pytest.importorskip("lab.paper.plots", reason="needs the extra `lab`")
     paths = plots.draw(*result, runner, tmp_path)
     maps = ["truth", "maps", "differences", "fleet_maps", "fleet_differences"]
     assert [p.stem for p in paths] == [*maps, "tracks", "errors", "reliability"]
@@ -143,30 +120,15 @@ def test_the_papers_map_is_written_as_a_tensor(result, runner: Runner, tmp_path:
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
-def test_options_reach_the_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_options_reach_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     asked: list[Plan] = []
     monkeypatch.setattr(experiment, "run", lambda _, plan: (asked.append(plan), ({"rows": []}, None))[1])
-    words = ["eval", "paper", "--json"]
-    for more in (["--seeds", "2", "--first-seed", "1000", "--seconds", "300"], [], ["--quick"]):
-        assert cli.main([*words, *more]) == 0
-    assert asked == [Plan(range(1000, 1002), 300.0), Plan(range(12), 1200.0), QUICK]
-    assert cli.main(["eval", "paper", "--quick", "--seeds", "3"]) == 1
-    error = capsys.readouterr().err
-    assert error == "sitegrid: --quick: has a drive of its own: leave out --seeds, --first-seed and --seconds\n"
-
-
-def test_one_of_the_tables_may_be_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    asked: list[Plan] = []
-    monkeypatch.setattr(experiment, "run", lambda _, plan: (asked.append(plan), ({"rows": []}, None))[1])
-    for tables in ("positions", "maps"):
-        assert cli.main(["eval", "paper", "--json", "--seeds", "2", "--tables", tables]) == 0
-    whole = Plan(range(2), 1200.0)
-    assert asked == [replace(whole, sources=()), replace(whole, positions=())]
-    for more in (["--quick"], ["--tensor", "map.npy"], ["--plots", "plots"]):
-        assert cli.main(["eval", "paper", "--tables", "positions", *more]) == 1
-        assert "leave out --" in capsys.readouterr().err
+    for more in ([], ["--quick"], ["--tables", "positions"], ["--tables", "maps"]):
+        assert run(["paper", "--json", "--out", str(tmp_path), *more], commands) == 0
+    whole = Plan(range(12), 1200.0)
+    assert asked == [whole, QUICK, replace(whole, sources=()), replace(whole, positions=())]
 
 
 def test_a_tensor_is_a_file_of_numpy(capsys: pytest.CaptureFixture[str]):
-    assert cli.main(["eval", "paper", "--tensor", "map.csv"]) == 1
+    assert run(["paper", "--tensor", "map.csv"], commands) == 1
     assert "map.npy" in capsys.readouterr().err

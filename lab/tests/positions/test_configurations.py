@@ -3,10 +3,10 @@
 import pytest
 
 from lab.campaign.recordings import PlannedDrive
+from lab.positions import configurations as table
 from lab.positions import published
 from lab.positions.configurations import Configuration
-from sitegrid.logs import configurations as table
-from sitegrid.logs.sensors import select
+from sitegrid.logs.sensors import UnsupportedError, select
 
 
 def used(machine):
@@ -39,12 +39,5 @@ def test_sensors_of_a_row_are_in_use_and_no_others():
 
 
 def test_more_receivers_than_there_are_is_refused():
-    with pytest.raises(table.UnsupportedError, match="3 GPS receivers, not 4"):
+    with pytest.raises(UnsupportedError, match="3 GPS receivers, not 4"):
         select(PlannedDrive(0, 1.0).machine, gps=4)
-
-
-@pytest.mark.parametrize("filter_", table.FILTERS)
-@pytest.mark.parametrize("profile", table.PROFILES)
-def test_filter_and_profile_reach_the_pipeline(filter_: str, profile: str):
-    options = Configuration(filter_, 1, 1, profile).options
-    assert (options.localisation.filter, options.localisation.profile) == (filter_, profile)

@@ -1,26 +1,23 @@
-"""The table: its rows on made-up scores, and on short recordings, with pictures."""
+"""The table: its rows on made-up scores, and on short recordings."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lab.campaign.experiment import Runner
-from lab.campaign.recordings import PAPER, PlannedDrive, load
+from lab.campaign.recordings import PAPER, PlannedDrive, load, make
 from lab.positions import table
 from lab.positions.configurations import Configuration
 from lab.positions.table import paired_ratio, ratios, summarise
 from protocol.machine.machine_config import MachineConfig
 from sitegrid.logs.replay import Score
-from sitegrid.proof.figures import Report
 
 FAST = replace(PAPER, world="fast")
-ONE, TWO, NONE = (Configuration("ukf", gps, 1, "default", 0.0) for gps in (1, 2, 0))
+ONE, TWO = (Configuration("ukf", gps, 1, "default", 0.0) for gps in (1, 2))
 SHARED = replace(TWO, machine_share=0.95)
-NEVER = Configuration("ukf", 9, 1, "default")
-SECONDS = 14.0
+DRIVE = PlannedDrive(3, 14.0, FAST.preset, FAST)
 
 
 def score(net_m: float, max_m: float = 3.0, us: float = 100.0, smoothed: tuple[float, ...] = (math.nan,) * 3) -> Score:
@@ -37,12 +34,6 @@ def test_row_has_means_over_seeds_and_stands_beside_the_paper():
     assert row["net_by_seed_m"] == [1.0, 2.0]
     assert row["nees_95"] == pytest.approx([2 - 0.707, 2 + 0.707])
     assert row["ci95_m"] == pytest.approx(12.7062 * math.sqrt(0.5) / math.sqrt(2), abs=1e-3)
-
-
-def test_a_single_seed_has_no_interval_and_a_row_of_ours_no_figure_of_the_paper():
-    row = summarise(Configuration("ukf", 3, 1, "default"), [score(1.0)])
-    assert row["ci95_m"] is None
-    assert row["paper_net_m"] is row["difference_m"] is None
 
 
 def test_pairing_takes_out_what_recordings_have_in_common():
@@ -85,85 +76,31 @@ def test_smoothed_poses_stand_beside_the_live_ones_of_the_same_drives():
 
 
 @pytest.fixture(scope="module")
-def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
-    return Runner(tmp_path_factory.mktemp("cache"))
-
-
-@pytest.fixture(scope="module")
-def result(runner: Runner) -> tuple[Report, list[table.Outcome]]:
-    return table.run(runner, (3,), SECONDS, (replace(ONE, machine_share=None), TWO, NONE, SHARED, NEVER), FAST)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder: Path = tmp_path_factory.mktemp("cache")
+    make(DRIVE, folder)
+    return folder
 
 
 @pytest.mark.slow
-def test_rows_are_scored_on_one_recording_and_what_cannot_run_is_named(result, runner: Runner):
-    report, outcomes = result
-    rows = report["rows"]
-    shown = [(row["gps"], row["machine_share"], row["paper_net_m"]) for row in rows]
-    assert shown == [(1, 0, 2.3234), (2, 0, 1.7217), (0, 0, 65.4774), (2, 0.95, 1.7217)]
-    assert all(0.05 < row["net_m"] < 8 and 0.3 < row["covered"] < 1 for row in (*rows[:2], rows[3]))
-    assert rows[1]["net_m"] != rows[3]["net_m"]
-    assert all(0.05 < row["smoothed_net_m"] < 8 and row["smoothed_coverage95"] > 0.3 for row in rows[:2])
-    assert rows[2]["covered"] == 1  # without GPS its start is given
-    assert all(row["us_per_second"] > 100 for row in rows)
-    assert [row["gps"] for row in report["missing"]] == [9]
-    assert "9" in report["missing"][0]["why"]
-    assert len(list(runner.cache.glob("paper-seed3-*"))) == 1
-    assert len(outcomes[0].run.time_s) > 4
-    assert [outcome.row for outcome in outcomes] == [ONE, TWO, NONE, SHARED]
-    assert list(rows[0])[:6] == ["filter", "gps", "imu", "profile", "machine_share", "rmse_x_m"]
-
-
-@pytest.mark.slow
-def test_the_share_that_was_recorded_is_the_recording_itself(runner: Runner, result):
+def test_the_share_that_was_recorded_is_the_recording_itself(cache: Path):
     """And another one changes what all receivers read, but not when: the drive and the seed are the same."""
-    drive = result[1][0].drive
-    recording = load(drive.folder(runner.cache))
-    assert table._with_share(table.replay_task(TWO, drive), runner.cache) == recording
-    shared = table._with_share(table.replay_task(SHARED, drive), runner.cache)
+    recording = load(DRIVE.folder(cache))
+    assert table._with_share(table.replay_task(TWO, DRIVE), cache) == recording
+    shared = table._with_share(table.replay_task(SHARED, DRIVE), cache)
     pairs = list(zip(recording.readings, shared.readings, strict=True))
     assert all(a.stamp_ns == b.stamp_ns and a.sensor == b.sensor for a, b in pairs)
     assert {a.sensor for a, b in pairs if a != b} == {"gps-1", "gps-2", "gps-3"}
 
 
-def test_the_report_says_how_slow_gps_errors_are():
-    error = table.gps_error(PlannedDrive(0, 1.0))
-    assert (error["slow_variance_share"], error["correlation_time_s"]) == (0.9, 45.0)
-
-
 @pytest.mark.slow
-def test_localisation_alone_runs(runner: Runner, result, monkeypatch: pytest.MonkeyPatch):
-    """So what a row costs is what localisation costs; and the same code on the same recording has the same score."""
-    monkeypatch.setattr("agents.pipeline.GroundEstimator", lambda *_: pytest.fail("estimates the ground"))
-    outcome = result[1][0]
-    again = table._replay(table.replay_task(ONE, outcome.drive), runner.cache)
-    changes = {"us_per_second": 0.0}
-    np.testing.assert_equal(asdict(replace(again, **changes)), asdict(replace(outcome.run, **changes)))
-
-
-@pytest.mark.slow
-def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):
-    cv2 = pytest.importorskip("cv2")
-    plots = pytest.importorskip("lab.positions.plots", reason="needs the extra `eval`")
-    paths = plots.draw(*result, runner, tmp_path)
-    assert [p.name for p in paths] == ["table.png", "errors.png", "tracks_seed3.png"]
-    for path in paths:
-        picture = cv2.imread(str(path))
-        assert picture.shape[1] > 800
-        assert picture.std() > 10
-
-
-@pytest.mark.slow
-def test_a_configuration_that_never_had_a_pose_still_has_a_row(
-    runner: Runner, result, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
+def test_a_configuration_that_never_had_a_pose_still_has_a_row(cache: Path, monkeypatch: pytest.MonkeyPatch):
     """Without a single GPS fix the machine cannot know where it is."""
     monkeypatch.setattr(table, "select", _deaf)
-    run = table._replay(table.replay_task(ONE, result[1][0].drive), runner.cache)
+    run = table._replay(table.replay_task(ONE, DRIVE), cache)
     row = table.summarise(ONE, [run])
     assert row["covered"] == 0.0
     assert math.isnan(row["net_m"])  # the command prints null
-    plots = pytest.importorskip("lab.positions.plots")
-    assert plots.draw(result[0], [replace(result[1][0], run=run)], runner, tmp_path) == []
 
 
 def _deaf(machine: MachineConfig, *_: int) -> MachineConfig:

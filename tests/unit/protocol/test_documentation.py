@@ -133,7 +133,7 @@ def test_example_of_a_manifest_is_read(tmp_path):
 
 
 def test_example_of_a_log_of_ones_own_is_read(tmp_path):
-    page = (ROOT / "lab" / "README.md").read_text()
+    page = (ROOT / "docs" / "own-log.md").read_text()
     _, manifest, truth = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "log.toml").write_text(manifest)
     (tmp_path / "evaluation.toml").write_text(truth)

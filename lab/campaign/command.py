@@ -1,0 +1,97 @@
+"""What the commands of experiments share: options, and an experiment that is run, printed and drawn."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any
+
+from lab.campaign.experiment import Runner
+from lab.campaign.provenance import made_by
+from lab.campaign.workers import cores
+from protocol.errors import ConfigError
+from sitegrid.options.outputs import FOLDER
+from sitegrid.options.values import count, positive, seed
+from sitegrid.process.lifetime import note, plain, raise_interrupts, say, tell
+from sitegrid.process.progress import Display
+from sitegrid.process.tables import lines
+from sitegrid.proof.figures import Report
+
+DEFAULT_SEEDS, DEFAULT_S = 12, 1200.0
+QUICK = "a small version of its own, in about a minute: to see that all works"
+Work = Callable[[Runner], tuple[Report, Any]]  # a report, and what its pictures are made of
+
+
+def add_runs(parser: ArgumentParser, seconds: float | None = None, plots: str = "", *, cases: bool = False) -> None:
+    """Options of an experiment with seeds. seconds: of a recording, if it makes any; plots: what it draws, if any."""
+    parser.add_argument("--seeds", type=count, default=DEFAULT_SEEDS, help="number of seeds (default %(default)s)")
+    parser.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
+    out = "folder for recordings and results (default %(default)s)"
+    parser.add_argument("--out", type=FOLDER, default="lab-output", help=out)
+    add_processes(parser)
+    if seconds is not None:
+        length = "length of each recording in seconds (default %(default)g)"
+        parser.add_argument("--seconds", type=positive, default=seconds, help=length)
+    if plots:
+        parser.add_argument("--plots", type=FOLDER, help=f"folder to draw {plots} into")
+    if cases:
+        parser.add_argument("--cases", type=_names, default=(), help="names, comma-separated; default all")
+
+
+def add_processes(parser: ArgumentParser) -> None:
+    """How many processes work."""
+    parser.add_argument("--processes", type=count, help="number of parallel processes (default: one per core)")
+
+
+def add_quick(parser: ArgumentParser) -> None:
+    """The quick version of an experiment."""
+    parser.add_argument("--quick", action="store_true", help=QUICK)
+
+
+def seeds_of(arguments: Namespace) -> range:
+    """The seeds that are asked for."""
+    return range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+
+
+def is_quick(arguments: Namespace) -> bool:
+    """Whether the quick version is asked for; ConfigError where it is, and drives of another length or other seeds."""
+    if arguments.quick and (seeds_of(arguments), arguments.seconds) != (range(DEFAULT_SEEDS), DEFAULT_S):
+        raise ConfigError("--quick", "has a drive of its own: leave out --seeds, --first-seed and --seconds")
+    return bool(arguments.quick)
+
+
+def perform(
+    arguments: Namespace,
+    title: str,
+    work: Work,
+    plots: str = "",
+    readable: Callable[[Report], Report] = lambda report: report,
+) -> int:
+    """Run an experiment with its progress shown, draw what is asked for, and print its report; returns the exit code.
+
+    plots: module whose `draw` makes the pictures. readable: of the report what people read.
+    """
+    raise_interrupts()  # the bar hides the cursor of the terminal
+    with Display(title, headless=arguments.json, kept=arguments.out) as display:
+        runner = Runner(arguments.out, arguments.processes or cores(), display.show)
+        report, outcomes = work(runner)
+    if not arguments.json:
+        note(f"recordings and results are in {arguments.out}")
+    if plots and arguments.plots:
+        pictures = import_module(plots)  # imported here: only pictures need matplotlib
+        report = {**report, "plots": list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))}
+    show(arguments, report, readable)
+    return 0
+
+
+def show(arguments: Namespace, report: Report, readable: Callable[[Report], Report] = lambda report: report) -> None:
+    """Print a report: with `--json` one object, with `made`, where it comes from."""
+    if arguments.json:
+        say(plain({"made": made_by(arguments.words), **report}))
+    else:
+        tell("\n\n".join(lines(plain(readable(report)))))
+
+
+def _names(text: str) -> Sequence[str]:
+    return tuple(name for name in text.split(",") if name)

@@ -1,0 +1,24 @@
+"""`python -m lab calibration`: machines that calibrate each other."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from functools import partial
+
+from lab.campaign.command import add_runs, perform, seeds_of
+
+HELP = "measure what calibration of machines by each other and by the ground gives the map"
+EXTRA = "lab"
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    add_runs(parser, 900.0, "the maps of the first seed before and after, and the table")
+
+
+def run(arguments: Namespace) -> int:
+    """Calibrate the machines of all cases."""
+    from lab.fleet import experiment
+
+    work = partial(experiment.run, seeds=seeds_of(arguments), seconds=arguments.seconds)
+    return perform(arguments, "machines drive, and are calibrated by the ground", work, "lab.fleet.plots")

@@ -1,1 +1,0 @@
-"""Positions without GPS: blackouts, receivers that come back wrong, drives from a start alone."""
