@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.speed.measure import START_NS
-from lab.speed.merge_work import BATCH, batches, samples_of
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.journal.location import JOURNAL_FILE
@@ -29,6 +27,7 @@ from sitegrid import connect
 from sitegrid.client import Client
 from sitegrid.process.children import Child, Children, wait_until
 from tests.integration.site_run import READY_S, kill
+from tests.site_work import BATCH, START_NS, batches, samples_of
 
 SITE, CONFIG = SiteConfig("pit", 48.0, 11.0), ServerConfig()
 HOURS = 2.2

@@ -1,4 +1,4 @@
-"""Days of work on a site of 1 km2: what the map server gets to fold when ten machines drive a web of roads all day.
+"""Days of work on a site of 1 km2: what ten machines send that drive a web of roads all day, and a store full of it.
 
 Five roads lead east and five north, 10 m wide and 1 km long: a tenth of the site. At each crossing a machine turns off
 or goes on, never back. On the way to the next one it keeps to its lane of the right-hand half of the road, and its
@@ -7,15 +7,26 @@ position is off by one and the same error, as errors of satellite positions last
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count, islice
+from itertools import chain, count, islice
+from pathlib import Path
 
 import numpy as np
 
-from lab.speed.measure import START_NS
+from mapserver.config import ServerConfig
+from mapserver.evidence import snapshot
+from mapserver.evidence.grid import Grid
+from mapserver.journal.facts import NO_FACTS
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.rows import Admission
 from protocol.arrays import AnyArray, Floats, Table
 from protocol.machine.samples import empty
+from protocol.site.site_config import SiteConfig
+from protocol.wire.messages import SampleBatch
+
+START_NS = 1_767_225_600_000_000_000
 
 MACHINES, ROADS = 10, 5  # roads in each direction
 WIDTH_M, LEG_M = 10.0, 250.0  # of a road; between two crossings
@@ -24,6 +35,7 @@ STD_M = 1.2  # of a position
 HOURS = 10.0  # of a working day
 BATCH = 100  # samples that a machine sends at once
 A_SECOND = 6  # likewise, each second
+IN_ONE_COMMIT = 10_000  # journal rows of a store
 LEG_SAMPLES = int(LEG_M / SPACING_M)
 SAMPLE_NS, DAY_NS = int(SPACING_M / SPEED_MPS * 1e9), 86_400 * 10**9
 # Ground: patches of 50 m with one resistance each, on gentle hills.
@@ -114,3 +126,28 @@ def _resistance(x: AnyArray, y: AnyArray) -> Floats:
     patch = (np.floor(x / PATCH_M) + 3 * np.floor(y / PATCH_M)).astype(np.int64)
     resistance: Floats = RESISTANCES[patch % len(RESISTANCES)]
     return resistance
+
+
+def write_store(folder: Path, site: SiteConfig, rows: int, tail_rows: int, in_row: int = BATCH) -> None:
+    """Write a journal of so many rows, and a snapshot tail_rows before its end, none where it is shorter.
+
+    in_row: samples in a row: BATCH, or A_SECOND as machines send them that are always connected.
+    """
+    config = ServerConfig().fold
+    journal, grid = JournalLocation(folder).open(site.name, site.frame), Grid(site.cell_m, config)
+    work = batches() if in_row == BATCH else chain.from_iterable(seconds_of(batches()))
+    sent: Counter[str] = Counter()
+    journal.begin()
+    for number, (name, batch) in enumerate(islice(work, rows), start=1):
+        new = SampleBatch(name, 1, sent[name] + 1, batch, site.frame)
+        journal.append(Admission(new, trimmed=0, lost=0), START_NS)
+        sent[name] += len(batch)
+        if number <= rows - tail_rows:
+            grid.fold(batch, name)
+        if number == rows - tail_rows:
+            snapshot.save(folder, number, grid.state(), site.cell_m, config, NO_FACTS.of_evidence())
+        if number % IN_ONE_COMMIT == 0:
+            journal.commit()
+            journal.begin()
+    journal.commit()
+    journal.close()
