@@ -1,12 +1,15 @@
 """Microseconds per step of the filters, own and filterpy's stock one; what the smoother and a whole agent cost.
 
 Stock comes twice: plain, which is wrong where angles cross +-pi, and with the functions for angles that it asks for.
+The agent's pure core is fed as a machine feeds it, in a process of its own that imports an agent alone:
+`python -m lab.speed.agent SECONDS`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,41 +21,69 @@ from agents.localisation.filters.motion import MotionModel, motion
 from agents.localisation.filters.square_root import definite
 from agents.localisation.filters.state import ATTITUDE, POSITION, RATE, VELOCITY, Layout
 from agents.localisation.filters.ukf import Ukf
-from lab.speed.agents import agent, smoother
-from lab.speed.measure import Report, machine, medians, timed
+from agents.localisation.localiser import LocalisationConfig
+from agents.positioning import PipelineConfig, Positioning
+from lab.speed import agent
+from lab.speed.measure import Figures, in_child, in_turn, rows_of, timed
 from protocol.arrays import Floats
+from protocol.machine.readings import Reading
+from sitegrid.proof.figures import Row
 
+OPTIONS = {"runs": 5, "steps": 1000}
+GOALS: dict[tuple[str, str], str] = {}
 LAYOUT = Layout()  # the 15 states
 MODEL = MotionModel(LAYOUT)
 DT_S = 0.01
+SMOOTHER_S, AGENT_S = 150, 60  # of drives; the smoother's window is full for the last minute
+LAGS_S = (0.0, 90.0)
 MEASURED = {"update position": slice(POSITION.start, POSITION.start + 2), "update rate": RATE}
 STOCK, ANGULAR = "stock ukf", "stock ukf, angles"
 FilterStep = Callable[[], object]
 
 
-def run(steps: int, runs: int) -> Report:
-    """Measure each step of each filter; a run does it so many times, and the median of the runs counts."""
-    variants = {STOCK: _stock({}), ANGULAR: _stock(ANGLE_SAFE), "ukf": _own(Ukf()), "ekf": _own(Ekf())}
-    works = {(name, step): work for name, made in variants.items() for step, work in made.items()}
+def run(steps: int, runs: int) -> Iterator[Row]:
+    """Each step of each filter, so many times a run; the smoother and a whole agent in percent of a core.
+
+    times_stock, times_stock_angles: how many times as fast as filterpy's filter.
+    """
+    filters = {STOCK: _stock({}), ANGULAR: _stock(ANGLE_SAFE), "ukf": _own(Ukf()), "ekf": _own(Ekf())}
+    works = {f"{name}, {step}": work for name, made in filters.items() for step, work in made.items()}
     for work in works.values():
         work()  # what is made once is made
-    seconds = medians({f"{name}/{step}": _timer(work, steps) for (name, step), work in works.items()}, runs)
-    rows = []
-    for name, step in works:
-        took_s = seconds[f"{name}/{step}"]
-        stock, angular = (round(seconds[f"{other}/{step}"] / took_s, 1) for other in (STOCK, ANGULAR))
-        us = round(took_s / steps * 1e6, 1)
-        rows.append({"filter": name, "step": step, "us": us, "x_stock": stock, "x_stock_angles": angular})
-    result = {"benchmark": "filter", "steps": steps, "runs": runs, **machine(), "rows": rows}
-    return {**result, "smoother": smoother.measured(runs), "agent": [agent.measured(runs)]}
+    took = in_turn({name: partial(_repeated, work, steps) for name, work in works.items()}, runs)
+    for name, figures in took.items():
+        step = name.rpartition(", ")[2]
+        stock, angular = (took[f"{other}, {step}"]["wall_s"] / figures["wall_s"] for other in (STOCK, ANGULAR))
+        us = figures["wall_s"] / steps * 1e6
+        yield from rows_of(name, {"us": us, "times_stock": stock, "times_stock_angles": angular})
+    fed = list(agent.bundles(SMOOTHER_S))
+    lags = {f"{name}, {lag_s:g}": partial(_smoothed, fed, name, lag_s) for name in ("ekf", "ukf") for lag_s in LAGS_S}
+    cost = in_turn(lags, runs)
+    for name in ("ekf", "ukf"):
+        without, with_it = (100 * cost[f"{name}, {lag_s:g}"]["cpu_s"] / SMOOTHER_S for lag_s in LAGS_S)
+        yield from rows_of(f"{name} and smoother", {"cpu_percent": with_it, "smoother_percent": with_it - without})
+    whole = in_turn({"agent": partial(in_child, "lab.speed.agent", str(AGENT_S))}, runs)
+    yield from rows_of("agent", whole["agent"])
 
 
-def _timer(work: FilterStep, steps: int) -> Callable[[], float]:
+def _repeated(work: FilterStep, steps: int) -> Figures:
     def repeat() -> None:
         for _ in range(steps):
             work()
 
-    return lambda: timed(repeat)
+    return timed(repeat)
+
+
+def _smoothed(fed: Sequence[Sequence[Reading]], name: str, lag_s: float) -> Figures:
+    """A whole drive with a filter and a smoother's lag."""
+    config = PipelineConfig(localisation=LocalisationConfig(filter=name, lag_s=lag_s))
+    positioning = Positioning(agent.SITE, agent.machine(), config)
+
+    def work() -> None:
+        for readings in fed:
+            positioning.step(readings)
+
+    return timed(work)
 
 
 def _start() -> Belief:

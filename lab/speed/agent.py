@@ -1,24 +1,23 @@
-"""What a whole agent costs: CPU share of a core and memory, of the pure core fed as a machine feeds it.
+"""A whole agent, fed as a machine feeds it: `python -m lab.speed.agent SECONDS` prints its share of a core and memory.
 
-It is measured in a process of its own, `python -m lab.speed.agents.agent SECONDS`, which imports an agent alone.
+It imports an agent alone.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import statistics
 import sys
 import time
 from collections.abc import Iterator
 
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
-from lab.speed.measure import in_child, memory_mb
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Imu, Reading
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.units import GRAVITY_MPS2
+from tests.memory import memory_mb
 
 SITE = SiteConfig("lot", 49.01, 8.4, 120.0)
 LEVERS_M = {"gps-1": (0.8, 0.5, 3.0), "gps-2": (0.8, -0.5, 3.0)}
@@ -26,14 +25,6 @@ START_NS, STEP_NS = 1_767_225_600_000_000_000, 10_000_000
 WHEELS_EVERY, FIX_EVERY = 2, 20  # steps of 10 ms: IMU at 100 Hz, encoder at 50 Hz, each receiver at 5 Hz
 SPEED_MPS, ACCEL_MPS2, RADIUS_M = 3.0, 0.5, 15.0
 FIX_M2, FIX_M = 1.0, 0.3
-SECONDS = 60
-
-
-def measured(runs: int) -> dict[str, float | int]:
-    """Run the agent's core in processes of its own; the median of the runs counts."""
-    runs_figures = [in_child("lab.speed.agents.agent", str(SECONDS)) for _ in range(runs)]
-    cpu, memory = (statistics.median(each[name] for each in runs_figures) for name in ("cpu_percent", "memory_mb"))
-    return {"seconds": SECONDS, "cpu_percent": round(cpu, 2), "memory_mb": round(memory, 1)}
 
 
 def machine() -> MachineConfig:

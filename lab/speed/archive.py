@@ -1,6 +1,6 @@
 """How long `sitegrid fold` takes for an archive: one thread, two threads, processes, a Dask cluster, one with deaths.
 
-Each variant is the whole command, in turn, started by `python -m lab.speed.folds.archive VARIANT ARCHIVE STORE`; the
+Each variant is the whole command, in turn, started by `python -m lab.speed.archive VARIANT ARCHIVE STORE`; the
 archive was just written, so that its files are in the system's cache. Hashes of the snapshots are compared.
 """
 
@@ -11,7 +11,6 @@ import json
 import logging
 import os
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, cast
@@ -27,55 +27,45 @@ from distributed import Client, LocalCluster
 from distributed.chaos import KillWorker
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from lab.speed.measure import Report, in_child, machine
-from lab.speed.merge_restart import SITE
-from lab.speed.merge_work import BATCH, batches
+from lab.speed.measure import ROOT, Figures, in_child, in_turn, rows_of, say
+from lab.speed.site import SITE
 from mapserver.journal.archive import HOUR_NS, write_file
 from mapserver.journal.rows import JournalRow
+from sitegrid.proof.figures import Row
+from tests.site_work import BATCH, batches
 
 STORE = "0123456789abcdef"
 WORKERS = 2
 KILL_S = 20.0  # mean life of a worker, where workers die: a task takes five to ten
-GOAL = 1.6  # times as fast as one thread, with two processes
+OPTIONS = {"samples": 50_000_000, "runs": 1}
+GOALS = {("jobs", "times_one_thread"): ">= 1.6"}
 VARIANTS = ("thread", "threads", "jobs", "dask", "graceful", "segfault")
 
 
-def run(samples: int, runs: int) -> Report:
-    """Fold an archive of so many samples, in hourly files of ten machines' work.
+def run(samples: int, runs: int) -> Iterator[Row]:
+    """An archive of so many samples, in hourly files of ten machines' work, folded by every variant in turn.
 
-    Rows: wall and processor time (medians; of all processes), `faster`: how many times as fast as one thread, the hash
-    of the map, and how many workers died. Variants: one thread, two threads of one process, two processes, two workers
-    of a Dask cluster on this host, and these while `distributed.chaos.KillWorker` ends them, in order or by a segfault.
+    One thread, two threads of one process, two processes, two workers of a Dask cluster on this host, and these while
+    `distributed.chaos.KillWorker` ends them, in order or by a segfault. wall_s, cpu_s of all processes,
+    times_one_thread: how many times as fast, deaths of workers. RuntimeError where the maps differ.
     """
     with tempfile.TemporaryDirectory() as path:
-        folder = Path(path)
-        _say(f"an archive of {samples} samples is written")
+        folder, hashes = Path(path), set[str]()
+        say(f"an archive of {samples} samples is written")
         _write(folder / "archive", samples)
-        taken: dict[str, list[Report]] = {name: [] for name in VARIANTS}
-        for number in range(runs):
-            for name, reports in taken.items():
-                _say(f"it is folded: {name}, run {number + 1} of {runs}")
-                out = folder / f"{name}-{number}"
-                reports.append(in_child("lab.speed.folds.archive", name, str(folder / "archive"), str(out)))
-    one_s = statistics.median(report["wall_s"] for report in taken["thread"])
-    rows = [_row(name, reports, one_s) for name, reports in taken.items()]
-    if len({row["hash"] for row in rows}) != 1:
-        raise RuntimeError(f"the maps differ: {rows}")
-    return {"benchmark": "archive", "samples": samples, "runs": runs, **machine(), "goal": GOAL, "rows": rows}
 
+        def folded(name: str) -> Figures:
+            say(f"it is folded: {name}")
+            with tempfile.TemporaryDirectory(dir=folder) as out:
+                figures = in_child("lab.speed.archive", name, str(folder / "archive"), out)
+            hashes.add(figures.pop("hash"))
+            return figures
 
-def _row(name: str, reports: list[Report], one_s: float) -> dict[str, Any]:
-    wall_s, cpu_s = (statistics.median(report[key] for report in reports) for key in ("wall_s", "cpu_s"))
-    hashes = {report["hash"] for report in reports}
-    return {
-        "variant": name,
-        "wall_s": round(wall_s, 1),
-        "cpu_s": round(cpu_s, 1),
-        "faster": round(one_s / wall_s, 2),
-        "peak_mb": round(max(report["peak_mb"] for report in reports)),
-        "deaths": sum(report["deaths"] for report in reports),
-        "hash": " ".join(sorted(hashes)),
-    }
+        took = in_turn({name: partial(folded, name) for name in VARIANTS}, runs)
+    if len(hashes) != 1:
+        raise RuntimeError(f"the maps differ: {hashes}")
+    for name, figures in took.items():
+        yield from rows_of(name, {**figures, "times_one_thread": took["thread"]["wall_s"] / figures["wall_s"]})
 
 
 def _write(folder: Path, samples: int) -> None:
@@ -96,7 +86,7 @@ def _rows(samples: int) -> Iterator[JournalRow]:
         sent[name] += len(batch)
 
 
-def fold_timed(variant: str, archive: Path, out: Path) -> Report:
+def fold_timed(variant: str, archive: Path, out: Path) -> dict[str, Any]:
     """Fold as one variant does it."""
     if variant == "thread":
         os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])  # which a fold respects
@@ -104,7 +94,7 @@ def fold_timed(variant: str, archive: Path, out: Path) -> Report:
     with _words(variant, deaths) as words:
         command = [sys.executable, "-m", "sitegrid.cli", "fold", str(archive), "--out", str(out), "--json", *words]
         start_s = time.perf_counter()
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=Path(__file__).parents[2])  # noqa: S603
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)  # noqa: S603
         wall_s = time.perf_counter() - start_s
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     (snapshot,) = out.glob("snapshot-*.npz")
@@ -146,10 +136,6 @@ def _words(variant: str, deaths: Deaths) -> Iterator[list[str]]:
                     client.register_plugin(killers(KILL_S, variant))
             yield ["--engine", cluster.scheduler_address.replace("tcp://", "dask://")]
             deaths.ended = True
-
-
-def _say(what: str) -> None:
-    print(f"archive: {what}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
