@@ -13,10 +13,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from lab.calibration import drives
+from lab.calibration.drives import Agent, FleetDrive
 from lab.campaign.experiment import Runner, replay_task
 from lab.campaign.recordings import Setup
-from lab.fleet import drives
-from lab.fleet.drives import Agent, FleetDrive
 from protocol.arrays import Table
 from protocol.errors import ConfigError
 from protocol.files import write_whole

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from agents.localisation.localiser import LocalisationConfig
+from lab.calibration import drives
+from lab.calibration.drives import Agent, AgentSamples
+from lab.calibration.solving import accused, calibrated, of_machine
 from lab.campaign.experiment import Task, read_result, replay_task
 from lab.cooperation.arms import Arm
 from lab.cooperation.maps import Timeline
-from lab.fleet import drives
-from lab.fleet.drives import Agent, AgentSamples
-from lab.fleet.solving import accused, calibrated, of_machine
 from mapserver.fleet.correction import Corrections
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.upkeep.calibrating import EVERY_NS

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lab.calibration import drives as fleet_drives
 from lab.campaign.experiment import Runner, replay_task
 from lab.cooperation import live, scores
 from lab.cooperation.arms import Arm, arms
@@ -16,7 +17,6 @@ from lab.cooperation.drives import REPAVED, TWO
 from lab.cooperation.live import LiveRun
 from lab.cooperation.network import FIGURES, SHARE_PCT
 from lab.cooperation.scores import ROUNDS, Judging, Scored, minutes_until
-from lab.fleet import drives as fleet_drives
 from protocol.errors import SitegridError
 from sitegrid.proof.figures import Goal, Report, Row, half_width, judge, rounded
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lab.tests.fleet.scenes import made_scene
 
 from lab.benchmark import publish, recordings, scores
 from lab.benchmark.recordings import FULL, PARTS, QUICK, part_hash
 from lab.benchmark.scores import FIGURES, Entry, figures_of, summarise
+from lab.calibration.drives import Scene, scene
 from lab.campaign.experiment import Runner
-from lab.fleet.drives import Scene, scene
-from lab.tests.fleet.scenes import made_scene
 from protocol.errors import ConfigError
 from sitegrid import cli
 from sitegrid.process.lifetime import plain

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lab.calibration.drives import Scene
 from lab.cooperation.drives import FOUR, REPAVED, lines, planned
 from lab.cooperation.maps import Timeline
 from lab.cooperation.repaved import driven_pct, inside, passes, repaved_rows
-from lab.fleet.drives import Scene
 from lab.ground.truth import true_ground
 from lab.tests.cooperation.samples import driving, track
 from mapserver.journal.facts import NO_FACTS

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lab.fleet.drives import Scene
+from lab.calibration.drives import Scene
 from mapserver.fleet.correction import measured
 from protocol.arrays import Bools, Floats, Floats32, Table
 

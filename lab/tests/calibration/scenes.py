@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lab.fleet.drives import Scene
+from lab.calibration.drives import Scene
 from protocol.arrays import Table
 from sim.truth import TruthMap
 from sitegrid.proof.tracks import LoadTrack

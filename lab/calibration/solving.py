@@ -5,28 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from lab.fleet.cases import FleetCase, Rows, Tampered, tampered
-from lab.fleet.drives import Scene
-from lab.fleet.true_errors import INTERIOR_M, TrueError, true_errors
+from lab.calibration.cases import FleetCase, Rows, Tampered, cells, tampered, truth_places
+from lab.calibration.drives import Scene
 from lab.maps.cases import CELL_M
 from lab.maps.methods import folded
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
 from mapserver.fleet.calibration import Calibration, calibrate
-from mapserver.fleet.correction import Correction, corrected
+from mapserver.fleet.correction import LAST_NS, Correction, corrected, measured
 from mapserver.fleet.ledger import Ledger
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.trust.auditor import Auditor
-from protocol.arrays import Bools, Floats, Ints, Table
+from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints, Table
 from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
 from sitegrid.proof.map_score import border_distance, driven_cells, region_of, window_of
 
 MAPS = ("before", "after", "oracle")
 FIGURES = ("wrong_pct", "interior_pct", "slope_pct")
 BATCH = 100  # samples of one machine at a time, as trust sees them
+INTERIOR_M = 2.0  # from a border of soils
+OUTLIER = 3.0  # typical errors beyond which a sample does not count
 
 
 @dataclass(frozen=True)
@@ -146,3 +148,55 @@ def _off(rows: Table, own: Sequence[Correction], error: TrueError) -> tuple[floa
     zero, scale = weight @ [each.zero for each in own], weight @ [each.scale / (1 - each.scale) for each in own]
     zero_var, scale_var = (weight @ [each.covariance[i][i] for each in own] for i in (0, 1))
     return zero - error.zero, scale - error.scale, math.sqrt(zero_var), math.sqrt(scale_var)
+
+
+# --- what the truth shows --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TrueError:
+    """What a machine's samples are off by from a stamp to another, fitted against the truth."""
+
+    from_ns: int
+    to_ns: int
+    zero: float
+    scale: float
+    across: float
+
+
+def true_errors(data: Tampered, name: str, true: Scene, spans: int) -> list[TrueError]:
+    """Zero and scale of what a machine measured, in equal spans of its samples, by least squares to the true ground.
+
+    Samples near borders of soils do not count, nor those further off than OUTLIER typical errors.
+    """
+    rows = measured(data.rows[name])
+    oldest, newest = int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max())
+    ends = [0, *((oldest * (spans - i) + newest * i) // spans for i in range(1, spans)), LAST_NS]
+    out = []
+    for from_ns, to_ns in pairwise(ends):
+        part = rows[(rows["stamp_ns"] >= from_ns) & (rows["stamp_ns"] < to_ns)]
+        out.append(TrueError(from_ns, to_ns, *_fit(part, data.earlier.get(name, data.c_rr), name, true)))
+    return out
+
+
+def _fit(rows: Table, c_rr: Floats32, name: str, true: Scene) -> tuple[float, float, float]:
+    """Zero, scale error k and lateral zero of these samples."""
+    track = true.tracks[name].at(rows["stamp_ns"])
+    at = cells(truth_places(rows, true, name), true)
+    ground, border_m = c_rr[at].astype(np.float64), border_distance(resistance_class(c_rr), true.truth.cell_m)[at]
+    ahead = np.stack([np.cos(track.yaw_rad), np.sin(track.yaw_rad)], axis=1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    d, slope = np.sign(rows["speed_mps"].astype(np.float64)), (track.gradient * ahead).sum(axis=1)
+    gradient = np.stack([rows["grade_e"], rows["grade_n"]], axis=1)
+    across = np.nanmedian(((gradient - track.gradient) * left).sum(axis=1))
+    usable = np.isfinite(rows["c_rr"]) & np.isfinite(slope) & (border_m > INTERIOR_M)
+    columns, off = np.stack([d, d * (d * ground + slope)], axis=1)[usable], (rows["c_rr"] - ground)[usable]
+    first = _least_squares(columns, off)
+    residual = np.abs(off - columns @ first)
+    near = residual < OUTLIER * 1.4826 * np.median(residual)
+    zero, scale = _least_squares(columns[near], off[near]).tolist()
+    return zero, scale, float(across)
+
+
+def _least_squares(A: AnyArray, b: AnyArray) -> Floats:
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], np.float64)
