@@ -11,6 +11,7 @@ import numpy as np
 from protocol.errors import ConfigError
 from sitegrid.proof.figures import Row
 
+Reduce = Callable[[Sequence[float | None]], float]  # from the seeds' values to one
 Figures = Mapping[str, Any]  # of one case and seed: numbers by name, None or NaN where nothing was to be judged
 
 
@@ -24,9 +25,9 @@ def median(values: Sequence[float | None]) -> float:
     return float(np.median(known)) if (known := _known(values)) else math.nan
 
 
-def strict_mean(values: Sequence[float | None]) -> float:
-    """Mean; NaN where any value is not known."""
-    return mean(values) if len(_known(values)) == len(values) else math.nan
+def strict(reduce: Reduce) -> Reduce:
+    """The same; NaN where any value is not known."""
+    return lambda values: reduce(values) if len(_known(values)) == len(values) else math.nan
 
 
 def column(by_seed: Sequence[Figures], name: str) -> list[Any]:
@@ -34,9 +35,7 @@ def column(by_seed: Sequence[Figures], name: str) -> list[Any]:
     return [figures[name] for figures in by_seed]
 
 
-def summary(
-    named: Row, by_seed: Sequence[Figures], reduce: Callable[[Sequence[float | None]], float] = mean, **others: Any
-) -> Row:
+def summary(named: Row, by_seed: Sequence[Figures], reduce: Reduce = mean, **others: Any) -> Row:
     """A row: what names the case, each figure over the seeds, others, and `by_seed`, what each seed gave."""
     over = {name: reduce(column(by_seed, name)) for name in by_seed[0]} if by_seed else {}
     return {**named, **over, **others, "by_seed": [dict(figures) for figures in by_seed]}

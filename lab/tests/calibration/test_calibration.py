@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lab.calibration.true_errors import true_errors
 
 from lab.calibration import experiment
 from lab.calibration.cases import CASES, RAMP_STEPS, FleetCase, tampered
 from lab.calibration.drives import Scene, planned, spoiled
 from lab.calibration.experiment import row_of
-from lab.calibration.solving import FIGURES, MAPS, CaseResult, JudgedMap, calibrated, judged, solved
+from lab.calibration.solving import FIGURES, MAPS, CaseResult, JudgedMap, calibrated, judged, solved, true_errors
 from lab.campaign.goals import goals
 from lab.tests.calibration.scenes import ROUTES, made_scene, track, truth
 from protocol.arrays import Table

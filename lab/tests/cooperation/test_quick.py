@@ -11,12 +11,10 @@ import pytest
 from lab.campaign.experiment import Runner
 from lab.cooperation import experiment, live, plots
 from lab.cooperation.experiment import QUICK, Outcome
-from lab.cooperation.processes import Processes
-from protocol.errors import SitegridError
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
 
-STORED = Path(__file__).parent / "cooperation_quick.json"
+STORED = Path(__file__).parent / "quick.json"
 # By the time that a decision is made, which differs from run to run; points of percent.
 WITHIN = {"covered_pct": 15.0, "wrong_pct": 15.0, "c_rr_pct": 15.0, "driven_wrong_pct": 15.0, "grade_pct": 0.2}
 EXACT = ("arm", "machines", "link", "recorded_s", "known_pct", "driven_known_pct")
@@ -63,7 +61,7 @@ def test_samples_arrive_after_they_were_true_and_links_carry_them(result):
 
 
 def test_its_figures_are_near_those_that_are_stored(result):
-    """`sitegrid eval cooperation --quick --json` printed them."""
+    """`python -m lab cooperation --quick --json` printed them."""
     stored, ours = rows(json.loads(STORED.read_text())), rows(result[0])
     assert list(ours) == list(stored) == ["two", "central"]
     for name, row in ours.items():
@@ -78,20 +76,6 @@ def test_it_goes_on_where_it_was(result, runner: Runner, monkeypatch: pytest.Mon
     monkeypatch.setattr(live, "run", lambda *_: pytest.fail("runs an arm again"))
     report, _ = experiment.run(runner, QUICK)
     assert plain(report) == result[0]
-
-
-def test_a_process_that_does_not_start_says_why_in_one_line(tmp_path: Path):
-    with Processes(tmp_path) as processes:
-        server = processes.start(
-            "server", "server", "--site-file", tmp_path / "none.toml", "--store", tmp_path / "store"
-        )
-        with pytest.raises(
-            SitegridError, match=r"^server: ended with \d+ .* `ready`; its last word: .*none.toml"
-        ) as error:
-            server.expect("ready", 60.0)
-    assert "\n" not in str(error.value)
-    with pytest.raises(ProcessLookupError):
-        os.kill(server.pid, 0)
 
 
 def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):
