@@ -219,7 +219,7 @@ def test_a_recording_that_differs_from_the_published_one_is_seen(made, data: Pat
     monkeypatch.setattr(recordings, "published_hashes", lambda: changed)
     assert [row["published"] for row in recordings.make(Runner(data), QUICK)] == [False, False]
     assert cli.main(["bench", "make", "--data", str(data), "--quick", "--processes", "1"]) == 0
-    said = "not as published: paper_site-2000-60s, loading-2000-60s; lab/benchmark.md says when that is so"
+    said = "not as published: paper_site-2000-60s, loading-2000-60s; lab/benchmark/README.md says when that is so"
     assert said in capsys.readouterr().out
     monkeypatch.setattr(recordings, "published_hashes", dict)
     assert [row["published"] for row in recordings.make(Runner(data), replace(QUICK))] == [None, None]

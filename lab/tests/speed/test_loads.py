@@ -12,7 +12,7 @@ import pytest
 
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
-from lab.speed import agent, fleet, ingest, merge, query, restart, sim, site
+from lab.speed import agent, fleet, ingest, merge, query, restart, scaling, sim, site
 from lab.speed import filter as filters
 from lab.speed.__main__ import LOADS, OPTIONS, load_of, main
 from lab.speed.measure import in_turn, judged, rows_of, scattered, track
@@ -22,6 +22,7 @@ from mapserver.journal.location import JournalLocation
 from protocol.errors import Refusal
 from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused
+from tests.paths import DOCS
 from tests.site_work import START_NS, batches, samples_of, seconds_of, write_store
 
 # The smallest size of each load, and cases that it must have.
@@ -254,3 +255,11 @@ def test_a_store_with_a_snapshot_and_a_tail_holds_the_same_grid_as_folding_all_o
     store.close()
     assert one.folded == other.folded == 2000
     assert [at.page.votes.tobytes() for at in one.pages] == [at.page.votes.tobytes() for at in other.pages]
+
+
+def test_the_page_of_many_sites_has_the_tables_that_follow_from_what_was_measured():
+    page = (DOCS / "scaling.md").read_text()
+    assert [table.splitlines()[0] for table in scaling.tables() if table not in page] == []
+    small, large = scaling.Needs(10, 10), scaling.Needs(1000, 500)
+    assert (large.sites, large.samples) == (2, pytest.approx(100 * small.samples))
+    assert scaling.carried(0.5) == scaling.carried(1.0) // 2
