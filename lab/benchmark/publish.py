@@ -1,6 +1,6 @@
 """Publish the hashes of recordings that were made, for others to compare theirs with.
 
-`sitegrid bench make --json > made.json`, then `python -m lab.benchmark.publish made.json`.
+`python -m lab bench make --json > made.json`, then `python -m lab.benchmark.publish made.json`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sitegrid.proof.figures import Report
 
 
 def with_hashes(published: Mapping[str, Mapping[str, Mapping[str, str]]], made: Report) -> Report:
-    """The published hashes with those of a report of `sitegrid bench make` in place of its edition's."""
+    """The published hashes with those of a report of `python -m lab bench make` in place of its edition's."""
     return {**published, made["edition"]: {row["name"]: {part: row[part] for part in PARTS} for row in made["rows"]}}
 
 

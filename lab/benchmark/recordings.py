@@ -181,7 +181,7 @@ def require_made(drive: BenchDrive, cache: Path) -> None:
         quick = " --quick" if drive.seconds < SECONDS else ""
         raise ConfigError(
             folder,
-            f"there is no such recording, or not all of it; `sitegrid bench make{quick} --data {cache}` makes it",
+            f"there is no such recording, or not all of it; `python -m lab bench make{quick} --data {cache}` makes it",
         )
     require_parts(folder, READ_BY_SCORES)
 

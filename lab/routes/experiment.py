@@ -28,7 +28,7 @@ class RouteCase:
     longer: float = 1.0
 
     def drive(self, seed: int, seconds: float) -> RoadDrive:
-        """The recording of a seed: that of `sitegrid eval roads`, where it has the same length."""
+        """The recording of a seed: that of `python -m lab roads`, where it has the same length."""
         return planned(self.name, seed, seconds * self.longer)
 
 

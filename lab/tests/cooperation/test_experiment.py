@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.cooperation.arms import arms
 from lab.cooperation.experiment import Outcome, Plan, report
 from lab.cooperation.live import LiveRun
 from lab.cooperation.network import FIGURES
@@ -144,8 +143,3 @@ def test_false_alarms_are_counted_over_all_that_was_watched():
 def test_recordings_that_are_too_short_are_refused():
     with pytest.raises(SitegridError, match="seconds: 200 is too short; a round of all tours takes 300 s"):
         Plan.full(SEEDS, 200.0)
-
-
-def test_an_arm_is_judged_with_the_length_of_its_recording():
-    lengths = {arm.name: arm.seconds for arm in arms(1000.0)}
-    assert (lengths["one"], lengths["two"], lengths["four"], lengths["eight"]) == (1000.0, 600.0, 450.0, 450.0)

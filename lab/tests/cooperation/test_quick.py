@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lab.campaign.experiment import Runner
-from lab.cooperation import experiment, live, plots
+from lab.cooperation import experiment, live
 from lab.cooperation.experiment import QUICK, Outcome
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
@@ -76,9 +76,3 @@ def test_it_goes_on_where_it_was(result, runner: Runner, monkeypatch: pytest.Mon
     monkeypatch.setattr(live, "run", lambda *_: pytest.fail("runs an arm again"))
     report, _ = experiment.run(runner, QUICK)
     assert plain(report) == result[0]
-
-
-def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):
-    drawn = plots.draw(result[0], result[1], runner, tmp_path)
-    assert [path.name for path in drawn] == ["links.png", "machines.png"]
-    assert all(path.stat().st_size > 10_000 for path in drawn)

@@ -19,14 +19,6 @@ from sim.truth import truth_map
 DRIVE = planned(3, 400.0, FOUR, "fast", repaves=True)
 
 
-def test_places_in_an_outline_and_near_it():
-    square = ((0, 0), (10, 0), (10, 10), (0, 10))
-    places = np.array([[5.0, 5.0], [9.0, 5.0], [12.0, 5.0], [20.0, 5.0]])
-    assert inside(square, places).tolist() == [True, True, False, False]
-    assert inside(square, places, 3.0).tolist() == [True, True, True, False]
-    assert inside(square, places, -2.0).tolist() == [True, False, False, False]
-
-
 def test_a_pass_counts_that_began_after_the_change_and_is_over():
     there = np.array([1, 1, 0, 0, 1, 1, 0, 1, 1], bool)
     own = track(np.zeros((9, 2)), step_s=1.0)
