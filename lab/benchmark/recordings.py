@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from protocol.errors import ConfigError
 from protocol.files import write_whole
 from protocol.machine.samples import COLUMNS
 from sim.scenario.file import load_scenario
-from sitegrid.proof.figures import Row
+from sitegrid.proof.figures import Report, Row
 
 HASHES = Path(__file__).parent / "hashes.json"  # of the parts of all recordings, by name, as they were published
 SAMPLES_FILE = "samples.csv"
@@ -195,3 +196,16 @@ def require_parts(folder: Path, parts: Sequence[str]) -> None:
         raise ConfigError(folder / MADE_FILE, f"cannot be read: {error}; {AGAIN}") from None
     if changed:
         raise ConfigError(folder / changed[0], f"is not what was made; {AGAIN}")
+
+
+# --- published hashes ------------------------------------------------------------------------------------------------
+
+
+def publish(made: Report) -> None:
+    """Take the hashes of a report of `python -m lab bench make --json` as those of its edition."""
+    hashes = {row["name"]: {part: row[part] for part in PARTS} for row in made["rows"]}
+    write_whole(HASHES, f"{json.dumps({**published_hashes(), made['edition']: hashes}, indent=1)}\n".encode())
+
+
+if __name__ == "__main__":
+    publish(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))

@@ -14,9 +14,9 @@ from lab.campaign.goals import goals
 from lab.campaign.summary import column, mean, median, strict, summary
 from lab.cooperation import live, scores
 from lab.cooperation.arms import Arm, arms
-from lab.cooperation.central import central_tasks
 from lab.cooperation.drives import TWO
 from lab.cooperation.live import LiveRun
+from lab.cooperation.maps import central_tasks
 from lab.cooperation.network import FIGURES, SHARE_PCT
 from lab.cooperation.scores import ROUNDS, Judging, Scored, minutes_until
 from protocol.errors import SitegridError

@@ -1,4 +1,4 @@
-"""How long `sitegrid fold` takes for an archive: one thread, two threads, processes, a Dask cluster, one with deaths.
+"""How long `sitegrid fold` takes for an archive: one thread, two threads, processes, a Dask cluster.
 
 Each variant is the whole command, in turn, started by `python -m lab.speed.archive VARIANT ARCHIVE STORE`; the
 archive was just written, so that its files are in the system's cache. Hashes of the snapshots are compared.
@@ -23,9 +23,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 
-from distributed import Client, LocalCluster
-from distributed.chaos import KillWorker
-from distributed.diagnostics.plugin import SchedulerPlugin
+from distributed import LocalCluster
 
 from lab.speed.measure import ROOT, Figures, in_child, in_turn, rows_of, say
 from lab.speed.site import SITE
@@ -36,18 +34,16 @@ from tests.site_work import BATCH, batches
 
 STORE = "0123456789abcdef"
 WORKERS = 2
-KILL_S = 20.0  # mean life of a worker, where workers die: a task takes five to ten
 OPTIONS = {"samples": 50_000_000, "runs": 1}
 GOALS = {("jobs", "times_one_thread"): ">= 1.6"}
-VARIANTS = ("thread", "threads", "jobs", "dask", "graceful", "segfault")
+VARIANTS = ("thread", "threads", "jobs", "dask")
 
 
 def run(samples: int, runs: int) -> Iterator[Row]:
     """An archive of so many samples, in hourly files of ten machines' work, folded by every variant in turn.
 
-    One thread, two threads of one process, two processes, two workers of a Dask cluster on this host, and these while
-    `distributed.chaos.KillWorker` ends them, in order or by a segfault. wall_s, cpu_s of all processes,
-    times_one_thread: how many times as fast, deaths of workers. RuntimeError where the maps differ.
+    One thread, two threads of one process, two processes, two workers of a Dask cluster on this host. wall_s, cpu_s of
+    all processes, times_one_thread: how many times as fast. RuntimeError where the maps differ.
     """
     with tempfile.TemporaryDirectory() as path:
         folder, hashes = Path(path), set[str]()
@@ -90,8 +86,7 @@ def fold_timed(variant: str, archive: Path, out: Path) -> dict[str, Any]:
     """Fold as one variant does it."""
     if variant == "thread":
         os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])  # which a fold respects
-    deaths = Deaths()
-    with _words(variant, deaths) as words:
+    with _engine(variant) as words:
         command = [sys.executable, "-m", "sitegrid.cli", "fold", str(archive), "--out", str(out), "--json", *words]
         start_s = time.perf_counter()
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)  # noqa: S603
@@ -102,40 +97,20 @@ def fold_timed(variant: str, archive: Path, out: Path) -> dict[str, Any]:
         "wall_s": wall_s,
         "cpu_s": sum(each.ru_utime + each.ru_stime for each in usage),
         "peak_mb": max(each.ru_maxrss for each in usage) * 1024 / 1e6,
-        "deaths": deaths.count,
         "hash": hashlib.sha256(snapshot.read_bytes()).hexdigest()[:16],
     }
 
 
-class Deaths(SchedulerPlugin):
-    """Counts workers that leave a scheduler, but for those that are asked to in the end."""
-
-    def __init__(self) -> None:
-        self.count, self.ended = 0, False
-
-    def remove_worker(self, *_: object, **__: object) -> None:
-        """As the scheduler calls it."""
-        self.count += not self.ended
-
-
 @contextmanager
-def _words(variant: str, deaths: Deaths) -> Iterator[list[str]]:
+def _engine(variant: str) -> Iterator[list[str]]:
     """Options of a variant, and the cluster that they name."""
-    if variant in ("thread", "threads"):
-        yield []
-    elif variant == "jobs":
-        yield ["--jobs", str(WORKERS)]
-    else:
-        clusters, clients, killers = cast("tuple[Any, Any, Any]", (LocalCluster, Client, KillWorker))  # without types
-        options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
-        with clusters(n_workers=WORKERS, threads_per_worker=1, **options) as cluster:
-            cluster.scheduler.add_plugin(deaths)
-            cluster.adapt(minimum=WORKERS, maximum=WORKERS, interval="1 s")  # a nanny may end with its worker
-            if variant != "dask":
-                with clients(cluster) as client:
-                    client.register_plugin(killers(KILL_S, variant))
-            yield ["--engine", cluster.scheduler_address.replace("tcp://", "dask://")]
-            deaths.ended = True
+    if variant != "dask":
+        yield ["--jobs", str(WORKERS)] if variant == "jobs" else []
+        return
+    cluster_of = cast("Any", LocalCluster)  # without types
+    options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
+    with cluster_of(n_workers=WORKERS, threads_per_worker=1, **options) as cluster:
+        yield ["--engine", cluster.scheduler_address.replace("tcp://", "dask://")]
 
 
 if __name__ == "__main__":
