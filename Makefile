@@ -59,10 +59,11 @@ soak: venv
 	$(BIN)/python -m tests.soak
 
 bench: venv
-	$(BIN)/python -m lab.speed merge
-	$(BIN)/python -m lab.speed live
-	$(BIN)/python -m lab.speed query
-	$(BIN)/python -m lab.speed memory
-	$(BIN)/python -m lab.speed ingest
-	$(BIN)/python -m lab.speed sim
-	$(BIN)/python -m lab.speed filter
+	$(BIN)/python -m lab speed merge
+	$(BIN)/python -m lab speed ingest
+	$(BIN)/python -m lab speed fleet
+	$(BIN)/python -m lab speed live
+	$(BIN)/python -m lab speed query
+	$(BIN)/python -m lab speed restart
+	$(BIN)/python -m lab speed filter
+	$(BIN)/python -m lab speed sim

@@ -1,1 +1,1 @@
-"""A benchmark that others can enter: recordings with truth, rules, baselines, and the table (lab/benchmark.md)."""
+"""A benchmark that others can enter: recordings with truth, rules (README.md), baselines, and the table."""

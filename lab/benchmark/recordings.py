@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,16 +14,16 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from lab.calibration import drives
+from lab.calibration.drives import Agent, FleetDrive
 from lab.campaign.experiment import Runner, replay_task
 from lab.campaign.recordings import Setup
-from lab.fleet import drives
-from lab.fleet.drives import Agent, FleetDrive
 from protocol.arrays import Table
 from protocol.errors import ConfigError
 from protocol.files import write_whole
 from protocol.machine.samples import COLUMNS
 from sim.scenario.file import load_scenario
-from sitegrid.proof.figures import Row
+from sitegrid.proof.figures import Report, Row
 
 HASHES = Path(__file__).parent / "hashes.json"  # of the parts of all recordings, by name, as they were published
 SAMPLES_FILE = "samples.csv"
@@ -181,7 +182,7 @@ def require_made(drive: BenchDrive, cache: Path) -> None:
         quick = " --quick" if drive.seconds < SECONDS else ""
         raise ConfigError(
             folder,
-            f"there is no such recording, or not all of it; `sitegrid bench make{quick} --data {cache}` makes it",
+            f"there is no such recording, or not all of it; `python -m lab bench make{quick} --data {cache}` makes it",
         )
     require_parts(folder, READ_BY_SCORES)
 
@@ -195,3 +196,16 @@ def require_parts(folder: Path, parts: Sequence[str]) -> None:
         raise ConfigError(folder / MADE_FILE, f"cannot be read: {error}; {AGAIN}") from None
     if changed:
         raise ConfigError(folder / changed[0], f"is not what was made; {AGAIN}")
+
+
+# --- published hashes ------------------------------------------------------------------------------------------------
+
+
+def publish(made: Report) -> None:
+    """Take the hashes of a report of `python -m lab bench make --json` as those of its edition."""
+    hashes = {row["name"]: {part: row[part] for part in PARTS} for row in made["rows"]}
+    write_whole(HASHES, f"{json.dumps({**published_hashes(), made['edition']: hashes}, indent=1)}\n".encode())
+
+
+if __name__ == "__main__":
+    publish(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))

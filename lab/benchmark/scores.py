@@ -11,9 +11,9 @@ import numpy as np
 
 from lab.benchmark.entries import CONFIDENCE, VALUES, is_samples, read_map, read_samples
 from lab.benchmark.recordings import SAMPLES_FILE, BenchDrive, Edition, require_made
+from lab.calibration.drives import Scene, scene
+from lab.calibration.solving import served
 from lab.campaign.workers import each
-from lab.fleet.drives import Scene, scene
-from lab.fleet.solving import served
 from lab.maps.cases import CELL_M
 from lab.maps.methods import METHODS, Layers, folded, in_order, merge_hard
 from lab.maps.uncertainty import Believed

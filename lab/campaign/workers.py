@@ -34,7 +34,7 @@ def each(work: Callable[[Job], Result], jobs: Sequence[Job], processes: int) -> 
         return
     context = multiprocessing.get_context("spawn")
     count = min(processes, len(jobs))
-    with _environment(ONE_THREAD), ProcessPoolExecutor(count, context, _end_with_parent) as pool:
+    with environment(ONE_THREAD), ProcessPoolExecutor(count, context, _end_with_parent) as pool:
         futures = {pool.submit(_guarded, work, job): job for job in jobs}
         try:
             for future in as_completed(futures):
@@ -64,7 +64,7 @@ def _watch_parent() -> None:
 
 
 @contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
+def environment(values: dict[str, str]) -> Iterator[None]:
     """Set variables that child processes inherit."""
     before = {name: os.environ[name] for name in values if name in os.environ}
     os.environ.update(values)

@@ -1,4 +1,4 @@
-"""`python -m lab bench`: a benchmark of maps that others can enter (lab/benchmark.md)."""
+"""`python -m lab bench`: a benchmark of maps that others can enter (lab/benchmark/README.md)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def run(arguments: Namespace) -> int:
     show(arguments, report, _readable)
     others = [row["name"] for row in report["rows"] if row.get("published") is False]
     if others and not arguments.json:
-        tell(f"not as published: {', '.join(others)}; lab/benchmark.md says when that is so")
+        tell(f"not as published: {', '.join(others)}; lab/benchmark/README.md says when that is so")
     return 0
 
 

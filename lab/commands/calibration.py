@@ -13,12 +13,12 @@ EXTRA = "lab"
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
-    add_runs(parser, 900.0, "the maps of the first seed before and after, and the table")
+    add_runs(parser, 900.0)
 
 
 def run(arguments: Namespace) -> int:
     """Calibrate the machines of all cases."""
-    from lab.fleet import experiment
+    from lab.calibration import experiment
 
     work = partial(experiment.run, seeds=seeds_of(arguments), seconds=arguments.seconds)
-    return perform(arguments, "machines drive, and are calibrated by the ground", work, "lab.fleet.plots")
+    return perform(arguments, "machines drive, and are calibrated by the ground", work)

@@ -13,7 +13,7 @@ EXTRA = "lab"
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command; seconds are those of a lone machine, which drives the tours of all."""
-    add_runs(parser, DEFAULT_S, "what is known over time, by number of machines and by link")
+    add_runs(parser, DEFAULT_S)
     add_quick(parser)
 
 
@@ -24,4 +24,4 @@ def run(arguments: Namespace) -> int:
 
     plan = QUICK if is_quick(arguments) else Plan.full(seeds_of(arguments), arguments.seconds)
     work = partial(experiment.run, plan=plan)
-    return perform(arguments, "machines drive, and draw one map", work, "lab.cooperation.plots")
+    return perform(arguments, "machines drive, and draw one map", work)

@@ -18,9 +18,9 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> int:
     """Judge the roads of all cases."""
+    from lab.campaign.summary import chosen
     from lab.roads import experiment
 
-    work = partial(
-        experiment.run, seeds=seeds_of(arguments), seconds=arguments.seconds, cases=experiment.select(arguments.cases)
-    )
+    cases = chosen(experiment.CASES, arguments.cases)
+    work = partial(experiment.run, seeds=seeds_of(arguments), seconds=arguments.seconds, cases=cases)
     return perform(arguments, "machines drive on patches of soil, their samples show roads", work)

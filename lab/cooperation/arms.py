@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.calibration.drives import spoiled
 from lab.campaign.recordings import RecordedDrive
 from lab.cooperation.drives import EIGHT, FOUR, MIXED, ONE, TWO, Crew, SharedDrive, planned
-from lab.fleet.drives import spoiled
 from lab.positions.substitution import TrueMotion, gps_errors, with_gps_errors
 from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig

@@ -8,31 +8,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lab.calibration import drives as fleet_drives
 from lab.campaign.experiment import Runner, replay_task
+from lab.campaign.goals import goals
+from lab.campaign.summary import column, mean, median, strict, summary
 from lab.cooperation import live, scores
 from lab.cooperation.arms import Arm, arms
-from lab.cooperation.central import central_tasks
-from lab.cooperation.drives import REPAVED, TWO
+from lab.cooperation.drives import TWO
 from lab.cooperation.live import LiveRun
+from lab.cooperation.maps import central_tasks
 from lab.cooperation.network import FIGURES, SHARE_PCT
 from lab.cooperation.scores import ROUNDS, Judging, Scored, minutes_until
-from lab.fleet import drives as fleet_drives
 from protocol.errors import SitegridError
-from sitegrid.proof.figures import Goal, Report, Row, half_width, judge, rounded
+from sitegrid.proof.figures import Report, Row, half_width, judge, rounded
 
 WHOLE_S, LEAST_S = 1200.0, 300.0  # of a lone machine's recording
-ALONE, FOUR = "one", "four"
+ALONE = "one"
 DIGITS = 4
 DECIDED = ("c_rr_pct", "grade_pct")  # that are shown with what was decided in the end, too
-ENDS_ALONE = ("driven_wrong_pct", "driven_slope_wrong_pct", "driven_known_pct", "places_c_rr_pct")  # in the end alone
-SPEEDUPS = (Goal({"arm": FOUR}, "speedup", ">=", 3.0),)
-ENDS = (Goal({"arm": FOUR}, "c_rr_pct", "<=", 6.0),)
-# Sahlholm and Johansson's trucks: 0.17 % grade after six passes.
-GRADES = tuple(Goal({"arm": FOUR, "rounds": n}, "grade_pct", "<=", limit) for n, limit in ((1, 0.45), (6, 0.17)))
-COSTS = tuple(
-    Goal({"arm": arm}, "cost_pct", "<=", limit) for arm, limit in (("bad_machine", 0.05), ("standalone", 0.1))
-)
-PASSES = tuple(Goal({"ground": name}, "passes", "<=", 2) for name in REPAVED)
 
 
 @dataclass(frozen=True)
@@ -41,7 +34,7 @@ class Plan:
 
     seeds: Sequence[int]
     arms: tuple[Arm, ...]
-    central: str = FOUR
+    central: str = "four"
 
     @classmethod
     def full(cls, seeds: Sequence[int], whole_s: float = WHOLE_S) -> Plan:
@@ -96,7 +89,13 @@ def report(plan: Plan, outcomes: Sequence[Outcome]) -> Report:
     rounds = [row for each in outcomes if not each.judging.central for row in round_rows(each)]
     repaved = [row for each in outcomes if each.judging.arm.repaves for row in repaved_rows(each)]
     spoiled = [spoiled_row(each) for each in outcomes if each.judging.arm.spoiled]
-    judged = (ENDS, rows), (SPEEDUPS, speedups), (GRADES, rounds), (PASSES, repaved), (COSTS, spoiled)
+    tables = {
+        "cooperation": rows,
+        "cooperation_speedups": speedups,
+        "cooperation_rounds": rounds,
+        "cooperation_repaved": repaved,
+        "cooperation_spoiled": spoiled,
+    }
     return {
         "seeds": list(plan.seeds),
         "rows": rows,
@@ -105,7 +104,7 @@ def report(plan: Plan, outcomes: Sequence[Outcome]) -> Report:
         "repaved": repaved,
         "spoiled": spoiled,
         "false_alarms": alarms(outcomes),
-        "goals": [] if plan == QUICK else [goal for goals, table in judged for goal in judge(goals, table)],
+        "goals": [] if plan == QUICK else [row for name, table in tables.items() for row in judge(goals(name), table)],
     }
 
 
@@ -113,34 +112,27 @@ def report(plan: Plan, outcomes: Sequence[Outcome]) -> Report:
 
 
 def arm_row(outcome: Outcome) -> Row:
-    """One arm: means over the seeds. None until SHARE_PCT was covered in all of them."""
+    """One arm: means over the seeds; minutes are NaN where SHARE_PCT was not covered in all of them."""
     arm, scored = outcome.judging.arm, outcome.scored
-    steps = scored[0].minutes
-    covered = {
-        "minutes": [each.by_stamp[:, 0] for each in scored],
-        "arrived_min": [each.by_arrival[:, 0] for each in scored],
-    }
-    until = {name: [minutes_until(steps, part, SHARE_PCT) for part in parts] for name, parts in covered.items()}
-    ends = {name: _mean([each.end[name] for each in scored]) for name in (*FIGURES, *ENDS_ALONE)}
-    row: Row = {
-        "arm": outcome.judging.name,
-        "machines": arm.machines,
-        "link": "perfect" if outcome.judging.central else arm.link.name,
-        "recorded_s": arm.seconds,
-        **{name: _mean(values) for name, values in until.items()},
-        **ends,
-        **_link_figures(outcome),
-        "by_seed": {**until, "driven_wrong_pct": [each.end["driven_wrong_pct"] for each in scored]},
-        "over_time": _over_time(scored),
-    }
-    return rounded(row, DIGITS)
+    by_seed = [
+        {
+            "minutes": minutes_until(each.minutes, each.by_stamp[:, 0], SHARE_PCT),
+            "arrived_min": minutes_until(each.minutes, each.by_arrival[:, 0], SHARE_PCT),
+            **each.end,
+        }
+        for each in scored
+    ]
+    link = "perfect" if outcome.judging.central else arm.link.name
+    named = {"arm": outcome.judging.name, "machines": arm.machines, "link": link, "recorded_s": arm.seconds}
+    others = {**_link_figures(outcome), "over_time": _over_time(scored)}
+    return rounded(summary(named, by_seed, strict(mean), **others), DIGITS)
 
 
 def _link_figures(outcome: Outcome) -> Row:
     """What a machine's link carried in an hour of its work, and how the replay went; None of one process."""
     runs, arm = [each for each in outcome.runs if each], outcome.judging.arm
     names = ("sent_mb_per_h", "received_mb_per_h", "delivered", "late_s", "same_pct")
-    same = _mean([each.same_pct for each in outcome.scored if each.same_pct is not None])
+    same = mean([each.same_pct for each in outcome.scored])
     if not runs:
         return dict(zip(names, (None, None, None, None, same), strict=True))
     hours = arm.machines * arm.seconds / 3600 * len(runs)
@@ -165,14 +157,15 @@ def _over_time(scored: Sequence[Scored]) -> list[Row]:
 
 
 def speedup_rows(rows: Sequence[Row]) -> list[Row]:
-    """How many times sooner than a lone machine each arm has covered SHARE_PCT, paired; None where one never had."""
-    lone = next((row for row in rows if row["arm"] == ALONE), None)
+    """How many times sooner than a lone machine each arm has covered SHARE_PCT, paired; NaN where one never had."""
     out = []
-    for row in rows if lone else ():
-        pairs = zip(lone["by_seed"]["minutes"], row["by_seed"]["minutes"], strict=True) if lone else ()
-        times = [pair[0] / pair[1] for pair in pairs]
-        out.append({"arm": row["arm"], "speedup": _mean(times), "ci95": half_width(np.array(times)), "by_seed": times})
-    return [rounded(row, DIGITS) for row in out]
+    for lone in (row for row in rows if row["arm"] == ALONE):
+        for row in rows:
+            pairs = zip(column(lone["by_seed"], "minutes"), column(row["by_seed"], "minutes"), strict=True)
+            times = [alone / together for alone, together in pairs]
+            by_seed = [{"speedup": each} for each in times]
+            out.append(summary({"arm": row["arm"]}, by_seed, strict(mean), ci95=half_width(np.array(times))))
+    return rounded(out, DIGITS)
 
 
 def round_rows(outcome: Outcome) -> list[Row]:
@@ -182,41 +175,36 @@ def round_rows(outcome: Outcome) -> list[Row]:
     out = []
     for number, rounds in enumerate(ROUNDS):
         of_seeds = [each.rounds[number] if number < len(each.rounds) else nothing for each in outcome.scored]
-        row: Row = {"arm": outcome.judging.name, "rounds": rounds}
-        row |= {name: _mean([each[name] for each in of_seeds]) for name in names}
-        row |= {f"decided_{name}": _mean([each["decided"][name] for each in of_seeds]) for name in DECIDED}
-        out.append(rounded({**row, "by_seed": {"grade_pct": [each["grade_pct"] for each in of_seeds]}}, DIGITS))
-    return out
+        by_seed = [
+            {name: each[name] for name in names} | {f"decided_{name}": each["decided"][name] for name in DECIDED}
+            for each in of_seeds
+        ]
+        out.append(summary({"arm": outcome.judging.name, "rounds": rounds}, by_seed, strict(mean)))
+    return rounded(out, DIGITS)
 
 
 def repaved_rows(outcome: Outcome) -> list[Row]:
-    """Each ground that is repaved: medians over the seeds, None where one did not show it."""
+    """Each ground that is repaved: medians over the seeds, NaN where one did not show it; shares pass by pass."""
     out = []
     for parts in zip(*(each.repaved for each in outcome.scored), strict=True):
-        row: Row = {"ground": parts[0]["ground"], "cells": parts[0]["cells"]}
-        for name in ("passes", "least_passes", "minutes", "arrived_min"):
-            values = [part[name] for part in parts]
-            row[name] = None if None in values else float(np.median(values))
-        by_seed = {
-            name: [part[name] for part in parts]
-            for name in ("passes", "least_passes", "by_pass_pct", "driven_by_pass_pct")
-        }
-        out.append(rounded({**row, "by_seed": by_seed}, DIGITS))
-    return out
+        names = ("passes", "least_passes", "minutes", "arrived_min")
+        by_seed = [{name: part[name] for name in names} for part in parts]
+        by_pass = {name: column(parts, name) for name in ("by_pass_pct", "driven_by_pass_pct")}
+        named = {"ground": parts[0]["ground"], "cells": parts[0]["cells"]}
+        out.append(summary(named, by_seed, strict(median), **by_pass))
+    return rounded(out, DIGITS)
 
 
 def spoiled_row(outcome: Outcome) -> Row:
     """What the machine that is not as the others costs these: means over the seeds, 0 where the map is better."""
     parts = [each.spoiled for each in outcome.scored]
-    names = ("cost_pct", "let_in_pct", "estimated_cost_pct")
-    row: Row = {
-        "arm": outcome.judging.name,
-        **{name: max(0.0, _mean([part[name] for part in parts])) for name in names},
+    by_seed = [{name: part[name] for name in ("cost_pct", "let_in_pct", "estimated_cost_pct")} for part in parts]
+    excluded = {
+        "excluded": sum(bool(part["excluded"]) for part in parts),
+        "excluded_min": mean(column(parts, "excluded_min")),
     }
-    row["excluded"] = sum(bool(part["excluded"]) for part in parts)
-    row["excluded_min"] = _mean([part["excluded_min"] for part in parts if part["excluded_min"] is not None])
-    row["by_seed"] = {name: [part[name] for part in parts] for name in names}
-    return rounded(row, DIGITS)
+    named = {"arm": outcome.judging.name}
+    return rounded(summary(named, by_seed, lambda values: max(0.0, mean(values)), **excluded), DIGITS)
 
 
 def alarms(outcomes: Sequence[Outcome]) -> Row:
@@ -224,7 +212,3 @@ def alarms(outcomes: Sequence[Outcome]) -> Row:
     live_ones = [each for outcome in outcomes if not outcome.judging.central for each in outcome.scored]
     count, area = sum(each.alarms for each in live_ones), sum(each.km2_days for each in live_ones)
     return rounded({"count": count, "km2_days": area, "per_km2_day": count / area if area else None}, 8, per_km2_day=1)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if len(values) else math.nan

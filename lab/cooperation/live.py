@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from lab.campaign.experiment import Experiment, Task
+from lab.campaign.workers import ONE_THREAD, environment
 from lab.cooperation.arms import Arm, Link, logs_of
 from lab.cooperation.drives import SharedDrive
-from lab.cooperation.processes import Process, Processes
 from mapserver.config import TrustConfig
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import JournalRow
@@ -31,6 +32,7 @@ from protocol.machine.samples import joined
 from protocol.site.site_config import site_toml
 from protocol.wire.session import free_endpoint
 from sim.simulator import START_NS
+from sitegrid.process.children import Child, Children
 from tests.tcp_proxy import Proxy
 
 READY_S = 600.0  # a first start compiles kernels: minutes on a busy machine
@@ -67,28 +69,29 @@ def run(arm: Arm, drive: SharedDrive, cache: Path) -> LiveRun:
     with tempfile.TemporaryDirectory() as path, ExitStack() as opened:
         folder = Path(path)
         logs = dict(logs_of(arm, drive, cache, folder))
-        processes = opened.enter_context(Processes(folder))
-        port = _serve(processes, folder, logs, arm.speed)
+        opened.enter_context(environment(ONE_THREAD))
+        processes = opened.enter_context(Children(logs_folder(cache)))
+        port, pids = _serve(processes, folder, logs, arm.speed)
         links = [opened.enter_context(Proxy(port)) for _ in logs]
         agents = [
             processes.start(name, *_agent(folder, name, log, link, arm.speed))
             for (name, log), link in zip(logs.items(), links, strict=True)
         ]
+        began_s: dict[str, float] = {}
         ending = threading.Event()
-        watch = threading.Thread(target=_keep_weather, args=(arm.link, links, agents, arm.speed, ending), daemon=True)
+        weather = (arm.link, dict(zip(logs, links, strict=True)), began_s, arm.speed, ending)
+        watch = threading.Thread(target=_keep_weather, args=weather, daemon=True)
         watch.start()
         opened.callback(watch.join)
         opened.callback(ending.set)
-        for agent in agents:
-            agent.expect("ready", READY_S)
         took_s = arm.seconds / arm.speed
-        reports = [agent.expect("ended", took_s + LATE_S) for agent in agents]
-        late_s = max(agent.seen_s["ended"] - agent.seen_s["ready"] for agent in agents) - took_s
-        pids = {name: process.pid for name, process in processes.all.items()}
+        with ThreadPoolExecutor(len(agents)) as pool:
+            reports = list(pool.map(lambda agent: _replayed(agent, began_s, took_s), agents))
+        late_s = max(report["took_s"] for report in reports) - took_s
+        pids |= {agent.name: agent.pid for agent in agents}
         processes.close()
         ending.set()
         rows, events = _journal(folder / "store")
-        began_s = {agent.name: agent.seen_s["ready"] for agent in agents}
         return LiveRun(
             samples=joined([row.rows for row in rows]),
             machine=_repeated([list(logs).index(row.machine) for row in rows], rows),
@@ -103,34 +106,50 @@ def run(arm: Arm, drive: SharedDrive, cache: Path) -> LiveRun:
         )
 
 
-def _serve(processes: Processes, folder: Path, logs: dict[str, Path], speed: float) -> int:
-    """Start router and map server; returns the router's port."""
+def logs_folder(cache: Path) -> Path:
+    """Where processes log, so that one that failed can be looked into."""
+    folder = cache / "cooperation-logs"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _serve(processes: Children, folder: Path, logs: dict[str, Path], speed: float) -> tuple[int, dict[str, int]]:
+    """Start router and map server; returns the router's port, and process ids."""
     endpoint = free_endpoint()
     site = open_log(next(iter(logs.values()))).site
     (folder / "site.toml").write_text(site_toml(site), encoding="utf-8")
     options = {"judge_s": TrustConfig().judge_s / speed}
     lines = ["[store]", "archive_after_h = 0.0", "[trust]", *toml_lines(options)]  # stamps of logs are of another day
     (folder / "server.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    processes.start("router", "router", "--listen", endpoint).expect("ready", READY_S)
+    router = processes.start("router", "router", "--listen", endpoint)
+    router.expect("ready", READY_S)
     files = ("--site-file", folder / "site.toml", "--config", folder / "server.toml", "--store", folder / "store")
-    processes.start("server", "server", "--endpoint", endpoint, *files).expect("ready", READY_S)
-    return int(endpoint.rpartition(":")[2])
+    server = processes.start("server", "server", "--endpoint", endpoint, *files)
+    server.expect("ready", READY_S)
+    return int(endpoint.rpartition(":")[2]), {"router": router.pid, "server": server.pid}
 
 
-def _agent(folder: Path, name: str, log: Path, link: Proxy, speed: float) -> Sequence[object]:
+def _agent(folder: Path, name: str, log: Path, link: Proxy, speed: float) -> Sequence[str | Path | float]:
     source = ("--driver", "replay", "--log", log, "--speed", speed)
     return ("agent", "--endpoint", link.endpoint, *source, "--spool", folder / f"{name}.db", "--json")
 
 
+def _replayed(agent: Child, began_s: dict[str, float], took_s: float) -> dict[str, Any]:
+    """Wait for an agent's end; its last line, and `took_s`, from when it was ready. began_s: is told when that was."""
+    agent.expect("ready", READY_S)
+    began_s[agent.name] = time.time()
+    return {**agent.expect("ended", took_s + LATE_S)["ended"], "took_s": time.time() - began_s[agent.name]}
+
+
 def _keep_weather(
-    link: Link, links: Sequence[Proxy], agents: Sequence[Process], speed: float, ending: threading.Event
+    link: Link, links: Mapping[str, Proxy], began_s: Mapping[str, float], speed: float, ending: threading.Event
 ) -> None:
     """Have each link's weather follow its agent's time, from its start on."""
     while not ending.wait(STEP_S):
-        for turn, (proxy, agent) in enumerate(zip(links, agents, strict=True)):
-            if not (began_s := agent.seen_s.get("ready")):
+        for turn, (name, proxy) in enumerate(links.items()):
+            if name not in began_s:
                 continue
-            weather = link.weather(turn, (time.time() - began_s) * speed, speed)
+            weather = link.weather(turn, (time.time() - began_s[name]) * speed, speed)
             if weather != proxy.weather:
                 proxy.set(weather)
 

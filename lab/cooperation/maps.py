@@ -1,4 +1,4 @@
-"""The map of one arm as it was at any time, made of its journal: of samples by their stamps, or as they arrived.
+"""The map of one arm as it was at any time, made of its journal, or of what one process with a perfect link has.
 
 What the server decided about machines counts from when it decided it, so that a map of an early minute is what the
 server knew then. (Asked for the past, a map server corrects its samples by what it knows now; `decided` does that.)
@@ -8,24 +8,35 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from agents.localisation.localiser import LocalisationConfig
+from lab.calibration import drives
+from lab.calibration.drives import Agent, AgentSamples
+from lab.calibration.solving import accused, calibrated, of_machine
+from lab.campaign.experiment import Task, read_result, replay_task
+from lab.cooperation.arms import Arm
 from lab.cooperation.live import LiveRun
 from lab.cooperation.network import LAYERS
 from lab.maps.cases import CELL_M
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import FoldConfig, name_hash
 from mapserver.evidence.grid import Grid
+from mapserver.fleet.correction import Corrections
 from mapserver.ingest.decisions import Decisions
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.rows import Event
 from mapserver.query.views import read_cells, view_of
+from mapserver.upkeep.calibrating import EVERY_NS
 from protocol.arrays import Floats32, Ints, Table
 from protocol.site.geometry import CellWindow
+from sim.simulator import START_NS
 
 Layers = Mapping[str, Floats32]
+LAG_NS = round(LocalisationConfig().lag_s * 1e9)  # of the smoother: samples are final then, wherever it runs
 
 
 @dataclass(frozen=True)
@@ -103,3 +114,43 @@ def _when(now_ns: Ints, at_ns: Ints, from_ns: int) -> int:
     """When the site's now, which is now_ns (n,) from at_ns (n,) on, was `from_ns`."""
     reached = int(np.searchsorted(now_ns, from_ns))
     return int(at_ns[reached]) if from_ns and reached < len(at_ns) else (0 if not from_ns else int(at_ns[-1]))
+
+
+# --- one process with a perfect link ---------------------------------------------------------------------------------
+
+
+def central_tasks(arm: Arm, seed: int) -> list[Task[Agent]]:
+    """The pipelines of an arm's machines, as agents have them by default."""
+    drive = arm.drive(seed)
+    order = sorted(drive.machines)  # as the log folders lie
+    return [replay_task(Agent(order.index(name), closed_tours=True), drive) for name in arm.names(drive)]
+
+
+def central_timeline(arm: Arm, seed: int, cache: Path, *, arrived: bool) -> Timeline:
+    """What such a process has, by stamps or by when samples are final; it judges and calibrates once a minute."""
+    names = arm.names(arm.drive(seed))
+    rows = {
+        name: read_result(AgentSamples, drives.EXPERIMENT.file(task, cache)).samples
+        for name, task in zip(names, central_tasks(arm, seed), strict=True)
+    }
+    end_ns = START_NS + round(arm.seconds * 1e9)
+    samples = np.concatenate(list(rows.values()))
+    stamps = samples["stamp_ns"].astype(np.int64)
+    time_ns = np.minimum(stamps + LAG_NS, end_ns) if arrived else stamps
+    order = np.argsort(time_ns, kind="stable")
+    machine: Ints = np.repeat(np.arange(len(rows)), [len(table) for table in rows.values()])
+    facts = [(0, NO_FACTS)]
+    for now_ns in range(START_NS + EVERY_NS, end_ns + 1, EVERY_NS):
+        there = {name: table[table["stamp_ns"] <= now_ns - arrived * LAG_NS] for name, table in rows.items()}
+        facts.append((now_ns, decided({name: table for name, table in there.items() if len(table)})))
+    return Timeline(samples[order], machine[order], names, time_ns[order], tuple(facts))
+
+
+def decided(rows: Mapping[str, Table]) -> Facts:
+    """What the server's trust and calibration come to on samples."""
+    if not rows:
+        return NO_FACTS
+    bad = accused(rows, calibrated(rows))
+    result = calibrated(rows, bad)
+    own = [each for name in rows if name not in bad for each in of_machine(result, name)]
+    return Facts(frozenset(bad), Corrections(own))

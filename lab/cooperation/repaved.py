@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from lab.calibration.drives import Scene
 from lab.cooperation.drives import SharedDrive
 from lab.cooperation.maps import Layers, Timeline
 from lab.cooperation.network import SHARE_PCT, Network, network
-from lab.fleet.drives import Scene
 from lab.ground.truth import true_ground
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.ground_classes import resistance_class

@@ -8,18 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.calibration.cases import GAIN, Rows, gain
+from lab.calibration.drives import Scene, scene
+from lab.calibration.solving import served
 from lab.campaign.experiment import Experiment, Task, read_result, replay_task
 from lab.cooperation import live
 from lab.cooperation.arms import BAD, Arm
-from lab.cooperation.central import central_timeline
 from lab.cooperation.drives import SharedDrive, length_m
 from lab.cooperation.live import LiveRun
-from lab.cooperation.maps import Layers, Timeline
+from lab.cooperation.maps import Layers, Timeline, central_timeline
 from lab.cooperation.network import LAYERS, Network, figures, network
 from lab.cooperation.repaved import inside, outlines, repaved_rows
-from lab.fleet.cases import GAIN, Rows, gain
-from lab.fleet.drives import Scene, scene
-from lab.fleet.solving import served
 from lab.ground.truth import true_ground
 from lab.maps.methods import folded
 from lab.paper.maps import with_true_values

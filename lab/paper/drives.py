@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from lab.calibration.drives import Agent, planned
 from lab.campaign.experiment import Task, replay_task
 from lab.campaign.recordings import PAPER, PlannedDrive, Setup
-from lab.fleet.drives import Agent, planned
 from lab.paper.maps import Fleet
 from lab.positions.configurations import HEADLINE, PROFILES, Configuration, configurations
 from lab.positions.published import PLOTTING, POSITIONS

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.calibration import drives
+from lab.calibration.drives import scene
 from lab.campaign.experiment import Runner
 from lab.campaign.goals import goals
 from lab.campaign.recordings import PAPER, PlannedDrive
-from lab.fleet import drives
-from lab.fleet.drives import scene
 from lab.maps.uncertainty import Believed, coverage_pct, forecast_row, layers_forecast, pooled
 from lab.paper import maps
 from lab.paper.drives import QUICK, RECOMMENDED, MapSource, Plan

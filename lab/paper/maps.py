@@ -12,13 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.calibration import drives
+from lab.calibration.cases import Rows, Tampered, cells, truth_places
+from lab.calibration.drives import Agent, AgentSamples, Scene, scene
+from lab.calibration.solving import as_correction, served, true_errors
 from lab.campaign.experiment import Experiment, Task, read_result, replay_task
 from lab.campaign.recordings import PlannedDrive
-from lab.fleet import drives
-from lab.fleet.cases import Rows, Tampered, cells, truth_places
-from lab.fleet.drives import Agent, AgentSamples, Scene, scene
-from lab.fleet.solving import as_correction, served
-from lab.fleet.true_errors import true_errors
 from lab.maps.methods import SERVER_LAYERS, Layers, folded, hits_of, in_order, last_write, merge_hard
 from lab.maps.uncertainty import Forecast, by_frequency, by_mean
 from mapserver.fleet.correction import corrected

@@ -16,11 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from lab.calibration.drives import scene
 from lab.campaign import pictures
 from lab.campaign.experiment import Runner
 from lab.campaign.pictures import EAST, NORTH, ZONE_RGB, head
 from lab.campaign.recordings import load
-from lab.fleet.drives import scene
 from lab.maps.cases import CELL_M
 from lab.maps.uncertainty import BINS
 from lab.paper.experiment import MapOutcome, Outcomes

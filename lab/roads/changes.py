@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lab.fleet.drives import Scene
+from lab.calibration.drives import Scene
 from lab.ground.truth import true_ground
 from lab.roads.drives import RoadDrive
 from lab.roads.repairs import UNTOUCHED, SegmentRepairs

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from lab.calibration.drives import FleetDrive
 from lab.campaign.recordings import Setup, toml_of
-from lab.fleet.drives import FleetDrive
 from protocol.arrays import Floats
 from sim.scenario.file import load_scenario
 from sim.scenario.ground import ZoneConfig

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lab.fleet.cases import Rows
-from lab.fleet.drives import FleetDrive, Scene
-from lab.fleet.solving import calibrated, of_machine
+from lab.calibration.cases import Rows
+from lab.calibration.drives import FleetDrive, Scene
+from lab.calibration.solving import calibrated, of_machine
 from lab.roads.truth import TrueTrack, TrueTraffic, true_tracks, true_traffic
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid

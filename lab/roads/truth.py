@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.fleet.drives import FleetDrive, Scene
+from lab.calibration.drives import FleetDrive, Scene
 from mapserver.roads.ledger import Ledgers, mean
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.units import GRAVITY_MPS2

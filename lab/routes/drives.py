@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.fleet.drives import FleetDrive, Scene
+from lab.calibration.drives import FleetDrive, Scene
 from lab.roads.score import Recorded
 from lab.routes.legs import Leg, legs_of
 from lab.routes.maps import KnownMap, true_squares

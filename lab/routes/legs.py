@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.fleet.drives import FleetDrive, Scene
+from lab.calibration.drives import FleetDrive, Scene
 from protocol.arrays import Floats, Ints, Table
 from protocol.machine.log_folder import open_log
 from protocol.queries.routing import MACHINES, RouteMachine

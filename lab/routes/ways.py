@@ -9,7 +9,6 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from lab.routes.maps import KnownMap, true_squares
-from lab.routes.reference import least_cost
 from mapserver.routes.least_cost import Cell, Terrain, least_cost_line
 from mapserver.routes.route import route
 from protocol.arrays import Bools, Floats
@@ -18,6 +17,7 @@ from protocol.queries.route_requests import WayQuery
 from protocol.queries.routing import RouteMachine
 from sim.truth import TruthMap
 from sitegrid.proof.figures import Row
+from tests.reference.least_cost import least_cost
 
 SIZE = 150  # cells to a side
 HILLS_M, HILL_CELLS, PATCH_CELLS = 2.0, 20.0, 8.0  # of drawn maps: heights' deviation (slopes of 10 %), sizes

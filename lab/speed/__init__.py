@@ -1,6 +1,5 @@
-"""Speed, measured: `python -m lab.speed NAME`; `--help` lists them.
+"""Speed, measured: `python -m lab speed LOAD`; `--help` lists the loads.
 
-Each prints small tables, or with `--json` one JSON object; `--samples` and the like make a run longer or shorter.
-Figures of a shared machine scatter: variants are measured in turn within one run and given as medians, so trust their
-ratios.
+Each prints one table, or with `--json` one JSON object: a row per case and figure. Figures of a shared machine scatter:
+variants run in turn within one measurement and are given as medians, so trust their ratios.
 """

@@ -1,4 +1,4 @@
-"""The command line of the benchmarks."""
+"""The command line of the loads."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib import import_module
+from typing import Any, Protocol, cast
 
-from lab.speed import fold, ingest, live, merge, merge_memory, merge_restart, past, roads, sim
-from lab.speed.agents import filter as filters
-from lab.speed.asking import query
-from lab.speed.fleets import fleet, follow
-from lab.speed.folds import archive
-from lab.speed.measure import Report
-from lab.speed.merge_work import HOURS
-from lab.speed.scaling import sizes
-from lab.speed.web import pages as web
-from lab.speed.web import panels
+from lab.speed.measure import Goals, judged, machine
 from sitegrid.process.tables import table
+from sitegrid.proof.figures import Row
+
+
+class Load(Protocol):
+    """A module of this folder. OPTIONS: of `run`, with their defaults; GOALS: by case and figure."""
+
+    OPTIONS: Mapping[str, float]
+    GOALS: Goals
+    run: Callable[..., Iterator[Row]]
 
 
 def _count(word: str) -> int:
@@ -33,7 +35,7 @@ def _positive(word: str) -> float:
     return number
 
 
-OPTIONS = {
+OPTIONS: Mapping[str, tuple[str, Callable[[str], float], str]] = {
     "runs": ("N", _count, "of each variant; the median counts"),
     "samples": ("N", _count, "in a run, or a journal"),
     "steps": ("N", _count, "in a run"),
@@ -42,100 +44,48 @@ OPTIONS = {
     "hours": ("H", _positive, "of work"),
     "seconds": ("S", _positive, "simulated, or of the site's time, in a run"),
 }
-# Of each: what runs it, what it measures, and its options, named as the parameters of `run`, with their defaults.
-BENCHMARKS: dict[str, tuple[Callable[..., Report], str, dict[str, float]]] = {
-    "merge": (
-        merge.run,
-        "samples that the server folds into its grid, and plain sums",
-        {"runs": 5, "samples": 200_000},
-    ),
-    "memory": (merge_memory.run, "memory that a day of work on 1 km2 takes of the map server", {"hours": HOURS}),
-    "restart": (merge_restart.run, "time to open a store with a long journal", {"samples": 20_000_000}),
-    "fold": (
-        fold.run,
-        "journals that are folded again, and a decision about a machine",
-        {"hours": HOURS, "samples": 20_000_000, "runs": 1},
-    ),
-    "archive": (
-        archive.run,
-        "an archive that is folded by threads, processes and a cluster",
-        {"samples": 50_000_000, "runs": 1},
-    ),
-    "live": (
-        live.run,
-        "processor time of a server at work, by thread",
-        {"hours": 2.0, "seconds": 120.0},
-    ),
-    "past": (past.run, "checkpoints, maps of the past, the history of a point", {"hours": HOURS, "runs": 3}),
-    "query": (
-        query.run,
-        "queries of a real server, while samples come in, and what 20 clients cost the machines",
-        {"hours": HOURS, "queries": 200, "seconds": 20.0, "runs": 3},
-    ),
-    "roads": (
-        roads.run,
-        "roads of 40 km, the worklist of a day, and what asking for it costs a server that takes samples",
-        {"hours": 24.0, "runs": 5, "seconds": 120.0},
-    ),
-    "ingest": (ingest.run, "samples that the server takes, from bytes to the grid", {"runs": 5, "samples": 20_000}),
-    "fleet": (
-        fleet.run,
-        "a fleet at a real server: acknowledgements, and what they cost",
-        {"machines": 500, "seconds": 70.0, "hours": HOURS},
-    ),
-    "follow": (
-        follow.run,
-        "followers: how soon they show a sample, what readers cost the machines with them and without",
-        {"machines": 100, "seconds": 15.0, "hours": 1.0, "runs": 3},
-    ),
-    "web": (
-        web.run,
-        "the web server: what open pages cost, how soon they show what came in, tiles for other tools",
-        {"hours": HOURS, "seconds": 20.0},
-    ),
-    "panels": (
-        panels.run,
-        "how soon the page shows worklist and routes, on the demo's site",
-        {"seconds": 240.0, "runs": 15},
-    ),
-    "sizes": (
-        sizes.run,
-        "bytes per sample on a link, in journal and archive, and what an agent's link carries",
-        {"samples": 60_000, "seconds": 60.0},
-    ),
-    "sim": (sim.run, "simulated time of small and large fleets, sensors on", {"runs": 5, "seconds": 20.0}),
-    "filter": (
-        filters.run,
-        "steps of the filters, what the smoother adds, and a whole agent's CPU and memory",
-        {"runs": 5, "steps": 1000},
-    ),
+LOADS = {
+    "merge": "samples folded into the grid, against plain sums",
+    "ingest": "samples that the server takes, from bytes to the grid, by journal",
+    "fleet": "a fleet at a real server: acknowledgements, and what they cost; the link of an agent",
+    "live": "processor time of a server at work, by thread",
+    "query": "queries of a real server while samples come in",
+    "restart": "a store opened, a journal folded again, and memory",
+    "filter": "steps of the filters, the smoother, a whole agent",
+    "sim": "simulated time of small and large fleets, sensors on",
+    "archive": "an archive folded by threads, processes and a cluster (minutes)",
+    "followers": "how soon followers show a sample, and what readers cost with them and without",
 }
 
 
+def load_of(name: str) -> Load:
+    """The module of a load; only that one is imported, since a process that is measured has its parent's imports."""
+    return cast("Load", import_module(f"lab.speed.{name}"))
+
+
 def main(words: Sequence[str] | None = None) -> int:
-    """Run one benchmark and print what it found."""
-    arguments = vars(_parser().parse_args(words))
-    run, as_json = arguments.pop("run"), arguments.pop("json")
-    result: Report = run(**arguments)
-    tables = [result[name] for name in ("rows", "ingest", "decisions", "past", "smoother", "agent") if name in result]
-    print(json.dumps(result) if as_json else "\n\n".join(map(table, tables)))
-    for variant, remedy in result.get("missing", {}).items():
-        print(f"not measured: {variant}; {remedy}", file=sys.stderr)
+    """Run one load and print its table."""
+    arguments = vars(_parser(words).parse_args(words))
+    name, as_json = arguments.pop("load"), arguments.pop("json")
+    load = load_of(name)
+    report: dict[str, Any] = {"load": name, **arguments, **machine()}
+    report["rows"] = judged(load.run(**arguments), load.GOALS)
+    print(json.dumps(report) if as_json else table(report["rows"]))
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    """A sub-command for each benchmark, so that an option that does nothing for it is refused."""
-    parser = argparse.ArgumentParser(prog="python -m lab.speed", description="Measure how fast the parts are.")
-    names = parser.add_subparsers(required=True, metavar="NAME", help="what to measure:")
-    for name, (run, what, options) in BENCHMARKS.items():
-        benchmark = names.add_parser(name, help=what)
-        benchmark.set_defaults(run=run)
-        benchmark.add_argument("--json", action="store_true", help="print one JSON object")
-        for option, default in options.items():
+def _parser(words: Sequence[str] | None) -> argparse.ArgumentParser:
+    """A sub-command for each load, so that an option that does nothing for it is refused."""
+    parser = argparse.ArgumentParser(prog="python -m lab speed", description="Measure how fast the parts are.")
+    loads = parser.add_subparsers(required=True, metavar="LOAD", dest="load", help="what to measure:")
+    for name, what in LOADS.items():
+        load = loads.add_parser(name, help=what, description=f"Measure {what}.")
+        load.add_argument("--json", action="store_true", help="print one JSON object")
+        chosen = name in (sys.argv[1:] if words is None else words)
+        for option, default in load_of(name).OPTIONS.items() if chosen else ():
             metavar, kind, meaning = OPTIONS[option]
             text = f"{meaning} (%(default)s)"
-            benchmark.add_argument(f"--{option}", metavar=metavar, type=kind, default=default, help=text)
+            load.add_argument(f"--{option}", metavar=metavar, type=kind, default=default, help=text)
     return parser
 
 

@@ -1,4 +1,4 @@
-"""Samples per second from a machine's bytes to the grid: decode, check, commit to disk (FULL), fold.
+"""Samples from a machine's bytes to the grid (decode, check, commit to disk, fold), and their bytes in the journal.
 
 On SQLite and, where its server is installed, on PostgreSQL, alone and with a synchronous replica on the same disk.
 """
@@ -6,102 +6,102 @@ On SQLite and, where its server is installed, on PostgreSQL, alone and with a sy
 from __future__ import annotations
 
 import math
-import statistics
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
-from lab.speed.measure import START_NS, Report, machine, medians, timed, track
+import numpy as np
+
+from lab.speed.measure import in_turn, rows_of, say, timed, track
+from lab.speed.site import SITE
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
-from mapserver.journal.location import JournalLocation
+from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.server import warm_up
 from protocol.arrays import Table
-from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
-from tests import postgres_server as server
+from sitegrid.proof.figures import Row
+from tests import postgres_server as postgres
+from tests.site_work import LEG_SAMPLES, START_NS, drive
 
-SITE = SiteConfig("bench", 48.0, 11.0)
-NewUrl = Callable[[], str]
+OPTIONS = {"runs": 5, "samples": 20_000}
+SQLITE, POSTGRES, REPLICATED = "SQLite", "PostgreSQL", "PostgreSQL, synchronous replica"
+GOALS = {
+    (f"{POSTGRES}, 100 in a batch, 16 in a commit", "of_sqlite"): ">= 0.5",
+    (f"{REPLICATED}, 100 in a batch, 16 in a commit", "of_sqlite"): ">= 0.4",
+}
 BATCHES = (6, 100, 1000)  # samples: a second of a machine with a good link, half a minute of it, a backlog
 GROUPS = (1, 16)  # batches in one commit: a single machine waiting for its answer, and many at once
+SMALLEST, GROUP = 3, 10  # samples in a batch of a machine at 3 m/s, batches in a commit: bytes in the journal
+TABLES = "SELECT sum(pg_total_relation_size(oid)) FROM pg_class WHERE relkind = 'r' AND relnamespace = "
 
 
-def run(samples: int, runs: int) -> Report:
-    """Measure every size of batch and group, each run on a new store."""
+def run(samples: int, runs: int) -> Iterator[Row]:
+    """Every journal with every size of batch and group, each run on a new store, in turn; figures None without one.
+
+    of_sqlite: samples a second as a share of SQLite's. journal_b_per_sample: in batches of 3; of a database with
+    its indices, after a vacuum.
+    """
     rows = track(samples)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
         warm_up(ServerConfig())
-        databases, missing = _databases(opened)
+        urls = _journals(opened)
         cases = {
-            f"{journal} {size} {group}": (journal, size, group)
+            f"{journal}, {size} in a batch, {group} in a commit": (journal, size, group)
             for size in BATCHES
             for group in GROUPS
-            for journal in databases
+            for journal in urls
         }
-        cpu_s: dict[str, list[float]] = {name: [] for name in cases}
         variants = {
-            name: _variant(Path(folder), rows, case[1:], cpu_s[name], databases[case[0]])
-            for name, case in cases.items()
+            name: partial(_taken, Path(folder), _groups(rows, size, group), urls[journal])
+            for name, (journal, size, group) in cases.items()
         }
-        seconds = medians(variants, runs)
-    figures = [
-        {
-            "journal": journal,
-            "batch": size,
-            "batches_per_commit": group,
-            "samples_per_s": round(samples / seconds[name]),
-            "samples_per_cpu_s": round(samples / statistics.median(cpu_s[name])),
-            "ms_per_commit": round(seconds[name] / math.ceil(math.ceil(samples / size) / group) * 1e3, 3),
-            "of_sqlite": round(seconds[f"sqlite {size} {group}"] / seconds[name], 2),
-        }
-        for name, (journal, size, group) in cases.items()
-    ]
-    report = {"benchmark": "ingest", "samples": samples, "runs": runs, **machine(), "rows": figures}
-    return report | {"missing": missing}
+        took = in_turn(variants, runs)
+        for name, (_, size, group) in cases.items():
+            figures = {
+                "samples_per_s": samples / took[name]["wall_s"],
+                "samples_per_cpu_s": samples / took[name]["cpu_s"],
+                "ms_per_commit": took[name]["wall_s"] / math.ceil(math.ceil(samples / size) / group) * 1e3,
+                "of_sqlite": took[f"{SQLITE}, {size} in a batch, {group} in a commit"]["wall_s"] / took[name]["wall_s"],
+            }
+            yield from rows_of(name, figures)
+        yield from rows_of(SQLITE, {"journal_b_per_sample": _sqlite_bytes(Path(folder), samples)})
+        yield from rows_of(POSTGRES, {"journal_b_per_sample": _postgres_bytes(Path(folder), samples, urls)})
 
 
-def _databases(opened: ExitStack) -> tuple[dict[str, NewUrl], dict[str, str]]:
-    """What makes the URL of a new journal, by the name of what keeps it; and what is not measured, and why."""
-    there: dict[str, NewUrl] = {"sqlite": lambda: ""}
+def _journals(opened: ExitStack) -> dict[str, Callable[[], str]]:
+    """What makes the URL of a new journal, by the name of what keeps it."""
+    there: dict[str, Callable[[], str]] = {SQLITE: lambda: ""}
     try:
-        primary = opened.enter_context(server.cluster())
-        there["postgres"] = lambda: primary.new_database().url
-        replicated = opened.enter_context(server.cluster())
-        opened.enter_context(server.replica(replicated, "b"))
+        primary = opened.enter_context(postgres.cluster())
+        there[POSTGRES] = lambda: primary.new_database().url
+        replicated = opened.enter_context(postgres.cluster())
+        opened.enter_context(postgres.replica(replicated, "b"))
         replicated.sql("ALTER SYSTEM SET synchronous_standby_names = 'b'")
         replicated.sql("SELECT pg_reload_conf()")
-        there["postgres, synchronous replica"] = lambda: replicated.new_database().url
+        there[REPLICATED] = lambda: replicated.new_database().url
     except RuntimeError as error:
-        return there, {"postgres": str(error)}
-    return there, {}
+        say(f"not measured: PostgreSQL; {error}")
+    return there
 
 
-def _variant(
-    folder: Path, rows: Table, case: tuple[int, int], cpu_s: list[float], new_url: NewUrl
-) -> Callable[[], float]:
-    """Send all samples through a new store; clocks run from the first byte until all samples are in the map.
-
-    cpu_s: takes the processor time of each run.
-    """
-    size, group = case
+def _groups(rows: Table, size: int, group: int) -> list[list[Incoming]]:
     sent = (SampleBatch("loader-1", 1, i + 1, rows[i : i + size], SITE.frame) for i in range(0, len(rows), size))
     batches = [Incoming(batch.machine, encode_batch(batch)) for batch in sent]
-    groups = [batches[first : first + group] for first in range(0, len(batches), group)]
+    return [batches[first : first + group] for first in range(0, len(batches), group)]
 
-    def work() -> float:
-        with tempfile.TemporaryDirectory(dir=folder) as path:
-            store = Store(JournalLocation(Path(path), new_url()), SITE, ServerConfig(), lambda: START_NS)
-            start_cpu_s = time.process_time()
-            seconds = timed(lambda: _take(store, groups))
-            cpu_s.append(time.process_time() - start_cpu_s)
-            store.close()
-        return seconds
 
-    return work
+def _taken(folder: Path, groups: list[list[Incoming]], new_url: Callable[[], str]) -> dict[str, float]:
+    """Send all samples through a new store; clocks run from the first byte until all samples are in the map."""
+    with tempfile.TemporaryDirectory(dir=folder) as path:
+        store = Store(JournalLocation(Path(path), new_url()), SITE, ServerConfig(), lambda: START_NS)
+        took = timed(lambda: _take(store, groups))
+        store.close()
+    return took
 
 
 def _take(store: Store, groups: list[list[Incoming]]) -> None:
@@ -109,3 +109,28 @@ def _take(store: Store, groups: list[list[Incoming]]) -> None:
         if not all(isinstance(answer, Ack) for answer in store.commit(group)):
             raise RuntimeError("the store refused a batch")
     store.grid.known_cells()  # folds what waits
+
+
+def _fill(location: JournalLocation, samples: int) -> None:
+    """Samples of a machine as it drives."""
+    rows = np.concatenate(list(islice(drive(np.random.default_rng(1)), 1 + samples // LEG_SAMPLES)))
+    store = Store(location, SITE, ServerConfig(), lambda: START_NS)
+    _take(store, _groups(rows[:samples], SMALLEST, GROUP))
+    store.close()
+
+
+def _sqlite_bytes(folder: Path, samples: int) -> float:
+    _fill(JournalLocation(folder / "bytes"), samples)
+    return (folder / "bytes" / JOURNAL_FILE).stat().st_size / samples
+
+
+def _postgres_bytes(folder: Path, samples: int, urls: dict[str, Callable[[], str]]) -> float | None:
+    """None where PostgreSQL is not installed."""
+    if POSTGRES not in urls:
+        return None
+    with postgres.cluster() as cluster:
+        database = cluster.new_database()
+        _fill(JournalLocation(folder / "rows", database.url), samples)
+        database.sql("VACUUM")
+        ((size,),) = database.sql(f"{TABLES} 'sitegrid'::regnamespace")
+        return float(size) / samples

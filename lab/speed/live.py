@@ -18,8 +18,8 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from lab.speed.measure import START_NS, Report, machine
-from lab.speed.merge_work import BATCH, Batches, batches, samples_of, seconds_of
+from lab.speed.measure import rows_of
+from lab.speed.site import SITE
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import warm_up
 from mapserver.fleet.correction import UNCORRECTED
@@ -29,28 +29,30 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal.location import JournalLocation
 from mapserver.trust.auditor import Auditor
 from mapserver.upkeep.jobs import Audit, ChangeSearch
-from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
+from sitegrid.proof.figures import Row
+from tests.site_work import BATCH, START_NS, Batches, batches, samples_of, seconds_of
 
-SITE, CONFIG = SiteConfig("bench", 48.0, 11.0), ServerConfig()
-GOALS = {"look": 10.0, "sum": 60.0}
+OPTIONS = {"hours": 2.0, "seconds": 120.0}
+FIGURE = "cpu_ms_per_s"
+GOALS = {("look", FIGURE): "<= 10", ("sum", FIGURE): "<= 60"}
+CONFIG = ServerConfig()
 ANSWERED_S = 60.0
 
 
-def run(hours: float, seconds: float) -> Report:
-    """Measure after so many hours of work, over so many seconds of the site's time.
+def run(hours: float, seconds: float) -> Iterator[Row]:
+    """After so many hours of work, over so many seconds of the site's time.
 
-    Rows: thread, and its milliseconds of processor time per second of the site's time: writer, which decodes batches,
-    commits and answers; fold, on the same thread, of what waits at each read; look for changes, with what the writer
-    does for it; audit, which follows the journal and judges; snapshot, of both threads that make it; sum of all.
+    Cases are threads: writer, which decodes batches, commits and answers; fold, on the same thread, of what waits at
+    each read; look for changes, with what the writer does for it; audit, which follows the journal and judges;
+    snapshot, of both threads that make it; sum of all.
     """
     warm_up(CONFIG.fold)
     with tempfile.TemporaryDirectory() as folder:
-        figures = _measured(Path(folder), hours, max(1, round(seconds)))
-    figures["sum"] = sum(figures.values())
-    rows = [{"thread": name, "cpu_ms_per_s": round(ms, 3), "goal": GOALS.get(name)} for name, ms in figures.items()]
-    return {"benchmark": "live", "hours": hours, "seconds": seconds, **machine(), "rows": rows}
+        ms = _measured(Path(folder), hours, max(1, round(seconds)))
+    for name, value in (*ms.items(), ("sum", sum(ms.values()))):
+        yield from rows_of(name, {FIGURE: value})
 
 
 def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:

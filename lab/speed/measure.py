@@ -1,4 +1,4 @@
-"""What the benchmarks share: samples to measure with, and variants measured in turn."""
+"""What the loads share: rows of figures, variants measured in turn, samples to measure with, child processes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,55 @@ import numpy as np
 
 from protocol.arrays import Table
 from protocol.machine.samples import empty
+from sitegrid.proof.figures import Goal, Row
+from tests.site_work import START_NS
 
-Report = dict[str, Any]
-START_NS = 1_767_225_600_000_000_000
+ROOT = Path(__file__).parents[2]
+DIGITS = 4  # significant, of every figure
 SIDE_M = 1024.0  # of the site; three sums for each of its cells of 1 m take 25 MB, more than a cache holds
+Figures = Mapping[str, float | None]  # of one case, by name; None where something is not installed
+Goals = Mapping[tuple[str, str], str]  # by case and figure: "<= 150", ">= 0.9"
+
+
+def rows_of(case: str, figures: Figures) -> Iterator[Row]:
+    """A row per figure of a case."""
+    for name, value in figures.items():
+        yield {"case": case, "figure": name, "value": None if value is None else float(f"{value:.{DIGITS}g}")}
+
+
+def judged(rows: Iterable[Row], goals: Goals) -> list[Row]:
+    """Rows with the goal of each, None where it has none, and whether it is met."""
+    return [row | _judgement(row["value"], goals.get((row["case"], row["figure"]))) for row in rows]
+
+
+def _judgement(value: float | None, goal: str | None) -> Row:
+    if goal is None:
+        return {"goal": None, "met": None}
+    relation, limit = goal.split()
+    return {"goal": goal, "met": Goal({}, "", "<=" if relation == "<=" else ">=", float(limit)).is_met(value)}
+
+
+def in_turn(variants: Mapping[str, Callable[[], Figures]], runs: int) -> dict[str, dict[str, float]]:
+    """Median of each figure of each variant; one run of each in turn, so that all meet the same disturbances."""
+    measured: dict[str, list[Figures]] = {name: [] for name in variants}
+    for _ in range(runs):
+        for name, variant in variants.items():
+            measured[name].append(variant())
+    return {
+        name: {figure: statistics.median(float(run[figure] or 0.0) for run in each) for figure in each[0]}
+        for name, each in measured.items()
+    }
+
+
+def timed(work: Callable[[], object]) -> dict[str, float]:
+    """Seconds that work took: `wall_s` by the clock, `cpu_s` of this process."""
+    start_s, start_cpu_s = time.perf_counter(), time.process_time()
+    work()
+    return {"wall_s": time.perf_counter() - start_s, "cpu_s": time.process_time() - start_cpu_s}
 
 
 def track(n: int, seed: int = 0) -> Table:
-    """Samples half a metre apart along a winding drive, as a machine at work sends them."""
+    """Samples (n,) half a metre apart along a winding drive, as a machine at work sends them."""
     draw = np.random.default_rng(seed)
     heading = np.cumsum(draw.normal(0.0, 0.05, n))
     x, y = (SIDE_M / 2 + np.cumsum(0.5 * part(heading)) for part in (np.cos, np.sin))
@@ -32,7 +74,7 @@ def track(n: int, seed: int = 0) -> Table:
 
 
 def scattered(n: int, seed: int = 0) -> Table:
-    """Samples anywhere on the site, as an archive of many machines is folded."""
+    """Samples (n,) anywhere on the site, as an archive of many machines is folded."""
     draw = np.random.default_rng(seed)
     x, y = draw.uniform(0.0, SIDE_M, (2, n))
     return _fill(n, draw, x, y, draw.uniform(-np.pi, np.pi, n))
@@ -51,36 +93,35 @@ def _fill(n: int, draw: np.random.Generator, x: Any, y: Any, heading: Any) -> Ta
     return rows
 
 
-def medians(variants: Mapping[str, Callable[[], float]], runs: int) -> dict[str, float]:
-    """Median of each variant's figure [s]; one run of each in turn, so that all meet the same disturbances."""
-    seconds: dict[str, list[float]] = {name: [] for name in variants}
-    for _ in range(runs):
-        for name, variant in variants.items():
-            seconds[name].append(variant())
-    return {name: statistics.median(figures) for name, figures in seconds.items()}
-
-
-def timed(work: Callable[[], object]) -> float:
-    """Seconds that the work took."""
-    start_s = time.perf_counter()
-    work()
-    return time.perf_counter() - start_s
-
-
-def memory_mb(name: str = "VmRSS", pid: int | None = None) -> float:
-    """Memory of this process or another: resident now, or with VmHWM the most that ever was.
-
-    getrusage would count a parent's too.
-    """
-    lines = Path(f"/proc/{pid or 'self'}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(name)) * 1024 / 1e6
-
-
-def in_child(module: str, *words: str) -> Report:
+def in_child(module: str, *words: str) -> dict[str, Any]:
     """What a module prints as one JSON object when it runs in a process of its own."""
-    command, root = [sys.executable, "-m", module, *words], Path(__file__).parent.parent
-    result: Report = json.loads(subprocess.run(command, cwd=root, check=True, capture_output=True).stdout)  # noqa: S603
+    command = [sys.executable, "-m", module, *words]
+    result: dict[str, Any] = json.loads(subprocess.run(command, cwd=ROOT, check=True, capture_output=True).stdout)  # noqa: S603
     return result
+
+
+@contextmanager
+def child(module: str, *words: str, end_s: float = 0.0) -> Iterator[list[Figures]]:
+    """A module in a process of its own that prints `ready`; once left, the JSON object that it prints in the end.
+
+    end_s: how long it may take from then on; 0 for one that prints nothing and is ended.
+    """
+    printed: list[Figures] = []
+    command = [sys.executable, "-m", module, *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT, text=True) as process:  # noqa: S603
+        try:
+            if process.stdout is None or "ready" not in process.stdout.readline():
+                raise RuntimeError(f"{module} did not start: nothing was measured")
+            yield printed
+            if end_s:
+                printed.append(json.loads(process.communicate(timeout=end_s)[0]))
+        finally:
+            process.terminate()
+
+
+def say(what: str) -> None:
+    """Progress, and what could not be measured."""
+    print(what, file=sys.stderr, flush=True)
 
 
 def machine() -> dict[str, Any]:

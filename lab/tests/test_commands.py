@@ -18,7 +18,7 @@ from sitegrid.options.values import count, positive, seed
 NAMES = [info.name for info in iter_modules(commands.__path__)]
 # Where the work of each command begins: module and function; these take seeds.
 WORK = {
-    "calibration": "lab.fleet.experiment",
+    "calibration": "lab.calibration.experiment",
     "cooperation": "lab.cooperation.experiment",
     "ground": "lab.ground.experiment",
     "maps": "lab.maps.experiment",

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from agents.delivery.audit import read_audit
-from lab.speed.measure import memory_mb
 from mapserver.config import ServerConfig
 from mapserver.journal.history import history_rows
 from mapserver.journal.location import JOURNAL_FILE
@@ -29,6 +28,7 @@ from tests.chaos.leashed import Process
 from tests.chaos.outcome import Console, FaultOutcome, TimeSpan, longest_pause
 from tests.chaos.recordings import IDLE, SECONDS, SPEED, START_NS, Recordings
 from tests.journals import history_beside
+from tests.memory import memory_mb
 
 READY_S = 120.0  # a server's first start in a new folder compiles its kernels
 RESUME_S = 60.0

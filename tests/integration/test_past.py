@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.speed.measure import START_NS
-from lab.speed.merge_work import BATCH, batches, samples_of
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.journal.location import JOURNAL_FILE
@@ -30,6 +28,7 @@ from sitegrid.client import Client
 from sitegrid.process.children import Child, Children
 from tests.integration.site_run import kill
 from tests.patience import PATIENCE_S, until
+from tests.site_work import BATCH, START_NS, batches, samples_of
 
 SITE, CONFIG = SiteConfig("pit", 48.0, 11.0), ServerConfig()
 HOURS = 2.2

@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from lab.speed import merge_restart
-from lab.speed.merge_work import batches
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import LAST_NS, Correction
@@ -29,6 +27,7 @@ from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.integration.test_operation import Sender, end, session_of
 from tests.patience import until
 from tests.reference.correction import in_numpy
+from tests.site_work import batches, write_store
 from tests.unit.mapserver.data import same
 
 pytestmark = pytest.mark.processes
@@ -37,13 +36,12 @@ ROWS = 3000  # of 100 samples: their fold takes a good part of a second
 
 
 @pytest.fixture
-def site(tmp_path: Path, children: Children, monkeypatch: pytest.MonkeyPatch) -> SiteRun:
+def site(tmp_path: Path, children: Children) -> SiteRun:
     """A site whose store has samples of ten machines, and no snapshot."""
     run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
     options = tmp_path / "server.toml"
     options.write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
-    monkeypatch.setattr(merge_restart, "SITE", load_site(run.site_file))
-    merge_restart.build(tmp_path / "store", ROWS, tail_rows=ROWS)
+    write_store(tmp_path / "store", load_site(run.site_file), ROWS, tail_rows=ROWS)
     run.start_router()
     return run
 

@@ -58,11 +58,6 @@ def test_every_arm_has_a_name_of_its_own_and_no_more_machines_than_its_recording
         assert each.machines <= len(drive.machines)
 
 
-def test_arms_share_recordings():
-    folders = {each.drive(0).folder(Path()) for each in arms(1200.0)}
-    assert len(folders) == 5  # alone, two, eight, repaved, mixed
-
-
 @pytest.mark.slow
 def test_a_bad_machine_reads_another_torque_and_believes_its_antennas_elsewhere(cache: Path, tmp_path: Path):
     good, right, _ = readings(cache, tmp_path, "")

@@ -51,18 +51,3 @@ def test_the_shared_stretch_is_in_every_tour():
     for leg in lines().values():
         off_m = np.hypot(leg.points[:, 0] - 96.0, leg.points[:, 1] - 66.0)
         assert off_m.min() < 0.5
-
-
-def test_machines_of_one_seed_have_the_same_names_alone_and_among_others():
-    assert planned(1, 1.0, ONE, None).machines == planned(1, 1.0, EIGHT, None).machines[:1]
-    assert planned(1, 1.0, MIXED, None).tours == {
-        "loader-1": ("west",),
-        "loader-2": ("south",),
-        "truck-1": ("north",),
-        "truck-2": ("east",),
-    }
-
-
-def test_another_drive_is_another_recording(tmp_path: Path):
-    drives = [planned(1, 10.0, crews, None, repaves=repaves) for crews in (ONE, FOUR) for repaves in (False, True)]
-    assert len({drive.folder(tmp_path) for drive in drives}) == 4

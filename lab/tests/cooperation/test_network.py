@@ -1,7 +1,5 @@
 """Cells of the road network, and figures of maps with known answers."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -52,12 +50,6 @@ def test_a_map_that_is_right_has_no_errors(cells: Network):
     assert (got["wrong_pct"], got["c_rr_pct"], got["c_rr_all_pct"], got["grade_all_pct"]) == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_an_empty_map_covers_nothing_and_has_no_errors_either(cells: Network):
-    got = figures({name: np.full((150, 200), np.nan) for name in perfect(cells)}, cells)
-    assert (got["covered_pct"], got["known_pct"]) == (0.0, 0.0)
-    assert all(np.isnan(got[name]) for name in FIGURES[2:])
-
-
 def test_errors_are_what_they_were_made(cells: Network):
     layers = perfect(cells)
     layers["resistance"] *= 1.1
@@ -66,14 +58,6 @@ def test_errors_are_what_they_were_made(cells: Network):
     assert got["c_rr_pct"] == pytest.approx(10.0)
     assert got["c_rr_all_pct"] == pytest.approx(10.0)
     assert np.hypot(got["grade_pct"], got["grade_across_pct"]) == pytest.approx(0.3)
-
-
-def test_a_cell_that_is_not_sure_is_known_but_not_covered(cells: Network):
-    layers = perfect(cells)
-    layers["confidence"][cells.row[:300], cells.column[:300]] = 0.59
-    got = figures(layers, cells)
-    assert got["known_pct"] == 100.0
-    assert got["covered_pct"] == pytest.approx(100.0 * (1 - 300 / len(cells.row)))
 
 
 def test_errors_near_borders_and_breaks_are_told_apart(cells: Network):
@@ -86,13 +70,6 @@ def test_errors_near_borders_and_breaks_are_told_apart(cells: Network):
     assert got["c_rr_pct"] == got["grade_pct"] == got["grade_across_pct"] == 0.0
     assert got["c_rr_all_pct"] > 1.0
     assert got["grade_all_pct"] > 0.5
-
-
-def test_a_part_has_those_cells_alone(cells: Network):
-    part = cells.part(cells.tour == 1)
-    assert len(part.row) == (cells.tour == 1).sum() == len(part.plane) == len(part.c_rr)
-    assert figures(perfect(cells), part)["covered_pct"] == 100.0
-    assert replace(part, row=cells.row).column is part.column
 
 
 def test_distance_from_a_break_of_slope_counts_from_the_ramps_foot():

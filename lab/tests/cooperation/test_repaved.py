@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lab.calibration.drives import Scene
 from lab.cooperation.drives import FOUR, REPAVED, lines, planned
 from lab.cooperation.maps import Timeline
 from lab.cooperation.repaved import driven_pct, inside, passes, repaved_rows
-from lab.fleet.drives import Scene
 from lab.ground.truth import true_ground
 from lab.tests.cooperation.samples import driving, track
 from mapserver.journal.facts import NO_FACTS
@@ -17,14 +17,6 @@ from sim.simulator import START_NS
 from sim.truth import truth_map
 
 DRIVE = planned(3, 400.0, FOUR, "fast", repaves=True)
-
-
-def test_places_in_an_outline_and_near_it():
-    square = ((0, 0), (10, 0), (10, 10), (0, 10))
-    places = np.array([[5.0, 5.0], [9.0, 5.0], [12.0, 5.0], [20.0, 5.0]])
-    assert inside(square, places).tolist() == [True, True, False, False]
-    assert inside(square, places, 3.0).tolist() == [True, True, True, False]
-    assert inside(square, places, -2.0).tolist() == [True, False, False, False]
 
 
 def test_a_pass_counts_that_began_after_the_change_and_is_over():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lab.calibration.drives import Scene
 from lab.cooperation.drives import FOUR, REPAVED, TOURS, length_m, planned
 from lab.cooperation.live import LiveRun
 from lab.cooperation.maps import Timeline
@@ -12,7 +13,6 @@ from lab.cooperation.scores import (
     rounds_ns,
     same_pct,
 )
-from lab.fleet.drives import Scene
 from lab.ground.truth import true_ground
 from lab.tests.cooperation.samples import driving, track
 from sim.simulator import START_NS

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lab.tests.fleet.scenes import made_scene
 
-from lab.fleet.drives import Agent, Scene
+from lab.calibration.drives import Agent, Scene
 from lab.paper.maps import (
     AS_SENT,
     AS_TRUE,
@@ -23,7 +24,6 @@ from lab.paper.maps import (
     with_true_values,
 )
 from lab.positions.configurations import Configuration
-from lab.tests.fleet.scenes import made_scene
 from protocol.arrays import Table
 from sitegrid.proof.map_score import region_of, score, true_layers
 

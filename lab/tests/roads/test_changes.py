@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from lab.roads import experiment
 from lab.roads.changes import CELLS, CELLS_REPAIRS, SEGMENTS, CellPasses, ChangedGround, Changes, changes, pooled
 from lab.roads.repairs import SegmentRepairs, TrueRepair, shown_at
 from lab.roads.score import Recorded, roads
@@ -98,20 +97,6 @@ def test_what_a_machine_drives_on_a_cell_within_a_minute_is_one_pass():
     assert over.end_ns[over.cell == 0] / 1e9 == pytest.approx([21.25, 240], abs=1)
 
 
-def test_who_stands_on_a_cell_passes_it_once():
-    over = CellPasses.of_tracks(
-        [track((0, 0.5, 0.5), (10, 2.5, 0.5), (300, 2.5, 0.5), (310, 5.5, 0.5))], CellWindow(0, 0, 6, 1)
-    )
-    assert over.cell.tolist() == list(range(6))
-    assert over.end_ns[over.cell == 2] / 1e9 == pytest.approx([301.7], abs=0.5)
-
-
-def test_two_machines_have_a_pass_each_and_what_is_outside_counts_nowhere():
-    ways = [track((0, -3.0, 0.5), (10, 2.0, 0.5)), track((5, 1.5, 3.0), (9, 1.5, -3.0))]
-    over = CellPasses.of_tracks(ways, CellWindow(0, 0, 2, 2))
-    assert sorted(over.cell.tolist()) == [0, 1, 1, 3]
-
-
 def test_figures_are_of_all_places_of_all_recordings():
     one = Changes("cells", [1, 2, 3, 5], [1, None, 3, 2], [0.0, None, 4.0, 2.0], 10, 8, 1, 0.25)
     other = Changes("cells", [3], [None], [None], 0, 0, 0, 0.25)
@@ -134,17 +119,6 @@ def test_figures_are_of_all_places_of_all_recordings():
     }
     nothing = pooled([other])
     assert (nothing["precision_pct"], nothing["delay_passes"], nothing["recall_3_pct"]) == (None, None, 0.0)
-
-
-def test_rows_are_of_each_kind_and_none_without_repairs():
-    part = {"kind": "cells", "passes": [2], "needed": [2], "minutes": [1.23456]}
-    part |= {"said": 1, "right": 1, "false_alarms": 0, "km2_days": 0.001}
-    rows = experiment.change_rows([[part, {**part, "kind": "segments"}]] * 2)
-    assert [(row["kind"], row["changed"], row["delay_min"]) for row in rows] == [
-        ("cells", 2, 1.235),
-        ("segments", 2, 1.235),
-    ]
-    assert experiment.change_rows([[], []]) == []
 
 
 def test_a_change_needs_the_passes_until_the_one_that_showed_it():

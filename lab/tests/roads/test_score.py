@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import kendalltau
 
+from lab.campaign.goals import goals
+from lab.campaign.summary import chosen
 from lab.roads import experiment
 from lab.roads.drives import BAD, planned
 from lab.roads.score import Recorded, kendall, kept_after, roads
@@ -61,21 +63,21 @@ def test_rows_sum_repairs_and_take_medians_of_the_rest():
         "saved_j": 9.0,
         "true_saved_j": 10.0,
     }
-    row = experiment.summarise(experiment.CASES[3], [seed, {**seed, "seen_2": 1, "false_alarms": 1}])
+    row = experiment.row_of(experiment.CASES[3], [seed, {**seed, "seen_2": 1, "false_alarms": 1}])
     assert (row["repairs"], row["seen_2_pct"], row["seen_3_pct"]) == (8, 50.0, 100.0)
     assert (row["false_per_1000"], row["saved_pct"]) == (5.0, -10.0)
     assert (row["cells_changed_pct"], row["cells_since_pct"]) == (25.0, 75.0)
-    plain = experiment.summarise(experiment.CASES[0], [{"c_pct": 3.0}, {"c_pct": 9.0}, {"c_pct": 4.0}])
+    plain = experiment.row_of(experiment.CASES[0], [{"c_pct": 3.0}, {"c_pct": 9.0}, {"c_pct": 4.0}])
     assert plain["c_pct"] == 4.0
     assert len(plain["by_seed"]) == 3
-    assert judge(experiment.GOALS[:1], [plain])[0]["met"]
+    assert judge(goals("roads")[:1], [plain])[0]["met"]
 
 
 def test_cases_are_chosen_by_name_and_others_refused():
-    assert [case.name for case in experiment.select(["repairs", "haul_road"])] == ["haul_road", "repairs"]
-    assert experiment.select([]) == experiment.CASES
+    assert [case.name for case in chosen(experiment.CASES, ["repairs", "haul_road"])] == ["haul_road", "repairs"]
+    assert chosen(experiment.CASES, []) == experiment.CASES
     with pytest.raises(ConfigError, match="`haul` is not known; known: haul_road"):
-        experiment.select(["haul"])
+        chosen(experiment.CASES, ["haul"])
 
 
 def test_names_are_those_of_the_day_before_where_the_same_roads_are_driven():
@@ -102,7 +104,7 @@ def test_a_day_after_is_judged_with_the_next_seed_and_what_is_judged_is_kept(tmp
             asked.extend((what.name, task.variant.name, task.seed, getattr(task.variant, "other", 0)) for task in tasks)
             return [experiment.Judged({"c_pct": 1.0}) for _ in tasks]
 
-    monkeypatch.setattr(experiment, "GOALS", experiment.GOALS[:1])
+    monkeypatch.setattr(experiment, "goals", lambda _: goals("roads")[:1])
     report, _ = experiment.run(Runner(), [4, 5, 6], 90.0, experiment.CASES[:1])
     assert [each for each in asked if each[0] == "roads"] == [
         ("roads", "haul_road", 4, 5),
@@ -116,12 +118,3 @@ def test_a_day_after_is_judged_with_the_next_seed_and_what_is_judged_is_kept(tmp
     ]
     names = {experiment.EXPERIMENT.file(task, tmp_path).name for task in tasks}
     assert len(names) == 2
-
-
-def test_seeds_far_beyond_a_goal_are_named():
-    goals = [goal for goal in experiment.GOALS if goal.figure in ("c_pct", "tau", "top_pct", "total_pct")]
-    good = {"c_pct": 11.9, "tau": 0.78, "top_pct": 95.6, "total_pct": -11.0}
-    bad = {"c_pct": 12.1, "tau": 0.77, "top_pct": 95.4, "total_pct": -12.5}
-    table = [{"case": "haul_road", "by_seed": [good, bad]}]
-    named = experiment.beyond(goals, table, [7, 8])
-    assert {(row["name"], row["seed"], row["value"]) for row in named} == {(name, 8, bad[name]) for name in bad}

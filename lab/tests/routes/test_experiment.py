@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from lab.campaign.goals import goals
 from lab.routes import experiment, ways
 from lab.routes.drives import seed_figures
 from lab.routes.maps import KnownMap, true_squares
 from mapserver.routes.route import route
-from protocol.errors import ConfigError
 from protocol.queries.route_requests import RouteQuery
 from protocol.units import GRAVITY_MPS2
 from sim.truth import TruthMap
@@ -37,9 +37,9 @@ def test_figures_of_a_seed_and_of_all():
     assert seed["energy_pct"] == pytest.approx(100 * np.sqrt((0.03**2 + 0.04**2) / 2))
     assert (seed["energy_mean_pct"], seed["energy_worst_pct"]) == (pytest.approx(-0.5), pytest.approx(4.0))
     assert (seed["energy_inside_pct"], seed["legs"], seed["km"]) == (50.0, 2, 1.0)
-    row = experiment.summarise("haul_road", [seed, {**seed, "back_pct": 9.0}, seed])
+    row = experiment.row_of("haul_road", [seed, {**seed, "back_pct": 9.0}, seed])
     assert (row["legs"], row["back_pct"], row["max_back_pct"]) == (6, 4.0, 9.0)
-    met = {(goal["name"], goal["met"]) for goal in judge(experiment.GOALS[:6], [row])}
+    met = {(goal["name"], goal["met"]) for goal in judge(goals("routes")[:6], [row])}
     assert met == {
         ("energy_pct", True),
         ("max_energy_pct", True),
@@ -48,13 +48,6 @@ def test_figures_of_a_seed_and_of_all():
         ("time_pct", True),
         ("max_time_pct", True),
     }
-
-
-def test_cases_are_chosen_by_name():
-    assert experiment.select(["ways"]) == ("ways",)
-    assert experiment.select([]) == experiment.NAMES
-    with pytest.raises(ConfigError, match="'mars' is not known; known: haul_road"):
-        experiment.select(["mars"])
 
 
 @pytest.mark.slow

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from lab.routes.reference import graph, least_cost, neighbours
 from mapserver.routes.grid_search import LEAST_COST
 from mapserver.routes.least_cost import Terrain, cost_of, least_cost_line, moves, reaches
+from tests.reference.least_cost import graph, least_cost, neighbours
 
 
 def even(size: int = 100, resistance: float = 0.02, crawl: float = math.inf) -> Terrain:

@@ -1,0 +1,104 @@
+"""What calibration by the fleet gives the map: every case before, after, and with the errors that the truth shows.
+
+Recordings of PyBullet drives are replayed by whole pipelines with estimated, smoothed positions. The samples go through
+the server's own ledger, solver, trust, correction, fold and read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from lab.calibration import drives
+from lab.calibration.cases import CASES, PAPER, FleetCase
+from lab.calibration.drives import Agent, FleetDrive, planned, scene
+from lab.calibration.solving import MAPS, CaseResult, solved
+from lab.campaign.experiment import Runner, replay_task
+from lab.campaign.goals import goals
+from lab.campaign.summary import column, mean, median, summary
+from sitegrid.proof.figures import Report, Row, judge, root_mean_square, rounded
+
+LOADERS = 4  # of a drive of the paper's site with the usual sensors
+DIGITS = 4
+
+
+def run(
+    runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[FleetCase] = CASES
+) -> tuple[Report, dict[FleetCase, list[CaseResult]]]:
+    """Record, replay, calibrate and judge all cases with all seeds; a row per case and map, means over the seeds."""
+    wanted = {
+        (drive, agent): replay_task(agent, drive)
+        for seed in seeds
+        for case in cases
+        for drive in [_drive(case, seed, seconds)]
+        for agent in _agents(case, drive)
+    }
+    samples = dict(zip(wanted, runner.run(drives.EXPERIMENT, list(wanted.values())), strict=True))
+    results: dict[FleetCase, list[CaseResult]] = {case: [] for case in cases}
+    for seed in seeds:
+        for case in cases:
+            drive = _drive(case, seed, seconds)
+            true = scene(drive, runner.cache)
+            names = sorted(true.tracks)
+            rows = {names[agent.index]: samples[drive, agent].samples for agent in _agents(case, drive)}
+            results[case].append(solved(case, rows, true))
+    table = [row_of(case.name, name, of_case) for case, of_case in results.items() for name in MAPS]
+    known = [goal for goal in goals("calibration") if goal.row["case"] in {case.name for case in cases}]
+    return {"seeds": list(seeds), "seconds": seconds, "rows": table, "goals": judge(known, table)}, results
+
+
+def _drive(case: FleetCase, seed: int, seconds: float) -> FleetDrive:
+    """The recording of a case: cases of the paper's site with the usual sensors share one of four loaders."""
+    if case.scenario != PAPER:
+        return planned(case.scenario, seed, seconds)
+    return planned(PAPER, seed, seconds, case.machines if case.preset else LOADERS, case.preset)
+
+
+def _agents(case: FleetCase, drive: FleetDrive) -> list[Agent]:
+    places = range(case.machines or drive.machines)
+    own = (case.calibrates, case.closed_tours)
+    return [Agent(index, *own, case.first_s, index in case.bad) for index in places]
+
+
+def row_of(case: str, name: str, results: Sequence[CaseResult]) -> Row:
+    """Of one map of a case: means over the seeds, and errors of zeros and scales of all seeds.
+
+    change, from_oracle, slope_change: how much more of the map after is wrong than before and of the oracle [points].
+    """
+    by_seed = [figures_of(result, name) for result in results]
+    wrong, change, from_oracle = (column(by_seed, each) for each in ("wrong_pct", "change_pct", "from_oracle_pct"))
+    row = summary(
+        {"case": case, "map": name},
+        by_seed,
+        rms_zero=_rms(results, {"before": "applied", "after": "zeros"}.get(name)),
+        rms_scale=_rms(results, {"after": "scales"}.get(name)),
+        normalised=_rms(results, {"after": "normalised"}.get(name)) ** 2,
+        median_wrong_pct=median(wrong),
+        max_wrong_pct=max(wrong),
+        above_before_pct=max(0.0, mean(change)),
+        max_above_before_pct=max(0.0, *change),
+        above_oracle_pct=max(0.0, mean(from_oracle)),
+        max_above_oracle_pct=max(0.0, *from_oracle),
+        common_scale_observed=sum(result.common[0] for result in results),
+        reasons=sorted({result.common[1] for result in results} - {""}),
+        distrusted=[dict(result.distrusted) for result in results],
+    )
+    return rounded(row, DIGITS, rms_zero=6)
+
+
+def _rms(results: Sequence[CaseResult], errors: str | None) -> float:
+    """Root mean square of errors of all seeds; NaN of a map that has none."""
+    return root_mean_square(np.concatenate([getattr(result, errors) for result in results])) if errors else math.nan
+
+
+def figures_of(result: CaseResult, name: str) -> Row:
+    """Wrong cells of one map with one seed, in percent, and against the map before and the oracle."""
+    own, before, oracle = (result.maps[each].figures for each in (name, "before", "oracle"))
+    return {
+        **own,
+        "change_pct": own["wrong_pct"] - before["wrong_pct"],
+        "from_oracle_pct": own["wrong_pct"] - oracle["wrong_pct"],
+        "slope_change_pct": own["slope_pct"] - before["slope_pct"],
+    }

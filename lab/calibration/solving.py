@@ -1,0 +1,202 @@
+"""One case: its samples through the server's ledger, solver, trust, correction, fold and read, and the maps judged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from lab.calibration.cases import FleetCase, Rows, Tampered, cells, tampered, truth_places
+from lab.calibration.drives import Scene
+from lab.maps.cases import CELL_M
+from lab.maps.methods import folded
+from mapserver.config import ServerConfig
+from mapserver.evidence.fold_config import is_foldable
+from mapserver.fleet.calibration import Calibration, calibrate
+from mapserver.fleet.correction import LAST_NS, Correction, corrected, measured
+from mapserver.fleet.ledger import Ledger
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD
+from mapserver.trust.auditor import Auditor
+from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints, Table
+from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
+from sitegrid.proof.map_score import border_distance, driven_cells, region_of, window_of
+
+MAPS = ("before", "after", "oracle")
+FIGURES = ("wrong_pct", "interior_pct", "slope_pct")
+BATCH = 100  # samples of one machine at a time, as trust sees them
+INTERIOR_M = 2.0  # from a border of soils
+OUTLIER = 3.0  # typical errors beyond which a sample does not count
+
+
+@dataclass(frozen=True)
+class JudgedMap:
+    """One map: FIGURES by name; of its cells (rows, columns) the classes, estimated and true, and which were passed."""
+
+    figures: Mapping[str, float]
+    estimated: Ints
+    true: Ints
+    passed: Bools
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """One case with one seed, each map by its name. zeros, scales: errors of the corrections, over their std too.
+
+    applied: errors of the zeros that agents applied in the end. common: whether the common scale is observed, and why
+    not. distrusted: by trust, with reasons.
+    """
+
+    maps: Mapping[str, JudgedMap]
+    zeros: Floats
+    scales: Floats
+    normalised: Floats
+    applied: Floats
+    common: tuple[bool, str]
+    distrusted: Mapping[str, str]
+
+
+def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
+    """Calibrate a case's samples, and judge its maps."""
+    data = tampered(case, recorded, true)
+    names = sorted(data.rows)
+    distrusted = accused(data.rows, calibrated(data.rows))
+    result = calibrated(data.rows, set(distrusted))
+    let_in = {names[index] for index in case.let_in}
+    shown = [name for name in names if name in let_in or name not in distrusted]
+    errors = {name: true_errors(data, name, true, case.spans) for name in shown}
+    by_truth = {name: [as_correction(name, error) for error in errors[name]] for name in shown}
+    own = {name: of_machine(result, name) for name in shown}
+    of_maps: tuple[Mapping[str, Sequence[Correction]], ...] = (dict.fromkeys(shown, ()), own, by_truth)
+    maps = {
+        title: judged({name: corrected(data.rows[name], of_map[name]) for name in shown}, data, true)
+        for title, of_map in zip(MAPS, of_maps, strict=True)
+    }
+    off = [_off(data.rows[name], own[name], error) for name in shown for error in errors[name]]
+    zeros, scales, zero_std, scale_std = np.array(off).T
+    normalised = np.concatenate([zeros / zero_std, scales / scale_std])
+    applied = np.array([data.rows[name]["applied_zero"][-1] - errors[name][-1].zero for name in shown], np.float64)
+    common = result.common.observed, result.common.reason
+    return CaseResult(maps, zeros, scales, normalised, applied, common, distrusted)
+
+
+def served(rows: Rows) -> dict[str, Table]:
+    """The samples that the server folds: of the machines that it trusts, corrected by its calibration."""
+    distrusted = accused(rows, calibrated(rows))
+    result = calibrated(rows, distrusted)
+    return {name: corrected(rows[name], of_machine(result, name)) for name in sorted(rows) if name not in distrusted}
+
+
+def of_machine(result: Calibration, name: str) -> list[Correction]:
+    """The corrections of one machine."""
+    return [each for each in result.corrections if each.machine == name]
+
+
+def accused(rows: Rows, result: Calibration) -> dict[str, str]:
+    """Machines that the server's trust excludes, and why: it judges corrected samples, which come in turn."""
+    auditor = Auditor(CELL_M)
+    right = {name: corrected(table, of_machine(result, name)) for name, table in rows.items()}
+    for first in range(0, max(map(len, right.values())), BATCH):
+        for name, table in sorted(right.items()):
+            auditor.add(name, table[first : first + BATCH])
+    verdicts = auditor.verdicts(result.machines)
+    return {name: ", ".join(verdict.reasons) for name, verdict in verdicts.items() if verdict.contradicts}
+
+
+def calibrated(rows: Rows, excluded: Collection[str] = ()) -> Calibration:
+    """What the server's ledger and solver make of samples."""
+    config, stays = ServerConfig(), {}
+    for name, table in rows.items():
+        ledger = Ledger()
+        ledger.add(table[is_foldable(table, config.fold)])
+        stays[name] = ledger.stays()
+    return calibrate(stays, excluded)
+
+
+def judged(rows: Rows, data: Tampered, true: Scene) -> JudgedMap:
+    """The server's map of these samples, over the cells that the machines truly passed."""
+    truth, c_rr = true.truth, data.c_rr
+    layers = folded(rows.items(), window_of(truth), ("resistance",))
+    estimated, classes = resistance_class(layers["resistance"]), resistance_class(c_rr)
+    tracks_m = [true.tracks[name].place_m for name in data.passed_by or rows]
+    passed = driven_cells(region_of(truth, {}), tracks_m) & (classes != UNKNOWN)
+    inner = passed & (border_distance(classes, truth.cell_m) > INTERIOR_M)
+    steep = passed & (slope_class(truth.grade_east, truth.grade_north) == SLOPE)
+
+    def wrong(where: Bools) -> float:
+        return wrong_percent(estimated[where], classes[where])
+
+    figures = dict(zip(FIGURES, map(wrong, (passed, inner, steep)), strict=True))
+    return JudgedMap(figures, estimated, classes, passed)
+
+
+def as_correction(name: str, error: TrueError) -> Correction:
+    """What takes the true error off."""
+    scale = error.scale / (1 + error.scale)
+    return Correction(name, error.from_ns, error.to_ns, error.zero, scale, error.across, ())
+
+
+def _off(rows: Table, own: Sequence[Correction], error: TrueError) -> tuple[float, float, float, float]:
+    """Errors of a machine's corrections, of the zero and of the scale k, and what they state as standard deviation."""
+    if not own:
+        return -error.zero, -error.scale, ZERO_STD, SCALE_STD
+    stamps = rows["stamp_ns"][(rows["stamp_ns"] >= error.from_ns) & (rows["stamp_ns"] < error.to_ns)]
+    count = np.array([((stamps >= each.from_ns) & (stamps < each.to_ns)).sum() for each in own], np.float64)
+    weight = count / count.sum()
+    zero, scale = weight @ [each.zero for each in own], weight @ [each.scale / (1 - each.scale) for each in own]
+    zero_var, scale_var = (weight @ [each.covariance[i][i] for each in own] for i in (0, 1))
+    return zero - error.zero, scale - error.scale, math.sqrt(zero_var), math.sqrt(scale_var)
+
+
+# --- what the truth shows --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TrueError:
+    """What a machine's samples are off by from a stamp to another, fitted against the truth."""
+
+    from_ns: int
+    to_ns: int
+    zero: float
+    scale: float
+    across: float
+
+
+def true_errors(data: Tampered, name: str, true: Scene, spans: int) -> list[TrueError]:
+    """Zero and scale of what a machine measured, in equal spans of its samples, by least squares to the true ground.
+
+    Samples near borders of soils do not count, nor those further off than OUTLIER typical errors.
+    """
+    rows = measured(data.rows[name])
+    oldest, newest = int(rows["stamp_ns"].min()), int(rows["stamp_ns"].max())
+    ends = [0, *((oldest * (spans - i) + newest * i) // spans for i in range(1, spans)), LAST_NS]
+    out = []
+    for from_ns, to_ns in pairwise(ends):
+        part = rows[(rows["stamp_ns"] >= from_ns) & (rows["stamp_ns"] < to_ns)]
+        out.append(TrueError(from_ns, to_ns, *_fit(part, data.earlier.get(name, data.c_rr), name, true)))
+    return out
+
+
+def _fit(rows: Table, c_rr: Floats32, name: str, true: Scene) -> tuple[float, float, float]:
+    """Zero, scale error k and lateral zero of these samples."""
+    track = true.tracks[name].at(rows["stamp_ns"])
+    at = cells(truth_places(rows, true, name), true)
+    ground, border_m = c_rr[at].astype(np.float64), border_distance(resistance_class(c_rr), true.truth.cell_m)[at]
+    ahead = np.stack([np.cos(track.yaw_rad), np.sin(track.yaw_rad)], axis=1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    d, slope = np.sign(rows["speed_mps"].astype(np.float64)), (track.gradient * ahead).sum(axis=1)
+    gradient = np.stack([rows["grade_e"], rows["grade_n"]], axis=1)
+    across = np.nanmedian(((gradient - track.gradient) * left).sum(axis=1))
+    usable = np.isfinite(rows["c_rr"]) & np.isfinite(slope) & (border_m > INTERIOR_M)
+    columns, off = np.stack([d, d * (d * ground + slope)], axis=1)[usable], (rows["c_rr"] - ground)[usable]
+    first = _least_squares(columns, off)
+    residual = np.abs(off - columns @ first)
+    near = residual < OUTLIER * 1.4826 * np.median(residual)
+    zero, scale = _least_squares(columns[near], off[near]).tolist()
+    return zero, scale, float(across)
+
+
+def _least_squares(A: AnyArray, b: AnyArray) -> Floats:
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], np.float64)

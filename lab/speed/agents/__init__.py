@@ -1,1 +1,0 @@
-"""What runs on a machine: the steps of the filters, and a whole agent."""

@@ -1,0 +1,117 @@
+"""How long `sitegrid fold` takes for an archive: one thread, two threads, processes, a Dask cluster.
+
+Each variant is the whole command, in turn, started by `python -m lab.speed.archive VARIANT ARCHIVE STORE`; the
+archive was just written, so that its files are in the system's cache. Hashes of the snapshots are compared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, cast
+
+from distributed import LocalCluster
+
+from lab.speed.measure import ROOT, Figures, in_child, in_turn, rows_of, say
+from lab.speed.site import SITE
+from mapserver.journal.archive import HOUR_NS, write_file
+from mapserver.journal.rows import JournalRow
+from sitegrid.proof.figures import Row
+from tests.site_work import BATCH, batches
+
+STORE = "0123456789abcdef"
+WORKERS = 2
+OPTIONS = {"samples": 50_000_000, "runs": 1}
+GOALS = {("jobs", "times_one_thread"): ">= 1.6"}
+VARIANTS = ("thread", "threads", "jobs", "dask")
+
+
+def run(samples: int, runs: int) -> Iterator[Row]:
+    """An archive of so many samples, in hourly files of ten machines' work, folded by every variant in turn.
+
+    One thread, two threads of one process, two processes, two workers of a Dask cluster on this host. wall_s, cpu_s of
+    all processes, times_one_thread: how many times as fast. RuntimeError where the maps differ.
+    """
+    with tempfile.TemporaryDirectory() as path:
+        folder, hashes = Path(path), set[str]()
+        say(f"an archive of {samples} samples is written")
+        _write(folder / "archive", samples)
+
+        def folded(name: str) -> Figures:
+            say(f"it is folded: {name}")
+            with tempfile.TemporaryDirectory(dir=folder) as out:
+                figures = in_child("lab.speed.archive", name, str(folder / "archive"), out)
+            hashes.add(figures.pop("hash"))
+            return figures
+
+        took = in_turn({name: partial(folded, name) for name in VARIANTS}, runs)
+    if len(hashes) != 1:
+        raise RuntimeError(f"the maps differ: {hashes}")
+    for name, figures in took.items():
+        yield from rows_of(name, {**figures, "times_one_thread": took["thread"]["wall_s"] / figures["wall_s"]})
+
+
+def _write(folder: Path, samples: int) -> None:
+    """Write an archive: hours of reception, each when its last sample was stamped."""
+    hour: list[tuple[JournalRow, int]] = []
+    for row in _rows(samples):
+        if hour and row.received_ns // HOUR_NS != hour[0][1] // HOUR_NS:
+            write_file(folder, STORE, SITE, iter(hour))
+            hour = []
+        hour.append((row, row.received_ns))
+    write_file(folder, STORE, SITE, iter(hour))
+
+
+def _rows(samples: int) -> Iterator[JournalRow]:
+    sent: Counter[str] = Counter()
+    for number, (name, batch) in enumerate(islice(batches(), max(1, samples // BATCH)), start=1):
+        yield JournalRow(number, name, 1, sent[name] + 1, batch, int(batch["stamp_ns"][-1]))
+        sent[name] += len(batch)
+
+
+def fold_timed(variant: str, archive: Path, out: Path) -> dict[str, Any]:
+    """Fold as one variant does it."""
+    if variant == "thread":
+        os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])  # which a fold respects
+    with _engine(variant) as words:
+        command = [sys.executable, "-m", "sitegrid.cli", "fold", str(archive), "--out", str(out), "--json", *words]
+        start_s = time.perf_counter()
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)  # noqa: S603
+        wall_s = time.perf_counter() - start_s
+    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    (snapshot,) = out.glob("snapshot-*.npz")
+    return {
+        "wall_s": wall_s,
+        "cpu_s": sum(each.ru_utime + each.ru_stime for each in usage),
+        "peak_mb": max(each.ru_maxrss for each in usage) * 1024 / 1e6,
+        "hash": hashlib.sha256(snapshot.read_bytes()).hexdigest()[:16],
+    }
+
+
+@contextmanager
+def _engine(variant: str) -> Iterator[list[str]]:
+    """Options of a variant, and the cluster that they name."""
+    if variant != "dask":
+        yield ["--jobs", str(WORKERS)] if variant == "jobs" else []
+        return
+    cluster_of = cast("Any", LocalCluster)  # without types
+    options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
+    with cluster_of(n_workers=WORKERS, threads_per_worker=1, **options) as cluster:
+        yield ["--engine", cluster.scheduler_address.replace("tcp://", "dask://")]
+
+
+if __name__ == "__main__":
+    print(json.dumps(fold_timed(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))))

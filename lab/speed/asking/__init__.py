@@ -1,1 +1,0 @@
-"""Queries of a real server: how soon they are answered, and what many clients cost the machines."""

@@ -1,0 +1,115 @@
+"""A whole fleet at one map server: how fast batches are acknowledged, what that costs, and how many it takes.
+
+Also the link of one agent at work, in real time: its bytes by TCP with Zenoh's framing, acknowledgements and signs of
+life; TLS and the headers of TCP and IP come on top.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+from lab.speed.measure import ROOT, Figures, in_child, rows_of
+from lab.speed.site import SESSIONS, SITE, Machine, Site, fleet, send_all, session, settle, used
+from mapserver.journal.archive import write_file
+from mapserver.journal.location import JournalLocation
+from protocol.site.site_file import load_site
+from protocol.wire import keys
+from sitegrid.proof.figures import Row
+from tests.memory import memory_mb
+from tests.site_work import BATCH, HOURS, START_NS, samples_of, write_store
+from tests.tcp_proxy import Proxy
+
+OPTIONS = {"machines": 500, "seconds": 70.0, "hours": HOURS}
+LOADS = {"paced": 1.0, "saturated": 0.0}  # seconds from batch to batch of a machine
+GOALS = {
+    ("paced", "refused"): "<= 0",
+    ("paced", "ack_ms_p99"): "<= 150",
+    ("paced", "server_cores"): "<= 0.6",
+    ("paced", "disk_mb_per_s"): "<= 7",
+    ("saturated", "samples_per_s"): ">= 25000",
+}
+SITE_FILE = ROOT / "config" / "site.toml"
+LAG_S = 100.0  # from a place on the road to its sample: what comes before is not the usual traffic
+SPEED = 1.0  # of the agent's drive: health and acknowledgements are by the clock
+
+
+def run(machines: int, seconds: float, hours: float) -> Iterator[Row]:
+    """Machines that send to a server with a store of so many hours of work, paced, then as fast as they are served.
+
+    Figures: samples a second that were acknowledged, refused batches, milliseconds until an acknowledgement, cores and
+    the most memory of server and router, what the server writes. Agent: bytes a second of its link and samples a
+    second, for as long; bytes of a sample in an archive, whose files are compressed: made-up samples would take fewer.
+    """
+    with tempfile.TemporaryDirectory() as path, Site(Path(path)) as site, ExitStack() as opened:
+        write_store(Path(path), SITE, samples_of(hours) // BATCH, tail_rows=0)
+        server = opened.enter_context(site.serving())
+        links = [opened.enter_context(session(site.endpoint)) for _ in range(min(machines, SESSIONS))]
+        senders = fleet(links, machines)
+        settle(server)
+        for name, period_s in LOADS.items():
+            yield from rows_of(name, _measured(server, site.router, senders, seconds, period_s))
+    with tempfile.TemporaryDirectory() as path:
+        yield from rows_of("agent", _agent_link(Path(path), seconds))
+
+
+def _measured(server: int, router: int, senders: list[Machine], seconds: float, period_s: float) -> Figures:
+    written = _written_bytes(server)
+    with used(server, router) as cores:
+        sent = send_all(senders, seconds, period_s)
+    return {
+        **sent.figures,
+        "server_cores": cores[0],
+        "router_cores": cores[1],
+        "server_mb": memory_mb("VmHWM", server),
+        "router_mb": memory_mb("VmHWM", router),
+        "disk_mb_per_s": (_written_bytes(server) - written) / sent.took_s / 1e6,
+    }
+
+
+def _written_bytes(process: int) -> int:
+    """What a process has had written to disks."""
+    lines = Path(f"/proc/{process}/io").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("write_bytes"))
+
+
+def _agent_link(folder: Path, seconds: float) -> Figures:
+    """An agent that replays a simulated drive. Somebody listens to its pose and health: else they are never sent."""
+    log, store, config = folder / "log", folder / "store", load_site(SITE_FILE)
+    store.mkdir()
+    words = ("--record", log, "--machines", 1, "--seconds", SPEED * seconds + 2 * LAG_S, "--speed", 0)
+    in_child("sitegrid.cli", "sim", *map(str, words))
+    with ExitStack() as opened:
+        site = opened.enter_context(Site(store, config))
+        opened.enter_context(site.serving())
+        link = opened.enter_context(Proxy(int(site.endpoint.rpartition(":")[2])))
+        listener = opened.enter_context(session(site.endpoint))
+        for key in (keys.poses_all(config.name), keys.health_all(config.name)):
+            listener.declare_subscriber(key, lambda _: None)
+        replay = ("--driver", "replay", "--log", log / "loader-1" / "log.toml", "--speed", SPEED)
+        site.start("agent", "agent", "--endpoint", link.endpoint, "--spool", folder / "spool.db", *replay)
+        time.sleep(LAG_S / SPEED)
+        before, began_s = (link.carried("there"), link.carried("back"), _acknowledged(store)), time.monotonic()
+        time.sleep(seconds)
+        after, took_s = (link.carried("there"), link.carried("back"), _acknowledged(store)), time.monotonic() - began_s
+    up, down, rate = ((now - then) / took_s for now, then in zip(after, before, strict=True))
+    return {"up_b_per_s": up, "down_b_per_s": down, "samples_per_s": rate, "archive_b_per_sample": _archived(store)}
+
+
+def _acknowledged(store: Path) -> int:
+    with JournalLocation(store).reader() as journal:
+        return sum(mark.seq for mark in journal.watermarks().values())
+
+
+def _archived(store: Path) -> float:
+    """Bytes of a sample in an archive of all of a journal as one file."""
+    location = JournalLocation(store)
+    with location.reader() as journal:
+        rows = ((row, START_NS) for row in journal.read())
+        path = write_file(location.archive.folder, journal.identity().id, SITE, rows)
+    if path is None:
+        raise RuntimeError("the journal is empty: nothing was measured")
+    return path.stat().st_size / _acknowledged(store)

@@ -1,1 +1,0 @@
-"""Archives that are folded by processes and clusters."""

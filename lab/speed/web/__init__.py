@@ -1,1 +1,0 @@
-"""The web server, as people and tools meet it."""

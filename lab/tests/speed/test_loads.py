@@ -1,0 +1,265 @@
+"""The loads of `python -m lab speed`: one law over all of them, and what they measure with."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
+from lab.speed import agent, fleet, ingest, merge, query, restart, scaling, sim, site
+from lab.speed import filter as filters
+from lab.speed.__main__ import LOADS, OPTIONS, load_of, main
+from lab.speed.measure import in_turn, judged, rows_of, scattered, track
+from mapserver.evidence.grid import Grid
+from mapserver.ingest.store import Store
+from mapserver.journal.location import JournalLocation
+from protocol.errors import Refusal
+from protocol.wire.codec import decode_batch
+from protocol.wire.messages import Ack, Refused
+from tests.paths import DOCS
+from tests.site_work import START_NS, batches, samples_of, seconds_of, write_store
+
+# The smallest size of each load, and cases that it must have.
+SMALLEST = {
+    "merge": ("--samples 1000 --runs 1", [f"track, {name}" for name in merge.variants()]),
+    "ingest": ("--samples 250 --runs 1", ["SQLite, 6 in a batch, 1 in a commit", "SQLite", "PostgreSQL"]),
+    "fleet": ("--machines 8 --seconds 3 --hours 0.02", ["paced", "saturated", "agent"]),
+    "live": ("--hours 0.05 --seconds 2", ["writer", "fold", "look", "audit", "snapshot", "sum"]),
+    "query": (
+        "--hours 0.1 --queries 2",
+        ["cold way", "cold as_of", "warm way", "warm as_of"],
+    ),
+    "restart": ("--samples 1950 --hours 0.02 --runs 1", ["open, rows of 6", "fold, 2 threads", "grid", "server"]),
+    "filter": ("--steps 3 --runs 1", ["stock ukf, predict", "ekf, update rate", "ukf and smoother", "agent"]),
+    "sim": ("--seconds 0.5 --runs 2", ["pybullet, 1", "fast, 3"]),
+    "archive": ("--samples 20000 --runs 1", ["thread", "threads", "jobs", "dask"]),
+    "followers": ("--machines 4 --seconds 2 --hours 0.02 --runs 1", ["alone", "readers", "readers and followers"]),
+}
+COLUMNS = ["case", "figure", "value", "goal", "met"]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What no option makes small."""
+    monkeypatch.setattr(sim, "FLEETS", (("paper_site", "pybullet", 1, 1.0), ("busy_site", "fast", 3, 1.0)))
+    monkeypatch.setattr(filters, "SMOOTHER_S", 20)
+    monkeypatch.setattr(filters, "AGENT_S", 20)
+    monkeypatch.setattr(ingest, "BATCHES", (6, 100))
+    monkeypatch.setattr(fleet, "SPEED", 20.0)
+    monkeypatch.setattr(restart, "TAIL_SAMPLES", 700)
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", LOADS)
+def test_every_load_prints_figures_in_the_same_columns(name, small, capsys):
+    words, cases = SMALLEST[name]
+    assert main([name, "--json", *words.split()]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["load"] == name
+    rows = printed["rows"]
+    assert all(list(row) == COLUMNS for row in rows)
+    assert not set(cases) - {row["case"] for row in rows}
+    assert len({(row["case"], row["figure"]) for row in rows}) == len(rows)
+    values = [row["value"] for row in rows if row["value"] is not None]
+    assert all(math.isfinite(value) for value in values)
+    assert sum(value > 0 for value in values) > len(values) / 2
+    judgements = {(row["case"], row["figure"]): row["goal"] for row in rows if row["goal"]}
+    if name not in ("ingest", "sim"):  # PostgreSQL may be missing; fleets are others here
+        assert judgements == dict(load_of(name).GOALS)
+
+
+def test_a_table_has_the_columns_of_the_json(monkeypatch, capsys):
+    monkeypatch.setattr(sim, "run", lambda **_: rows_of("pybullet, 1", {sim.PACE: 26.0, "none": None}))
+    main(["sim"])
+    head, first, second = capsys.readouterr().out.splitlines()
+    assert head.split() == COLUMNS
+    assert first.split() == ["pybullet,", "1", sim.PACE, "26.0", ">=", "25", "True"]
+    assert second.split()[-4:] == ["none", "-", "-", "-"]
+
+
+@pytest.mark.parametrize("name", LOADS)
+def test_an_option_that_does_nothing_for_a_load_or_is_not_positive_is_refused(name, capsys):
+    own = load_of(name).OPTIONS
+    words = [[f"--{option}", "2"] for option in OPTIONS if option not in own]
+    words += [[f"--{option}", value] for option in own for value in ("0", "-1", "many", "nan")]
+    for bad in words:
+        with pytest.raises(SystemExit) as refusal:
+            main([name, *bad])
+        assert refusal.value.code == 2
+        assert bad[0] in capsys.readouterr().err
+
+
+def test_variants_take_turns_and_medians_count():
+    order = []
+    drawn = {"a": iter((3.0, 1.0, 2.0)), "b": iter((9.0, 8.0, 7.0))}
+
+    def variant(name):
+        def run():
+            order.append(name)
+            return {"x": next(drawn[name])}
+
+        return run
+
+    assert in_turn({name: variant(name) for name in drawn}, 3) == {"a": {"x": 2.0}, "b": {"x": 8.0}}
+    assert order == ["a", "b"] * 3
+
+
+def test_a_goal_that_is_missed_or_not_measured_is_not_met():
+    goals = {("a", "x"): "<= 2", ("a", "y"): ">= 2", ("b", "x"): "<= 2"}
+    rows = [*rows_of("a", {"x": 2.0, "y": 1.9, "z": 1.0}), *rows_of("b", {"x": None})]
+    assert [row["met"] for row in judged(rows, goals)] == [True, False, None, False]
+
+
+@pytest.mark.parametrize("draw", [track, scattered])
+def test_both_plain_sums_are_those_of_bincount(draw):
+    rows = draw(3000)
+    rows["x_m"][1::2], rows["y_m"][1::2] = rows["x_m"][::2], rows["y_m"][::2]  # cells that are hit again
+    cell = np.floor(rows["y_m"]).astype(int) * merge.SIDE + np.floor(rows["x_m"]).astype(int)
+    value = rows["c_rr"].astype(float)
+    expected = [np.bincount(cell, weights, merge.SIDE**2) for weights in (None, value, value * value)]
+    assert expected[0].max() >= 2
+    for add in (merge.add_at, merge.add_by_loop):
+        total = merge.sums()
+        for part in (rows[:1000], rows[1000:]):
+            add(total, part)
+        np.testing.assert_allclose(total, np.stack(expected, axis=1), rtol=1e-9, atol=1e-15)
+
+
+def test_a_second_of_site_time_is_read_at_once():
+    rows = track(250)  # 10 ms apart, the first one at the beginning of a second
+    parts = list(merge.spans(rows, merge.SECOND_NS))
+    assert [len(part) for part in parts] == [100, 100, 50]
+    assert np.concatenate(parts).tobytes() == rows.tobytes()
+
+
+def test_own_and_stock_filters_move_alike():
+    start = filters._start()
+    moves = filters.motion(filters.MODEL, start, 0.3)
+    np.testing.assert_allclose(filters._stock_motion(start.x, 0.3), moves.f(start.x[None])[0], atol=1e-14)
+
+
+def test_the_agents_readings_come_at_their_rates_and_give_a_pose():
+    pipeline = Pipeline(agent.SITE, agent.machine(), PipelineConfig())
+    for readings in agent.bundles(20):
+        counts = {s.name: sum(r.sensor == s.name for r in readings) for s in agent.machine().sensors}
+        assert counts == {"imu": 100, "wheels": 50, "gps-1": 5, "gps-2": 5}
+        pipeline.step(readings)
+    assert pipeline.pose is not None
+    assert math.dist((pipeline.pose.x_m, pipeline.pose.y_m), agent.place(agent.progress(20)[0])[:2]) < 1.0
+
+
+def test_a_fold_that_lacks_samples_is_no_measurement(tmp_path, monkeypatch):
+    write_store(tmp_path, site.SITE, 20, tail_rows=20)
+    assert restart.fold(tmp_path, 2)["samples"] == 2000
+    monkeypatch.setattr(restart, "fold_history", lambda *_, **__: True)
+    with pytest.raises(RuntimeError, match="0 of 2000 samples are in the grid"):
+        restart.fold(tmp_path, 2)
+
+
+@pytest.mark.slow
+def test_no_place_is_asked_for_twice_and_all_are_where_somebody_drove():
+    work = list(islice(batches(), 50))
+    driven = np.concatenate([rows for _, rows in work])
+    asked = query.kinds(work)
+    points, regions, past = (list(islice(asked[name], 100)) for name in ("point", "region", "as_of"))
+    half = query.REGION_M / 2
+    places = [(q.x_m, q.y_m) for q in points + past] + [(q.area.west_m + half, q.area.south_m + half) for q in regions]
+    cells = set(map(tuple, np.floor(np.stack([driven["x_m"], driven["y_m"]], axis=1)).tolist()))
+    assert len(set(places)) == 300
+    assert set(places) <= cells
+    assert {q.when.as_of_ns for q in past} <= set(driven["stamp_ns"].tolist())
+    tracks = set(zip(driven["x_m"].tolist(), driven["y_m"].tolist(), strict=True))
+    assert all(set(route.line) <= tracks for route in islice(asked["route"], 5))
+
+
+# --- machines that send ----------------------------------------------------------------------------------------------
+
+
+class Link:
+    """Stands for a session: takes batches as a server does, but refuses some and answers at once."""
+
+    def __init__(self) -> None:
+        self.taken: Counter[str] = Counter()
+        self.refuse = 0
+
+    def get(self, key: str, handler, payload: bytes, timeout: float) -> None:
+        sent = decode_batch(payload, 1e9)
+        assert sent.first_seq == self.taken[sent.machine] + 1  # each sample once, in order
+        assert (len(sent.rows), key.rsplit("/", 1)[-1]) == (site.SAMPLES, sent.machine)
+        self.refuse -= 1
+        if self.refuse >= 0:
+            self.answers.put((self.number, 0.0, Refused(Refusal.OVERLOADED, "", retry_after_s=0.01)))
+            return
+        self.taken[sent.machine] += len(sent.rows)
+        self.answers.put((self.number, 0.0, Ack(sent.last_seq, 1)))
+
+
+def test_a_machine_that_was_refused_sends_the_same_again(monkeypatch):
+    link, real = Link(), site._ask
+    link.refuse = 2
+
+    def ask(one, number, answers) -> None:
+        link.number, link.answers = number, answers
+        real(one, number, answers)
+
+    monkeypatch.setattr(site, "_ask", ask)
+    result = site.send_all(site.fleet([link], 2), 0.05, 0.02)
+    assert result.refused == 2
+    assert result.samples == sum(link.taken.values()) > 0
+    assert len(result.ms) * site.SAMPLES == result.samples
+
+
+def test_a_refusal_that_stays_ends_the_measurement():
+    (one,) = site.fleet([Link()], 1)
+    with pytest.raises(RuntimeError, match="refused a batch"):
+        site._take(one, Refused(Refusal.WRONG_FRAME, ""), 0.0, 1.0, site.Sent())
+
+
+# --- a site's work ---------------------------------------------------------------------------------------------------
+
+
+def test_work_drives_a_tenth_of_a_square_kilometre():
+    rows = np.concatenate([rows for _, rows in islice(batches(), samples_of(2.0) // 100)])
+    driven = {(x, y) for x, y in zip((rows["x_m"] // 10).tolist(), (rows["y_m"] // 10).tolist(), strict=True)}
+    roads = sum(min(x % 25, 24 - x % 25) == 0 or min(y % 25, 24 - y % 25) == 0 for x, y in driven)
+    assert 0.95 * len(driven) < roads <= len(driven)  # along roads every 250 m, errors of position aside
+    assert rows["distance_m"].sum() == pytest.approx(10 * 3.0 * 2 * 3600, rel=0.01)
+
+
+def test_work_is_a_function_of_its_seed_and_a_second_has_what_ten_machines_drive_in_it():
+    one, same, other = (next(batches(seed))[1] for seed in (1, 1, 2))
+    assert one.tobytes() == same.tobytes() != other.tobytes()
+    first = next(seconds_of(batches()))
+    assert len({name for name, _ in first}) == len(first) == 10
+    assert {len(rows) for _, rows in first} == {6}
+    assert samples_of(10.0) == 2_160_000
+
+
+def test_a_store_with_a_snapshot_and_a_tail_holds_the_same_grid_as_folding_all_of_it(tmp_path):
+    write_store(tmp_path, site.SITE, 20, tail_rows=7)
+    store, grid = (
+        Store(JournalLocation(tmp_path), site.SITE, restart.CONFIG, lambda: START_NS),
+        Grid(1.0, restart.CONFIG.fold),
+    )
+    for name, rows in islice(batches(), 20):
+        grid.fold(rows, name)
+    one, other = store.grid.state(), grid.state()
+    store.close()
+    assert one.folded == other.folded == 2000
+    assert [at.page.votes.tobytes() for at in one.pages] == [at.page.votes.tobytes() for at in other.pages]
+
+
+def test_the_page_of_many_sites_has_the_tables_that_follow_from_what_was_measured():
+    page = (DOCS / "scaling.md").read_text()
+    assert [table.splitlines()[0] for table in scaling.tables() if table not in page] == []
+    small, large = scaling.Needs(10, 10), scaling.Needs(1000, 500)
+    assert (large.sites, large.samples) == (2, pytest.approx(100 * small.samples))
+    assert scaling.carried(0.5) == scaling.carried(1.0) // 2
