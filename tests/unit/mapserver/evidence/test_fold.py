@@ -21,11 +21,6 @@ def weight_of(grid: Grid, block: tuple[int, int] = (0, 0)) -> np.ndarray:
     return grid.evidence([block]).weight[0].reshape(16, 16)
 
 
-def cell_count(grid: Grid) -> int:
-    """Largest count of any cell in any of its votes."""
-    return max(int(at.page.votes["count"].max()) for at in grid.state().pages)
-
-
 # --- weights ---------------------------------------------------------------------------------------------------------
 
 metres = st.floats(-20_000, 20_000)

@@ -95,20 +95,6 @@ def deliver(writer: Writer, seed: int, n: int = 40, machine: str = "a", first_se
     send(writer, [incoming(random_samples(n, seed), first_seq, machine, spool_id=1 + seed)])
 
 
-def test_a_follower_has_the_map_of_the_server_bit_for_bit_from_its_start_and_as_rows_come_in(tmp_path):
-    with closing(open_writer(tmp_path)) as writer:
-        for seed in range(5):
-            deliver(writer, seed, machine="ab"[seed % 2])
-        with following(tmp_path) as one:
-            catches_up(one, writer)
-            for seed in range(5, 12):
-                deliver(writer, seed, machine="abc"[seed % 3])
-                catches_up(one, writer)
-            rows, seconds = one.behind()
-            assert rows == 0
-            assert 0 <= seconds < 5
-
-
 def test_a_follower_that_is_started_before_the_server_waits_for_it(tmp_path):
     with following(tmp_path / "store") as one:
         with pytest.raises(QueryError) as refused:
@@ -129,24 +115,6 @@ def test_a_follower_goes_on_while_the_server_starts_again(tmp_path):
         with closing(open_writer(tmp_path)) as again:
             deliver(again, 2)
             catches_up(one, again)
-
-
-def test_decisions_and_corrections_in_mid_run_make_the_same_map(tmp_path):
-    with closing(open_writer(tmp_path)) as writer, closing(Refolding(writer, past_of(writer))) as refolding:
-        for seed in range(4):
-            deliver(writer, seed, machine="abc"[seed % 3])
-        with following(tmp_path) as one:
-            catches_up(one, writer)
-            whole = one.run(lambda replica: replica.grid.counts().folded)
-            refolding.wait(refolding.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)), WAIT_S)
-            catches_up(one, writer)
-            assert one.run(lambda replica: replica.facts.excluded) == {"b"}
-            assert one.run(lambda replica: replica.grid.counts().folded) < whole
-            deliver(writer, 9, machine="b")  # what is not in the map counts in no time
-            deliver(writer, 10, machine="c")
-            catches_up(one, writer)
-            refolding.wait(refolding.decide(TrustDecision("b", True, PERSON, "repaired", NOW_NS)), WAIT_S)
-            catches_up(one, writer)
 
 
 def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_path, monkeypatch):
@@ -377,23 +345,6 @@ def test_a_decision_of_a_newer_version_ends_it(tmp_path):
         writer.run(lambda store: store.journal.append_event("calibration", NOW_NS, body))
         wait_for(lambda: one.ended)
         assert "open it with that version" in one.ended
-
-
-def test_a_damaged_row_is_named_and_the_map_says_how_far_behind_it_is(tmp_path, caplog):
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-
-        def damage(store) -> None:
-            store.journal._db.execute("INSERT INTO journal VALUES (2, x'00')")
-            store.journal._db.execute("INSERT INTO extent SELECT 2, 1, 1, 0, 0, 1, 1, 0")
-
-        writer.run(damage)
-        wait_for(lambda: one.behind()[0] == 1 and "journal row 2" in caplog.text)
-        assert not one.ended
-        assert version(one).row == 1
-        writer.run(lambda store: store.journal._db.execute("DELETE FROM journal WHERE row = 2"))
-        writer.run(lambda store: store.journal._db.execute("DELETE FROM extent WHERE row = 2"))
 
 
 def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):

@@ -105,22 +105,6 @@ def judged(sent, machine="a", site=SITE):
     judge(sent, machine, site, now_ns)
 
 
-def test_a_good_batch_passes():
-    judged(batch(samples(3), 5, lost_before=2))
-
-
-def test_a_batch_under_the_key_of_another_machine_is_refused():
-    with pytest.raises(MessageError, match="'a' sends under the key of 'b'") as caught:
-        judged(batch(samples()), machine="b")
-    assert caught.value.reason == Refusal.WRONG_MACHINE
-
-
-def test_a_batch_of_another_site_frame_is_refused():
-    with pytest.raises(MessageError, match="compare the site files") as caught:
-        judged(batch(samples(), frame="deadbeef"))
-    assert caught.value.reason == Refusal.WRONG_FRAME
-
-
 def test_a_stamp_ahead_of_the_wall_clock_is_refused_where_the_site_says_so():
     wall = replace(SITE, clock="wall", clock_tolerance_s=2.0)
     at_limit, beyond = (samples(3, stamp_ns=[NOW_NS - 10**12, NOW_NS + ahead, NOW_NS]) for ahead in (2e9, 2.1e9))

@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 
 from mapserver.ingest.batches import decode_batches
 from protocol.errors import MessageError
-from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import COLUMNS, GRADE, LIMITS, RESISTANCE, SAMPLE_DTYPE
 from protocol.wire.codec import decode_batch, encode_batch
-from protocol.wire.messages import SampleBatch
 from tests.unit.mapserver.data import batch, random_samples, samples
 
 EXTENT_M = 20_000.0
@@ -94,16 +92,6 @@ def test_each_limit_is_that_of_the_protocol(name):
         are_equal([good, payload, good])
         verdicts.add(isinstance(one_by_one(payload), MessageError))
     assert verdicts == {True, False}
-
-
-def test_stamps_are_compared_as_integers():
-    """As floats, the nanosecond beyond the year 2100 would be the last one of it."""
-    assert float(MAX_STAMP_NS + 1) == float(MAX_STAMP_NS)
-    rows = samples(2, stamp_ns=[MAX_STAMP_NS, MAX_STAMP_NS + 1])
-    (first, second) = (encode_batch(batch(rows[i : i + 1], 1)) for i in (0, 1))
-    accepted, refused = decode_batches([first, second], EXTENT_M)
-    assert isinstance(accepted, SampleBatch)
-    assert (refused.field, refused.row) == ("stamp_ns", 0)
 
 
 def test_refused_ones_leave_the_others_as_they_are():

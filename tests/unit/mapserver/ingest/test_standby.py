@@ -124,8 +124,13 @@ def test_after_a_failed_read_it_tries_again_ever_more_seldom(location, standby, 
 def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
     with closing(opened(location)) as store:
         send(store, 1, 2)
-        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
         standby.follow(5.0)
+        row, grid = standby.grid_for(store.journal, store.facts)
+        assert (row, same(grid, store.grid)) == (2, True)
+        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        assert standby.grid_for(store.journal, facts) is None, "the grid of other facts"
+        standby.follow(5.0)
+        assert standby.grid_for(store.journal, store.facts) is None
         send(store, 1, 3, machine="b")
         standby.follow(5.0)
         assert standby.row == 5

@@ -66,14 +66,6 @@ def test_a_group_is_answered_in_order(store):
     assert (store.merged, store.journalled, store.grid.folded) == (3, 3, 10)
 
 
-def test_a_refused_batch_leaves_no_trace(store):
-    bad = samples(3, speed_mps=[1.0, 1e6, 1.0])
-    answer = store.commit([incoming(bad)])[0]
-    assert answer == Refused(Refusal.OUT_OF_RANGE, "speed_mps[1]: 1e+06: not between -100 and 100", 0)
-    assert store.journalled == store.grid.folded == 0
-    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1, store=store.identity.id)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_sent_at_least_once_is_merged_exactly_once(store, seed):
     rows, draw = random_samples(120, seed), np.random.default_rng(seed)
@@ -113,18 +105,6 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
     }
 
 
-@pytest.mark.parametrize("method", ["begin", "append"])
-def test_a_journal_that_cannot_be_written_refuses(store, monkeypatch, method):
-
-    def locked(*_):
-        raise UnwrittenError("journal", "database is locked")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(store.journal, method, locked)
-        assert store.commit([incoming(samples(3))])[0].reason == Refusal.STORE
-    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1, store=store.identity.id)
-
-
 def test_losses_and_repeats_are_counted(store):
     store.commit([incoming(samples(3)), incoming(samples(2), 2), incoming(samples(1), 10, lost_before=6)])
     assert store.counters == {"batches": 2, "samples_trimmed": 2, "samples_lost": 6}
@@ -154,34 +134,6 @@ def test_info_tells_the_state_in_plain_values(store):
         "newest_ns": NOW_NS + 2 * 10**9,
         "missing": 0,
     }
-
-
-def test_now_is_the_newest_accepted_stamp_also_after_a_restart(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(2, stamp_ns=[500, 300])), incoming(samples(1, stamp_ns=400), machine="b")])
-    assert store.newest_ns == 500
-    store.close()
-    store = open_store(tmp_path)
-    assert store.newest_ns == 500
-    store.close()
-
-
-def test_a_restart_goes_on_where_it_ended(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(3)), incoming(samples(1), machine="b")])
-    store.close()
-    store = open_store(tmp_path)
-    assert store.commit([incoming(samples(5))])[0] == Ack(5, 3, trimmed=3, store=store.identity.id)
-    assert store.grid.folded == 6
-    store.close()
-
-
-def test_a_second_server_on_a_store_is_refused_until_the_first_ends(tmp_path):
-    store = open_store(tmp_path)
-    with pytest.raises(StoreError, match="another server is using this store"):
-        open_store(tmp_path)
-    store.close()
-    open_store(tmp_path).close()
 
 
 def test_a_store_that_cannot_be_opened_is_let_go(tmp_path):
@@ -347,15 +299,6 @@ def test_a_store_keeps_its_id_and_so_does_a_copy_of_it(tmp_path):
     for name in ("a", "copy"):
         with closing(open_store(tmp_path / name)) as again:
             assert again.identity == identity
-
-
-def test_a_damaged_id_is_found_when_the_store_is_opened(tmp_path):
-    open_store(tmp_path).close()
-    with closing(sqlite3.connect(tmp_path / "journal.db")) as db:
-        db.execute("UPDATE meta SET value = replace(value, substr(value, 1, 1), 'x') WHERE key = 'store'")
-        db.commit()
-    with pytest.raises(StoreError, match="the store of the journal is damaged"):
-        open_store(tmp_path)
 
 
 def test_a_run_that_is_bound_to_another_store_is_refused_until_a_person_accepts_that_one(tmp_path):

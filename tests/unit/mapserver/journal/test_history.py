@@ -1,11 +1,10 @@
 from collections.abc import Iterator
-from pathlib import Path
 from threading import Thread
 
 import numpy as np
 import pytest
 
-from mapserver.journal.archive import FOLDER, HOUR_NS, Archive, archive
+from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.rows import Admission, JournalRow, Selection
 from mapserver.journal.sqlite.journal import SqliteJournal
@@ -110,12 +109,4 @@ def test_a_missing_file_is_no_silent_gap(tmp_path):
     history.archive.paths()[1].unlink()
     with pytest.raises(StoreError, match="the file with row 2 is missing"):
         list(history_rows(history))
-    journal.close()
-
-
-def test_an_archive_stands_beside_its_journal(tmp_path):
-    journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
-    history = history_beside(journal)
-    assert (history.journal, history.archive.folder) == (journal, Path(tmp_path / FOLDER))
-    assert isinstance(history.archive, Archive)
     journal.close()

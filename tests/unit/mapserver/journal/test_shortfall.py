@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import random
 import shutil
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -197,18 +195,3 @@ def test_readers_beside_the_journal_need_no_mark(folder):
     mark_path(folder / "journal.db").unlink()
     with SqliteReader(folder / "journal.db") as reader:
         assert reader.last_row == 2 * BATCHES
-
-
-@pytest.fixture
-def lax_umask() -> Iterator[None]:
-    before = os.umask(0)
-    yield
-    os.umask(before)
-
-
-@pytest.mark.usefixtures("lax_umask")
-def test_only_its_owner_reads_the_files_of_a_journal(tmp_path):
-    with closing(open_journal(tmp_path / "store")) as journal:
-        write(journal, "loader-1", 1)
-        modes = {path.name: path.stat().st_mode & 0o777 for path in (tmp_path / "store").iterdir()}
-    assert modes == dict.fromkeys(("journal.db", "journal.db-wal", "journal.db-shm", "journal.db-mark"), 0o600)

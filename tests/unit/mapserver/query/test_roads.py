@@ -211,22 +211,6 @@ def test_bounds_off_the_site_are_refused(writer):
     assert refused.value.reason == Refusal.OUT_OF_RANGE
 
 
-@pytest.mark.parametrize(
-    "query",
-    [
-        SegmentsQuery(),
-        SegmentsQuery(5, 7, 9, Bounds(-1, -2, 3, 4), "a"),
-        WorklistQuery(),
-        PointQuery(1.0, 2.0, when=When(5, 6, repairs=True)),
-        WhyQuery(1.0, 2.0),
-        WhyQuery(1.0, 2.0, 5, repairs=True),
-        WorklistQuery(0.03, 0.4, 7, 5, 7, 9, Bounds(-1, -2, 3, 4), "a b"),
-    ],
-)
-def test_queries_survive_the_wire(query):
-    assert parse_query(query.name, encode_query(query)) == query
-
-
 def test_traffic_of_one_stamp_is_no_division_by_nothing(tmp_path):
     rows = passes(LINE, 1)
     rows["stamp_ns"] = START_NS

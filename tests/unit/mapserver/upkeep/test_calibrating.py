@@ -79,14 +79,6 @@ def of_ledgers(job: Calibrating) -> Calibration:
     return replace(job.solve()[0], begins_ns={})
 
 
-def test_the_errors_of_machines_are_found(writer):
-    deliver(writer)
-    found_out = solved(writer).machines
-    for name, errors in (("a", Errors(zero=0.008)), ("b", Errors(-0.006, 0.05)), ("c", Errors(0.0, -0.04))):
-        assert found_out[name].zero == pytest.approx(errors.zero, abs=0.002)
-    assert found_out["b"].scale - found_out["c"].scale == pytest.approx(0.09, abs=0.02)
-
-
 def test_followed_live_made_at_a_start_or_from_the_archive_ledgers_are_the_same(writer, tmp_path, monkeypatch):
     live, _ = calibrating(writer)
     with closing(live):
