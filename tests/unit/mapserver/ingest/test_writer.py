@@ -251,15 +251,6 @@ def test_work_between_batches_is_done_and_sees_those_before(start):
     assert seen[0] >= 2
 
 
-def test_waiting_for_a_merged_row_returns_once_it_is(start):
-    writer, called = start(), Future()
-    writer.waits.add(2, WAIT_S, called.set_result)
-    send(writer, [incoming(samples(1))])
-    assert not called.done()
-    send(writer, [incoming(samples(1), 2)])
-    assert called.result(WAIT_S) is None
-
-
 def test_waiting_for_a_row_that_does_not_come_times_out(start):
     writer = start()
     send(writer, [incoming(samples(1))])
@@ -587,12 +578,3 @@ def test_every_reason_to_refuse_is_provoked_here():
     elsewhere |= {Refusal.NOT_HERE}  # which followers say
     elsewhere |= {Refusal.UNKNOWN_MACHINE, Refusal.EXPIRED}  # commands and tiles, in the tests of the answers
     assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
-
-
-def test_refused_queries_are_counted_by_reason(start):
-    writer = start()
-    for _ in range(2):
-        writer.count("refused_query_unknown_layer")
-    writer.count("refused_query_too_large")
-    counters = writer.info()["counters"]
-    assert (counters["refused_query_unknown_layer"], counters["refused_query_too_large"]) == (2, 1)

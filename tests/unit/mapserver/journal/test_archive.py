@@ -433,14 +433,6 @@ def test_nothing_is_forgotten_before_file_and_name_are_on_disk(day, monkeypatch)
     assert done == ["sync", "replace", "sync folder", "rename", "sync folder", "forget"]
 
 
-def test_what_a_kill_left_half_written_is_removed(day):
-    day.folder.mkdir()
-    for name in (ar.TEMPORARY, f".{ar.TEMPORARY}.{os.getpid()}.0.part"):
-        (day.folder / name).write_bytes(b"half")
-    day.archive()
-    assert len(list(day.folder.iterdir())) == 3
-
-
 KILLED = """
 import os, signal, sys
 from importlib import import_module

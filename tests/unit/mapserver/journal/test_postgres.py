@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -603,14 +603,20 @@ def test_a_long_dump_holds_nobody_up(tmp_path, database):
 # --- replicas ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def pair() -> Iterator[tuple[Cluster, Cluster]]:
+@contextmanager
+def synchronous_pair() -> Iterator[tuple[Cluster, Cluster]]:
     """A primary and its synchronous replica."""
     with server.cluster() as primary, server.replica(primary, "b") as replica:
         primary.sql("ALTER SYSTEM SET synchronous_standby_names = 'b'")
         primary.sql("SELECT pg_reload_conf()")
         wait_for(lambda: primary.sql("SELECT sync_state FROM pg_stat_replication") == [("sync",)])
         yield primary, replica
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[Cluster, Cluster]]:
+    with synchronous_pair() as both:
+        yield both
 
 
 @pytest.mark.slow
