@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import Store
 from mapserver.journal.history import history_rows
 from mapserver.journal.journal import ArchivedError, Journal, JournalReader, JournalState, UnwrittenError
@@ -25,7 +24,18 @@ from protocol.site.geometry import Bounds
 from protocol.wire.codec import pack, unpack
 from protocol.wire.messages import Ack, Refused
 from tests.postgres_server import Database
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, incoming, now_ns, random_samples, same, samples
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    batch,
+    fold_of,
+    incoming,
+    now_ns,
+    random_samples,
+    same,
+    samples,
+)
 
 
 @dataclass
@@ -354,11 +364,9 @@ def test_after_a_fault_at_any_statement_nothing_is_lost_or_double(place, number,
 
 def assert_whole(store: Store, sent: dict[str, Any]) -> None:
     """Each sample is in the journal once, bit for bit, and the grid is the fold of them."""
-    expected = Grid(SITE.cell_m, CONFIG.fold)
     there: dict[str, list[bytes]] = {machine: [] for machine in sent}
     for row in history_rows(store.history):
         there[row.machine] += [sample.tobytes() for sample in row.rows]
-        expected.fold(row.rows, row.machine)
     assert there == {machine: [sample.tobytes() for sample in rows] for machine, rows in sent.items()}
-    assert same(store.grid, expected)
+    assert same(store.grid, fold_of(history_rows(store.history)))
     assert store.merged == store.journalled == store.journal.state().row

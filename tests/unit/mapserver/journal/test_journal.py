@@ -15,7 +15,7 @@ from mapserver.journal.sqlite.reader import SqliteQueries, SqliteReader
 from mapserver.journal.writing import meta_line
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, put, random_samples, samples
 
 
 def newest_ns(journal: SqliteJournal | SqliteReader) -> int:
@@ -341,9 +341,7 @@ def test_a_new_journal_goes_on_after_an_archive(tmp_path):
         journal.follow_archive(20, marks)
         assert (journal.last_row, journal.archived_row, journal.watermarks()) == (20, 20, marks)
         assert journal.samples == 56
-        journal.begin()
-        journal.append(Admission(batch(samples(3), 51), trimmed=0, lost=0), NOW_NS)
-        journal.commit()
+        put(journal, batch(samples(3), 51))
         journal.check()
     with closing(SqliteJournal(tmp_path / "journal.db", "pit", SITE.frame)) as again:
         assert (again.last_row, again.archived_row, again.samples, again.shortfall) == (21, 20, 59, None)

@@ -35,7 +35,18 @@ from tests import postgres_server as server
 from tests.pooler import SwappingPooler
 from tests.postgres_server import Cluster, Database
 from tests.tcp_proxy import Proxy, Weather
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, past_of, random_samples, same, wait_for
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    fold_of,
+    incoming,
+    now_ns,
+    past_of,
+    random_samples,
+    same,
+    wait_for,
+)
 
 YEAR_NS = 365 * 86400 * 10**9
 
@@ -204,11 +215,8 @@ def test_a_holder_that_says_nothing_loses_the_lock_by_itself(tmp_path, database)
             assert same(second.grid, folded_by(second))
 
 
-def folded_by(store: Store) -> Any:
-    grid = Grid(SITE.cell_m, CONFIG.fold)
-    for row in history_rows(store.history):
-        grid.fold(row.rows, row.machine)
-    return grid
+def folded_by(store: Store) -> Grid:
+    return fold_of(history_rows(store.history))
 
 
 def test_a_holder_that_stops_in_the_middle_of_a_message_loses_the_lock(tmp_path, database):

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from mapserver.journal.rows import Admission, Watermark
+from mapserver.journal.rows import Watermark
 from mapserver.journal.shortfall import KIND, Shortfall, SpoolShortfall, missing
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.disk.high_water_mark import mark_path
 from protocol.errors import StoreError
-from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, put, random_samples
 
 MACHINES = ("loader-1", "loader-2")
 BATCHES, SAMPLES = 10, 100  # of each machine, of each batch
@@ -26,10 +26,7 @@ def open_journal(folder: Path) -> SqliteJournal:
 
 
 def write(journal: SqliteJournal, machine: str, first_seq: int, n: int = SAMPLES, lost: int = 0) -> None:
-    journal.begin()
-    sent = batch(random_samples(n, first_seq), first_seq, machine=machine)
-    journal.append(Admission(sent, trimmed=0, lost=lost), NOW_NS)
-    journal.commit()
+    put(journal, batch(random_samples(n, first_seq), first_seq, machine=machine), lost=lost)
 
 
 @pytest.fixture(scope="module")
