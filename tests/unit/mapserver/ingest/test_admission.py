@@ -39,12 +39,6 @@ def test_what_is_there_already_is_trimmed(first, n, watermark, new, trimmed):
         assert admission.batch.first_seq == new[0]
 
 
-def test_a_gap_is_refused_with_the_expected_number():
-    with pytest.raises(GapError, match="sample 4 is expected next") as caught:
-        admit(numbered(6, 2), 3)
-    assert (caught.value.expected, caught.value.reason, caught.value.field) == (4, Refusal.GAP, "first_seq")
-
-
 @pytest.mark.parametrize(("lost_before", "lost"), [(2, 2), (3, 2), (5, 2)])
 def test_a_gap_that_is_declared_lost_is_taken_and_counted(lost_before, lost):
     admission = admit(numbered(6, 2, lost_before=lost_before), 3)
@@ -60,13 +54,6 @@ def test_a_gap_of_which_too_little_is_declared_lost_is_refused(lost_before):
 def test_nothing_is_lost_that_has_arrived_already():
     admission = admit(numbered(6, 2, lost_before=5), 6)
     assert (numbers(admission), admission.lost, admission.trimmed) == ([7], 0, 1)
-
-
-@pytest.mark.parametrize("watermark", [0, 3, 1000])
-@pytest.mark.parametrize("first", [1, 50])
-def test_an_empty_batch_asks_for_the_watermark(watermark, first):
-    admission = admit(numbered(first, 0), watermark)
-    assert (admission.watermark, admission.trimmed, admission.lost) == (watermark, 0, 0)
 
 
 @given(st.lists(st.tuples(st.integers(0, 39), st.integers(1, 15), st.integers(1, 3)), max_size=30), st.integers(1, 40))

@@ -85,9 +85,8 @@ def ended(code: str, number: signal.Signals = signal.SIGTERM) -> tuple[int, str,
     return process.returncode, output, errors, time.monotonic() - begin_s
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_who_ends_in_time_ends_as_it_likes(number: signal.Signals):
-    code, output, errors, _ = ended(STUBBORN.format(end_s=15, late_s=0), number)
+def test_who_ends_in_time_ends_as_it_likes():
+    code, output, errors, _ = ended(STUBBORN.format(end_s=15, late_s=0))
     assert (code, output, errors) == (3, "done\n", "")
 
 
