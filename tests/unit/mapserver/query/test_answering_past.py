@@ -279,7 +279,7 @@ def test_answers_about_the_past_travel_as_bytes(answers):
 def test_the_upkeep_is_asked(served):
     upkeep = FakeUpkeep()
     answers = served(upkeep=upkeep)
-    commands = Commands(answers._source._writer, upkeep, answers.info)  # type: ignore[arg-type]
+    commands = Commands(answers.writer, upkeep, answers.info)  # type: ignore[arg-type]
     machines = codec.decode_machines(answered(answers, "machines", {"after": "1"})).machines
     assert [(machine.name, machine.trusted) for machine in machines] == [("a", True), ("b", False)]
     changes = codec.decode_changes(answered(answers, "changes", {"after": "41"})).changes

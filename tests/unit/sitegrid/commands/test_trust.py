@@ -43,7 +43,6 @@ CHANGE = GroundChange(4, T0, T0 + 60 * 10**9, (10.0, -20.0, 40.0, 12.5), 615, 0.
 UNKNOWN = dict.fromkeys(("zero", "zero_std", "scale", "scale_std", "across", "across_std"))
 KNOWN = {"zero": 0.0025, "zero_std": 0.0005, "scale": -0.03, "scale_std": 0.005, "across": 0.0, "across_std": 0.001}
 SPANS = (CorrectedSpan(0, T0, 0.1, 0.0, 0.0, 10.0), CorrectedSpan(T0, 2**62, 0.00251, -0.03, 0.0, 10.0))
-BY = ("heights", "crossings")
 CALIBRATION = CalibrationAnswer(
     STORE,
     17,
