@@ -143,12 +143,12 @@ def test_an_empty_transaction_is_no_row(journal, reader):
 
 
 def test_lost_samples_are_summed_and_move_the_watermark_alone(journal, reader):
-    write(journal, admission(), admission(2, 6, lost=2))
+    write(journal, admission(), admission(2, 6, lost=2), admission(1, 9, lost=1))
     journal.begin()
-    journal.declare_lost(Admission(batch(samples(0), 14), trimmed=0, lost=6))
+    journal.declare_lost(Admission(batch(samples(0), 16), trimmed=0, lost=6))
     journal.commit()
-    assert (reader.watermarks()["a", 7].seq, reader.watermarks()["a", 7].lost) == (13, 2 + 6)
-    assert reader.last_row == 2
+    assert (reader.watermarks()["a", 7].seq, reader.watermarks()["a", 7].lost) == (15, 2 + 1 + 6)
+    assert reader.last_row == 3
 
 
 def test_events_are_numbered_and_all_or_none(journal, reader):

@@ -79,19 +79,6 @@ def test_a_region_is_cut_from_its_blocks(answers, bounds):
     assert np.isfinite(expected).any()
 
 
-def test_a_region_far_away_is_unknown(answers):
-    far = region(answers, 10_000, 10_000, 10_020, 10_010)
-    assert far["grade_east"].shape == (10, 20)
-    assert np.isnan(far["grade_east"]).all()
-    assert far.merged == 1
-
-
-def test_no_names_give_all_layers(answers):
-    here = region(answers, 0, -5, 5, 0, names=())
-    assert tuple(here.layers) == tuple(LAYERS)
-    assert all(layer.dtype == np.float32 for layer in here.layers.values())
-
-
 def test_many_blocks_are_read_in_pieces_and_put_together(tmp_path, monkeypatch):
     monkeypatch.setattr("mapserver.evidence.grid.READ_BLOCKS", 3)
     rows = random_samples(300, 3)

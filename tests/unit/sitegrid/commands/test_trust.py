@@ -27,7 +27,6 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
 from sitegrid.client import Client, connect
 from sitegrid.commands import query
-from sitegrid.door import build_parser
 from sitegrid.process.lifetime import plain
 from tests.unit.records import STORE, machine_state, version
 
@@ -359,9 +358,3 @@ def test_a_reader_that_leaves_ends_what_is_followed(server: FakeServer, monkeypa
         assert sitegrid(server, "query", "changes", "--follow") == 0
         monkeypatch.undo()
     assert stop.is_set()
-
-
-def test_json_may_stand_before_or_behind_the_query():
-    for words in (["query", "--json", "machines"], ["query", "machines", "--json"]):
-        assert build_parser().parse_args(words).json
-    assert not build_parser().parse_args(["query", "machines"]).json
