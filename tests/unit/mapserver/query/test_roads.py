@@ -524,7 +524,7 @@ def test_roads_of_a_map_that_is_there_at_the_start_are_made_at_once_and_none_aft
     answers.close()  # never begun
     answers = answers_of(repaired[0])
     answers.start()
-    wait_for(lambda: answers.info()["counters"][ROADS_MADE])
+    wait_for(lambda: answers.info()["counters"].get(ROADS_MADE))
     answers.close()
     wait_for(lambda: "roads" not in {thread.name for thread in threading.enumerate()})
     with closing(open_writer(tmp_path / "empty")) as opened, closing(RoadMaps(source_of(opened))) as empty:
