@@ -117,16 +117,6 @@ def test_hours_and_bounds_choose(writer):
     assert rows.total_kwh_ph < worklist(answers).total_kwh_ph
 
 
-def test_what_comes_in_shows_at_once_and_as_after_a_restart(writer, tmp_path):
-    answers = answers_of(writer)
-    segments(answers)
-    more = passes(LINE, 4, 0.08, seed=2, after_s=7200.0)
-    send(writer, [incoming(more, 1, machine="c")])
-    assert worklist(answers) == worklist(answers_of(writer))
-    assert segments(answers) == segments(answers_of(writer))
-    assert worklist(answers).rows[0].segment.resistance > 0.055
-
-
 @pytest.mark.parametrize("size", [37, 10_000])
 def test_shuffled_and_rebatched_samples_give_the_same_list(tmp_path, size):
     """Two machines on one road that was repaired, and on one of their own; whoever sends first, in whatever pieces."""

@@ -59,6 +59,8 @@ def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
         assert max(there.totals.braked_j, back.totals.braked_j) < 0.01 * back.totals.energy_j  # of one border
         assert there.totals.time_s == pytest.approx(80 / SLOW.speed_mps)
         assert there.machine == SLOW
+        for name in ("energy_j", "time_s"):
+            assert getattr(there.steps, name).sum() == pytest.approx(getattr(there.totals, name))
         assert (there.merged, there.totals.unknown, there.line_m.tolist()) == (1, 0.0, [[-40, 5], [40, 5]])
 
 

@@ -52,16 +52,6 @@ def test_on_a_plane_a_route_costs_resistance_and_height() -> None:
     assert steps.slope == pytest.approx(np.full(8, totals.lift_m / 200))
 
 
-def test_two_soils_cost_what_each_costs_and_stand_in_their_steps() -> None:
-    soils = np.where(np.arange(SIZE) < 110, 0.02, 0.06) + np.zeros((SIZE, 1))
-    steps, totals = route(line((10, 50), (210, 50)), fields(soils), SLOW, stops=ROLLING)
-    assert totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 100 + 0.06 * 100), rel=2e-3)
-    assert steps.resistance[[0, -1]] == pytest.approx([0.02, 0.06])
-    assert steps.energy_j.sum() == pytest.approx(totals.energy_j)
-    assert steps.time_s.sum() == pytest.approx(totals.time_s)
-    assert steps.distance_m[-1] == pytest.approx(200)
-
-
 def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
     ahead = line((10, 10), (170, 130))
     _, sure = route(ahead, fields(0.03, std=0.001), SLOW)

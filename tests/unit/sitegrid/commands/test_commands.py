@@ -116,11 +116,6 @@ def test_server_refuses_an_unknown_option(files: Path, capsys):
     assert not (files / "store").exists()
 
 
-def test_router_says_where_it_cannot_listen(capsys):
-    assert main(["router", "--insecure", "--listen", "tcp/192.0.2.1:7447"]) == 1
-    assert "tcp/192.0.2.1:7447: cannot listen here" in capsys.readouterr().err
-
-
 # --- options that only act inside a running command -------------------------------------------------------------------
 
 
