@@ -267,17 +267,6 @@ def test_lanes_that_disagree_leave_the_scale_at_the_data_sheet() -> None:
         assert {each.scale for each in result.corrections if each.machine == name} == {0.0}
 
 
-def test_many_places_that_step_on_their_own_leave_the_scale_at_the_data_sheet() -> None:
-    def borders(x_m: Floats, y_m: Floats, _: Floats) -> Floats:
-        """Borders of soils at the foot of two of three lanes, which have nothing to do with the slope."""
-        up, down = (y_m < 17.0) & (x_m > FOOT_M), (y_m > 32.0) & (x_m < FOOT_M)
-        return 0.03 + 0.02 * up + 0.02 * down
-
-    result = solve(fleet(borders))
-    assert result.common.reason == "places_disagree"
-    assert not result.common.observed
-
-
 def test_a_ramp_that_is_only_ever_climbed_shows_no_scale() -> None:
     rows = drive(RAMP, Errors(scale=0.1))
     climbed = rows[rows["y_m"] < 25.0]  # the rest is not sampled
@@ -411,13 +400,6 @@ def test_a_fault_is_one_also_against_ground_that_may_itself_be_off_by_what_data_
         state = result.machines["bad"]
         assert state.scale == pytest.approx(scale, abs=0.1)
         assert (state.beyond[1] > FAULT_SIGMAS[1]) == fault
-
-
-def test_a_scale_against_ground_whose_scale_nobody_knows_is_not_applied() -> None:
-    result = solve(with_bad(0.1, off_m=0.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x)), ("bad",))
-    assert not result.common.observed
-    assert {each.scale for each in result.corrections} == {0.0}
-    assert result.machines["bad"].scale_std == pytest.approx(SCALE_STD, rel=0.05)
 
 
 def test_on_level_ground_a_gain_unlike_all_others_is_a_fault_and_corrected() -> None:

@@ -404,6 +404,7 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
                 assert same(one.past.grid_as_of(reader, LAST), other.grid)
 
 
+@pytest.mark.nightly
 def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_it_is(tmp_path, caplog):
     with server.cluster() as primary, server.replica(primary, "b") as replica:
         database = primary.new_database()

@@ -238,19 +238,6 @@ def test_nobody_looks_at_a_store_that_is_closed_or_failed(start, monkeypatch):
         writer.look(lambda store: store.merged)
 
 
-def test_work_between_batches_is_done_and_sees_those_before(start):
-    writer, replies, seen = start(), Replies(), []
-    with held(writer):
-        writer.submit(incoming(samples(2)), replies[0])
-        reader = threading.Thread(target=lambda: seen.append(writer.run(lambda store: store.grid.folded)))
-        reader.start()
-        wait_for(lambda: writer._works)
-        writer.submit(incoming(samples(2), 3), replies[1])
-    reader.join(WAIT_S)
-    replies.wait(2)
-    assert seen[0] >= 2
-
-
 def test_waiting_for_a_row_that_does_not_come_times_out(start):
     writer = start()
     send(writer, [incoming(samples(1))])

@@ -627,7 +627,7 @@ def pair() -> Iterator[tuple[Cluster, Cluster]]:
         yield both
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # make test has the lock, the epoch and what a restore leaves
 def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_acknowledges_nothing(tmp_path, pair):
     primary, replica = pair
     database = primary.new_database()

@@ -75,7 +75,7 @@ def test_a_real_dump_holds_neither_writer_nor_follower_up_and_is_a_backup(tmp_pa
         assert send(store, 6).watermark == 10
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_base_backup_of_a_live_primary_has_what_was_acknowledged_before_it_began(tmp_path):
     with server.cluster() as primary, server.cluster_folder() as folder:
         database, copy = primary.new_database(), Cluster(folder)
@@ -110,7 +110,7 @@ def test_a_base_backup_of_a_live_primary_has_what_was_acknowledged_before_it_beg
             copy.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_commit_that_an_operator_stops_from_waiting_for_its_replica_is_not_acknowledged(tmp_path):
     with synchronous_pair() as (primary, replica):
         for end in ("pg_cancel_backend", "pg_terminate_backend"):
