@@ -9,6 +9,7 @@ from threading import Event, Thread
 from typing import Any
 
 import numpy as np
+import pytest
 import zenoh
 
 from mapserver.config import ServerConfig
@@ -24,6 +25,7 @@ from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Admission, JournalRow
 from mapserver.past.past import Past
 from protocol.arrays import Table
+from protocol.errors import MessageError, QueryError, Refusal
 from protocol.machine.samples import empty
 from protocol.site.geometry import CellWindow
 from protocol.site.site_config import SiteConfig
@@ -201,6 +203,14 @@ def open_writer(
 
 def past_of(writer: Writer) -> Past:
     return Past.of_store(writer.location.folder, writer.site.cell_m, writer.config.fold)
+
+
+@contextmanager
+def refused(reason: Refusal, match: str = "") -> Iterator[None]:
+    """What is within is refused, for this reason and in these words."""
+    with pytest.raises((QueryError, MessageError), match=match) as caught:
+        yield
+    assert caught.value.reason == reason
 
 
 class Replies:

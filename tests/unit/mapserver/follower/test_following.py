@@ -39,6 +39,7 @@ from tests.unit.mapserver.data import (
     open_writer,
     past_of,
     random_samples,
+    refused,
     same,
     send,
     wait_for,
@@ -97,9 +98,8 @@ def deliver(writer: Writer, seed: int, n: int = 40, machine: str = "a", first_se
 
 def test_a_follower_that_is_started_before_the_server_waits_for_it(tmp_path):
     with following(tmp_path / "store") as one:
-        with pytest.raises(QueryError) as refused:
+        with refused(Refusal.NOT_HERE):
             one.run(lambda replica: replica.version)
-        assert refused.value.reason == Refusal.NOT_HERE
         assert one.behind() == (0, float("inf"))
         with closing(open_writer(tmp_path / "store")) as writer:
             deliver(writer, 1)

@@ -35,6 +35,7 @@ from tests.unit.mapserver.data import (
     incoming,
     open_writer,
     random_samples,
+    refused,
     same,
     samples,
     send,
@@ -408,9 +409,8 @@ def test_a_probe_waits_for_nobody_and_hears_of_a_writer_that_hangs(start):
         clock.now_s += HANGS_S
         assert writer.alive() == ServerAlive(writer.store_id, 1, 1, HANGS_S)
         clock.now_s += 1.0
-        with pytest.raises(QueryError, match="at one piece of work for 31 s") as caught:
+        with refused(Refusal.STORE, "at one piece of work for 31 s"):
             writer.alive()
-        assert caught.value.reason == Refusal.STORE
     turn(writer)
     writer.close()
     with pytest.raises(QueryError, match="the server is ending"):
@@ -553,9 +553,8 @@ QUERIES = [
 @pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
 def test_a_refused_query_says_why(start, reason, name, parameters):
     writer = start()
-    with pytest.raises(QueryError) as caught:
+    with refused(reason):
         answered(answers_of(writer), name, parameters)
-    assert caught.value.reason == reason
 
 
 def test_every_reason_to_refuse_is_provoked_here():

@@ -22,9 +22,9 @@ from mapserver.layers.cell_layers import (
 )
 from mapserver.layers.gap_filling import AREA_LAYERS
 from protocol.config import from_table
-from protocol.errors import ConfigError, QueryError, Refusal
+from protocol.errors import ConfigError, Refusal
 from protocol.site.ground_classes import BOUNDARIES, SLOPE_LIMIT, ZONES
-from tests.unit.mapserver.data import NOW_NS, folded, samples
+from tests.unit.mapserver.data import NOW_NS, folded, refused, samples
 
 CELL = 8 * 16 + 8  # of the usual sample in its block
 RESISTANCE_LAYERS = ("resistance", "resistance_std", "resistance_class", "confidence")
@@ -308,9 +308,8 @@ def test_cells_with_too_little_evidence_are_unknown():
 def test_no_names_mean_all_layers_of_cells_and_an_unknown_one_is_named():
     assert select([]) == tuple(LAYERS)
     assert select(["grade", "resistance_filled", "visits"]) == ("grade", "resistance_filled", "visits")
-    with pytest.raises(QueryError, match=r"`colour`.*resistance_class.*resistance_filled") as caught:
+    with refused(Refusal.UNKNOWN_LAYER, r"`colour`.*resistance_class.*resistance_filled"):
         select(["grade", "colour"])
-    assert caught.value.reason == Refusal.UNKNOWN_LAYER
 
 
 def test_what_an_area_needs_is_read_once_from_cells():
