@@ -1,7 +1,7 @@
 """Samples, batches and stores for the tests of the map server."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +9,7 @@ from threading import Event, Thread
 from typing import Any
 
 import numpy as np
+import pytest
 import zenoh
 
 from mapserver.config import ServerConfig
@@ -19,9 +20,12 @@ from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import CompactPages, Page
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal.journal import Journal
 from mapserver.journal.location import JournalLocation
+from mapserver.journal.rows import Admission, JournalRow
 from mapserver.past.past import Past
 from protocol.arrays import Table
+from protocol.errors import MessageError, QueryError, Refusal
 from protocol.machine.samples import empty
 from protocol.site.geometry import CellWindow
 from protocol.site.site_config import SiteConfig
@@ -90,6 +94,22 @@ def batch(rows: Table, first_seq: int = 1, machine: str = "a", spool_id: int = 7
 
 def incoming(rows: Table, first_seq: int = 1, machine: str = "a", spool_id: int = 7, **more: Any) -> Incoming:
     return Incoming(machine, encode_batch(batch(rows, first_seq, machine, spool_id, **more)))
+
+
+def put(journal: Journal, sent: SampleBatch, received_ns: int = NOW_NS, lost: int = 0) -> None:
+    """One batch as one row of a journal."""
+    journal.begin()
+    journal.append(Admission(sent, trimmed=0, lost=lost), received_ns)
+    journal.commit()
+
+
+def fold_of(rows: Iterable[JournalRow], without: Container[str] = ()) -> Grid:
+    """The map of journal rows, folded from the first one on."""
+    grid = Grid(SITE.cell_m, CONFIG.fold)
+    for row in rows:
+        if row.machine not in without:
+            grid.fold(row.rows, row.machine)
+    return grid
 
 
 def folded(rows: Table, machine: str = "a", cell_m: float = 1.0, waiting_rows: int = LIVE_ROWS, **options: Any) -> Grid:
@@ -183,6 +203,14 @@ def open_writer(
 
 def past_of(writer: Writer) -> Past:
     return Past.of_store(writer.location.folder, writer.site.cell_m, writer.config.fold)
+
+
+@contextmanager
+def refused(reason: Refusal, match: str = "") -> Iterator[None]:
+    """What is within is refused, for this reason and in these words."""
+    with pytest.raises((QueryError, MessageError), match=match) as caught:
+        yield
+    assert caught.value.reason == reason
 
 
 class Replies:

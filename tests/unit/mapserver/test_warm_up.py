@@ -38,7 +38,7 @@ print(json.dumps([before, sorted(set(ready()))]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_nobody_who_asks_for_roads_and_routes_waits_for_a_kernel():
     done = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, check=False, timeout=170)
     assert done.returncode == 0, done.stderr

@@ -1,5 +1,6 @@
-"""Whom a client asks: followers and the server stood for by a session that answers from a table."""
+"""Whom a client asks, and what it does with answers that are no simple ones: a session answers from a table."""
 
+import time
 from collections import Counter
 from types import SimpleNamespace
 
@@ -8,7 +9,7 @@ import pytest
 
 from protocol.errors import LinkError, QueryError, Refusal
 from protocol.queries import answer_codec as codec
-from protocol.queries.answers import Piece, PointAnswer, Region, ServerAlive
+from protocol.queries.answers import GroundChange, Piece, PointAnswer, Region, ServerAlive
 from protocol.queries.origin import Origin, encode_origin
 from protocol.queries.requests import AliveQuery, Freshness, InfoQuery, PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
@@ -17,7 +18,7 @@ from protocol.wire.codec import pack
 from protocol.wire.messages import VERSION
 from sitegrid import asking
 from sitegrid.asking import Asker, Followers, preferred
-from sitegrid.client import Client
+from sitegrid.client import REGION_ATTEMPTS, Client
 from tests.unit.records import STORE, map_info, version
 
 POINT = codec.encode_point(PointAnswer(0.5, 1.5, {"visits": 2.0}, version(17, 3), 5))
@@ -26,10 +27,14 @@ SILENT, HANGS, UNREADABLE = "nobody", "hangs", "unreadable"
 
 
 class Site:
-    """A session with a site: followers by name and the server, "", each with what it answers."""
+    """A session with a site: followers by name and the server, "", each with what it answers.
 
-    def __init__(self, **answers: bytes | QueryError | str) -> None:
+    server: answers of the server one after the other, the last one for ever.
+    """
+
+    def __init__(self, *server: bytes | QueryError, **answers: bytes | QueryError | str) -> None:
         self.answers: dict[str, bytes | QueryError | str] = {"": POINT, **answers}
+        self._next = list(server)
         self.asked: list[tuple[str, str]] = []
         self.timeouts: list[float] = []
 
@@ -42,6 +47,8 @@ class Site:
         name = parts[3] if parts[2] == "follower" else ""
         self.asked.append((name, f"{parts[-1]}?{selector.parameters}"))
         self.timeouts.append(timeout)
+        if not name and self._next:
+            self.answers[""] = self._next.pop(0)
         answer = self.answers.get(name, SILENT)
         if answer == SILENT:
             return []
@@ -178,7 +185,7 @@ def test_pieces_of_a_region_are_asked_of_whoever_has_the_first(monkeypatch):
             gone.append(name)
             site.answers.pop(name)
         if name in site.answers:
-            site.answers[name] = codec.encode_region(piece_of(int(query == "piece")))
+            site.answers[name] = piece(int(query == "piece"))
         return asked(selector, timeout)
 
     monkeypatch.setattr(site, "get", get)
@@ -189,11 +196,13 @@ def test_pieces_of_a_region_are_asked_of_whoever_has_the_first(monkeypatch):
     assert client.origin.follower == other
 
 
-def piece_of(number: int) -> Region:
+def piece(number: int, merged: int = 7) -> bytes:
     """One of two pieces of 1 x 2 cells."""
     place = Piece(9, number, 2, 0, number, 1, 2)
     layers = {"visits": np.full((1, 1), number, np.float32)}
-    return Region(np.array([0.5]), np.array([0.5 + number]), 1.0, layers, version(7, 0), 5, place)
+    return codec.encode_region(
+        Region(np.array([0.5]), np.array([0.5 + number]), 1.0, layers, version(merged, 0), 5, place)
+    )
 
 
 def test_tokens_of_others_name_no_follower():
@@ -211,3 +220,59 @@ def test_a_region_that_nobody_reads_to_its_end_is_asked_of_others():
     with pytest.raises(QueryError, match="does not answer any more") as refused:
         asker(site).ask(query, at=Origin("a"))
     assert refused.value.reason == Refusal.EXPIRED
+
+
+# --- a server alone ---------------------------------------------------------------------------------------------------
+
+BUSY = QueryError(Refusal.OVERLOADED, "too much to do", 0.05)
+EXPIRED = QueryError(Refusal.EXPIRED, "gone")
+
+
+def client(*answers: bytes | QueryError, timeout_s: float = 10.0) -> tuple[Client, Site]:
+    site = Site(*answers)
+    return Client(site, "tcp/localhost:1", "pit", timeout_s), site  # type: ignore[arg-type]
+
+
+def test_a_server_that_has_too_much_to_do_is_asked_again_when_it_says():
+    asking, site = client(BUSY, BUSY, POINT)
+    began_s = time.monotonic()
+    assert asking.point(0, 0).values == {"visits": 2.0}
+    assert len(site.asked) == 3
+    assert time.monotonic() - began_s >= 2 * BUSY.retry_after_s
+
+
+@pytest.mark.parametrize(
+    ("answers", "most"), [([BUSY], 10), ([QueryError(Refusal.OUT_OF_RANGE, "too far")], 1)], ids=["busy", "refused"]
+)
+def test_a_server_that_stays_busy_is_asked_until_the_time_is_over_and_one_that_refuses_once(answers, most):
+    asking, site = client(*answers, timeout_s=0.3)
+    with pytest.raises(QueryError, match="too"):
+        asking.point(0, 0)
+    assert min(2, most) <= len(site.asked) <= most
+
+
+def test_pieces_are_asked_for_one_after_the_other():
+    asking, site = client(piece(0), piece(1))
+    shown: list[tuple[int, int]] = []
+    region = asking.region((0, 0, 1, 2), progress=lambda here, count: shown.append((here, count)))
+    assert region["visits"].tolist() == [[0], [1]]
+    assert site.asked[1] == ("", "piece?cursor=9;number=1")
+    assert shown == [(1, 2), (2, 2)]
+
+
+def test_a_region_that_expired_is_asked_for_again_from_its_first_piece_so_many_times():
+    asking, site = client(piece(0), EXPIRED, piece(0, 8), piece(1, 8))
+    assert asking.region((0, 0, 1, 2)).merged == 8
+    assert len(site.asked) == 4
+    asking, site = client(*[piece(0), EXPIRED] * REGION_ATTEMPTS)
+    with pytest.raises(QueryError, match="gone"):
+        asking.region((0, 0, 1, 2))
+    assert len(site.asked) == 2 * REGION_ATTEMPTS
+
+
+def test_more_changes_than_one_answer_holds_are_asked_for(monkeypatch):
+    monkeypatch.setattr(codec, "MAX_CHANGES", 2)
+    changes = [GroundChange(i, 1, 1, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, None) for i in (3, 4, 5)]
+    asking, site = client(*(codec.encode_changes(some, version(1, 0)) for some in (changes[:2], changes[2:])))
+    assert asking.changes(2) == changes
+    assert site.asked[1][1].endswith("after=4")

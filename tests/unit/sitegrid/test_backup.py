@@ -33,7 +33,7 @@ from sitegrid.process.children import wait_until
 from tests.unit.sitegrid.refold.archives import SITE, T0, samples
 
 pytest.importorskip("pyarrow.parquet")
-KILLS, WAIT_S = 12, 60.0
+KILLS, WAIT_S = 4, 60.0
 
 
 def rows_of(number: int) -> Table:

@@ -133,15 +133,6 @@ def test_detection_off_leaves_everything():
     assert now.counts.sum() == everything.counts.sum()
 
 
-@pytest.mark.parametrize("grounds", [[OLD, NEW, OLD], [OLD, OLD, OLD, NEW, OLD], [OLD, OLD, NEW, NEW, OLD]])
-def test_ground_that_was_different_for_a_while_is_read_as_it_is(grounds):
-    """Whether the short time is cut off or outvoted."""
-    grid = Grid(1.0, FoldConfig())
-    for hour, c_rr in enumerate(grounds):
-        grid.fold(lane(hour, -16, -16, 32, 32, c_rr=c_rr), "a")
-    assert np.allclose(resistance(read(grid))[area(-16, -16, 32, -2)], OLD, rtol=0.05)
-
-
 def test_of_two_changes_the_last_counts_and_dates():
     grid = Grid(1.0, FoldConfig())
     for hour, c_rr in enumerate([OLD, OLD, NEW, NEW, 0.01]):

@@ -21,11 +21,6 @@ def weight_of(grid: Grid, block: tuple[int, int] = (0, 0)) -> np.ndarray:
     return grid.evidence([block]).weight[0].reshape(16, 16)
 
 
-def cell_count(grid: Grid) -> int:
-    """Largest count of any cell in any of its votes."""
-    return max(int(at.page.votes["count"].max()) for at in grid.state().pages)
-
-
 # --- weights ---------------------------------------------------------------------------------------------------------
 
 metres = st.floats(-20_000, 20_000)
@@ -109,20 +104,6 @@ def test_weight_falls_off_with_the_covariance():
     assert weight[7, 8] == weight[9, 8]
 
 
-def test_correlation_turns_the_spread():
-    rows = samples(cov_xx_m2=1.0, cov_yy_m2=1.0, cov_xy_m2=0.9, distance_m=100.0)
-    weight = weight_of(folded(rows))
-    assert weight[9, 9] == weight[7, 7] > 10 * weight[9, 7]
-    assert weight[9, 7] == weight[7, 9]
-
-
-def test_a_parked_machine_has_no_vote():
-    grid = folded(samples(5, distance_m=0.0))
-    assert grid.known_cells() == 0
-    assert not total(grid).any()
-    assert not grid.state().pages
-
-
 # --- order and batching ----------------------------------------------------------------------------------------------
 
 
@@ -152,19 +133,6 @@ def test_no_count_wraps_before_it_is_packed(batch):
 
 
 # --- what votes for what ---------------------------------------------------------------------------------------------
-
-
-def test_a_sample_without_resistance_votes_for_grade_alone():
-    counts = total(folded(samples(c_rr=np.nan, c_rr_var=np.nan)))
-    assert not counts[ev.RESISTANCE].any()
-    assert counts[ev.GRADE_EAST].sum() == counts[ev.GRADE_NORTH].sum() == counts[ev.HEADING].sum() == UNITS
-
-
-def test_a_sample_without_grade_votes_for_resistance_alone():
-    counts = total(folded(samples(grade_e=np.nan, grade_n=np.nan, grade_var=np.nan)))
-    assert not counts[ev.GRADE_EAST].any()
-    assert not counts[ev.GRADE_NORTH].any()
-    assert counts[ev.RESISTANCE].sum() == UNITS
 
 
 @pytest.mark.parametrize(("c_rr", "bin_"), [(-0.5, 0), (0.0, 0), (0.004, 0), (0.4, 23), (5.0, 23)])
@@ -199,18 +167,6 @@ def test_neighbouring_zones_are_at_least_two_bins_apart():
 )
 def test_heading_sectors_are_centred_on_east(heading, sector):
     assert total(folded(samples(heading_rad=heading)))[ev.HEADING].argmax() == sector
-
-
-def test_a_machine_and_its_visit_set_one_bit_each_and_stay():
-    rows = samples(3, stamp_ns=NOW_NS + np.array([0, 1, 59]) * 10**9)
-    assert bits_set(folded(rows)) == [1, 1]  # within a minute: one visit
-    later = folded(samples(2, stamp_ns=NOW_NS + np.array([0, 120]) * 10**9))
-    assert bits_set(later) == [2, 1]
-
-
-def bits_set(grid: Grid) -> list[int]:
-    """Most bits that any cell's bitmaps of visits and machines have."""
-    return np.bitwise_count(grid.evidence([(0, 0)]).bitmaps).max(axis=(0, 1)).tolist()
 
 
 def test_a_sample_too_uncertain_is_the_newest_too():

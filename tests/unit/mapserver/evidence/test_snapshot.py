@@ -1,10 +1,9 @@
 import json
-import os
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +13,10 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.pages import CompactPages
-from protocol.wire.messages import Ack
-from tests.unit.mapserver.data import CONFIG, folded, incoming, merged, open_store, random_samples, same, samples
+from tests.unit.mapserver.data import CONFIG, folded, incoming, open_store, random_samples, same, samples
 
 FOLD = FoldConfig()
+Change = Callable[[dict[str, Any]], object]
 
 
 def names(folder: Path) -> list[str]:
@@ -26,30 +25,6 @@ def names(folder: Path) -> list[str]:
 
 def save(folder: Path, row: int, grid: Grid | None = None) -> Path:
     return snapshot.save(folder, row, (grid or folded(samples(3))).state(), 1.0, FOLD)
-
-
-@pytest.mark.parametrize("after", [0, 3, 10])
-def test_snapshot_and_tail_are_the_fold_of_everything(tmp_path, after):
-    running, copy = open_store(tmp_path / "store"), tmp_path / "copy"
-    parts = np.split(random_samples(200, 5), 10)
-    for i, part in enumerate(parts):
-        if i == after:
-            running.save_snapshot()
-        assert isinstance(running.commit([incoming(part, 1 + 20 * i)])[0], Ack)
-    if after == 10:
-        running.save_snapshot()
-    shutil.copytree(tmp_path / "store", copy)  # as after a power cut: the log is not folded into the journal
-    restarted = open_store(copy)
-    assert restarted.snapshot_row == after
-    assert same(restarted.grid, running.grid)
-    assert same(restarted.grid, folded(np.concatenate(parts)))
-    assert (restarted.merged, restarted.journalled, restarted.newest_ns) == (10, 10, running.newest_ns)
-    restarted.close(), running.close()
-
-
-def test_an_empty_folder_gives_an_empty_grid(tmp_path):
-    row, grid = snapshot.load_newest(tmp_path, 100, 1.0, FOLD)
-    assert (row, grid.known_cells()) == (0, 0)
 
 
 def test_a_snapshot_reads_back_to_the_bit(tmp_path):
@@ -93,24 +68,19 @@ def test_a_truncated_snapshot_is_passed_over_for_the_one_before(tmp_path, share)
     assert same(grid, folded(samples(3)))
 
 
-def test_a_snapshot_of_another_schema_is_passed_over(tmp_path, monkeypatch):
+OTHERS = {"bucket_s": 60.0, "std_cap_m": 2.0, "keep_buckets": 5, "keep_hours": 5, "keep_days": 5}
+
+
+def test_a_snapshot_of_another_fold_schema_floor_or_cell_is_passed_over(tmp_path, monkeypatch):
     path = save(tmp_path, 1)
-    monkeypatch.setattr(ev, "SCHEMA", ev.SCHEMA + 1)
-    assert snapshot.load(path, 1.0, FOLD) is None
-
-
-@pytest.mark.parametrize(
-    "change", [{"bucket_s": 60.0}, {"std_cap_m": 2.0}, {"keep_buckets": 5}, {"keep_hours": 5}, {"keep_days": 5}]
-)
-def test_a_snapshot_of_other_parameters_is_passed_over(tmp_path, change):
-    assert snapshot.load(save(tmp_path, 1), 1.0, replace(FOLD, **change)) is None
-
-
-def test_a_snapshot_of_other_cells_or_another_floor_is_passed_over(tmp_path, monkeypatch):
-    path = save(tmp_path, 1)
+    assert snapshot.load(path, 1.0, FOLD)
     assert snapshot.load(path, 0.5, FOLD) is None
-    monkeypatch.setattr(snapshot, "STD_FLOOR_M", 0.4)
-    assert snapshot.load(path, 1.0, FOLD) is None
+    for name, value in OTHERS.items():
+        assert snapshot.load(path, 1.0, replace(FOLD, **{name: value})) is None, name
+    for module, name, value in ((snapshot, "STD_FLOOR_M", 0.4), (ev, "SCHEMA", ev.SCHEMA + 1)):
+        with monkeypatch.context() as patched:
+            patched.setattr(module, name, value)
+            assert snapshot.load(path, 1.0, FOLD) is None, name
 
 
 def test_a_snapshot_of_other_facts_is_passed_over(tmp_path):
@@ -134,126 +104,72 @@ def test_an_empty_grid_is_kept_too(tmp_path):
 PARTS = CompactPages.__slots__
 
 
-@pytest.mark.parametrize("column", range(2, 9))
-@pytest.mark.parametrize("change", [-1, 1, 10**6, -(10**6)])
-def test_blocks_of_other_lengths_are_passed_over(tmp_path, column, change):
-    def changed(arrays):
-        arrays["blocks"][0, column] += change
+def changed(array: str, *place: int, value: int = 0, by: int = 0) -> Change:
+    """Have another value at a place of an array, or one that is off by so much."""
 
-    assert load_changed(tmp_path, changed) is None
+    def change(arrays: dict[str, Any]) -> None:
+        arrays[array][place] = arrays[array][place] + by if by else value
 
-
-@pytest.mark.parametrize(
-    ("array", "value"),
-    [
-        *(("table", (0, column, value)) for column in (0, 2, 3, 4, 5) for value in (-1, 10**6)),
-        *(("table", (0, column, 0)) for column in (2, 3, 5)),
-        ("table", (0, 1, -1)),
-        ("runs", (0, 0, 200)),
-        ("runs", (0, 1, 255)),
-        ("runs", (1, 0, 0)),
-        ("marks", (1, 0, 0)),
-        *(("marks", (0, column, 255)) for column in (1, 2, 3)),
-        ("words", (0, 2**63)),
-        ("words", (0, 0)),
-    ],
-)
-def test_pages_that_cannot_be_are_passed_over(tmp_path, array, value):
-    def changed(arrays):
-        *place, number = value
-        arrays[array][tuple(place)] = number
-
-    assert load_changed(tmp_path, changed) is None
+    return change
 
 
-def test_votes_out_of_order_are_passed_over(tmp_path):
-    def changed(arrays):
-        arrays["cells"] = arrays["cells"][::-1].copy()
-
-    assert load_changed(tmp_path, changed) is None
+def made(array: str, remake: Callable[[Any], Any]) -> Change:
+    return lambda arrays: arrays.__setitem__(array, remake(arrays[array]))
 
 
-@pytest.mark.parametrize("array", PARTS)
-@pytest.mark.parametrize(
-    "change", [lambda part: part[:-1], lambda part: part[..., None], lambda part: part.astype("f4")]
-)
-def test_arrays_of_another_kind_are_passed_over(tmp_path, array, change):
-    def changed(arrays):
-        arrays[array] = change(arrays[array])
+def without_total(name: str) -> Change:
+    def without(header: Any) -> Any:
+        return np.array(json.dumps({key: value for key, value in json.loads(str(header)).items() if key != name}))
 
-    if array != "high" or len(change(np.zeros(4, np.uint16))) == 4:  # no count is high: there is none to cut off
-        assert load_changed(tmp_path, changed) is None
+    return made("header", without)
 
 
-@pytest.mark.parametrize("array", ["header", "blocks", *PARTS])
-def test_a_missing_array_is_passed_over(tmp_path, array):
-    assert load_changed(tmp_path, lambda arrays: arrays.pop(array)) is None
+KINDS = (lambda part: part[:-1], lambda part: part[..., None], lambda part: part.astype("f4"))
+CHANGES = {
+    **{f"length {c} {n}": changed("blocks", 0, c, by=n) for c in range(2, 9) for n in (-1, 1, 10**6, -(10**6))},
+    **{f"table {c} {v}": changed("table", 0, c, value=v) for c in (0, 2, 3, 4, 5) for v in (-1, 10**6)},
+    **{f"table {c} 0": changed("table", 0, c) for c in (2, 3, 5)},
+    "an index before the first": changed("table", 0, 1, value=-1),
+    "a run of another plane": changed("runs", 0, 0, value=200),
+    "a run that is too long": changed("runs", 0, 1, value=255),
+    "runs out of order": changed("runs", 1, 0),
+    "marks out of order": changed("marks", 1, 0),
+    **{f"mark {c}": changed("marks", 0, c, value=255) for c in (1, 2, 3)},
+    "a word that is too large": changed("words", 0, value=2**63),
+    "a word of nothing": changed("words", 0),
+    "cells out of order": made("cells", lambda cells: cells[::-1].copy()),
+    **{  # no count is high: there is none to cut off
+        f"{array} of kind {kind}": made(array, remake)
+        for array in PARTS
+        for kind, remake in enumerate(KINDS)
+        if (array, kind) != ("high", 0)
+    },
+    **{f"no {array}": lambda arrays, array=array: arrays.pop(array) for array in ("header", "blocks", *PARTS)},
+    **{f"no total {name}": without_total(name) for name in ("row", "folded", "skipped", "newest_ns")},
+}
 
 
-@pytest.mark.parametrize("name", ["row", "folded", "skipped", "newest_ns"])
-def test_a_header_without_a_total_is_passed_over(tmp_path, name):
-    def change(arrays):
-        header = json.loads(str(arrays["header"]))
-        del header[name]
-        arrays["header"] = np.array(json.dumps(header))
-
-    assert load_changed(tmp_path, change) is None
+@pytest.fixture(scope="module")
+def two_blocks(tmp_path_factory):
+    """A snapshot of two blocks, as arrays."""
+    with np.load(save(tmp_path_factory.mktemp("whole"), 1, folded(samples(2, x_m=[8.0, 24.0])))) as file:
+        return dict(file)
 
 
-def load_changed(folder: Path, change):
-    """Load a snapshot of two blocks, of which something was changed in a way that no checksum sees."""
-    path = save(folder, 1, folded(samples(2, x_m=[8.0, 24.0])))
-    with np.load(path) as file:
-        arrays = dict(file)
-    change(arrays)
-    np.savez(path, **arrays)
-    return snapshot.load(path, 1.0, FOLD)
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_cannot_be_is_passed_over(tmp_path, two_blocks, change):
+    """Something was changed in a way that no checksum sees."""
+    arrays = {name: array.copy() for name, array in two_blocks.items()}
+    np.savez(tmp_path / "snapshot-1.npz", **arrays)
+    assert snapshot.load(tmp_path / "snapshot-1.npz", 1.0, FOLD)
+    CHANGES[change](arrays)
+    np.savez(tmp_path / "snapshot-1.npz", **arrays)
+    assert snapshot.load(tmp_path / "snapshot-1.npz", 1.0, FOLD) is None
 
 
 def test_a_snapshot_under_the_name_of_an_earlier_row_is_passed_over(tmp_path):
     save(tmp_path, 8).rename(tmp_path / "snapshot-2.npz")
     assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD)[0] <= 5
-
-
-FOLD_A_PART = """
-import sys
-from pathlib import Path
-import numpy as np
-from mapserver.evidence import snapshot
-from mapserver.evidence.grid import Grid
-from mapserver.evidence.fold_config import FoldConfig
-
-folder, part, waiting_rows = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-config = FoldConfig()
-grid = Grid(1.0, config, waiting_rows)
-for machine in ("a", "b"):
-    grid.fold(np.load(folder.parent / f"{machine}.npy")[part::3], machine)
-snapshot.save(folder, 1, grid.state(), 1.0, config)
-"""
-
-
-@pytest.mark.slow
-def test_parts_folded_in_processes_of_their_own_are_the_fold_of_everything(tmp_path):
-    """Three processes, which hash strings in three ways, with different space."""
-    rows = {machine: random_samples(90, seed, half_m=3.0) for seed, machine in enumerate("ab")}
-    for machine, one in rows.items():
-        one["stamp_ns"] += np.arange(90) % 30 * 9 * 3600 * 10**9
-        np.save(tmp_path / f"{machine}.npy", one)
-    children = []
-    for part, waiting_rows in enumerate((1, 64, 512)):
-        (folder := tmp_path / str(part)).mkdir()
-        words = [sys.executable, "-c", FOLD_A_PART, folder, str(part), str(waiting_rows)]
-        children.append(subprocess.Popen(words, env={**os.environ, "PYTHONHASHSEED": str(part + 1)}))
-    assert [child.wait(60) for child in children] == [0, 0, 0]
-
-    def parts() -> list[Grid]:
-        return [snapshot.load_newest(tmp_path / str(part), 1, 1.0, FOLD)[1] for part in range(3)]
-
-    whole = folded(rows["a"])
-    whole.fold(rows["b"], "b")
-    assert {at.tier for at in whole.state().pages} == {0, 1, 2, 3}
-    assert same(merged(parts()), whole)
-    assert same(merged(parts()[::-1]), whole)
 
 
 def test_a_snapshot_beyond_the_journal_is_passed_over(tmp_path):

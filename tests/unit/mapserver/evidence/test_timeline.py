@@ -112,33 +112,6 @@ def test_blocks_of_wide_counts_are_settled_beside_others():
     assert [next(line.items())[2].votes["count"].tolist() for line in lines] == [[2], [2**16 + 1], [3]]
 
 
-@pytest.mark.parametrize("keeps", [(1, 2, 4), (4, 1, 2), (2, 4, 1)])
-def test_the_newest_of_each_length_stay_apart(keeps):
-    buckets = [START + i * PER_HOUR // 2 for i in range(8 * 48)]
-    line = timeline(buckets, **dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True)))
-    assert [len([tier for tier, _ in places(line) if tier == k]) for k in range(4)] == [*keeps, 1]
-    assert set(places(line)) == by_definition(buckets, keeps)
-
-
-@given(st.lists(bucket, min_size=1, max_size=30))
-def test_no_evidence_is_lost_or_doubled(buckets):
-    counts, bitmaps = np.zeros(ev.COUNTS * ev.CELLS, np.uint64), np.zeros((ev.CELLS, 2), np.uint64)
-    newest_ns = np.zeros(ev.CELLS, np.int64)
-    for timed in timeline(buckets).timed():
-        timed.page.add_to(counts, bitmaps, newest_ns)
-    assert counts.sum() == len(buckets)
-    assert newest_ns.max() == max(buckets) * BUCKET_S * S + 7
-
-
-def test_a_timeline_goes_on_from_its_pages():
-    one = timeline(START + np.arange(0, 3 * PER_DAY, 7))
-    again = Timeline(one.tiers, SPACE, one.settled())
-    assert same(one, again)
-    one.add(page(START + 3 * PER_DAY)), again.add(page(START + 3 * PER_DAY))
-    assert same(one, again)
-    assert one.known_cells == again.known_cells == 1
-
-
 # --- spans -----------------------------------------------------------------------------------------------------------
 
 

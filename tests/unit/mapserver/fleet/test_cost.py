@@ -1,6 +1,5 @@
-"""Ten machines that drive all day cost no more than they may."""
+"""What machines that drive all day, and large fleets, take of memory; lab speed measures the time."""
 
-import time
 import tracemalloc
 
 import pytest
@@ -9,41 +8,30 @@ from mapserver.fleet.calibration import MOST_EPOCHS, MOST_MACHINES, calibrate, e
 from mapserver.fleet.ledger import EPOCHS, Ledger, newest
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
 
-MACHINES, HOURS = 10, 8
-MOST_BYTES = 50e6
-MOST_S = 10.0  # twice the goal: processor time itself doubles on a loaded machine
+ROUTES = (LOW, RAMP, RAMP_AGAIN)
 
 
 @pytest.mark.slow
-def test_ten_machines_for_a_day_take_little_memory_and_time() -> None:
-    ledgers = {f"m{i}": Ledger() for i in range(MACHINES)}
-    for i, ledger in enumerate(ledgers.values()):
-        route = (LOW, RAMP, RAMP_AGAIN)[i % 3]
-        for hour in range(HOURS):
-            errors = Errors(0.001 * i, 0.01 * i)
-            ledger.add(drive(route, errors, seconds=3600.0, seed=100 * i + hour, start_s=3600.0 * hour, late=False))
-    stays = {name: ledger.stays() for name, ledger in ledgers.items()}
-    assert sum(ledger.nbytes for ledger in ledgers.values()) < MOST_BYTES
-    began_s = time.process_time()
-    result = calibrate(stays)
-    assert time.process_time() - began_s < MOST_S
-    assert len(result.corrections) == MACHINES * EPOCHS
+def test_a_machine_that_drives_all_day_takes_little_memory() -> None:
+    ledger = Ledger()
+    for hour in range(8):
+        ledger.add(drive(RAMP, Errors(0.001, 0.01), seconds=3600.0, seed=hour, start_s=3600.0 * hour, late=False))
+    stays = ledger.stays()
+    assert ledger.nbytes < 5e6
+    assert len(calibrate({"a": stays}).corrections) == EPOCHS
 
 
-@pytest.mark.slow
-def test_a_hundred_machines_take_a_minute_and_a_gigabyte_at_most() -> None:
+@pytest.mark.nightly
+def test_a_hundred_machines_take_a_gigabyte_at_most() -> None:
     """What they know of four hours each is bounded: of all together a solve takes so many epochs."""
-    routes = (LOW, RAMP, RAMP_AGAIN)
-    tables = [Ledger() for _ in routes]
-    for i, (route, ledger) in enumerate(zip(routes, tables, strict=True)):
+    tables = [Ledger() for _ in ROUTES]
+    for i, (route, ledger) in enumerate(zip(ROUTES, tables, strict=True)):
         ledger.add(drive(route, Errors(0.002 * i, 0.02 * i), seconds=4 * 3600.0, seed=i, late=False))
     stays = {f"m{i:03d}": tables[i % 3].stays() for i in range(MOST_MACHINES)}
     tracemalloc.start()
-    began_s = time.process_time()
     result = calibrate(stays)
-    took_s, most_bytes = time.process_time() - began_s, tracemalloc.get_traced_memory()[1]
+    most_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert took_s < 60.0
     assert most_bytes < 0.7e9  # beside what the program itself takes
     assert len(result.corrections) == MOST_EPOCHS
     assert result.common.observed

@@ -18,7 +18,7 @@ def stays_of(parts: list[Table]) -> Table:
     return ledger.stays()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_order_and_any_batching_give_the_same_bits(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = random_samples(20_000, seed)
@@ -35,11 +35,10 @@ def test_only_the_newest_epochs_are_remembered() -> None:
     assert stays.tobytes() == stays_of([rows[newest]]).tobytes()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_clock_that_is_ahead_displaces_nothing_whenever_its_samples_come(seed: int) -> None:
+def test_a_clock_that_is_ahead_displaces_nothing_whenever_its_samples_come() -> None:
     right = np.concatenate([drive(LOW, seconds=5.0, start_s=300.0 * i) for i in range(EPOCHS + 5)])
     ahead = np.concatenate([drive(LOW, seconds=5.0, start_s=72_000.0 + 300.0 * i) for i in range(EPOCHS + 5)])
-    rng, until_ns = np.random.default_rng(seed), int(right["stamp_ns"].max())
+    rng, until_ns = np.random.default_rng(0), int(right["stamp_ns"].max())
     rows = rng.permutation(np.concatenate([right, ahead]))
     ledger = Ledger()
     ledger.until_ns = until_ns

@@ -248,10 +248,3 @@ def test_of_two_sound_machines_the_difference_is_shared() -> None:
     }
     machines = calibrate(ledgers(rows)).machines
     assert machines["one"].zero - machines["other"].zero == pytest.approx(0.008, abs=0.001)
-
-
-def test_a_closed_tour_names_the_machine_that_is_off() -> None:
-    rows = {"good": drive(LOW, Errors()), "bad": drive(LOW, Errors(11 * ZERO_STD), seed=1)}
-    machines = calibrate(ledgers(rows)).machines
-    assert machines["bad"].zero == pytest.approx(11 * ZERO_STD, abs=0.002)
-    assert machines["good"].zero == pytest.approx(0.0, abs=0.002)

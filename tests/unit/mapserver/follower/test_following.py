@@ -5,7 +5,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -39,6 +39,7 @@ from tests.unit.mapserver.data import (
     open_writer,
     past_of,
     random_samples,
+    refused,
     same,
     send,
     wait_for,
@@ -95,57 +96,13 @@ def deliver(writer: Writer, seed: int, n: int = 40, machine: str = "a", first_se
     send(writer, [incoming(random_samples(n, seed), first_seq, machine, spool_id=1 + seed)])
 
 
-def test_a_follower_has_the_map_of_the_server_bit_for_bit_from_its_start_and_as_rows_come_in(tmp_path):
-    with closing(open_writer(tmp_path)) as writer:
-        for seed in range(5):
-            deliver(writer, seed, machine="ab"[seed % 2])
-        with following(tmp_path) as one:
-            catches_up(one, writer)
-            for seed in range(5, 12):
-                deliver(writer, seed, machine="abc"[seed % 3])
-                catches_up(one, writer)
-            rows, seconds = one.behind()
-            assert rows == 0
-            assert 0 <= seconds < 5
-
-
 def test_a_follower_that_is_started_before_the_server_waits_for_it(tmp_path):
     with following(tmp_path / "store") as one:
-        with pytest.raises(QueryError) as refused:
+        with refused(Refusal.NOT_HERE):
             one.run(lambda replica: replica.version)
-        assert refused.value.reason == Refusal.NOT_HERE
         assert one.behind() == (0, float("inf"))
         with closing(open_writer(tmp_path / "store")) as writer:
             deliver(writer, 1)
-            catches_up(one, writer)
-
-
-def test_a_follower_goes_on_while_the_server_starts_again(tmp_path):
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-        writer.close()
-        assert one.run(lambda replica: replica.merged) == 1
-        with closing(open_writer(tmp_path)) as again:
-            deliver(again, 2)
-            catches_up(one, again)
-
-
-def test_decisions_and_corrections_in_mid_run_make_the_same_map(tmp_path):
-    with closing(open_writer(tmp_path)) as writer, closing(Refolding(writer, past_of(writer))) as refolding:
-        for seed in range(4):
-            deliver(writer, seed, machine="abc"[seed % 3])
-        with following(tmp_path) as one:
-            catches_up(one, writer)
-            whole = one.run(lambda replica: replica.grid.counts().folded)
-            refolding.wait(refolding.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)), WAIT_S)
-            catches_up(one, writer)
-            assert one.run(lambda replica: replica.facts.excluded) == {"b"}
-            assert one.run(lambda replica: replica.grid.counts().folded) < whole
-            deliver(writer, 9, machine="b")  # what is not in the map counts in no time
-            deliver(writer, 10, machine="c")
-            catches_up(one, writer)
-            refolding.wait(refolding.decide(TrustDecision("b", True, PERSON, "repaired", NOW_NS)), WAIT_S)
             catches_up(one, writer)
 
 
@@ -174,101 +131,108 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
         catches_up(one, writer)
 
 
-@settings(max_examples=15, deadline=None)
-@given(
-    st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 60), st.booleans()), min_size=1, max_size=12),
-    st.integers(0, 12),
-)
-def test_any_course_of_rows_and_decisions_makes_the_same_map(tmp_path_factory, course, begins):
-    folder = tmp_path_factory.mktemp("store")
-    with closing(open_writer(folder)) as writer, closing(Refolding(writer, past_of(writer))) as refolding:
-        one = Following(JournalLocation(folder), SITE, CONFIG)
-        with closing(one):
-            for number, (machine, n, decides) in enumerate(course):
-                if number == min(begins, len(course) - 1):
-                    one.start()
-                deliver(writer, number, n, machine)
-                if decides:
-                    trusted = writer.run(lambda store, machine=machine: machine in store.facts.excluded)
-                    decision = TrustDecision(machine, trusted, PERSON, "drawn", NOW_NS)
-                    refolding.wait(refolding.decide(decision), WAIT_S)
-            catches_up(one, writer)
-
-
-def test_a_journal_that_was_restored_from_a_backup_is_noticed_and_folded_again(tmp_path):
-    with closing(open_writer(tmp_path / "store")) as writer:
-        deliver(writer, 1)
-    shutil.copytree(tmp_path / "store", tmp_path / "backup")
-    with closing(open_writer(tmp_path / "store")) as writer:
-        for seed in (2, 3):
-            deliver(writer, seed)
-        with following(tmp_path / "store") as one:
-            catches_up(one, writer)
-            writer.close()
-            shutil.rmtree(tmp_path / "store")
-            (tmp_path / "backup").rename(tmp_path / "store")
-            wait_for(lambda: (version(one) or MapVersion("", 9, 0)).row == 1)
-            with closing(open_writer(tmp_path / "store")) as again:
-                deliver(again, 4, machine="b")  # other rows under the same numbers
-                deliver(again, 5, machine="b")
-                deliver(again, 6, machine="b")
-                catches_up(one, again)
-
-
-def test_other_rows_under_the_same_numbers_are_noticed_by_a_checksum(tmp_path, caplog):
-    for name, seeds in (("one", (1, 2, 3)), ("other", (1, 4, 5, 6))):
-        with closing(open_writer(tmp_path / name)) as writer:
-            for seed in seeds[:1]:
-                deliver(writer, seed)
-        if name == "one":
-            shutil.copytree(tmp_path / "one", tmp_path / "other")
-        with closing(open_writer(tmp_path / name)) as writer:
-            for seed in seeds[1:]:
-                deliver(writer, seed)
-    with following(tmp_path / "one") as one:
-        wait_for(lambda: (version(one) or MapVersion("", 0, 0)).row == 3)
-        (tmp_path / "one").rename(tmp_path / "gone")
-        (tmp_path / "other").rename(tmp_path / "one")
-        with closing(open_writer(tmp_path / "one")) as writer:
-            catches_up(one, writer)  # four rows: it has not lost any by number
-        assert "rows are gone" in caplog.text
-
-
-def archive_all(folder: Path, writer: Writer) -> None:
+def archive_all(folder: Path, writer: Writer) -> list[Path]:
+    """Have all rows in the archive; returns its new files."""
     location = JournalLocation(folder)
 
     def forget(until: int) -> int:
         return writer.run(lambda store: store.journal.forget(until))
 
     with location.reader() as reader:
-        assert list(archive(location.archive.folder, reader, SITE, NOW_NS + 10**15, forget, NOW_NS))
+        return list(archive(location.archive.folder, reader, SITE, NOW_NS + 10**15, forget, NOW_NS))
 
 
-def test_other_rows_under_archived_numbers_are_noticed_by_a_checksum(tmp_path, caplog):
-    """The journal itself has none of them any more, and all numbers are the same."""
-    for name, seed in (("one", 2), ("other", 3)):
-        with closing(open_writer(tmp_path / name)) as writer:
-            if name == "one":
-                deliver(writer, 1)
-        if name == "one":
-            shutil.copytree(tmp_path / "one", tmp_path / "backup")
-        else:
-            shutil.rmtree(tmp_path / "other")
-            (tmp_path / "backup").rename(tmp_path / "other")
-        with closing(open_writer(tmp_path / name)) as writer:
-            deliver(writer, seed)
-            archive_all(tmp_path / name, writer)
-            assert writer.run(lambda store: (store.journalled, store.journal.archived_row, store.journal.epoch)) == (
-                2,
-                2,
-                2,
-            )
+class Served:
+    """A writer and its folds over a folder: rows come in, machines are decided about, it archives and starts again."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._open()
+
+    def _open(self) -> None:
+        self.writer = open_writer(self._folder)
+        self._refolding = Refolding(self.writer, past_of(self.writer))
+
+    def does(self, what: str, machine: str, number: int, n: int) -> None:
+        deliver(self.writer, number, n, machine)
+        if what == "decides":
+            trusted = self.writer.run(lambda store: machine in store.facts.excluded)
+            decision = TrustDecision(machine, trusted, PERSON, "drawn", NOW_NS)
+            self._refolding.wait(self._refolding.decide(decision), WAIT_S)
+        elif what == "archives":
+            archive_all(self._folder, self.writer)
+        elif what == "starts again":
+            self.close()
+            self._open()
+
+    def close(self) -> None:
+        self._refolding.close()
+        self.writer.close()
+
+
+WHAT = st.sampled_from(["nothing more", "decides", "archives", "starts again"])
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.lists(st.tuples(WHAT, st.sampled_from("abc"), st.integers(1, 60)), min_size=1, max_size=12), st.integers(0, 12)
+)
+def test_any_course_of_rows_decisions_and_starts_makes_the_same_map(tmp_path_factory, course, begins):
+    folder = tmp_path_factory.mktemp("store")
+    with closing(Served(folder)) as served, closing(Following(JournalLocation(folder), SITE, CONFIG)) as one:
+        for number, (what, machine, n) in enumerate(course):
+            if number == min(begins, len(course) - 1):
+                one.start()
+            served.does(what, machine, number, n)
+        catches_up(one, served.writer)
+        rows, seconds = one.behind()
+        assert (rows, 0 <= seconds < WAIT_S) == (0, True)
+
+
+@dataclass(frozen=True)
+class Course:
+    """What goes on after the first row of each of two machines: other rows, and a decision about a machine."""
+
+    seeds: tuple[int, ...] = ()
+    decides: str = ""
+    archives: bool = False
+
+    def goes_on(self, folder: Path) -> MapVersion:
+        with closing(open_writer(folder)) as writer:
+            for seed in self.seeds:
+                deliver(writer, seed, machine="ab"[seed % 2])
+            for name in self.decides:
+                writer.run(lambda store, name=name: store.decide(TrustDecision(name, False, PERSON, "drifts", NOW_NS)))
+            if self.archives:  # the journal itself has none of them any more, and all numbers are the same
+                assert archive_all(folder, writer)
+            return writer.run(lambda store: store.version)
+
+
+COURSES = {
+    "a backup with fewer rows": (Course((2, 3)), Course()),
+    "other rows, and more of them": (Course((2, 3)), Course((4, 5, 6))),
+    "other rows under archived numbers": (Course((2,), archives=True), Course((3,), archives=True)),
+    "another decision under the same number": (Course(decides="a"), Course(decides="b")),
+}
+
+
+@pytest.mark.parametrize("courses", COURSES)
+def test_a_journal_that_went_another_course_is_noticed_and_folded_again(tmp_path, caplog, courses):
+    mine, theirs = COURSES[courses]
+    Course((0, 1)).goes_on(tmp_path / "one")
+    shutil.copytree(tmp_path / "one", tmp_path / "other")
+    row = mine.goes_on(tmp_path / "one").row
+    theirs.goes_on(tmp_path / "other")
     with following(tmp_path / "one") as one:
-        wait_for(lambda: (version(one) or MapVersion("", 0, 0)).row == 2)
+        wait_for(lambda: (version(one) or MapVersion("", 0, 0)).row == row)
         (tmp_path / "one").rename(tmp_path / "gone")
         (tmp_path / "other").rename(tmp_path / "one")
         wait_for(lambda: "rows are gone" in caplog.text)
         with closing(open_writer(tmp_path / "one")) as writer:
+            catches_up(one, writer)
+            excluded = writer.run(lambda store: store.facts.excluded)
+            assert one.run(lambda replica: replica.facts.excluded) == excluded == set(theirs.decides)
+            deliver(writer, 7)
             catches_up(one, writer)
         assert caplog.text.count("rows are gone") == 1
 
@@ -314,32 +278,6 @@ def test_a_slow_follower_holds_nobody_up_says_how_far_behind_it_is_and_has_the_s
         wait_for(lambda: one.behind()[0] == 0 and one.behind()[1] < 1.5)
 
 
-def test_rows_that_are_forgotten_below_the_follower_or_above_it_are_read_from_the_archive(tmp_path):
-    with closing(open_writer(tmp_path)) as writer:
-        for seed in range(6):
-            deliver(writer, seed)
-
-        def move(before: int) -> None:
-            location = JournalLocation(tmp_path)
-            with location.reader() as reader:
-                files = archive(
-                    location.archive.folder, reader, SITE, NOW_NS + 10**15, lambda until: forget(until), NOW_NS
-                )
-                assert list(files) or before
-
-        def forget(until: int) -> int:
-            return writer.run(lambda store: store.journal.forget(until))
-
-        move(0)
-        with following(tmp_path) as one:  # it begins without the rows of the journal, and without a snapshot
-            catches_up(one, writer)
-            deliver(writer, 7)
-            catches_up(one, writer)
-            move(1)
-            deliver(writer, 8)
-            catches_up(one, writer)
-
-
 def test_it_begins_with_the_snapshot_of_the_server(tmp_path, monkeypatch):
     with closing(open_writer(tmp_path)) as writer:
         for seed in range(4):
@@ -377,23 +315,6 @@ def test_a_decision_of_a_newer_version_ends_it(tmp_path):
         writer.run(lambda store: store.journal.append_event("calibration", NOW_NS, body))
         wait_for(lambda: one.ended)
         assert "open it with that version" in one.ended
-
-
-def test_a_damaged_row_is_named_and_the_map_says_how_far_behind_it_is(tmp_path, caplog):
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-
-        def damage(store) -> None:
-            store.journal._db.execute("INSERT INTO journal VALUES (2, x'00')")
-            store.journal._db.execute("INSERT INTO extent SELECT 2, 1, 1, 0, 0, 1, 1, 0")
-
-        writer.run(damage)
-        wait_for(lambda: one.behind()[0] == 1 and "journal row 2" in caplog.text)
-        assert not one.ended
-        assert version(one).row == 1
-        writer.run(lambda store: store.journal._db.execute("DELETE FROM journal WHERE row = 2"))
-        writer.run(lambda store: store.journal._db.execute("DELETE FROM extent WHERE row = 2"))
 
 
 def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):
@@ -459,23 +380,6 @@ def test_a_damaged_row_behind_a_sound_one_takes_no_map_away(tmp_path, caplog):
         assert "rows are gone" not in caplog.text
 
 
-def test_another_decision_under_the_same_number_is_noticed_by_a_checksum(tmp_path, caplog):
-    with closing(open_writer(tmp_path / "store")) as writer:
-        for seed in (1, 2):
-            deliver(writer, seed, machine="ab"[seed % 2])
-    shutil.copytree(tmp_path / "store", tmp_path / "backup")
-    with closing(open_writer(tmp_path / "store")) as writer:
-        writer.run(lambda store: store.decide(TrustDecision("a", False, PERSON, "drifts", NOW_NS)))
-    with following(tmp_path / "store") as one:
-        wait_for(lambda: version(one) and one.run(lambda replica: replica.facts.excluded) == {"a"})
-        with closing(open_writer(tmp_path / "backup")) as writer:
-            writer.run(lambda store: store.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)))
-        (tmp_path / "store").rename(tmp_path / "gone")
-        (tmp_path / "backup").rename(tmp_path / "store")
-        wait_for(lambda: version(one) and one.run(lambda replica: replica.facts.excluded) == {"b"})
-        assert "rows are gone" in caplog.text
-
-
 def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_path, database):
     location = JournalLocation(tmp_path / "store", database.url)
     with closing(Store(location, SITE, CONFIG, now_ns)) as store:
@@ -500,6 +404,7 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
                 assert same(one.past.grid_as_of(reader, LAST), other.grid)
 
 
+@pytest.mark.nightly
 def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_it_is(tmp_path, caplog):
     with server.cluster() as primary, server.replica(primary, "b") as replica:
         database = primary.new_database()

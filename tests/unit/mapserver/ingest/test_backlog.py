@@ -15,12 +15,6 @@ def filled(batches: str, size: int = 10, limit: int = 10**9) -> Backlog[str]:
     return backlog
 
 
-def test_machines_are_taken_in_turn_and_each_ones_batches_in_order():
-    backlog = filled("aaaabbc")
-    assert backlog.take() == ["a1", "b1", "c1", "a2", "b2", "a3", "a4"]
-    assert (len(backlog), backlog.size, backlog.take()) == (0, 0, [])
-
-
 def test_who_has_had_a_turn_comes_after_those_who_wait():
     backlog = filled("a" * 2 * GROUP_BATCHES + "b")
     first = backlog.take()

@@ -22,10 +22,6 @@ def added(waits: MergeWaits, row: int, wait_s: float = WAIT_S) -> Future:
     return called
 
 
-def test_a_row_that_is_merged_is_not_waited_for(waits):
-    assert added(waits, 5).done()
-
-
 def test_rows_call_back_as_they_are_merged_in_any_order(waits):
     later, sooner = added(waits, 9), added(waits, 7)
     waits.advance(6)

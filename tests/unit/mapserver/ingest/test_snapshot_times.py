@@ -1,30 +1,7 @@
-import math
-
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE, SnapshotTimes
-
-
-def test_a_snapshot_is_due_by_time_or_by_what_a_restart_would_fold():
-    times = SnapshotTimes(60.0, 100.0)
-    assert (times.due_s(0), times.due_s(RESTART_SAMPLES - 1), times.due_s(RESTART_SAMPLES)) == (160.0, 160.0, 100.0)
-
-
-def test_none_is_due_while_one_is_written():
-    times = SnapshotTimes(60.0, 100.0)
-    times.began(160.0)
-    assert times.due_s(10 * RESTART_SAMPLES) == math.inf
-    times.ended(161.0)
-    assert times.due_s(RESTART_SAMPLES) == 161.0 + 1.0 * (1 / SHARE - 1)
-    assert times.due_s(0) == 220.0
-
-
-def test_after_a_failure_nothing_is_tried_for_a_while():
-    times = SnapshotTimes(60.0, 0.0)
-    times.began(60.0)
-    times.ended(60.1, failed=True)
-    assert times.due_s(RESTART_SAMPLES) == 120.1
 
 
 @given(st.lists(st.tuples(st.floats(0.001, 100), st.integers(0, 2 * RESTART_SAMPLES)), min_size=1), st.floats(0.1, 600))

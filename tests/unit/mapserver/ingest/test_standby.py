@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from mapserver.evidence.grid import Grid
 from mapserver.ingest import standby as module
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
@@ -19,7 +18,7 @@ from mapserver.journal.postgres import reader as postgres_reader
 from mapserver.trust.decisions import PERSON, TrustDecision
 from protocol.errors import StoreError
 from tests.postgres_server import Database
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, random_samples, same, wait_for
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, fold_of, incoming, now_ns, random_samples, same, wait_for
 
 
 @pytest.fixture
@@ -49,11 +48,7 @@ def send(store: Store, first: int, last: int, machine: str = "a") -> None:
 
 def is_fold(standby: Standby, journal: JournalQueries, without: frozenset[str] = frozenset()) -> bool:
     """Whether the grid is what its rows make."""
-    grid = Grid(SITE.cell_m, CONFIG.fold)
-    for row in journal.read(until=standby.row):
-        if row.machine not in without:
-            grid.fold(row.rows, row.machine)
-    return same(standby._grid, grid)
+    return same(standby._grid, fold_of(journal.read(until=standby.row), without))
 
 
 def fails_after(reads: int, standby: Standby) -> None:
@@ -124,8 +119,13 @@ def test_after_a_failed_read_it_tries_again_ever_more_seldom(location, standby, 
 def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
     with closing(opened(location)) as store:
         send(store, 1, 2)
-        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
         standby.follow(5.0)
+        row, grid = standby.grid_for(store.journal, store.facts)
+        assert (row, same(grid, store.grid)) == (2, True)
+        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        assert standby.grid_for(store.journal, facts) is None, "the grid of other facts"
+        standby.follow(5.0)
+        assert standby.grid_for(store.journal, store.facts) is None
         send(store, 1, 3, machine="b")
         standby.follow(5.0)
         assert standby.row == 5

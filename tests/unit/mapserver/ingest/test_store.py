@@ -66,14 +66,6 @@ def test_a_group_is_answered_in_order(store):
     assert (store.merged, store.journalled, store.grid.folded) == (3, 3, 10)
 
 
-def test_a_refused_batch_leaves_no_trace(store):
-    bad = samples(3, speed_mps=[1.0, 1e6, 1.0])
-    answer = store.commit([incoming(bad)])[0]
-    assert answer == Refused(Refusal.OUT_OF_RANGE, "speed_mps[1]: 1e+06: not between -100 and 100", 0)
-    assert store.journalled == store.grid.folded == 0
-    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1, store=store.identity.id)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_sent_at_least_once_is_merged_exactly_once(store, seed):
     rows, draw = random_samples(120, seed), np.random.default_rng(seed)
@@ -104,31 +96,7 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
     again = store.commit([incoming(samples(3), 3), incoming(samples(4), machine="b")])
     assert [(a.watermark, a.trimmed) for a in again] == [(5, 0), (4, 0)]
     assert store.grid.folded == 9
-    assert store.info()["machines"]["b"] == {
-        "spools": 1,
-        "samples": 4,
-        "lost": 0,
-        "newest_ns": NOW_NS + 3 * 10**9,
-        "missing": 0,
-    }
-
-
-@pytest.mark.parametrize("method", ["begin", "append"])
-def test_a_journal_that_cannot_be_written_refuses(store, monkeypatch, method):
-
-    def locked(*_):
-        raise UnwrittenError("journal", "database is locked")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(store.journal, method, locked)
-        assert store.commit([incoming(samples(3))])[0].reason == Refusal.STORE
-    assert store.commit([incoming(samples(3))])[0] == Ack(3, 1, store=store.identity.id)
-
-
-def test_losses_and_repeats_are_counted(store):
-    store.commit([incoming(samples(3)), incoming(samples(2), 2), incoming(samples(1), 10, lost_before=6)])
-    assert store.counters == {"batches": 2, "samples_trimmed": 2, "samples_lost": 6}
-    assert store.info()["machines"] == {"a": counts(1, 4, 6, NOW_NS + 2 * 10**9)}
+    assert store.info()["machines"]["b"] == counts(1, 4, 0, NOW_NS + 3 * 10**9)
 
 
 def test_info_tells_the_state_in_plain_values(store):
@@ -147,41 +115,7 @@ def test_info_tells_the_state_in_plain_values(store):
     assert (info["samples_merged"], info["samples_too_unsure"], info["cells"]) == (5, 2, 1)
     assert info["bounds"] == (0, 0, 16, 16)
     assert info["stamp_ns"] == NOW_NS + 10**12
-    assert info["machines"]["a"] == {
-        "spools": 2,
-        "samples": 5,
-        "lost": 0,
-        "newest_ns": NOW_NS + 2 * 10**9,
-        "missing": 0,
-    }
-
-
-def test_now_is_the_newest_accepted_stamp_also_after_a_restart(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(2, stamp_ns=[500, 300])), incoming(samples(1, stamp_ns=400), machine="b")])
-    assert store.newest_ns == 500
-    store.close()
-    store = open_store(tmp_path)
-    assert store.newest_ns == 500
-    store.close()
-
-
-def test_a_restart_goes_on_where_it_ended(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(3)), incoming(samples(1), machine="b")])
-    store.close()
-    store = open_store(tmp_path)
-    assert store.commit([incoming(samples(5))])[0] == Ack(5, 3, trimmed=3, store=store.identity.id)
-    assert store.grid.folded == 6
-    store.close()
-
-
-def test_a_second_server_on_a_store_is_refused_until_the_first_ends(tmp_path):
-    store = open_store(tmp_path)
-    with pytest.raises(StoreError, match="another server is using this store"):
-        open_store(tmp_path)
-    store.close()
-    open_store(tmp_path).close()
+    assert info["machines"]["a"] == counts(2, 5, 0, NOW_NS + 2 * 10**9)
 
 
 def test_a_store_that_cannot_be_opened_is_let_go(tmp_path):
@@ -323,13 +257,7 @@ def test_samples_at_the_end_of_a_spool_are_declared_lost_without_a_row(tmp_path)
     assert store.counters["samples_lost"] == 4
     store.close()
     store = open_store(tmp_path)
-    assert store.machines()["a"] == {
-        "spools": 1,
-        "samples": 3,
-        "lost": 4,
-        "newest_ns": NOW_NS + 2 * 10**9,
-        "missing": 0,
-    }
+    assert store.machines()["a"] == counts(1, 3, 4, NOW_NS + 2 * 10**9)
     store.close()
 
 
@@ -347,15 +275,6 @@ def test_a_store_keeps_its_id_and_so_does_a_copy_of_it(tmp_path):
     for name in ("a", "copy"):
         with closing(open_store(tmp_path / name)) as again:
             assert again.identity == identity
-
-
-def test_a_damaged_id_is_found_when_the_store_is_opened(tmp_path):
-    open_store(tmp_path).close()
-    with closing(sqlite3.connect(tmp_path / "journal.db")) as db:
-        db.execute("UPDATE meta SET value = replace(value, substr(value, 1, 1), 'x') WHERE key = 'store'")
-        db.commit()
-    with pytest.raises(StoreError, match="the store of the journal is damaged"):
-        open_store(tmp_path)
 
 
 def test_a_run_that_is_bound_to_another_store_is_refused_until_a_person_accepts_that_one(tmp_path):
@@ -397,12 +316,12 @@ DAY = 86_400 * 10**9
 
 def test_the_site_s_now_is_that_of_trusted_machines_and_is_taken_back(tmp_path):
     with closing(open_store(tmp_path)) as store:
-        store.commit([incoming(samples(1)), incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
+        store.commit([incoming(samples(1)), incoming(samples(2, stamp_ns=[NOW_NS + DAY, NOW_NS]), machine="b")])
         assert store.newest_ns == NOW_NS + DAY
         store.decide(TrustDecision("b", trusted=False, by="person", reason="its clock", stamp_ns=1))
         store.adopt(folded(samples(1)), 2, Facts(frozenset({"b"})))
         assert store.newest_ns == store.info()["stamp_ns"] == NOW_NS
-        store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), 2, machine="b")])
+        store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), 3, machine="b")])
         assert (store.newest_ns, store.machines()["b"]["newest_ns"]) == (NOW_NS, NOW_NS + DAY)
     with closing(open_store(tmp_path)) as store:
         assert store.newest_ns == NOW_NS

@@ -1,29 +1,21 @@
 from collections.abc import Iterator
-from pathlib import Path
 from threading import Thread
 
 import numpy as np
 import pytest
 
-from mapserver.journal.archive import FOLDER, HOUR_NS, Archive, archive
+from mapserver.journal.archive import FOLDER, HOUR_NS, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.rows import Admission, JournalRow, Selection
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
-from protocol.arrays import Table
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
 from tests.journals import history_beside
-from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, put, random_samples, samples
 
 pytest.importorskip("pyarrow.parquet")
 PARTS = {name: np.split(random_samples(200, seed, half_m=25.0), 10) for seed, name in enumerate("ab")}
-
-
-def add(journal: SqliteJournal, rows: Table, first_seq: int, machine: str = "a", received_ns: int = NOW_NS) -> None:
-    journal.begin()
-    journal.append(Admission(batch(rows, first_seq, machine), 0, 0), received_ns)
-    journal.commit()
 
 
 @pytest.fixture(scope="module", params=[0, 3, 20], ids=lambda rows: f"{rows} archived")
@@ -33,7 +25,7 @@ def store(request, tmp_path_factory) -> Iterator[History]:
     journal = SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
     for i in range(10):
         for machine in "ab":
-            add(journal, PARTS[machine][i], 1 + 20 * i, machine, NOW_NS + journal.last_row * HOUR_NS)
+            put(journal, batch(PARTS[machine][i], 1 + 20 * i, machine), NOW_NS + journal.last_row * HOUR_NS)
     reader = SqliteReader(journal.path)
     list(archive(folder / FOLDER, reader, SITE, NOW_NS + request.param * HOUR_NS, journal.forget))
     assert journal.archived_row == request.param
@@ -77,7 +69,7 @@ def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
 def test_rows_come_once_while_another_thread_archives_and_the_owner_writes(tmp_path):
     journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
     for i in range(120):
-        add(journal, samples(1), i + 1, received_ns=NOW_NS + i // 10 * HOUR_NS)
+        put(journal, batch(samples(1), i + 1), NOW_NS + i // 10 * HOUR_NS)
     owner_calls: list[int] = []
 
     def age() -> None:
@@ -103,19 +95,11 @@ def test_rows_come_once_while_another_thread_archives_and_the_owner_writes(tmp_p
 def test_a_missing_file_is_no_silent_gap(tmp_path):
     journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
     for i in range(3):
-        add(journal, samples(1), i + 1, received_ns=NOW_NS + i * HOUR_NS)
+        put(journal, batch(samples(1), i + 1), NOW_NS + i * HOUR_NS)
     history = history_beside(journal)
     with SqliteReader(journal.path) as reader:
         list(archive(tmp_path / FOLDER, reader, SITE, NOW_NS + 2 * HOUR_NS, journal.forget))
     history.archive.paths()[1].unlink()
     with pytest.raises(StoreError, match="the file with row 2 is missing"):
         list(history_rows(history))
-    journal.close()
-
-
-def test_an_archive_stands_beside_its_journal(tmp_path):
-    journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
-    history = history_beside(journal)
-    assert (history.journal, history.archive.folder) == (journal, Path(tmp_path / FOLDER))
-    assert isinstance(history.archive, Archive)
     journal.close()

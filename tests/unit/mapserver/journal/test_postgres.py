@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,18 @@ from tests import postgres_server as server
 from tests.pooler import SwappingPooler
 from tests.postgres_server import Cluster, Database
 from tests.tcp_proxy import Proxy, Weather
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, now_ns, past_of, random_samples, same, wait_for
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    fold_of,
+    incoming,
+    now_ns,
+    past_of,
+    random_samples,
+    same,
+    wait_for,
+)
 
 YEAR_NS = 365 * 86400 * 10**9
 
@@ -66,17 +77,12 @@ def hang(store: Store) -> None:
         ("postgresql://127.0.0.1:1/x", "cannot be read: connection.*refused"),
         ("postgresql://[", "--journal: is no PostgreSQL URL"),
         ("postgresql://host/db?nonsense=1", "--journal: is no PostgreSQL URL"),
+        ("", 'database "nothing" does not exist'),
     ],
 )
-def test_a_url_that_leads_nowhere_is_one_line(tmp_path, url, problem):
+def test_a_url_that_leads_nowhere_is_one_line(tmp_path, postgres_cluster, url, problem):
     with pytest.raises(SitegridError, match=problem) as caught:
-        JournalLocation(tmp_path, url).exists()
-    assert "\n" not in str(caught.value)
-
-
-def test_a_database_that_does_not_exist_is_one_line(tmp_path, postgres_cluster):
-    with pytest.raises(StoreError, match='database "nothing" does not exist') as caught:
-        JournalLocation(tmp_path, postgres_cluster.url("nothing")).store_id()
+        JournalLocation(tmp_path, url or postgres_cluster.url("nothing")).exists()
     assert "\n" not in str(caught.value)
 
 
@@ -198,10 +204,8 @@ def test_a_holder_that_says_nothing_loses_the_lock_by_itself(tmp_path, database)
     with closing(open_store(tmp_path / "one", database)) as first:
         assert send(first, 1).epoch == 1
         hang(first)
-        began_s = time.monotonic()
         with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
             second = open_store(tmp_path / "two", database, standby)
-        assert time.monotonic() - began_s < session.HANGS_S + 5.0
         with closing(second):
             assert isinstance(send(first, 6), Refused), "its session is gone, and it does not know yet"
             with pytest.raises(FencedError, match="another server has taken over the journal, with epoch 2 after 1"):
@@ -211,11 +215,8 @@ def test_a_holder_that_says_nothing_loses_the_lock_by_itself(tmp_path, database)
             assert same(second.grid, folded_by(second))
 
 
-def folded_by(store: Store) -> Any:
-    grid = Grid(SITE.cell_m, CONFIG.fold)
-    for row in history_rows(store.history):
-        grid.fold(row.rows, row.machine)
-    return grid
+def folded_by(store: Store) -> Grid:
+    return fold_of(history_rows(store.history))
 
 
 def test_a_holder_that_stops_in_the_middle_of_a_message_loses_the_lock(tmp_path, database):
@@ -245,9 +246,7 @@ def test_a_holder_whose_network_swallows_all_bytes_notices_it(tmp_path, database
             wait_for(lambda: store.journal._session.lost)
             assert isinstance(send(store, 6), Refused), "and no thread waits for ever"
             assert send(second, 6).epoch == 2
-            began_s = time.monotonic()
             store.close()
-            assert time.monotonic() - began_s < session.ANSWER_S + 1.0
 
 
 def test_a_commit_whose_answer_never_comes_ends_once_another_server_has_taken_over(tmp_path, database):
@@ -287,25 +286,18 @@ def test_a_holder_that_works_keeps_the_lock(tmp_path, database):
 
 
 def test_a_writer_without_its_lock_cannot_commit(tmp_path, database):
-    """The epoch alone fences it: its session stands, as behind a pooler."""
-    with closing(open_store(tmp_path, database)) as store:
-        database.sql("UPDATE sitegrid.head SET epoch = epoch + 1")
-        with pytest.raises(FencedError):
-            send(store, 1)
-        assert store.journal.fenced
-        assert database.sql("SELECT count(*) FROM sitegrid.journal") == [(0,)]
-
-
-def test_a_server_without_the_journal_acknowledges_not_even_what_it_had(tmp_path, database):
-    with closing(open_store(tmp_path, database)) as store:
-        assert isinstance(send(store, 1), Ack)
-        database.sql("UPDATE sitegrid.head SET epoch = epoch + 1")
-        with pytest.raises(FencedError):
-            send(store, 1)
-    with closing(open_store(tmp_path, database)) as store:
-        database.sql("UPDATE sitegrid.head SET epoch = epoch + 1")
-        with pytest.raises(FencedError):
-            store.commit([incoming(random_samples(0, 1), 1)])
+    """The epoch alone fences it: its session stands, as behind a pooler. Not even what it had is acknowledged again."""
+    for had in (1, 2):
+        with closing(open_store(tmp_path, database)) as store:
+            if had == 1:
+                assert isinstance(send(store, 1), Ack)
+            database.sql("UPDATE sitegrid.head SET epoch = epoch + 1")
+            with pytest.raises(FencedError):
+                send(store, 1 if had == 1 else 6)
+            assert store.journal.fenced
+            with pytest.raises(FencedError):
+                store.commit([incoming(random_samples(0, 1), 1)])
+        assert database.sql("SELECT count(*) FROM sitegrid.journal") == [(1,)]
 
 
 class LostAnswer:
@@ -544,37 +536,13 @@ def test_a_warm_grid_counts_as_what_no_snapshot_has(tmp_path, database):
         assert second.samples_behind == 0
 
 
-def test_a_standby_follows_rows_and_decisions(tmp_path, database):
-    standby = Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)
-    with closing(open_store(tmp_path / "one", database)) as store, closing(standby):
-        for first in (1, 6):
-            send(store, first)
-            send(store, first, machine="b")
-        standby.follow(5.0)
-        row, grid = standby.grid_for(store.journal, store.facts)
-        assert row == 4
-        assert same(grid, store.grid)
-        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
-        standby.follow(5.0)
-        assert standby.grid_for(store.journal, store.facts) is None, "the grid of other facts"
-        _, grid = standby.grid_for(store.journal, facts)
-        assert grid.folded == 10
-
-
-def test_a_standby_whose_clock_is_a_year_ahead_takes_over(tmp_path, database):
-    with closing(open_store(tmp_path / "one", database)) as store:
-        send(store, 1)
-    with closing(open_store(tmp_path / "two", database, clock_ns=NOW_NS + YEAR_NS)) as other:
-        assert (send(other, 6).watermark, other.journal.epoch) == (10, 2)
-
-
 def test_a_standby_whose_clock_is_a_year_behind_says_so_and_takes_nothing_until_it_is_right(tmp_path, database):
     with closing(open_store(tmp_path / "one", database)) as store:
         send(store, 1)
     with closing(open_store(tmp_path / "two", database, clock_ns=NOW_NS - YEAR_NS)) as other:
         assert send(other, 6).reason == Refusal.SERVER_CLOCK
-    with closing(open_store(tmp_path / "two", database)) as other:
-        assert send(other, 6).watermark == 10
+    with closing(open_store(tmp_path / "two", database, clock_ns=NOW_NS + YEAR_NS)) as other:
+        assert (send(other, 6).watermark, other.journal.epoch) == (10, 3), "a year ahead, it takes over"
 
 
 # --- what a backup leaves ---------------------------------------------------------------------------------------------
@@ -643,8 +611,8 @@ def test_a_long_dump_holds_nobody_up(tmp_path, database):
 # --- replicas ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def pair() -> Iterator[tuple[Cluster, Cluster]]:
+@contextmanager
+def synchronous_pair() -> Iterator[tuple[Cluster, Cluster]]:
     """A primary and its synchronous replica."""
     with server.cluster() as primary, server.replica(primary, "b") as replica:
         primary.sql("ALTER SYSTEM SET synchronous_standby_names = 'b'")
@@ -653,7 +621,13 @@ def pair() -> Iterator[tuple[Cluster, Cluster]]:
         yield primary, replica
 
 
-@pytest.mark.slow
+@pytest.fixture
+def pair() -> Iterator[tuple[Cluster, Cluster]]:
+    with synchronous_pair() as both:
+        yield both
+
+
+@pytest.mark.nightly  # make test has the lock, the epoch and what a restore leaves
 def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_acknowledges_nothing(tmp_path, pair):
     primary, replica = pair
     database = primary.new_database()
@@ -670,7 +644,6 @@ def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_ac
     answers: list[Ack | Refused] = []
     writing = threading.Thread(target=lambda: answers.append(send(first, 16)), daemon=True)
     writing.start()
-    began_s = time.monotonic()
     replica.sql("ALTER SYSTEM RESET synchronous_standby_names")  # it is alone now, which a person decides
     replica.sql("SELECT pg_reload_conf()")
     wait_for(lambda: replica.sql("SHOW synchronous_standby_names") == [("",)])
@@ -681,7 +654,6 @@ def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_ac
         assert second.journal.watermark("a", 7).seq == acknowledged[-1]
         answer = send(second, 16)
         assert (answer.watermark, answer.epoch) == (20, 2)
-    assert time.monotonic() - began_s < 10.0
     assert not answers, "the old primary waits for a replica that does not come"
     primary.stop()
     writing.join(20.0)

@@ -19,7 +19,7 @@ from protocol.wire.messages import Ack, Refused
 from tests import postgres_server as server
 from tests.postgres_server import Cluster, Database
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, random_samples, same, wait_for
-from tests.unit.mapserver.journal.test_postgres import folded_by, open_store, place, send
+from tests.unit.mapserver.journal.test_postgres import folded_by, open_store, place, send, synchronous_pair
 
 MANY = 2000  # samples of a row, so that a dump is more than what a pipe holds
 
@@ -75,7 +75,7 @@ def test_a_real_dump_holds_neither_writer_nor_follower_up_and_is_a_backup(tmp_pa
         assert send(store, 6).watermark == 10
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_base_backup_of_a_live_primary_has_what_was_acknowledged_before_it_began(tmp_path):
     with server.cluster() as primary, server.cluster_folder() as folder:
         database, copy = primary.new_database(), Cluster(folder)
@@ -110,39 +110,41 @@ def test_a_base_backup_of_a_live_primary_has_what_was_acknowledged_before_it_beg
             copy.stop()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("end", ["pg_cancel_backend", "pg_terminate_backend"])
-def test_a_commit_that_an_operator_stops_from_waiting_for_its_replica_is_not_acknowledged(tmp_path, end):
-    with server.cluster() as primary, server.replica(primary, "b") as replica:
-        database = primary.new_database()
-        primary.sql("ALTER SYSTEM SET synchronous_standby_names = 'b'")
-        primary.sql("SELECT pg_reload_conf()")
-        wait_for(lambda: primary.sql("SELECT sync_state FROM pg_stat_replication") == [("sync",)])
-        with closing(open_store(tmp_path, database)) as store:
-            assert isinstance(send(store, 1), Ack)
-            with stopped(replica):
-                answers: list[Ack | Refused] = []
-                waiting = threading.Thread(target=lambda: answers.append(send(store, 6)), daemon=True)
-                waiting.start()
-                waits = "application_name = 'sitegrid writer' AND wait_event = 'SyncRep'"
-                wait_for(lambda: bool(primary.sql(f"SELECT 1 FROM pg_stat_activity WHERE {waits}")))
-                primary.sql(f"SELECT {end}(pid) FROM pg_stat_activity WHERE {waits}")
-                waiting.join(20.0)
-                assert [answer.reason for answer in answers] == [Refusal.STORE]
-                count = "SELECT count(*) FROM sitegrid.journal"
-                assert database.sql(count) == [(2,)], "it is there, but on this host alone"
+@pytest.mark.nightly
+def test_a_commit_that_an_operator_stops_from_waiting_for_its_replica_is_not_acknowledged(tmp_path):
+    with synchronous_pair() as (primary, replica):
+        for end in ("pg_cancel_backend", "pg_terminate_backend"):
+            stops_waiting(tmp_path / end, primary, replica, end)
 
-                # The same again is not acknowledged either, until the replica has both.
-                again = threading.Thread(target=lambda: answers.append(send(store, 6)), daemon=True)
-                again.start()
-                again.join(2.0)
-                assert not any(isinstance(answer, Ack) for answer in answers)
-            again.join(20.0)
-            wait_for(lambda: isinstance(send(store, 6), Ack))
-            wait_for(lambda: replica.shows_all_of(primary))
-            assert Database(replica, database.name).sql(count) == [(2,)]
-            assert store.journal.watermark("a", 7).seq == 10
-            assert same(store.grid, folded_by(store))
+
+def stops_waiting(folder: Path, primary: Cluster, replica: Cluster, end: str) -> None:
+    """An operator ends the wait of a commit for a replica that hangs."""
+    database = primary.new_database()
+    with closing(open_store(folder, database)) as store:
+        assert isinstance(send(store, 1), Ack)
+        with stopped(replica):
+            answers: list[Ack | Refused] = []
+            waiting = threading.Thread(target=lambda: answers.append(send(store, 6)), daemon=True)
+            waiting.start()
+            waits = "application_name = 'sitegrid writer' AND wait_event = 'SyncRep'"
+            wait_for(lambda: bool(primary.sql(f"SELECT 1 FROM pg_stat_activity WHERE {waits}")))
+            primary.sql(f"SELECT {end}(pid) FROM pg_stat_activity WHERE {waits}")
+            waiting.join(20.0)
+            assert [answer.reason for answer in answers] == [Refusal.STORE]
+            count = "SELECT count(*) FROM sitegrid.journal"
+            assert database.sql(count) == [(2,)], "it is there, but on this host alone"
+
+            # The same again is not acknowledged either, until the replica has both.
+            again = threading.Thread(target=lambda: answers.append(send(store, 6)), daemon=True)
+            again.start()
+            again.join(2.0)
+            assert not any(isinstance(answer, Ack) for answer in answers)
+        again.join(20.0)
+        wait_for(lambda: isinstance(send(store, 6), Ack))
+        wait_for(lambda: replica.shows_all_of(primary))
+        assert Database(replica, database.name).sql(count) == [(2,)]
+        assert store.journal.watermark("a", 7).seq == 10
+        assert same(store.grid, folded_by(store))
 
 
 @contextmanager

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import random
 import shutil
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from mapserver.journal.rows import Admission, Watermark
+from mapserver.journal.rows import Watermark
 from mapserver.journal.shortfall import KIND, Shortfall, SpoolShortfall, missing
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.disk.high_water_mark import mark_path
 from protocol.errors import StoreError
-from tests.unit.mapserver.data import NOW_NS, SITE, batch, random_samples
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, put, random_samples
 
 MACHINES = ("loader-1", "loader-2")
 BATCHES, SAMPLES = 10, 100  # of each machine, of each batch
@@ -28,10 +26,7 @@ def open_journal(folder: Path) -> SqliteJournal:
 
 
 def write(journal: SqliteJournal, machine: str, first_seq: int, n: int = SAMPLES, lost: int = 0) -> None:
-    journal.begin()
-    sent = batch(random_samples(n, first_seq), first_seq, machine=machine)
-    journal.append(Admission(sent, trimmed=0, lost=lost), NOW_NS)
-    journal.commit()
+    put(journal, batch(random_samples(n, first_seq), first_seq, machine=machine), lost=lost)
 
 
 @pytest.fixture(scope="module")
@@ -197,18 +192,3 @@ def test_readers_beside_the_journal_need_no_mark(folder):
     mark_path(folder / "journal.db").unlink()
     with SqliteReader(folder / "journal.db") as reader:
         assert reader.last_row == 2 * BATCHES
-
-
-@pytest.fixture
-def lax_umask() -> Iterator[None]:
-    before = os.umask(0)
-    yield
-    os.umask(before)
-
-
-@pytest.mark.usefixtures("lax_umask")
-def test_only_its_owner_reads_the_files_of_a_journal(tmp_path):
-    with closing(open_journal(tmp_path / "store")) as journal:
-        write(journal, "loader-1", 1)
-        modes = {path.name: path.stat().st_mode & 0o777 for path in (tmp_path / "store").iterdir()}
-    assert modes == dict.fromkeys(("journal.db", "journal.db-wal", "journal.db-shm", "journal.db-mark"), 0o600)

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.journal import stamp_index
-from mapserver.journal.rows import LAST, Admission, Selection
+from mapserver.journal.rows import LAST, Selection
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.journal.stamp_index import StampIndex
-from tests.unit.mapserver.data import NOW_NS, SITE, batch, samples
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, put, samples
 
 S = 10**9
 
@@ -25,10 +25,8 @@ def small_chunks(monkeypatch):
 
 
 def append(journal: SqliteJournal, first_s: int, last_s: int) -> None:
-    journal.begin()
     stamps = NOW_NS + np.array([first_s, last_s]) * S
-    journal.append(Admission(batch(samples(2, stamp_ns=stamps), 1 + 2 * journal.last_row), 0, 0), NOW_NS)
-    journal.commit()
+    put(journal, batch(samples(2, stamp_ns=stamps), 1 + 2 * journal.last_row))
 
 
 def inside(stretches, last: int) -> list[int]:

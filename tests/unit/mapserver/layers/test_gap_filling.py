@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapserver.layers.cell_layers import ReadConfig, derive_area, margin_cells, required
+from mapserver.layers.cell_layers import ReadConfig, derive_area, margin_cells
 from mapserver.layers.gap_filling import (
     AREA_LAYERS,
     GRADE_PRIOR_STD,
@@ -77,9 +77,8 @@ def test_the_kernel_counts_area_so_that_the_size_of_cells_does_not_matter():
     assert sparse_kernel(5.0, 0.25).sum() == pytest.approx(sparse_kernel(5.0, 1.0).sum(), rel=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_known_cells_keep_what_they_have(seed):
-    cells = random_map(seed)
+def test_known_cells_keep_what_they_have():
+    cells = random_map(0)
     made = fill(cells, *AREA_LAYERS)
     known = np.isfinite(cells["resistance"])
     for filled, source in (("resistance_filled", "resistance"), ("resistance_class_filled", "resistance_class"),
@@ -118,7 +117,7 @@ def test_between_concrete_and_sand_no_dirt_is_invented():
     assert (made["resistance_class_filled"][:, 20:] == 4).all()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_filled_resistance_is_like_some_ground_within_reach(seed):
     cells = random_map(seed, known_share=0.05)
     filled, known = fill(cells, "resistance_filled"), np.isfinite(cells["resistance"])
@@ -242,8 +241,3 @@ def test_one_sure_cell_fills_with_its_own_value():
     assert std[5, 5] == 0.01
     assert np.nanmax(std) <= 2.0
     assert np.array_equal(np.isnan(std), np.isnan(filled))
-
-
-def test_each_area_layer_needs_only_what_exists():
-    for name in AREA_LAYERS:
-        assert set(required([name])) <= set(window())

@@ -9,14 +9,13 @@ from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.facts import Facts
-from mapserver.journal.rows import Admission
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past.making import make
 from mapserver.past.past import Past
 from mapserver.past.plan import HOUR_NS
 from protocol.arrays import Table
-from tests.unit.mapserver.data import NOW_NS, SITE, batch
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, put
 
 FOLD = FoldConfig()
 S = 10**9
@@ -34,10 +33,7 @@ class PastStore:
 
     def add(self, rows: Table, machine: str = "a") -> None:
         first_seq = 1 + sum(len(table) for name, table in self.sent if name == machine)
-        self.journal.begin()
-        received_ns = NOW_NS + self.journal.last_row * HOUR_NS
-        self.journal.append(Admission(batch(rows, first_seq, machine), 0, 0), received_ns)
-        self.journal.commit()
+        put(self.journal, batch(rows, first_seq, machine), NOW_NS + self.journal.last_row * HOUR_NS)
         self.sent.append((machine, rows))
 
     def archive(self, rows: int) -> None:

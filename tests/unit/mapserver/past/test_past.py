@@ -44,10 +44,6 @@ def test_the_stamp_itself_belongs_to_the_past(tmp_path):
         assert [store.as_of(t).folded for t in (99, 100, 299, 300)] == [0, 1, 2, 3]
 
 
-def test_a_grid_without_a_machine_is_that_of_the_others(store):
-    assert same(store.as_of(NOW_NS + HOUR_NS, "b"), store.folded(NOW_NS + HOUR_NS, "b"))
-
-
 @pytest.mark.parametrize("closed_h", [None, 1, 2])
 @pytest.mark.parametrize("cell_m", [0.25, 1.0, 3.0])
 def test_a_window_holds_the_same_evidence_as_the_whole(tmp_path, cell_m, closed_h):

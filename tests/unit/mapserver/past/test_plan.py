@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from mapserver.past.plan import DAY_NS, GRACE_NS, HOUR_NS, due, surplus, thinned
 
 DAY = 20_000 * DAY_NS
-MINUTE_NS = 60 * 10**9
 
 
 def next_stamp(*stamps: int):

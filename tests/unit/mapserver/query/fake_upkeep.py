@@ -34,17 +34,29 @@ class FakeUpkeep:
         return asdict(machine_state(machine, trusted=trusted is not False))
 
 
-def answers_of(writer: Writer, upkeep: FakeUpkeep | None = None) -> Answers:
-    return Answers(ServerSource(writer, upkeep or FakeUpkeep(), past_of(writer)))  # type: ignore[arg-type]
+def source_of(writer: Writer, upkeep: FakeUpkeep | None = None) -> ServerSource:
+    return ServerSource(writer, upkeep or FakeUpkeep(), past_of(writer))  # type: ignore[arg-type]
 
 
-def answered(answers: Answers, name: str, parameters: dict[str, str]) -> bytes:
+class AnswersOf(Answers):
+    """Answers that say what they are of."""
+
+    def __init__(self, writer: Writer, upkeep: FakeUpkeep | None = None) -> None:
+        self.writer, self.source = writer, source_of(writer, upkeep)
+        super().__init__(self.source)
+
+
+def answers_of(writer: Writer, upkeep: FakeUpkeep | None = None) -> AnswersOf:
+    return AnswersOf(writer, upkeep)
+
+
+def answered(answers: AnswersOf, name: str, parameters: dict[str, str]) -> bytes:
     """Parse a query, wait for the row that it asks for, the newest unless it says which, and answer it."""
-    newest = answers._source.run(lambda state: state.version.row)
+    newest = answers.source.run(lambda state: state.version.row)
     if parameters.get("as_of") is None and name in ("segments", "worklist", "route", "way"):
         parameters = {"after": str(newest), **parameters}
     query, waited = parse_query(name, parameters), Future()
-    answers._source.waits.add(query.fresh.after, query.fresh.wait_s, waited.set_result)
+    answers.source.waits.add(query.fresh.after, query.fresh.wait_s, waited.set_result)
     if error := waited.result(WAIT_S):
         raise error
     return answers.answer(query)

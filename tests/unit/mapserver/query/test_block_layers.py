@@ -13,7 +13,6 @@ from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.block_layers import BlockLayers
-from mapserver.query.views import read_cells, view_now
 from protocol.queries.answer_codec import decode_point
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 from tests.unit.mapserver.data import CONFIG, SITE, incoming, open_writer, random_samples, samples, send
@@ -35,42 +34,6 @@ def same(a, b) -> None:
     assert a.keys() == b.keys()
     for name, layer in a.items():
         np.testing.assert_array_equal(layer, b[name], err_msg=name)
-
-
-@pytest.mark.slow
-def test_whatever_is_kept_equals_what_is_derived_afresh(tmp_path):
-    """Bit for bit, while samples come in here and there, and windows and layers change."""
-    rng = np.random.default_rng(5)
-    kept = fresh()
-    with closing(open_writer(tmp_path)) as writer:
-        for turn in range(12):
-            rows = random_samples(80, seed=turn, half_m=8.0)
-            rows["x_m"] += rng.uniform(-60, 60)
-            rows["y_m"] += rng.uniform(-40, 40)
-            rows["stamp_ns"] += turn * 400 * 10**9
-            send(writer, [incoming(rows, first_seq=1 + 80 * turn)])
-            left, bottom = rng.integers(-80, 20, 2)
-            window = CellWindow(int(left), int(bottom), int(rng.integers(1, 90)), int(rng.integers(1, 90)))
-            names = tuple(rng.choice(ALL, rng.integers(1, 6), replace=False).tolist())
-            same(read(kept, writer, window, names), read(fresh(), writer, window, names))
-        same(read(kept, writer), read(fresh(), writer))
-        cells = writer.run(
-            lambda state: read_cells(view_now(state, WINDOW), WINDOW, tuple(LAYERS), SITE.cell_m, CONFIG)
-        )
-        same(read(kept, writer, names=tuple(LAYERS)), cells)
-    assert kept.used > 20
-
-
-def test_a_cell_has_the_same_bits_in_any_window(tmp_path):
-    with closing(open_writer(tmp_path)) as writer:
-        send(writer, [incoming(random_samples(3000, seed=1))])
-        whole = read(fresh(), writer)
-        for column, row in ((-70, -45), (-33, 7), (0, 0), (-1, -1), (15, 16)):
-            window = CellWindow(column, row, 1, 1)
-            alone = read(fresh(), writer, window)
-            for name, layer in alone.items():
-                cut = whole[name][row - WINDOW.row, column - WINDOW.column]
-                np.testing.assert_array_equal(layer[0, 0], cut, err_msg=name)
 
 
 def test_only_what_lies_near_to_new_samples_is_derived_again(tmp_path):

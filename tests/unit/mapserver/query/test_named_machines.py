@@ -8,7 +8,7 @@ import pytest
 from mapserver.query.named_machines import LOOK_BACK_NS, NamedMachines
 from protocol.errors import QueryError, Refusal
 from protocol.queries.route_requests import RouteQuery
-from protocol.queries.routing import LOADER, MACHINES, NamedMachine
+from protocol.queries.routing import LOADER, MACHINES, NamedMachine, decode_answer
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
@@ -39,7 +39,7 @@ def answers(tmp_path):
 
 def asked(answers, machine: NamedMachine, as_of_ns: int | None = None):
     query = RouteQuery(LINE, machine, stops=(False, False), as_of_ns=as_of_ns)
-    return answers._routes.route(query)
+    return decode_answer(answers.answer(query))
 
 
 def test_a_named_machine_weighs_what_it_said_last_and_drives_as_fast_as_it_did(answers):
@@ -79,13 +79,12 @@ def test_new_samples_are_followed_and_old_ones_forgotten(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(drive(NOW_NS, 22e3), machine="truck-1")])
         answers = answers_of(writer)
-        machines: NamedMachines = answers._routes._machines
+        machines = NamedMachines(answers.source)
         assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == 22e3
         send(writer, [incoming(drive(NOW_NS + 60 * S, 40e3), 21, machine="truck-1")])
         assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == 40e3
         late_ns = NOW_NS + 3 * LOOK_BACK_NS
         send(writer, [incoming(drive(late_ns, np.nan), 41, machine="truck-1")])
         assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == MACHINES["truck"].mass_kg
-        assert len(machines._now.slots) == 1
-        fresh = NamedMachines(answers._source)
+        fresh = NamedMachines(answers.source)
         assert fresh.resolve(NamedMachine("truck-1"), None) == machines.resolve(NamedMachine("truck-1"), None)

@@ -3,19 +3,22 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mapserver.fleet.correction import Correction, Corrections
 from mapserver.journal.facts import Facts
+from mapserver.journal.location import JournalLocation
 from mapserver.query import road_maps
-from mapserver.query.answering import LAYERS_DERIVED
+from mapserver.query.answering import LAYERS_DERIVED, ROADS_MADE, Answers
 from mapserver.query.map_tiles import Tiles
 from mapserver.query.road_maps import ASKED_S, FRESH_S, RoadMaps
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.map_tiles import PLANES
 from protocol.queries.requests import (
+    Freshness,
     PointQuery,
     RegionQuery,
     TilesQuery,
@@ -29,8 +32,8 @@ from protocol.queries.roads import decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import decode_answer
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import WAIT_S, incoming, open_writer, send, wait_for
-from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
+from tests.unit.mapserver.data import WAIT_S, incoming, open_writer, refused, send, wait_for
+from tests.unit.mapserver.query.fake_upkeep import answered, answers_of, source_of
 from tests.unit.mapserver.roads.drives import START_NS, along, passes
 
 HOUR_NS = 3600 * 10**9
@@ -112,16 +115,6 @@ def test_hours_and_bounds_choose(writer):
     rows = worklist(answers, bounds=Bounds(0, 50, 300, 300))
     assert {row.segment.id for row in rows.rows} <= set(late)
     assert rows.total_kwh_ph < worklist(answers).total_kwh_ph
-
-
-def test_what_comes_in_shows_at_once_and_as_after_a_restart(writer, tmp_path):
-    answers = answers_of(writer)
-    segments(answers)
-    more = passes(LINE, 4, 0.08, seed=2, after_s=7200.0)
-    send(writer, [incoming(more, 1, machine="c")])
-    assert worklist(answers) == worklist(answers_of(writer))
-    assert segments(answers) == segments(answers_of(writer))
-    assert worklist(answers).rows[0].segment.resistance > 0.055
 
 
 @pytest.mark.parametrize("size", [37, 10_000])
@@ -206,25 +199,8 @@ def test_bad_parameters_are_refused_by_name(name, parameters, problem):
 
 
 def test_bounds_off_the_site_are_refused(writer):
-    with pytest.raises(QueryError, match="off the site") as refused:
+    with refused(Refusal.OUT_OF_RANGE, "off the site"):
         segments(answers_of(writer), bounds=Bounds(1e6, 0, 2e6, 10))
-    assert refused.value.reason == Refusal.OUT_OF_RANGE
-
-
-@pytest.mark.parametrize(
-    "query",
-    [
-        SegmentsQuery(),
-        SegmentsQuery(5, 7, 9, Bounds(-1, -2, 3, 4), "a"),
-        WorklistQuery(),
-        PointQuery(1.0, 2.0, when=When(5, 6, repairs=True)),
-        WhyQuery(1.0, 2.0),
-        WhyQuery(1.0, 2.0, 5, repairs=True),
-        WorklistQuery(0.03, 0.4, 7, 5, 7, 9, Bounds(-1, -2, 3, 4), "a b"),
-    ],
-)
-def test_queries_survive_the_wire(query):
-    assert parse_query(query.name, encode_query(query)) == query
 
 
 def test_traffic_of_one_stamp_is_no_division_by_nothing(tmp_path):
@@ -377,10 +353,10 @@ def test_layers_that_repairs_leave_as_they_are_are_kept_for_all(repaired):
 
 def test_tiles_show_a_repair_with_the_next_row(repaired):
     opened, _ = repaired
-    answers, ages = answers_of(opened), {}
-    tiles = Tiles(answers._source, lambda: dict(ages))
+    source, ages = source_of(opened), {}
+    tiles = Tiles(source, lambda: dict(ages))
     first = tiles.answer(TilesQuery())
-    ages |= answers._roads.read().ages
+    ages |= RoadMaps(source).read().ages
     assert tiles.answer(TilesQuery(first.version)).tiles == (), "who has this row would not ask for it"
     send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine="c")])
     later = {(tile.x, tile.y): tile for tile in tiles.answer(TilesQuery(first.version)).tiles}
@@ -389,14 +365,14 @@ def test_tiles_show_a_repair_with_the_next_row(repaired):
     resistance = PLANES["resistance"].values()
     assert resistance[before[0, 0].unpacked()["resistance"]][row].max() > 0.03
     assert resistance[later[0, 0].unpacked()["resistance"]][row] == pytest.approx(0.02, rel=0.2)
-    fresh = Tiles(answers._source, lambda: dict(ages)).answer(TilesQuery())
+    fresh = Tiles(source, lambda: dict(ages)).answer(TilesQuery())
     assert {(tile.x, tile.y): tile.planes for tile in fresh.tiles}[0, 0] == later[0, 0].planes
 
 
 def test_pictures_have_the_ages_of_some_seconds_ago(repaired, monkeypatch):
     opened, _ = repaired
     monkeypatch.setattr(road_maps, "CHEAP", DEAR)
-    roads = answers_of(opened)._roads
+    roads = RoadMaps(source_of(opened))
     known = roads.lately()
     assert known.keys() == roads.read().ages.keys() != set()
     send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine="c")])
@@ -427,7 +403,7 @@ class Clock:
 def test_roads_are_those_of_the_last_seconds_and_say_which(repaired):
     opened, _ = repaired
     clock = Clock(look_s=0.5)
-    roads = RoadMaps(answers_of(opened)._source, clock)
+    roads = RoadMaps(source_of(opened), clock)
     first = roads.read()
     come(opened)
     clock.now_s += FRESH_S - 2.0
@@ -442,7 +418,7 @@ def test_roads_are_those_of_the_last_seconds_and_say_which(repaired):
 def test_roads_that_are_soon_made_are_of_a_moment_ago(repaired):
     opened, _ = repaired
     clock = Clock(look_s=0.01)
-    roads = RoadMaps(answers_of(opened)._source, clock)
+    roads = RoadMaps(source_of(opened), clock)
     first = roads.read()
     come(opened)
     clock.now_s += 0.5
@@ -466,18 +442,26 @@ def test_who_waits_for_a_row_gets_roads_of_it(repaired, monkeypatch):
 
 def test_roads_of_another_fact_are_of_no_use(repaired):
     opened, _ = repaired
-    roads = answers_of(opened)._roads
+    roads = RoadMaps(source_of(opened))
     known = roads.read()
     opened.run(lambda store: setattr(store, "facts", Facts(frozenset({"b"}), number=1)))
     assert roads.read().version.fact == 1 != known.version.fact
 
 
+WHOLE = RouteQuery(((15.0, 10.0), (205.0, 10.0)))
+
+
+def row_of(answers: Answers, query: RouteQuery) -> int:
+    """Which row of the journal a route is of."""
+    return decode_answer(answers.answer(query)).version.row
+
+
 @pytest.fixture
 def slow(repaired, monkeypatch):
-    """Answers to which newer roads are in the making beside, once `come` was called, until an event is set."""
+    """Answers to which newer roads are in the making beside, since somebody waits for them, until an event is set."""
     opened, _ = repaired
     answers, may_end, began = answers_of(opened), threading.Event(), threading.Event()
-    answers._roads.read()
+    assert row_of(answers, WHOLE) == 4
     whole = road_maps.network
 
     def slowly(skeleton):
@@ -488,97 +472,72 @@ def slow(repaired, monkeypatch):
     monkeypatch.setattr(road_maps, "network", slowly)
     monkeypatch.setattr(road_maps, "CHEAP", DEAR)
     come(opened)
-    making = threading.Thread(target=answers._roads.renew)
-    making.start()
-    assert began.wait(WAIT_S)
-    yield answers, may_end
-    may_end.set()
-    making.join()
-
-
-def test_roads_in_the_making_hold_up_no_route(slow):
-    answers, may_end = slow
-    line = ((15.0, 10.0), (205.0, 10.0))
-    meanwhile = answers._routes.route(RouteQuery(line))
-    assert meanwhile.version.row == answers._routes.route(RouteQuery(line)).version.row == 4
-    assert answers._routes.route(RouteQuery(line, repairs=False)).version.row == 5
-    may_end.set()
-    wait_for(lambda: answers._routes.route(RouteQuery(line)).version.row == 5)
-
-
-def test_who_waits_for_roads_takes_those_in_the_making(slow):
-    answers, may_end = slow
     with ThreadPoolExecutor(4) as pool:
-        waiting = [pool.submit(answers._roads.reach, 5) for _ in range(4)]
+        waiting = [pool.submit(row_of, answers, replace(WHOLE, fresh=Freshness(5))) for _ in range(4)]
+        assert began.wait(WAIT_S)
+        yield answers, may_end, waiting
         may_end.set()
-        for one in waiting:
-            one.result(WAIT_S)
-    assert answers._roads.read().version.row == 5
 
 
-def test_a_picture_goes_without_newer_roads_that_take_long(slow, monkeypatch):
-    answers, _ = slow
-    known = answers._roads.read().ages
-    monkeypatch.setattr(road_maps, "FRESH_S", -1.0)  # too old at once
-    assert answers._roads.lately() is known
+def test_roads_in_the_making_hold_up_nobody_and_who_waits_for_them_takes_them(slow, monkeypatch):
+    answers, may_end, waiting = slow
+    assert row_of(answers, WHOLE) == row_of(answers, WHOLE) == 4
+    assert row_of(answers, replace(WHOLE, repairs=False)) == 5
+    with monkeypatch.context() as patched:
+        patched.setattr(road_maps, "FRESH_S", -1.0)  # too old at once
+        assert answers.tiles(TilesQuery()).version.row == 5, "a picture goes without them"
+    may_end.set()
+    assert [one.result(WAIT_S) for one in waiting] == [5] * 4
+    assert row_of(answers, WHOLE) == 5
 
 
 def test_roads_are_made_beside_while_somebody_asks(repaired):
     opened, _ = repaired
     clock = Clock()
-    roads = RoadMaps(answers_of(opened)._source, clock)
+    roads = RoadMaps(source_of(opened), clock)
     roads.renew()
-    assert roads._newest is None, "nobody has asked yet"
+    assert roads.made == 0, "nobody has asked yet"
     roads.read()
     clock.now_s += ASKED_S
     come(opened)
     roads.renew()
-    assert roads._newest.roads.version.row == 4, "nobody asked for long"
-    assert roads.read().version.row == 5
+    assert roads.made == 1, "nobody asked for long"
+    assert (roads.read().version.row, roads.made) == (5, 2)
     come(opened, "d")
     roads.renew()
-    assert roads.read().version.row == 6, "and now somebody does"
+    assert (roads.made, roads.read().version.row, roads.made) == (3, 6, 3), "and now somebody does"
 
 
-def test_roads_of_a_map_that_is_there_at_the_start_are_made_at_once(repaired, tmp_path):
-    answers = answers_of(repaired[0])
-    answers.start()
-    wait_for(lambda: answers._roads._newest)
-    answers.close()
-    with closing(open_writer(tmp_path / "empty")) as opened:
-        empty = answers_of(opened)._roads
-        empty.start()
-        empty.renew()
-        assert empty._newest is None, "nobody has asked yet"
-        empty.close()
-
-
-def test_the_end_of_a_server_ends_the_making_of_roads(repaired):
+def test_roads_of_a_map_that_is_there_at_the_start_are_made_at_once_and_none_after_the_end(repaired, tmp_path):
     answers = answers_of(repaired[0])
     answers.close()  # never begun
+    answers = answers_of(repaired[0])
     answers.start()
-    thread = answers._roads._thread
+    wait_for(lambda: answers.info()["counters"].get(ROADS_MADE))
     answers.close()
-    assert not thread.is_alive()
+    wait_for(lambda: "roads" not in {thread.name for thread in threading.enumerate()})
+    with closing(open_writer(tmp_path / "empty")) as opened, closing(RoadMaps(source_of(opened))) as empty:
+        empty.start()
+        empty.renew()
+        assert empty.made == 0, "nobody has asked yet"
 
 
 def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
     opened, _ = repaired
     monkeypatch.setattr(road_maps, "FRESH_S", 0.0)
-    roads, failures = answers_of(opened)._roads, iter("12")
-    follow = roads._follow
+    failures, reader = iter("12"), JournalLocation.reader
 
-    def fails(*args):
+    def fails(location):
         if next(failures, None):
             raise StoreError("journal", "the disk is gone")
-        return follow(*args)
+        return reader(location)
 
-    monkeypatch.setattr(roads, "_follow", fails)
-    with pytest.raises(QueryError, match="the disk is gone"):
-        roads.read()
-    roads.start()
-    wait_for(lambda: roads._newest)
-    roads.close()
+    monkeypatch.setattr(JournalLocation, "reader", fails)
+    with closing(RoadMaps(source_of(opened))) as roads:
+        with pytest.raises(QueryError, match="the disk is gone"):
+            roads.read()
+        roads.start()
+        wait_for(lambda: roads.made)
 
 
 def test_where_nothing_changed_cells_are_as_they_are(writer):
@@ -677,7 +636,6 @@ def test_an_unknown_machine_is_refused_by_name(writer, ask):
 
 def test_more_segments_than_an_answer_holds_are_refused_with_what_to_do(writer, monkeypatch):
     monkeypatch.setattr("mapserver.query.roads.MOST_SEGMENTS", 10)
-    with pytest.raises(QueryError, match="at most 10 are answered: ask for less with `bounds`") as refused:
+    with refused(Refusal.TOO_LARGE, "at most 10 are answered: ask for less with `bounds`"):
         segments(answers_of(writer))
-    assert refused.value.reason == Refusal.TOO_LARGE
     assert segments(answers_of(writer), bounds=Bounds(0, 0, 100, 50)).segments

@@ -6,8 +6,8 @@ import pytest
 
 from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.query.server_source import Commands
-from protocol.errors import QueryError, Refusal
-from tests.unit.mapserver.data import open_writer
+from protocol.errors import Refusal
+from tests.unit.mapserver.data import open_writer, refused
 
 GONE = {"store": "0123456789abcdef", "reason": "its disk died"}
 
@@ -30,7 +30,6 @@ def test_an_accepted_store_that_is_not_written_is_refused_as_a_decision_is(
             raise error
 
         writer._store.journal.append_event = refuse  # type: ignore[method-assign]
-        with pytest.raises(QueryError, match=problem) as caught:
+        with refused(reason, problem):
             commands.obey("accept", GONE)
-        assert caught.value.reason == reason
         assert not writer._store.accepted

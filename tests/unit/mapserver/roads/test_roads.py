@@ -78,11 +78,6 @@ def test_a_loop_with_corners_is_closed():
     assert not degrees(shown)
 
 
-def test_a_crossing_is_crossed():
-    shown = roads(passes(along([(20, 50), (180, 50)])), passes(along([(100, 0), (100, 100)]), seed=1))
-    assert degrees(shown) == {1: 4, 4: 1}
-
-
 def test_a_way_that_is_seldom_driven_crosses_one_that_is_driven_much():
     shown = roads(passes(along([(20, 50), (180, 50)]), 60), passes(along([(100, 0), (100, 100)]), 2, seed=1))
     assert degrees(shown) == {1: 4, 4: 1}

@@ -52,24 +52,6 @@ def test_on_a_plane_a_route_costs_resistance_and_height() -> None:
     assert steps.slope == pytest.approx(np.full(8, totals.lift_m / 200))
 
 
-def test_there_less_back_is_twice_the_height() -> None:
-    ahead, layers = line((10, 10), (170, 10), (170, 150)), fields(0.03, east=0.004, north=0.01)
-    there, back = (route(way, layers, SLOW, stops=ROLLING)[1] for way in (ahead, ahead[::-1]))
-    assert max(there.braked_j, back.braked_j) < 1e-3 * back.energy_j  # where it turns, the slope along is another one
-    assert there.energy_j - back.energy_j == pytest.approx(2 * WEIGHT_N * there.lift_m)
-    assert there.lift_m == pytest.approx(-back.lift_m)
-
-
-def test_two_soils_cost_what_each_costs_and_stand_in_their_steps() -> None:
-    soils = np.where(np.arange(SIZE) < 110, 0.02, 0.06) + np.zeros((SIZE, 1))
-    steps, totals = route(line((10, 50), (210, 50)), fields(soils), SLOW, stops=ROLLING)
-    assert totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 100 + 0.06 * 100), rel=2e-3)
-    assert steps.resistance[[0, -1]] == pytest.approx([0.02, 0.06])
-    assert steps.energy_j.sum() == pytest.approx(totals.energy_j)
-    assert steps.time_s.sum() == pytest.approx(totals.time_s)
-    assert steps.distance_m[-1] == pytest.approx(200)
-
-
 def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
     ahead = line((10, 10), (170, 130))
     _, sure = route(ahead, fields(0.03, std=0.001), SLOW)
@@ -137,14 +119,6 @@ def test_what_was_driven_on_and_not_measured_lies_between_what_was() -> None:
     beyond = fields(np.where(np.arange(SIZE) < 100, 0.01, np.nan) + np.zeros((SIZE, 1)))
     last, _ = route(line((10, 50), (190, 50)), beyond, SLOW, stops=ROLLING)
     assert last.resistance[-1] == pytest.approx(0.01)
-
-
-def test_where_nothing_is_known_a_route_has_no_cost_unless_it_is_said() -> None:
-    layers = fields(math.nan)
-    with pytest.raises(QueryError, match="nobody has driven near this line yet"):
-        route(line((10, 50), (140, 50)), layers, SLOW)
-    _, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, prices=Prices(layers, 0.05))
-    assert (totals.unknown, totals.energy_j) == pytest.approx((1.0, WEIGHT_N * 0.05 * 130))
 
 
 def test_a_machine_too_weak_for_a_slope_is_told_where() -> None:

@@ -24,7 +24,7 @@ def same(one: Surface, other: Surface) -> bool:
     )
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_order_and_any_batching_give_the_same_bits(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = random_samples(20_000, seed)

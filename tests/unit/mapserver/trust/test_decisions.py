@@ -21,11 +21,6 @@ def judged(decisions: TrustDecisions, verdict: Verdict, times: int) -> list[Trus
     return made
 
 
-def test_nobody_is_distrusted_at_first():
-    assert TrustDecisions([]).distrusted == frozenset()
-    assert TrustDecisions([]).newest("c") is None
-
-
 def test_a_machine_is_distrusted_once_the_verdict_stands():
     decisions = TrustDecisions([])
     assert judged(decisions, BAD, DISTRUST_AFTER - 1) == []

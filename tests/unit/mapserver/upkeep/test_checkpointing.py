@@ -121,14 +121,6 @@ def test_hours_of_the_last_day_are_made_and_days_stay(opened):
         assert all(site.is_true(hour) for hour in (8.2, 11.9, 12, 30.3, 36.9, 61))
 
 
-def test_a_log_that_is_replayed_at_once_gets_days_then_hours(opened):
-    with opened() as site:
-        site.drive([1, 30, 31, 60, 81, 82, 90])
-        site.run()
-        assert site.hours == [24, 48, 66, 82, 83]
-        assert all(site.is_true(hour) for hour in (1.4, 24, 31.2, 60, 82.2, 90.4))
-
-
 def test_one_that_lacks_many_late_rows_is_made_again(opened, monkeypatch):
     monkeypatch.setattr(checkpointing, "LATE_ROWS", 3)
     with opened() as site:

@@ -147,20 +147,6 @@ def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
         assert same(site.grid, fold_of(sent, site.config))
 
 
-def test_rows_of_an_excluded_machine_are_kept_and_stay_out(opened):
-    sent = fleet({}, size=16)
-    with opened() as site:
-        for name in sent:
-            send(site.writer, [incoming(sent[name][0], 1, name)])
-        site.upkeep.trust("b", False, "", 20.0)
-        for name in sent:
-            send(site.writer, [incoming(sent[name][1], 1 + len(sent[name][0]), name)])
-        assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert site.machine("b")["samples"] == sum(map(len, sent["b"]))
-        site.upkeep.trust("b", True, "", 20.0)
-        assert same(site.grid, fold_of(sent, site.config))
-
-
 @pytest.mark.parametrize("snapshot", [True, False])
 def test_a_decision_outlives_the_server(opened, tmp_path, snapshot):
     sent = fleet({}, size=16)

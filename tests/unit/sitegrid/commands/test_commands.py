@@ -12,12 +12,11 @@ import pytest
 
 from agents.config import AgentConfig
 from mapserver.config import ServerConfig
-from protocol.errors import ConfigError, LinkError
+from protocol.errors import ConfigError
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import machine_toml
 from protocol.site.geometry import Bounds
 from protocol.site.site_file import load_site
-from protocol.wire.session import free_endpoint
 from sim.config import resolve
 from sim.scenario.file import FOLDER, load_scenario
 from sim.truth import TruthMap
@@ -70,12 +69,6 @@ def test_sim_writes_what_agents_need(tmp_path: Path):
     assert machine == load_scenario("paper_site").rigs()[1].machine
 
 
-@pytest.mark.slow  # it waits for a router
-def test_sim_publishes_nothing_without_a_router(capsys):
-    assert main(["sim", "--endpoint", free_endpoint(), "--seconds", "1"]) == 1
-    assert "start one with `sitegrid router`" in capsys.readouterr().err
-
-
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
     (tmp_path / "agent.toml").write_text("linger_s = 3.5\n" + machine_toml(replace(MACHINE, name="digger")))
@@ -121,20 +114,6 @@ def test_server_refuses_an_unknown_option(files: Path, capsys):
     assert main(["server", *words]) == 1
     assert "unknown key `buckets`; known: bucket_s" in capsys.readouterr().err
     assert not (files / "store").exists()
-
-
-def test_router_says_where_it_cannot_listen(capsys):
-    assert main(["router", "--insecure", "--listen", "tcp/192.0.2.1:7447"]) == 1
-    assert "tcp/192.0.2.1:7447: cannot listen here" in capsys.readouterr().err
-
-
-@pytest.mark.slow  # it waits for a router
-def test_connect_names_the_endpoint_that_does_not_answer():
-    from sitegrid import connect
-
-    endpoint = free_endpoint()
-    with pytest.raises(LinkError, match=endpoint.replace(".", r"\.")):
-        connect(endpoint)
 
 
 # --- options that only act inside a running command -------------------------------------------------------------------

@@ -27,7 +27,6 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
 from sitegrid.client import Client, connect
 from sitegrid.commands import query
-from sitegrid.door import build_parser
 from sitegrid.process.lifetime import plain
 from tests.unit.records import STORE, machine_state, version
 
@@ -43,7 +42,6 @@ CHANGE = GroundChange(4, T0, T0 + 60 * 10**9, (10.0, -20.0, 40.0, 12.5), 615, 0.
 UNKNOWN = dict.fromkeys(("zero", "zero_std", "scale", "scale_std", "across", "across_std"))
 KNOWN = {"zero": 0.0025, "zero_std": 0.0005, "scale": -0.03, "scale_std": 0.005, "across": 0.0, "across_std": 0.001}
 SPANS = (CorrectedSpan(0, T0, 0.1, 0.0, 0.0, 10.0), CorrectedSpan(T0, 2**62, 0.00251, -0.03, 0.0, 10.0))
-BY = ("heights", "crossings")
 CALIBRATION = CalibrationAnswer(
     STORE,
     17,
@@ -360,9 +358,3 @@ def test_a_reader_that_leaves_ends_what_is_followed(server: FakeServer, monkeypa
         assert sitegrid(server, "query", "changes", "--follow") == 0
         monkeypatch.undo()
     assert stop.is_set()
-
-
-def test_json_may_stand_before_or_behind_the_query():
-    for words in (["query", "--json", "machines"], ["query", "machines", "--json"]):
-        assert build_parser().parse_args(words).json
-    assert not build_parser().parse_args(["query", "machines"]).json

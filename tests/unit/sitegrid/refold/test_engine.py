@@ -16,7 +16,7 @@ from sitegrid.refold import engine
 from sitegrid.refold.engine import EngineError, Here, Processes
 from tests.unit.sitegrid.refold.tasks import die, die_once, fail, hang, square
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 WAIT_S = 60.0
 
 
