@@ -40,11 +40,10 @@ QUIET = "[store]\narchive_after_h = 0.0\n[trust]\nexclude = false\n[calibration]
 class Followed(SiteRun):
     """Router and server with followers, and a session that sends samples."""
 
-    def start_follower(self, name: str, *options: str | Path, ready: bool = True) -> Child:
+    def start_follower(self, name: str, *, ready: bool = True) -> Child:
         words = ("--endpoint", self.endpoint, "--site-file", self.site_file, "--name", name)
         config = ("--config", self.folder / "server.toml")
-        where = () if "--copy" in options else ("--store", self.folder / "store")
-        child = self.children.start(name, "follow", *words, *config, *where, *options)
+        child = self.children.start(name, "follow", *words, *config, "--store", self.folder / "store")
         if ready:
             assert child.expect("ready", READY_S)["name"] == name
         return child
@@ -127,7 +126,7 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
     server = run.serve()
     for machine in "abcabc":
         sender.send(machine)
-    near, far = run.start_follower("near"), run.start_follower("far", "--copy", run.folder / "copy")  # of the journal
+    near, far = run.start_follower("near"), run.start_follower("far")
     followers = [near, far]
     pids = f"server pid {server.pid}, followers pids {[one.pid for one in followers]}"
     with run.connect() as client:
