@@ -18,7 +18,6 @@ from typing import TypeVar
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.follower.replica import Replica
-from mapserver.ingest.decisions import NewerDecisionError
 from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import History, read_history
@@ -103,7 +102,7 @@ class Following:
         while not (self._ending.is_set() or self.ended):
             try:
                 self._read_for_a_while()
-            except (UnfitError, NewerDecisionError) as error:
+            except UnfitError as error:
                 self.ended = str(error)
             except (StoreError, OSError) as error:
                 self._name(str(error))

@@ -373,16 +373,6 @@ def test_a_journal_of_another_site_or_frame_ends_it(tmp_path, site, problem):
         assert "compare the site files" in one.ended
 
 
-def test_a_decision_of_a_newer_version_ends_it(tmp_path):
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-        body = {"version": 99, "machine": "a"}
-        writer.run(lambda store: store.journal.append_event("calibration", NOW_NS, body))
-        wait_for(lambda: one.ended)
-        assert "open it with that version" in one.ended
-
-
 def test_a_damaged_row_is_named_and_the_map_says_how_far_behind_it_is(tmp_path, caplog):
     with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
         deliver(writer, 1)
