@@ -25,7 +25,6 @@ from mapserver.past.past import Past
 from mapserver.query import road_maps, routes
 from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.answering import Answers
-from mapserver.query.journal_queryable import JournalQueryable
 from mapserver.query.queryable import MapQueryable, Replies, question
 from mapserver.query.server_source import Commands, ServerSource
 from mapserver.upkeep.upkeep import Upkeep
@@ -98,7 +97,6 @@ class Server:
         self._replies, self._commands = Replies(source), Commands(self._writer, self._upkeep, self.answers.info)
         self._pool = AnswerPool("command", COMMAND_THREADS, MOST_COMMANDS)
         self._queries = MapQueryable(readers, keys.map_queries_all(site.name), source, self.answers)
-        self._rows = JournalQueryable(readers, keys.journal(site.name), source)
         self.answers.start()
         self._queryables = [
             ingest.declare_queryable(keys.ingest_all(site.name), self._on_batch),
@@ -125,7 +123,6 @@ class Server:
         for queryable in self._queryables:
             queryable.undeclare()  # type: ignore[no-untyped-call]
         self._queries.stop()
-        self._rows.close()
         self._queries.close()
         self.answers.close()
         self._pool.close()

@@ -23,19 +23,11 @@ from mapserver.fleet.observability import OBSERVED
 from mapserver.fleet.spans import VALUES, paint
 
 KIND = "calibration"
-VERSION = 1  # of the event; what a newer one means is not known here
+VERSION = 1  # of the event
 SOLVER, PERSON = "solver", "person"
 # The solver decides at most so often: each time, samples are folded again. In the first minutes of machines, when it
 # learns most and there is little to fold, as soon as they have driven twice as long as at the last decision.
 EVERY_NS = 600 * 10**9
-
-
-class NewerVersionError(ValueError):
-    """A decision that this version cannot read."""
-
-    def __init__(self, version: object) -> None:
-        problem = f"a correction of a machine's samples of version {version!r}, by a newer version of this program"
-        super().__init__(f"{problem}; this one knows version {VERSION}")
 
 
 @dataclass(frozen=True)
@@ -65,9 +57,9 @@ class CalibrationDecision:
 
     @classmethod
     def from_body(cls, body: Mapping[str, Any]) -> CalibrationDecision:
-        """Undo `body`; NewerVersionError where a newer version wrote it."""
+        """Undo `body`; ValueError where it is of another version."""
         if body.get("version") != VERSION:
-            raise NewerVersionError(body.get("version"))
+            raise ValueError(f"has a correction of version {body.get('version')!r}, this program knows {VERSION}")
         machine = body["machine"]
         corrections = tuple(
             Correction(machine, from_ns, to_ns, zero, scale, across, tuple(map(tuple, covariance)), most_share)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 import zenoh
 
 from mapserver.config import ServerConfig
-from mapserver.follower.copying import Copying
 from mapserver.follower.follower_source import FollowerSource
 from mapserver.follower.following import Following
 from mapserver.journal.location import JournalLocation
@@ -31,22 +30,18 @@ class Follower:
         self,
         session: zenoh.Session,
         name: str,
-        journal: JournalLocation | Copying,
+        journal: JournalLocation,
         site: SiteConfig,
         config: ServerConfig,
         now_ns: Callable[[], int],
     ) -> None:
-        """journal: that of the server, or a copy that is made of it. LinkError where another follower has this name."""
+        """LinkError where another follower has this name."""
         self._session, self._owner, self._key = session, this_process(), keys.follower_owner(site.name, name)
         self._token_key = keys.follower_alive(site.name, name)
         self._token: zenoh.LivelinessToken | None = None
         self._rivals: set[Owner] = set()
         self._look_s = time.monotonic() + LOOK_S
-        self._copying = journal if isinstance(journal, Copying) else None
-        if isinstance(journal, Copying):
-            self.following = Following(journal.location, site, config, lambda: journal.known)
-        else:
-            self.following = Following(journal, site, config)
+        self.following = Following(journal, site, config)
         self.source = FollowerSource(name, self.following, now_ns)
         self.answers = Answers(self.source)
         # Declared before anybody is asked: of two that start at once, one at least hears the other.
@@ -58,8 +53,6 @@ class Follower:
             self.following.close()
             raise LinkError(f"follower {name}", f"{self.ended}; choose another --name")
         self._queries = MapQueryable(session, keys.follower_queries(site.name, name), self.source, self.answers)
-        if self._copying:
-            self._copying.start()
         self.following.start()
         self.answers.start()
 
@@ -73,7 +66,7 @@ class Follower:
         """Why it cannot go on, empty while it can; the process should end."""
         if earlier := [owner for owner in self._rivals if owner < self._owner]:
             return f"another follower has this name, {min(earlier)}"
-        return self.following.ended or (self._copying.ended if self._copying else "")
+        return self.following.ended
 
     def tend(self) -> None:
         """Show the token while the map is of now, and look for others of this name."""
@@ -92,14 +85,10 @@ class Follower:
         self._hide()
         self._queries.stop()
         self.following.stop()
-        if self._copying:
-            self._copying.stop()
         self._queries.close()
         self.answers.close()
         self._identity.undeclare()  # type: ignore[no-untyped-call]
         self.following.close()
-        if self._copying:
-            self._copying.close()
 
     def _hide(self) -> None:
         if self._token:

@@ -18,7 +18,6 @@ from typing import TypeVar
 from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.follower.replica import Replica
-from mapserver.ingest.decisions import NewerDecisionError
 from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import History, read_history
@@ -34,7 +33,6 @@ from protocol.site.site_config import SiteConfig
 ASK_S = 1.0  # a notification may be lost: the journal is asked so often all the same
 OPEN_S = 2.0  # a connection lasts so long: another file may have taken the place of the one that it reads
 RETRY_S = 1.0
-Known = Callable[[], tuple[int, float]]
 T = TypeVar("T")
 log = logging.getLogger("mapserver.follower.following")
 
@@ -50,15 +48,11 @@ class Following:
     goes on; the process should end.
     """
 
-    def __init__(
-        self, location: JournalLocation, site: SiteConfig, config: ServerConfig, known: Known | None = None
-    ) -> None:
-        """known: of the journal that this one is a copy of: its last row, and when that was asked for [s]."""
+    def __init__(self, location: JournalLocation, site: SiteConfig, config: ServerConfig) -> None:
         self.location, self.site, self.config = location, site, config
         self.waits = MergeWaits(0)
         self.past = self._new_past()
         self.ended = ""
-        self._known = known
         self._lock = threading.Lock()  # of the replica: held while pages are taken from it, or rows are folded
         self._replica: Replica | None = None
         self._epoch = 0  # the newest one that was seen
@@ -108,7 +102,7 @@ class Following:
         while not (self._ending.is_set() or self.ended):
             try:
                 self._read_for_a_while()
-            except (UnfitError, NewerDecisionError) as error:
+            except UnfitError as error:
                 self.ended = str(error)
             except (StoreError, OSError) as error:
                 self._name(str(error))
@@ -146,8 +140,7 @@ class Following:
         replica = self._replica
         if replica and self._lags(reader, state, replica):
             return
-        last_row, as_of_s = self._known() if self._known else (state.row, complete_s)
-        self._journalled = max(state.row, last_row)
+        self._journalled = state.row
         if replica is None or self._is_gone(reader, state, replica):
             replica = self._begin(reader, state)
         if replica is None:
@@ -156,8 +149,8 @@ class Following:
             _hear(replica, reader)
         self._fold(reader, replica, state.row)
         self._correct(reader, replica)
-        if replica.merged >= last_row:
-            self._complete_s = max(self._complete_s, as_of_s)
+        if replica.merged >= state.row:
+            self._complete_s = max(self._complete_s, complete_s)
         self.waits.advance(replica.merged)
 
     def _lags(self, reader: JournalReader, state: JournalState, replica: Replica) -> bool:
@@ -174,7 +167,7 @@ class Following:
             reader.identity().id != replica.store
             or state.row < replica.merged
             or state.event < replica.event
-            or is_other(reader.event_checksum(replica.event), replica.event_checksum)
+            or _is_other(reader.event_checksum(replica.event), replica.event_checksum)
             or state.epoch < self._epoch
             or self._is_another_row(reader, replica)
         )
@@ -188,7 +181,7 @@ class Following:
         checksum = reader.row_checksum(replica.merged)
         if checksum is None and replica.checksum is not None:
             checksum = self._archived_checksum(reader, replica.merged)
-        return is_other(checksum, replica.checksum)
+        return _is_other(checksum, replica.checksum)
 
     def _archived_checksum(self, reader: JournalReader, row: int) -> int | None:
         """Of a row in the archive, which is read once; None where nothing new can be said."""
@@ -281,7 +274,7 @@ class Following:
             return fold_anew(self.past, reader, facts, self._ending.is_set)
 
 
-def is_other(there: int | None, known: int | None) -> bool:
+def _is_other(there: int | None, known: int | None) -> bool:
     """Whether two checksums of one number are known, and differ: the journal went another course."""
     return None not in (there, known) and there != known
 

@@ -58,7 +58,7 @@ class Replica:
         return self._decisions.facts
 
     def hear(self, events: Iterable[Event], where: str) -> None:
-        """Take further events in their order. StoreError for a decision that only a newer version understands."""
+        """Take further events in their order. StoreError for a decision of another version."""
         heard = list(events)
         self._decisions.hear(heard, where)
         for event in heard:

@@ -8,7 +8,7 @@ from typing import Any
 
 from mapserver.fleet import decisions as calibration
 from mapserver.fleet.correction import LAST_NS, NO_SHARE
-from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions, NewerVersionError
+from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions
 from mapserver.journal.facts import Facts
 from mapserver.journal.journal import JournalQueries
 from mapserver.journal.rows import Event
@@ -22,10 +22,6 @@ Decision = TrustDecision | CalibrationDecision
 KINDS = (trust.KIND, calibration.KIND)
 
 
-class NewerDecisionError(StoreError):
-    """A decision that only a newer version understands."""
-
-
 class Decisions:
     """Decisions about machines. trust, calibration: those of either kind; facts: what all of them come to."""
 
@@ -35,7 +31,7 @@ class Decisions:
 
     @classmethod
     def of_journal(cls, journal: JournalQueries) -> Decisions:
-        """Those that a journal has; StoreError where one was written by a newer version."""
+        """Those that a journal has; StoreError where one is of another version."""
         decisions = cls()
         decisions.hear(journal.events(), journal.where)
         return decisions
@@ -100,6 +96,5 @@ def _decision(event: Event, where: str) -> Decision:
         return TrustDecision(**event.body)
     try:
         return CalibrationDecision.from_body(event.body)
-    except NewerVersionError as error:
-        problem = f"event {event.id}: {error}; open it with that version, or choose another --store"
-        raise NewerDecisionError(where, problem) from None
+    except ValueError as error:
+        raise StoreError(where, f"event {event.id} {error}") from None

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from mapserver.fleet.decisions import CalibrationDecision, NewerVersionError
+from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.journal.archive import READABLE
 from mapserver.journal.places import Place
 from protocol.errors import StoreError
@@ -31,7 +31,7 @@ def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> 
 
 
 def load(folder: Path | Place) -> list[CalibrationDecision]:
-    """Read what `save` wrote, nothing where there is no file; StoreError for damage, and for a newer version."""
+    """Read what `save` wrote, nothing where there is no file; StoreError for damage, and for another version."""
     path = folder / FILE
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -44,8 +44,8 @@ def load(folder: Path | Place) -> list[CalibrationDecision]:
         raise StoreError(path, problem)
     try:
         return [CalibrationDecision.from_body(body) for body in table["decisions"]]
-    except NewerVersionError as error:
-        raise StoreError(path, f"{error}; fold it with that version") from None
+    except ValueError as error:
+        raise StoreError(path, str(error)) from None
 
 
 def _checksum(table: dict[str, Any]) -> int:

@@ -10,7 +10,6 @@ from typing import Any
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.journal import Journal, JournalQueries, JournalReader, Waiting
 from mapserver.journal.postgres import MARK_FILE
-from mapserver.journal.rows import StoreIdentity
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.disk.traces import Traces, look_beside
@@ -65,10 +64,6 @@ class JournalLocation:
     def open_file(self, site: str, frame: str, descends: Iterable[str] = ()) -> SqliteJournal:
         """As `open`, of a file in the folder, which can be made to go on after an archive."""
         return SqliteJournal(self._file, site, frame, descends)
-
-    def open_copy(self, identity: StoreIdentity, site: str, frame: str) -> Journal:
-        """Become the writer of a copy of another journal, with the identity of that; make it where there is none."""
-        return SqliteJournal(self._file, site, frame, identity.descends, identity.id)
 
     def reader(self) -> JournalReader:
         """Read it; StoreError where that cannot be done."""

@@ -104,9 +104,9 @@ class TableWriter(TableQueries):
                 raise StoreError(self.where, problem)
 
 
-def new_meta(schema: int, site: str, frame: str, descends: Iterable[str], store: str = "") -> list[Line]:
-    """What a new journal says of itself. descends: ids of the stores that it is made from. store: of a copy, its id."""
-    store = " ".join((store or secrets.token_hex(8), *descends))
+def new_meta(schema: int, site: str, frame: str, descends: Iterable[str]) -> list[Line]:
+    """What a new journal says of itself. descends: ids of the stores that it is made from."""
+    store = " ".join((secrets.token_hex(8), *descends))
     meta = {"schema": str(schema), "site": site, "frame": frame, "store": store}
     return [meta_line(*each) for each in meta.items()]
 

@@ -136,11 +136,6 @@ def follower_of(key: str) -> str:
     raise ConfigError(f"key {key}", "names no follower")
 
 
-def journal(site: str) -> str:
-    """The rows of a site's journal: a query that the map server answers, piece by piece."""
-    return f"{ROOT}/{check_name(site, 'site')}/journal"
-
-
 def machine_of(key: str) -> str:
     """Name of the machine in a key of `ingest/` or `machine/`; a ConfigError where there is none."""
     parts = key.split("/")

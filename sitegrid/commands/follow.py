@@ -10,13 +10,12 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 from protocol.config import from_table
-from protocol.errors import ConfigError, LinkError
+from protocol.errors import LinkError
 from protocol.files import load_toml
 from protocol.site.site_file import load_site
 from protocol.wire.keys import check_name
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
-from sitegrid.options.outputs import FOLDER
 from sitegrid.process.kernels import compilation_reported
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
 from sitegrid.security.join import join
@@ -31,10 +30,9 @@ def add_options(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add_network(parser)
     add("--site-file", type=Path, required=True, help="site file of the server: name, origin, cells")
-    where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--store", type=Path, help="the server's store on this host, which is only read")
-    where.add_argument("--copy", type=FOLDER, help="folder for a copy of the journal, where the server is elsewhere")
-    add("--journal", metavar="URL", default="", help="the server's database, postgresql://..., beside its --store")
+    add("--store", type=Path, required=True, help="the server's store on this host, which is only read")
+    database = "the server's database, postgresql://...; --store is a folder of this host then"
+    add("--journal", metavar="URL", default="", help=database)
     add("--config", type=Path, help="the server's file with options (config/server.toml)")
     add("--name", help="name of this follower, another one for each (default the name of this host)")
 
@@ -42,15 +40,10 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Follow until stopped."""
     from mapserver.config import ServerConfig
-    from mapserver.follower.copying import Copying
     from mapserver.follower.follower import Follower
     from mapserver.journal.location import JournalLocation
     from mapserver.server import warm_up
 
-    if arguments.copy and arguments.journal:
-        raise ConfigError(
-            "--journal", "a copy is made of the server's journal, wherever that is: leave one of both out"
-        )
     stop = stop_flag()
     use_many_threads()
     return_large_blocks()
@@ -63,10 +56,7 @@ def run(arguments: Namespace) -> int:
             warm_up(config)
         joined = join(arguments.endpoint, arguments.keys, 30.0, role="follower", name=name, site=site.name)
         session = opened.enter_context(closing(open_session(joined)))
-        if arguments.copy:
-            journal: JournalLocation | Copying = Copying(session, site, arguments.copy)
-        else:
-            journal = JournalLocation(arguments.store, arguments.journal)
+        journal = JournalLocation(arguments.store, arguments.journal)
         follower = opened.enter_context(closing(Follower(session, name, journal, site, config, time.time_ns)))
         is_ready = False
         while not stop.wait(TEND_S):
@@ -75,8 +65,7 @@ def run(arguments: Namespace) -> int:
             follower.tend()
             if follower.is_shown and not is_ready:
                 is_ready = True
-                folder = str(arguments.store or arguments.copy)
-                say({"ready": "follow", "site": site.name, "name": name, "store": folder})
+                say({"ready": "follow", "site": site.name, "name": name, "store": str(arguments.store)})
     return 0
 
 

@@ -1,4 +1,4 @@
-"""`sitegrid plot`: the paper's plotter; once, or redrawn live while machines drive."""
+"""`sitegrid plot`: the paper's plotter."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 from sitegrid.options.groups import add_network, add_site
 from sitegrid.options.outputs import PICTURE
-from sitegrid.options.values import named_text, positive
+from sitegrid.options.values import named_text
 
-HELP = "draw the map, once or live"
+HELP = "draw the map"
 EXTRA = "server"
 
 
@@ -30,13 +30,10 @@ def add_options(parser: ArgumentParser) -> None:
     drawn.add_argument("--between", type=float, nargs=4, metavar=ends, help="the same of the line that costs least")
     values = "a value of the drive, as machine=truck or cost=time: as `sitegrid query way` takes it; may be repeated"
     add("--set", action="append", type=named_text, default=[], metavar="NAME=VALUE", help=values)
-    add("--follow", action="store_true", help="redraw while machines drive, until stopped")
-    add("--every", type=positive, default=1.0, help="seconds between two pictures (default %(default)s)")
-    add("--pictures", type=int, default=0, help="with --follow: exit after this many pictures")
 
 
 def run(arguments: Namespace) -> int:
-    """Draw the map; with --follow again and again until stopped."""
+    """Draw the map."""
     from sitegrid.pictures.draw import run as draw
 
     return draw(arguments)

@@ -127,7 +127,7 @@ def check_followers(followers: list[FollowerState], info: MapInfo) -> Finding:
         return skipped("followers", "none answers; where readers are many, start `sitegrid follow`")
     if others := [one.name for one in followers if one.store != info.store]:
         problem = f"{', '.join(others)} has the map of another store than the map server, {info.store}"
-        return Finding(Level.FAIL, "followers", problem, "start it with the --store of the server, or a new --copy")
+        return Finding(Level.FAIL, "followers", problem, "start it with the --store and --journal of the server")
     worst = max(followers, key=lambda one: one.behind_s)
     if worst.behind_s > SHOWN_S:
         advice = "clients ask others meanwhile; look at its log, and at the load of its host"

@@ -1,4 +1,4 @@
-"""Pictures of the map as it is, with the tracks of the machines; once, or again and again."""
+"""Pictures of the map as it is, with the tracks of the machines."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_
 from mapserver.pictures.profile import draw_drive
 from mapserver.pictures.worklist import draw_worklist
 from protocol.arrays import Floats32
-from protocol.errors import ConfigError, LinkError, QueryError
+from protocol.errors import ConfigError
 from protocol.queries.answers import MachineState, Region
 from protocol.queries.parameters import text_of
 from protocol.queries.requests import parse_query
@@ -30,7 +30,7 @@ from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.explanations import calibrations
 from sitegrid.listener import Listener
-from sitegrid.process.lifetime import note, say, stop_flag
+from sitegrid.process.lifetime import note, say
 
 AROUND_M = 30.0  # of the map around a drive
 STEP_M, MOST_STEPS = 5.0, 1000  # of a drive's profile
@@ -40,40 +40,19 @@ SAMPLES_FOLLOW = "the map follows a minute or two later"  # the smoother's lag, 
 
 
 def run(arguments: Namespace) -> int:
-    """Draw the map; with --follow again and again until stopped."""
-    stop = stop_flag()
+    """Draw what is asked for."""
+    files = {"picture": str(arguments.out)}
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
-        tracks = TrackRecorder(client.session, client.site)
-        drawn = 0
-        while not stop.is_set():
-            drawn += _draw_if_possible(client, arguments, tracks.tracks())
-            if not arguments.follow or drawn == arguments.pictures:
-                break
-            stop.wait(arguments.every)
-        tracks.close()
-    table = {"picture": str(arguments.out), "drawn": drawn}
-    if drawn and arguments.truth:
-        table["difference"] = str(beside(arguments.out))
-    files = [str(value) for name, value in table.items() if name != "drawn"] if drawn else []
-    say(table) if arguments.json else note("\n".join(files) or "nothing was drawn")
-    return 0
-
-
-def _draw_if_possible(client: Client, arguments: Namespace, tracks: list[Track]) -> int:
-    """Draw one picture; with --follow, wait for a server that does not answer."""
-    try:
         if query := _query(arguments):
             draw_line(client, arguments.out, query, arguments.bounds)
         elif arguments.worklist:
             draw_roads(client, arguments.out, arguments.bounds)
         else:
-            draw(client, arguments.out, arguments.bounds, tracks, arguments.truth)
-    except (LinkError, QueryError) as error:
-        if not arguments.follow:
-            raise
-        note(f"sitegrid plot: {error}; trying again")
-        return 0
-    return 1
+            draw(client, arguments.out, arguments.bounds, [], arguments.truth)
+            if arguments.truth:
+                files["difference"] = str(beside(arguments.out))
+    say(files) if arguments.json else note("\n".join(files.values()))
+    return 0
 
 
 def _query(arguments: Namespace) -> RouteQuery | WayQuery | None:

@@ -107,7 +107,6 @@ _SINGLE = (
     "worklist",
     "alive",
     "origin",
-    "journal_piece",
     *PLAIN[1:],
     "error",
 )

@@ -36,13 +36,6 @@ from protocol.queries.calibration import (
     decode_calibration,
     encode_calibration,
 )
-from protocol.queries.journal_piece import (
-    EventMessage,
-    JournalPiece,
-    RowMessage,
-    decode_journal_piece,
-    encode_journal_piece,
-)
 from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encode_tiles
 from protocol.queries.origin import Origin, decode_origin, encode_origin
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
@@ -282,16 +275,6 @@ WORKLIST = Worklist(
     ),
     (RoadChange("3_-2_e", STRETCH.line, T0, T0 + 60 * 10**9, 0.0625, 0.03125, 2.5),),
 )
-JOURNAL = JournalPiece(
-    STORE,
-    ("fedcba9876543210",),
-    18,
-    0x1234ABCD,
-    4,
-    0x89ABCDEF,
-    (RowMessage(17, T0, codec.encode_batch(BATCH)), RowMessage(18, T0 + 1, codec.encode_batch(BATCH))),
-    (EventMessage(4, "trust", T0, {"machine": "loader-1", "trusted": False, "by": "person", "reason": "drifts"}),),
-)
 ROUTE = RouteAnswer(
     version=records.MapVersion(STORE, 17, 3),
     stamp_ns=T0 + 9,
@@ -345,7 +328,6 @@ GOLDEN: dict[str, Golden] = {
         answers.decode_changes,
     ),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),
-    "journal_piece.bin": Golden(JOURNAL, encode_journal_piece, decode_journal_piece),
     "origin.bin": Golden(Origin("reader-1", 3, 0.25), encode_origin, decode_origin),
     "origin_server.bin": Golden(Origin(), encode_origin, decode_origin),
     "alive.bin": Golden(records.ServerAlive(STORE, 18, 17, 0.25), answers.encode_alive, answers.decode_alive),

@@ -181,7 +181,7 @@ def test_after_an_accident_the_next_start_has_the_fact_in_its_map(
 
 
 @pytest.mark.nightly
-def test_a_fact_of_a_newer_version_keeps_the_server_from_starting_in_one_line(site: SiteRun):
+def test_a_fact_of_another_version_keeps_the_server_from_starting_in_one_line(site: SiteRun):
     server = serve(site)
     with site.connect() as client:
         client.info(after=Senders(site, client).send(DRIVES))
@@ -194,7 +194,7 @@ def test_a_fact_of_a_newer_version_keeps_the_server_from_starting_in_one_line(si
     refused = said("server", "--endpoint", site.endpoint, *words)
     assert refused.code == 1
     (line,) = refused.err.strip().splitlines()
-    assert "version 2, by a newer version of this program; this one knows version 1; open it with that" in line
+    assert "has a correction of version 2, this program knows 1" in line
     assert said("fold", site.folder / "store", "--out", site.folder / "new").code == 1
     with closing(sqlite3.connect(path)) as database:
         assert database.execute("SELECT COUNT(*) FROM events").fetchone() == (1,), "it is still there"

@@ -245,7 +245,6 @@ def test_a_simulator_whose_router_hangs_ends_in_time(site: SiteRun):
         end(sim)
 
 
-@pytest.mark.nightly
 def test_a_query_that_follows_ends_in_time_also_while_the_server_hangs(site: SiteRun, children: Children):
     site.start_router()
     server = site.start_server()

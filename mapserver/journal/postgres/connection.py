@@ -16,8 +16,8 @@ SCHEMA = "sitegrid"  # the database's schema with the tables
 MISSING = ("3D000", "3F000", "42P01")  # SQLSTATEs: no such database, schema, table
 REPLICAS = """SELECT current_setting('synchronous_standby_names') <> '',
 (SELECT count(*) FROM pg_stat_replication)"""
-# Text comes as text also from a database of no encoding (SQL_ASCII). Limits that the database has for others would end
-# sessions that wait for an hour, and statements that read a long journal; which there are depends on the version.
+# Limits that the database has for others would end sessions that wait for an hour, and statements that read a long
+# journal; which there are depends on the version.
 _SET_UP = f"""SET search_path = {SCHEMA}; SET standard_conforming_strings = on;
 SELECT set_config(name, '0', false) FROM pg_settings
 WHERE name IN ('idle_session_timeout', 'statement_timeout', 'lock_timeout', 'transaction_timeout')"""  # noqa: S608
@@ -47,7 +47,7 @@ def shown(url: str) -> str:
 def connect(url: str, role: str, **more: str) -> Connection:
     """Open a connection; psycopg.Error says why not. role: what the database shows of it."""
     given = conninfo.conninfo_to_dict(url)
-    settings = {**DEFAULTS, "application_name": f"sitegrid {role}", **given, **more, "client_encoding": "utf8"}
+    settings = {**DEFAULTS, "application_name": f"sitegrid {role}", **given, **more}
     db = psycopg.connect("", autocommit=True, prepare_threshold=None, **settings)  # type: ignore[arg-type]
     try:
         db.execute(_SET_UP)

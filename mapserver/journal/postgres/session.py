@@ -44,8 +44,7 @@ SET tcp_keepalives_count = 2
 """
 _SETTINGS = """SELECT current_setting('server_version_num')::int, current_setting('fsync'),
 current_setting('full_page_writes'), set_config('synchronous_commit',
-    CASE current_setting('synchronous_commit') WHEN 'remote_apply' THEN 'remote_apply' ELSE 'on' END, false),
-pg_backend_pid()"""
+    CASE current_setting('synchronous_commit') WHEN 'remote_apply' THEN 'remote_apply' ELSE 'on' END, false)"""
 log = logging.getLogger("mapserver.journal.postgres.session")
 
 
@@ -69,7 +68,7 @@ class WriterSession:
             raise UnwrittenError(where, line(error)) from None
         self._db.add_notice_handler(self._on_notice)
         try:
-            self._pid = self._require_settings()
+            self._require_settings()
             self._db.execute(SET_UP)
             self._look_for_replicas()
         except psycopg.Error as error:
@@ -136,9 +135,9 @@ class WriterSession:
             self._lose("it is closed")
         in_time.cancel()
 
-    def _require_settings(self) -> int:
-        """The backend's process id; StoreError where what it acknowledges may be lost."""
-        ((version, fsync, pages, commit, pid),) = self._db.execute(_SETTINGS).fetchall()
+    def _require_settings(self) -> None:
+        """StoreError where what it acknowledges may be lost."""
+        ((version, fsync, pages, commit),) = self._db.execute(_SETTINGS).fetchall()
         if version < OLDEST:
             raise StoreError(self._where, f"is PostgreSQL {version // 10_000}; a journal needs version 14 or newer")
         for name, value in (("fsync", fsync), ("full_page_writes", pages)):
@@ -147,10 +146,6 @@ class WriterSession:
                 raise StoreError(self._where, problem)
         if commit not in ("on", "remote_apply"):
             raise StoreError(self._where, f"keeps synchronous_commit = {commit}; let this user turn it on")
-        if pid != self._db.info.backend_pid:
-            problem = "is a connection pooler, whose sessions may be swapped; give PostgreSQL's own address"
-            raise StoreError(self._where, problem)
-        return int(pid)
 
     def _look_for_replicas(self) -> None:
         ((synchronous, replicas),) = self._db.execute(REPLICAS).fetchall()
@@ -182,10 +177,8 @@ class WriterSession:
     def _say_something(self, *, look: bool) -> None:
         self._asked_s, self._is_sign = time.monotonic(), True
         try:
-            ((pid,),) = self._db.execute("SELECT pg_backend_pid()").fetchall()
-            if pid != self._pid:
-                self._lose("the session was swapped for another one, so its lock is gone")
-            elif look:
+            self._db.execute("SELECT 1")
+            if look:
                 self._look_for_replicas()
         except psycopg.Error as error:
             self._lose(line(error))

@@ -33,8 +33,8 @@ class SqliteJournal(TableWriter, SqliteQueries):
 
     fenced = ""
 
-    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = (), store: str = "") -> None:
-        """descends: ids of the stores that a new one is made from. store: id of the one that a new one is a copy of."""
+    def __init__(self, path: Path, site: str, frame: str, descends: Iterable[str] = ()) -> None:
+        """descends: ids of the stores that a new one is made from."""
         self.path, self._row = path, 0
         self._changed: dict[str, int] = {}  # by the open transaction, for the mark
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
-                self._create_or_check(site, frame, descends, store)
+                self._create_or_check(site, frame, descends)
                 self._row = super().last_row
                 self.check()
                 self.epoch = self.state().epoch + 1
@@ -173,10 +173,10 @@ class SqliteJournal(TableWriter, SqliteQueries):
             self.rollback()
             raise
 
-    def _create_or_check(self, site: str, frame: str, descends: Iterable[str], store: str) -> None:
+    def _create_or_check(self, site: str, frame: str, descends: Iterable[str]) -> None:
         if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone():
             self._db.executescript("BEGIN IMMEDIATE;" + TABLES)
-            meta = new_meta(SCHEMA, site, frame, descends, store)
+            meta = new_meta(SCHEMA, site, frame, descends)
             self._db.executemany("INSERT INTO meta VALUES (?, ?, ?)", meta)
             self._db.execute("COMMIT")
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # no damage of a log takes the store's id away

@@ -1,5 +1,6 @@
 """A follower of a real journal: equal to the server bit for bit, whatever happens to the journal."""
 
+import os
 import shutil
 import sqlite3
 import threading
@@ -307,14 +308,56 @@ def test_a_journal_of_another_site_or_frame_ends_it(tmp_path, site, problem):
         assert "compare the site files" in one.ended
 
 
-def test_a_decision_of_a_newer_version_ends_it(tmp_path):
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-        body = {"version": 99, "machine": "a"}
-        writer.run(lambda store: store.journal.append_event("calibration", NOW_NS, body))
-        wait_for(lambda: one.ended)
-        assert "open it with that version" in one.ended
+DAMAGES = {
+    "cut off": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "overwritten": lambda path: path.write_bytes(b"garbage" * 20_000),
+    "empty": lambda path: path.write_bytes(b""),
+    "gone": lambda path: path.unlink(),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_a_journal_damaged_beneath_a_follower_takes_no_map_away_and_gives_none_to_a_new_one(
+    tmp_path, monkeypatch, caplog, damage
+):
+    monkeypatch.setattr(module, "OPEN_S", 0.2)
+    monkeypatch.setattr(module, "RETRY_S", 0.1)
+    path = tmp_path / "journal.db"
+    with closing(open_writer(tmp_path)) as writer:
+        for seed in (1, 2, 3):
+            deliver(writer, seed)
+    with following(tmp_path) as one:
+        wait_for(lambda: version(one) is not None)
+        sound = path.read_bytes()
+        damage(path)
+        wait_for(lambda: "cannot follow problem=" in caplog.text and one.behind()[1] > 0.5)
+        assert version(one).row == 3
+        for snapshot in tmp_path.glob("*.npz"):
+            snapshot.unlink()
+        with following(tmp_path) as new:
+            wait_for(lambda: new._problem)
+            assert version(new) is None
+            assert new.behind()[1] == float("inf")
+        path.write_bytes(sound)
+        with closing(open_writer(tmp_path)) as writer:
+            deliver(writer, 4)
+            catches_up(one, writer)
+
+
+def test_a_row_that_is_gone_from_a_database_is_named_and_gives_no_map(tmp_path, database, caplog):
+    location = JournalLocation(tmp_path / "store", database.url)
+    with closing(Writer(Store(location, SITE, CONFIG, now_ns))) as writer:
+        for seed in (1, 2, 3):
+            deliver(writer, seed)
+        (row,) = database.sql("SELECT record FROM sitegrid.journal WHERE row = 2")
+        database.sql("DELETE FROM sitegrid.journal WHERE row = 2")
+        one = Following(JournalLocation(tmp_path / "elsewhere", database.url), SITE, CONFIG)
+        one.start()
+        with closing(one):
+            wait_for(lambda: "what follows number 1 is damaged" in caplog.text)
+            assert version(one) is None
+            database.sql(f"INSERT INTO sitegrid.journal VALUES (2, '\\x{bytes(row[0]).hex()}')")
+            catches_up(one, writer)
 
 
 def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):

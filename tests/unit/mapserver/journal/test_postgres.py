@@ -32,7 +32,6 @@ from mapserver.upkeep.refolding import Refolding
 from protocol.errors import ConfigError, QueryError, Refusal, SitegridError, StoreError
 from protocol.wire.messages import Ack, Refused
 from tests import postgres_server as server
-from tests.pooler import SwappingPooler
 from tests.postgres_server import Cluster, Database
 from tests.tcp_proxy import Proxy, Weather
 from tests.unit.mapserver.data import (
@@ -146,21 +145,6 @@ def test_commits_are_synchronous_whatever_the_database_says(tmp_path, database):
         assert store.journal._session.run("SHOW synchronous_commit") == [("on",)]
 
 
-def test_a_pooler_is_refused_and_a_session_that_is_swapped_loses_the_lock(tmp_path, database):
-    database_url = database.url
-    with closing(SwappingPooler(database.cluster.port)) as pooler:
-        url = database_url.replace(str(database.cluster.port), str(pooler.port))
-        with pytest.raises(StoreError, match=r"pooler.*PostgreSQL's own address"):
-            Store(JournalLocation(tmp_path, url), SITE, CONFIG, now_ns)
-    with closing(SwappingPooler(database.cluster.port, honest=True)) as pooler:
-        pooler.swaps = False  # while the server starts, it looks like the real one
-        url = database_url.replace(str(database.cluster.port), str(pooler.port))
-        with closing(Store(JournalLocation(tmp_path, url), SITE, CONFIG, now_ns)) as store:
-            assert isinstance(send(store, 1), Ack)
-            pooler.swaps = True
-            wait_for(lambda: "swapped" in store.journal._session.lost)
-
-
 def test_a_folder_is_of_one_journal(tmp_path, database, postgres_cluster):
     open_store(tmp_path / "one", database).close()
     other = postgres_cluster.new_database()
@@ -174,16 +158,6 @@ def test_a_folder_is_of_one_journal(tmp_path, database, postgres_cluster):
     Store(JournalLocation(tmp_path / "two"), SITE, CONFIG, now_ns).close()
     with pytest.raises(ConfigError, match=r"journal\.db of its own"):
         open_store(tmp_path / "two", database)
-
-
-def test_a_database_of_any_encoding_has_a_journal(tmp_path, postgres_cluster):
-    """SQL_ASCII is what `initdb` makes under the C locale: its text comes as bytes, unless that is said."""
-    for encoding in ("sql_ascii", "latin1"):
-        name = f"in_{encoding}"
-        postgres_cluster.sql(f"CREATE DATABASE {name} TEMPLATE template0 ENCODING '{encoding}' LOCALE 'C'")
-        for first in (1, 6):
-            with closing(open_store(tmp_path / encoding, Database(postgres_cluster, name))) as store:
-                assert send(store, first).watermark == first + 4
 
 
 def test_limits_that_a_database_has_for_others_are_not_for_a_server(tmp_path, database):
@@ -286,7 +260,7 @@ def test_a_holder_that_works_keeps_the_lock(tmp_path, database):
 
 
 def test_a_writer_without_its_lock_cannot_commit(tmp_path, database):
-    """The epoch alone fences it: its session stands, as behind a pooler. Not even what it had is acknowledged again."""
+    """The epoch alone fences it: its session stands. Not even what it had is acknowledged again."""
     for had in (1, 2):
         with closing(open_store(tmp_path, database)) as store:
             if had == 1:
@@ -440,7 +414,7 @@ def test_a_session_that_is_lost_while_it_waits_is_closed_and_fences_nobody(tmp_p
     monkeypatch.setattr(PostgresJournal, "_on_loss", lambda self: (real(self), looked.release()))
     first = open_store(tmp_path / "one", database)
     send(first, 1)
-    mine = f"application_name = 'sitegrid writer' AND pid <> {first.journal._session._pid}"
+    mine = f"application_name = 'sitegrid writer' AND pid <> {first.journal._session._db.info.backend_pid}"
     with closing(StandsBy(tmp_path / "two", database)) as second:
         wait_for(lambda: second.standby.row == 1)
         waiting = database.sql(f"SELECT pid FROM pg_stat_activity WHERE {mine}")

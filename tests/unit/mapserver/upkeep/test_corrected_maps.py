@@ -246,12 +246,12 @@ def test_a_snapshot_that_lacks_a_fact_is_folded_again(tmp_path):
         assert same(store.grid, fleet.folded(decision("a").corrections))
 
 
-def test_a_fact_of_a_newer_version_is_refused_not_ignored(tmp_path):
+def test_a_fact_of_another_version_is_refused_not_ignored(tmp_path):
     with closing(open_store(tmp_path)) as store:
         store.commit([incoming(samples(3))])
         store.decide(decision("a"))
         store.journal.append_event("calibration", NOW_NS, decision("a").body() | {"version": 2})
-    with pytest.raises(StoreError, match=r"journal\.db: event 2: .*version 2, by a newer version.*open it with that"):
+    with pytest.raises(StoreError, match=r"journal\.db: event 2 has a correction of version 2, this program knows 1"):
         open_store(tmp_path)
 
 

@@ -6,6 +6,7 @@ import json
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
@@ -119,61 +120,25 @@ def test_server_refuses_an_unknown_option(files: Path, capsys):
 # --- options that only act inside a running command -------------------------------------------------------------------
 
 
-class Stop:
-    """A stop flag that notes how long it was waited for, and is never set."""
-
-    def __init__(self) -> None:
-        self.waits: list[float] = []
-
-    def is_set(self) -> bool:
-        return False
-
-    def wait(self, seconds: float) -> bool:
-        self.waits.append(seconds)
-        return False
-
-
 class Nothing:
-    """Stands for a client and for its tracks."""
-
-    session = site = None
+    """Stands for a client or a session."""
 
     def __enter__(self) -> Nothing:
         return self
 
     def __exit__(self, *_: object) -> None: ...
 
-    def tracks(self) -> list[object]:
-        return []
-
     def close(self) -> None: ...
 
 
-@pytest.fixture
-def drawn(monkeypatch) -> tuple[list[tuple[Any, ...]], Stop]:
+def test_plot_draws_what_it_is_told_to(monkeypatch, capsys):
     pictures: list[tuple[Any, ...]] = []
-    stop = Stop()
-    monkeypatch.setattr(draw, "stop_flag", lambda: stop)
     monkeypatch.setattr(draw, "connect", lambda *_, **__: Nothing())
-    monkeypatch.setattr(draw, "TrackRecorder", lambda *_: Nothing())
     monkeypatch.setattr(draw, "draw", lambda _, *rest: pictures.append(rest))
-    return pictures, stop
-
-
-def test_plot_waits_between_pictures_and_ends_after_so_many(drawn):
-    pictures, stop = drawn
-    words = ["plot", "--follow", "--every", "2.5", "--pictures", "3"]
-    assert plot.run(build_parser().parse_args(words)) == 0
-    assert len(pictures) == 3
-    assert stop.waits == [2.5, 2.5]
-
-
-def test_plot_draws_once_what_it_is_told_to(drawn):
-    pictures, stop = drawn
     words = ["plot", "--out", "a.png", "--bounds", "1", "2", "3", "4", "--truth", "t.npz"]
-    plot.run(build_parser().parse_args(words))
+    assert plot.run(build_parser().parse_args(words)) == 0
     assert pictures == [(Path("a.png"), [1.0, 2.0, 3.0, 4.0], [], Path("t.npz"))]
-    assert stop.waits == []
+    assert capsys.readouterr().err == "a.png\na-difference.png\n"
     assert draw._bounds(None, [1.0, 2.0, 3.0, 4.0]) == Bounds(1, 2, 3, 4)
 
 
@@ -197,7 +162,7 @@ def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch):
         def __init__(self, *given: Any, **_: Any) -> None:
             configs.append(given[4])
 
-    monkeypatch.setattr(server, "stop_flag", Stop)
+    monkeypatch.setattr(server, "stop_flag", Event)
     monkeypatch.setattr("sitegrid.commands.server.open_session", lambda _: Nothing())
     monkeypatch.setattr("mapserver.server.Server", Failed)
     words = ["server", "--site-file", str(site), "--store", str(tmp_path / "store"), "--config", str(options)]

@@ -241,7 +241,7 @@ def test_damaged_corrections_of_an_archive_are_not_folded_without(tmp_path: Path
     assert not (tmp_path / "new").exists()
 
 
-def test_corrections_of_a_newer_version_are_refused(tmp_path: Path, capsys, monkeypatch):
+def test_corrections_of_another_version_are_refused(tmp_path: Path, capsys, monkeypatch):
     source = make_store(tmp_path / "source", archived=9)
     with monkeypatch.context() as later:
         later.setattr(decisions, "VERSION", 2)
@@ -250,7 +250,7 @@ def test_corrections_of_a_newer_version_are_refused(tmp_path: Path, capsys, monk
             archived_decisions.save(source / FOLDER, opened_store.identity.id, FACTS)
     for path in (source, source / FOLDER):
         assert run(path, "--out", tmp_path / "new") == 1
-        assert "version 2, by a newer version of this program; this one knows version 1" in capsys.readouterr().err
+        assert "has a correction of version 2, this program knows 1" in capsys.readouterr().err
         assert not (tmp_path / "new").exists()
 
 

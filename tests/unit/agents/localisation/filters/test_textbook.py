@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from agents.localisation import localiser as localiser_module
-from agents.localisation.filters.belief import Belief, Conditioned, DivergedError, Filter, Measurement, Model, Motion
+from agents.localisation.filters.belief import Belief, Conditioned, DivergedError, Filter, Measurement, Motion
 from agents.localisation.filters.ekf import Ekf
-from agents.localisation.filters.square_root import wrapped, wrapped_state
 from agents.localisation.filters.textbook import TextbookEkf, TextbookUkf
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.localiser import LocalisationConfig
@@ -72,94 +70,6 @@ def test_each_step_of_a_drive_is_that_of_our_own_filter(
     assert compared.steps > 2500
     assert compared.accepted > 2000
     assert compared.difference < 1e-9
-
-
-@pytest.mark.parametrize("angles", [False, True], ids=["lengths", "angles"])
-@pytest.mark.parametrize("k", [1, 2, 3, 6])
-@pytest.mark.parametrize("n", [1, 2, 15])
-def test_no_bit_differs_from_the_library(n: int, k: int, angles: bool) -> None:
-    """Random beliefs, motions and measurements; filterpy goes from sigma point to sigma point."""
-    of_motion, of_sensor = (0,) * angles, tuple(range(0, k, 2)) * angles
-    seen = np.arange(k) % n  # states
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        belief = Belief(0, 2 * rng.normal(size=n), spread(rng, n))
-        F, H = rng.normal(size=(n, n)), rng.normal(size=(k, n))
-        # The order of columns is that of our models, whose values adjoin by state.
-        f: Model = lambda s: np.asfortranarray(s + 0.1 * s * s)  # noqa: E731
-        h: Model = lambda s: np.asfortranarray(s[:, seen] * s[:, :1])  # noqa: E731
-        moves = Motion(f, constant(F), spread(rng, n), of_motion)
-        sensed = Measurement("a", 0, 3 * rng.normal(size=k), spread(rng, k), h, constant(H), of_sensor)
-        for ours, theirs in ((TextbookUkf(), LibraryUkf()), (TextbookEkf(), LibraryEkf())):
-            x, P = theirs.predict(belief, moves)
-            moved = ours.predict(belief, moves, 1)
-            np.testing.assert_array_equal(moved.x, wrapped_state(x, of_motion), f"seed {seed}")
-            np.testing.assert_array_equal(moved.P, P, f"seed {seed}")
-            x, P = theirs.condition(belief, sensed)
-            conditioned = ours.condition(belief, sensed).belief
-            np.testing.assert_array_equal(conditioned.x, x, f"seed {seed}")
-            np.testing.assert_array_equal(conditioned.P, P, f"seed {seed}")
-
-
-def constant(matrix: Floats) -> Model:
-    return lambda _: matrix
-
-
-def spread(rng: np.random.Generator, n: int) -> Floats:
-    """A covariance (n, n)."""
-    root = rng.normal(size=(n, n + 2))
-    covariance: Floats = 0.1 * root @ root.T
-    return covariance
-
-
-class AtOnce(UnscentedKalmanFilter):  # type: ignore[misc]
-    """The library's filter with a motion of all sigma points at once, in whatever order their values lie."""
-
-    def compute_process_sigmas(self, *_: object, **__: object) -> None:
-        self.sigmas_f = self.fx(self.points_fn.sigma_points(self.x, self.P))
-
-
-class LibraryUkf:
-    """filterpy as its manual has it: x (n,), P (n, n) after a motion, and after a measurement of one belief."""
-
-    def predict(self, belief: Belief, motion: Motion) -> tuple[Floats, Floats]:
-        stock = library_ukf(belief, 1)
-        stock.Q, stock.fx = motion.Q, motion.f
-        stock.predict()
-        return stock.x, stock.P
-
-    def condition(self, belief: Belief, measurement: Measurement) -> tuple[Floats, Floats]:
-        residual = lambda a, b: wrapped(a - b, measurement.angles)  # noqa: E731
-        mean = lambda points, weights: points[0] + weights.dot(residual(points, points[0]))  # noqa: E731
-        functions = {"z_mean_fn": mean, "residual_z": residual} if measurement.angles else {}
-        stock = library_ukf(belief, len(measurement.z), functions)
-        stock.sigmas_f = stock.points_fn.sigma_points(belief.x, belief.P)
-        stock.update(measurement.z, R=measurement.R, hx=lambda x: measurement.h(x[None])[0])
-        return stock.x, stock.P
-
-
-def library_ukf(belief: Belief, k: int, functions: dict[str, Any] | None = None) -> Any:
-    n = len(belief.x)
-    points = MerweScaledSigmaPoints(n, 1.0, 1.0, 3.0 - n)
-    stock: Any = AtOnce(n, k, 0.0, None, None, points, **(functions or {}))
-    stock.x, stock.P = belief.x, belief.P
-    return stock
-
-
-class LibraryEkf:
-    """The same of its ExtendedKalmanFilter."""
-
-    def predict(self, belief: Belief, motion: Motion) -> tuple[Floats, Floats]:
-        F = motion.jacobian(belief.x)
-        return motion.f(belief.x[None])[0], F.dot(belief.P).dot(F.T) + motion.Q
-
-    def condition(self, belief: Belief, measurement: Measurement) -> tuple[Floats, Floats]:
-        stock = ExtendedKalmanFilter(len(belief.x), len(measurement.z))
-        stock.x, stock.P = belief.x, belief.P
-        residual = lambda a, b: wrapped(a - b, measurement.angles)  # noqa: E731
-        hx = lambda x: measurement.h(x[None])[0]  # noqa: E731
-        stock.update(measurement.z, measurement.jacobian, hx, R=measurement.R, residual=residual)
-        return stock.x, stock.P
 
 
 @STOCK
