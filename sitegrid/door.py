@@ -12,7 +12,7 @@ import logging
 import pkgutil
 import sys
 from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
 
@@ -27,8 +27,8 @@ from sitegrid.process import streams
 from sitegrid.process.logs import start_logging
 
 INTERRUPTED = 130  # as a shell has it: 128 and the number of SIGINT
-# What needs an extra in some commands only; all else is in the extra of the command (`EXTRA` of its module).
-BESIDE = {"cryptography": "security", "filterpy": "paper", "gtsam": "oracle"}
+# What any command may need beside its own extra (`EXTRA` of its module, and `BESIDE` for some of its options).
+BESIDE = {"cryptography": "security", "filterpy": "paper"}
 OURS = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 ADVICE = {
     errno.EACCES: "run this as a user who may, or choose another place",
@@ -55,10 +55,10 @@ def run(words: Sequence[str], commands: ModuleType = commands, program: str = "s
 
 
 def _run(words: Sequence[str], commands: ModuleType, program: str) -> int:
-    extra = ""
+    extra, beside = "", BESIDE
     try:
         arguments = build_parser(commands, program).parse_args(words, Namespace(words=words))
-        extra = arguments.extra
+        extra, beside = arguments.extra, BESIDE | arguments.beside
         start_logging(verbose=arguments.verbose)
         return int(arguments.run(arguments))
     except SitegridError as error:
@@ -66,7 +66,7 @@ def _run(words: Sequence[str], commands: ModuleType, program: str) -> int:
     except zenoh.ZError as error:
         return _fail(f"network: {reason_of(error)}", words)
     except ModuleNotFoundError as error:
-        if not (advice := _extra_for(error, extra)):
+        if not (advice := _extra_for(error, extra, beside)):
             raise
         return _fail(advice, words)
     except OSError as error:
@@ -85,17 +85,17 @@ def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> 
     for word, name in sorted((info.name.rpartition(".")[2], info.name) for info in those if not info.ispkg):
         module = import_module(name)
         noun = add_command(nouns, word, module.HELP)
-        noun.set_defaults(run=module.run, extra=getattr(module, "EXTRA", ""))
+        noun.set_defaults(run=module.run, extra=getattr(module, "EXTRA", ""), beside=getattr(module, "BESIDE", {}))
         module.add_options(noun)
     return parser
 
 
-def _extra_for(error: ModuleNotFoundError, extra: str) -> str:
+def _extra_for(error: ModuleNotFoundError, extra: str, beside: Mapping[str, str] = BESIDE) -> str:
     """What to install for a command that misses a module; nothing where the module is ours, or no extra has it."""
     module = str(error.name).partition(".")[0]
     if module == "pybullet" and sys.version_info >= (3, 12):
         return "PyBullet has wheels for Python 3.11 alone: run this with that, or in the fast world (--world fast)"
-    extras = ",".join(dict.fromkeys(filter(None, (extra, BESIDE.get(module)))))
+    extras = ",".join(dict.fromkeys(filter(None, (extra, beside.get(module)))))
     if not extras or module in OURS or module in sys.stdlib_module_names:
         return ""
     return f"{module} is not installed: pip install '.[{extras}]' in the folder of this project"

@@ -17,7 +17,7 @@ from agents.stream_order import by_stamp
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection
-from sitegrid.logs.real_logs import refitted
+from sitegrid.logs.sensors import refitted
 from sitegrid.proof.figures import Row, rounded
 
 LOGS = Path(__file__).parents[1] / "logs"
