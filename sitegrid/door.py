@@ -11,7 +11,7 @@ import json
 import logging
 import pkgutil
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
@@ -77,17 +77,30 @@ def _run(words: Sequence[str], commands: ModuleType, program: str) -> int:
 
 
 def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> ArgumentParser:
-    """The parser of all commands, the modules of a package; its docstring's first line describes the program."""
-    parser = ArgumentParser(prog=program, description=(commands.__doc__ or "").partition("\n")[0])
+    """The parser of all commands, the modules of a package; its docstring's first line describes the program.
+
+    `GROUPS` of the package, names of commands by heading, are what `--help` lists.
+    """
+    about = (commands.__doc__ or "").partition("\n")[0]
+    parser = ArgumentParser(prog=program, description=about, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--version", action="version", version=f"sitegrid {package_version()}")
-    nouns = parser.add_subparsers(metavar="COMMAND", required=True)
+    nouns = parser.add_subparsers(metavar="COMMAND", required=True, help="one of those below; COMMAND --help says more")
     those = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")
-    for word, name in sorted((info.name.rpartition(".")[2], info.name) for info in those if not info.ispkg):
-        module = import_module(name)
+    modules = {info.name.rpartition(".")[2]: import_module(info.name) for info in those if not info.ispkg}
+    parser.epilog = _listed(getattr(commands, "GROUPS", {"commands": sorted(modules)}), modules)
+    for word, module in modules.items():
         noun = add_command(nouns, word, module.HELP)
         noun.set_defaults(run=module.run, extra=getattr(module, "EXTRA", ""), beside=getattr(module, "BESIDE", {}))
         module.add_options(noun)
     return parser
+
+
+def _listed(groups: Mapping[str, Sequence[str]], modules: Mapping[str, ModuleType]) -> str:
+    """Commands in groups, a line each."""
+    listed = (
+        f"{title}:\n" + "\n".join(f"  {w:<10} {modules[w].HELP}" for w in words) for title, words in groups.items()
+    )
+    return "\n\n".join(listed)
 
 
 def _extra_for(error: ModuleNotFoundError, extra: str, beside: Mapping[str, str] = BESIDE) -> str:
