@@ -11,8 +11,8 @@ import json
 import logging
 import pkgutil
 import sys
-from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
 
@@ -27,7 +27,7 @@ from sitegrid.process import streams
 from sitegrid.process.logs import start_logging
 
 INTERRUPTED = 130  # as a shell has it: 128 and the number of SIGINT
-# What needs an extra in some commands only; all else is in the extra of the command (`EXTRA` of its module).
+# What any command may need beside its own extra (`EXTRA` of its module, and `BESIDE` for some of its options).
 BESIDE = {"cryptography": "security", "filterpy": "paper"}
 OURS = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 ADVICE = {
@@ -55,10 +55,10 @@ def run(words: Sequence[str], commands: ModuleType = commands, program: str = "s
 
 
 def _run(words: Sequence[str], commands: ModuleType, program: str) -> int:
-    extra = ""
+    extra, beside = "", BESIDE
     try:
         arguments = build_parser(commands, program).parse_args(words, Namespace(words=words))
-        extra = arguments.extra
+        extra, beside = arguments.extra, BESIDE | arguments.beside
         start_logging(verbose=arguments.verbose)
         return int(arguments.run(arguments))
     except SitegridError as error:
@@ -66,7 +66,7 @@ def _run(words: Sequence[str], commands: ModuleType, program: str) -> int:
     except zenoh.ZError as error:
         return _fail(f"network: {reason_of(error)}", words)
     except ModuleNotFoundError as error:
-        if not (advice := _extra_for(error, extra)):
+        if not (advice := _extra_for(error, extra, beside)):
             raise
         return _fail(advice, words)
     except OSError as error:
@@ -77,25 +77,38 @@ def _run(words: Sequence[str], commands: ModuleType, program: str) -> int:
 
 
 def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> ArgumentParser:
-    """The parser of all commands, the modules of a package; its docstring's first line describes the program."""
-    parser = ArgumentParser(prog=program, description=(commands.__doc__ or "").partition("\n")[0])
+    """The parser of all commands, the modules of a package; its docstring's first line describes the program.
+
+    `GROUPS` of the package, names of commands by heading, are what `--help` lists.
+    """
+    about = (commands.__doc__ or "").partition("\n")[0]
+    parser = ArgumentParser(prog=program, description=about, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--version", action="version", version=f"sitegrid {package_version()}")
-    nouns = parser.add_subparsers(metavar="COMMAND", required=True)
+    nouns = parser.add_subparsers(metavar="COMMAND", required=True, help="one of those below; COMMAND --help says more")
     those = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")
-    for word, name in sorted((info.name.rpartition(".")[2], info.name) for info in those if not info.ispkg):
-        module = import_module(name)
+    modules = {info.name.rpartition(".")[2]: import_module(info.name) for info in those if not info.ispkg}
+    parser.epilog = _listed(getattr(commands, "GROUPS", {"commands": sorted(modules)}), modules)
+    for word, module in modules.items():
         noun = add_command(nouns, word, module.HELP)
-        noun.set_defaults(run=module.run, extra=getattr(module, "EXTRA", ""))
+        noun.set_defaults(run=module.run, extra=getattr(module, "EXTRA", ""), beside=getattr(module, "BESIDE", {}))
         module.add_options(noun)
     return parser
 
 
-def _extra_for(error: ModuleNotFoundError, extra: str) -> str:
+def _listed(groups: Mapping[str, Sequence[str]], modules: Mapping[str, ModuleType]) -> str:
+    """Commands in groups, a line each."""
+    listed = (
+        f"{title}:\n" + "\n".join(f"  {w:<10} {modules[w].HELP}" for w in words) for title, words in groups.items()
+    )
+    return "\n\n".join(listed)
+
+
+def _extra_for(error: ModuleNotFoundError, extra: str, beside: Mapping[str, str] = BESIDE) -> str:
     """What to install for a command that misses a module; nothing where the module is ours, or no extra has it."""
     module = str(error.name).partition(".")[0]
     if module == "pybullet" and sys.version_info >= (3, 12):
         return "PyBullet has wheels for Python 3.11 alone: run this with that, or in the fast world (--world fast)"
-    extras = ",".join(dict.fromkeys(filter(None, (extra, BESIDE.get(module)))))
+    extras = ",".join(dict.fromkeys(filter(None, (extra, beside.get(module)))))
     if not extras or module in OURS or module in sys.stdlib_module_names:
         return ""
     return f"{module} is not installed: pip install '.[{extras}]' in the folder of this project"

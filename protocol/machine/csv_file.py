@@ -4,7 +4,7 @@ import csv
 import gzip
 import math
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -137,19 +137,34 @@ def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str
                 _lines(text, path, csv_file),
                 fieldnames=csv_file.names or None,
                 delimiter="," if csv_file.delimiter == SPACES else csv_file.delimiter,
+                skipinitialspace=True,
             )
             require(csv_file.at_least, rows, path)
             yield rows
+    except FileNotFoundError:
+        raise LogFolderError(path, "is not there; `--data` names the folder of the files") from None
     except (OSError, EOFError, zlib.error, ValueError, csv.Error) as error:  # ValueError: no UTF-8, or no path
         raise LogFolderError(path, f"cannot be read: {error}") from None
 
 
 def require(names: Mapping[str, float], rows: "csv.DictReader[str]", path: Path) -> None:
-    """Refuse a file that lacks a column."""
-    header = rows.fieldnames or ()
+    """Refuse a file that lacks a column, or has two of its name."""
+    header = list(rows.fieldnames or ())
     for name in names:
         if name not in header:
             raise LogFolderError(path, f"has no column `{name}`; it has {', '.join(header)}")
+        if header.count(name) > 1:
+            raise LogFolderError(path, f"has {header.count(name)} columns `{name}`; name its columns by `names`")
+
+
+def no_number(row: Row, names: Iterable[str]) -> str:
+    """Which of these columns of a row has no number, as a sentence."""
+    for name in names:
+        try:
+            float(row[name])
+        except (ValueError, TypeError):
+            return f"{name}: {row[name]!r:.40} is not a number" if row[name] else f"{name}: a value is missing"
+    return "a value is not a number"
 
 
 def open_text(path: Path) -> IO[str]:

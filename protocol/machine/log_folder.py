@@ -15,7 +15,17 @@ from typing import Any
 from protocol.config import from_table, section, toml_lines
 from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal, RowError
 from protocol.files import load_toml
-from protocol.machine.csv_file import Column, CsvFile, Row, opened_rows, parse_column, require, stamp_reader, take_file
+from protocol.machine.csv_file import (
+    Column,
+    CsvFile,
+    Row,
+    no_number,
+    opened_rows,
+    parse_column,
+    require,
+    stamp_reader,
+    take_file,
+)
 from protocol.machine.log_columns import ReadingColumns, reading_columns
 from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
 from protocol.machine.readings import Reading, columns, parse_reading
@@ -90,6 +100,8 @@ class LogFolder:
     def _parser(self, source: SensorFile) -> Callable[[Row], Reading]:
         """What makes a reading of a row; raises RowError."""
         sensor, stamp, values = source.sensor, stamp_reader(source.stamp), source.columns.reader(self.site)
+        described = (source.stamp, *source.columns.described.values())
+        numbers = [*source.file.at_least, *(name for column in described for name in column.weights)]
 
         def parse(row: Row) -> Reading:
             try:
@@ -98,7 +110,7 @@ class LogFolder:
             except MessageError as error:
                 raise RowError(error.reason, str(error)) from None
             except (ValueError, TypeError, OverflowError):
-                raise RowError(Refusal.WRONG_TYPE, "a value is missing, or is not a number") from None
+                raise RowError(Refusal.WRONG_TYPE, no_number(row, numbers)) from None
 
         return parse
 
@@ -106,7 +118,9 @@ class LogFolder:
 def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
     """Read a manifest. manifest: the file, or the folder that holds it as `log.toml`; data: where the CSV files are."""
     if manifest.is_dir():
-        manifest = manifest / MANIFEST
+        folder, manifest = manifest, manifest / MANIFEST
+        if not manifest.exists():
+            raise ConfigError(folder, f"has no {MANIFEST} that describes its files; docs/log-folders.md has examples")
     where = str(manifest)
     table = load_toml(manifest)
     log = section(table, "log", where)

@@ -5,3 +5,12 @@ The commands of `sitegrid`, one module each: `HELP`, `add_options(parser)` and `
 A command module imports at its top only what the base install has. What needs an extra is imported inside a function,
 so that every command describes itself in any install, and `sitegrid --help` is quick.
 """
+
+# In the order of `sitegrid --help`: each command once.
+GROUPS = {
+    "run a site": ("router", "server", "agent", "web", "sim", "follow", "demo"),
+    "ask": ("query", "calibrate", "trust", "distrust"),
+    "look": ("plot", "log"),
+    "keep": ("backup", "restore", "verify", "accept", "fold"),
+    "help": ("doctor", "keys"),
+}

@@ -1,4 +1,4 @@
-"""`sitegrid log`: what a recording of a real machine shows."""
+"""`sitegrid log`: what of a recording of a machine is usable, and how well the machine is located in it."""
 
 from __future__ import annotations
 
@@ -7,51 +7,83 @@ from functools import partial
 from pathlib import Path
 
 from sitegrid.options.groups import add_action
+from sitegrid.options.outputs import PICTURE
 from sitegrid.options.values import count_or_names, names, setting, withhold
 from sitegrid.process.lifetime import note, plain, say, tell
-from sitegrid.process.tables import lines
+from sitegrid.process.tables import lines, table
 
-HELP = "look into a recording of a real machine"
+HELP = "check a recording of a machine, and replay it"
 EXTRA = "agent"
+BESIDE = {"cv2": "server"}  # for --picture alone
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     what = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
-    log = add_action(what, "run", "replay a recording and compare with withheld fixes or with its ground truth")
-    log.add_argument("manifest", type=Path, metavar="MANIFEST", help="log.toml, or its folder")
-    log.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
+    check = add_action(what, "check", "say what of a log folder is usable, and why the rest is not")
+    run = add_action(what, "run", "replay a log folder: positions without GPS, against a truth, and on known ground")
+    for action in (check, run):
+        action.add_argument("manifest", type=Path, metavar="FOLDER", help="folder with log.toml, or that file")
+        action.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
+    _add_options_of_run(run)
+
+
+def _add_options_of_run(run: ArgumentParser) -> None:
     off = (
         "OFF/PERIOD: no GPS for OFF seconds in every PERIOD; START,LENGTH: once, for LENGTH seconds; none: all of it; "
         "may be repeated, a row each (default none, 1/10, 10/30, 30/60)"
     )
-    log.add_argument("--withhold", action="append", type=withhold, metavar="WHEN", help=off)
+    run.add_argument("--withhold", action="append", type=withhold, metavar="WHEN", help=off)
     sensors = "names of the sensors to use, comma-separated, and no others (default: as the manifest says)"
-    log.add_argument("--sensors", type=names, default=(), metavar="NAMES", help=sensors)
+    run.add_argument("--sensors", type=names, default=(), metavar="NAMES", help=sensors)
     receivers = "of the GPS receivers, how many to use, or which, by name, comma-separated"
-    log.add_argument("--gps", type=count_or_names, default=(), metavar="N|NAMES", help=receivers)
-    log.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="filter (default %(default)s)")
+    run.add_argument("--gps", type=count_or_names, default=(), metavar="N|NAMES", help=receivers)
+    run.add_argument("--filter", choices=("ekf", "ukf"), default="ukf", help="filter (default %(default)s)")
     profile = "filter profile (default %(default)s)"
-    log.add_argument("--profile", choices=("default", "paper"), default="default", help=profile)
+    run.add_argument("--profile", choices=("default", "paper"), default="default", help=profile)
     option = "an option of [pipeline.localisation] in agent.toml, as start=[0,0,1.57]; may be repeated"
-    log.add_argument("--set", action="append", type=setting, default=[], metavar="NAME=VALUE", help=option)
+    run.add_argument("--set", action="append", type=setting, default=[], metavar="NAME=VALUE", help=option)
+    run.add_argument("--picture", type=PICTURE, metavar="FILE.png", help="draw the first row: track, fixes, truth")
 
 
 def run(arguments: Namespace) -> int:
-    """Replay a log."""
+    """Check a log, or replay it."""
+    return _check(arguments) if arguments.what == "check" else _run(arguments)
+
+
+def _check(arguments: Namespace) -> int:
+    """Say what is usable; 1 where nothing can be run."""
+    from sitegrid.logs.check import examine
+
+    examined = examine(arguments.manifest, arguments.data)
+    if arguments.json:
+        say(plain({"ok": examined.ok, **vars(examined)}))
+    else:
+        tell(table(examined.rows), "", f"begins: {examined.begins or 'never'}", "", *examined.findings)
+    return 0 if examined.ok else 1
+
+
+def _run(arguments: Namespace) -> int:
     from agents.localisation.localiser import LocalisationConfig
     from protocol.config import from_table
-    from sitegrid.logs import real_logs
+    from sitegrid.logs import outages
+    from sitegrid.logs.run import measurements, run
     from sitegrid.logs.sensors import chosen
 
+    draw = None
+    if arguments.picture:
+        from sitegrid.logs.picture import draw_log  # before the work: OpenCV may not be installed
+
+        draw = partial(draw_log, arguments.picture)
     named = {"filter": arguments.filter, "profile": arguments.profile, **dict(arguments.set)}
     options = from_table(LocalisationConfig, named, "--set")
-    patterns = [real_logs.parse_pattern(*words) for words in arguments.withhold or ()] or real_logs.WITHHOLD
+    patterns = [outages.parse_pattern(*words) for words in arguments.withhold or ()] or outages.WITHHOLD
     choose = partial(chosen, sensors=arguments.sensors, gps=arguments.gps)
-    report = real_logs.run(arguments.manifest, arguments.data, options, patterns, choose, on_progress=note)
-    shown = report if arguments.json else {**report, "measurements": real_logs.measurements(report["rows"])}
+    report = run(arguments.manifest, arguments.data, options, patterns, choose, on_progress=note, draw=draw)
     if arguments.json:
         say(plain(report))
     else:
-        tell("\n\n".join(lines(plain(shown))))
+        missing = report.pop("missing")
+        shown = {**report, "measurements": measurements(report["rows"])}
+        tell("\n\n".join([*lines(plain(shown)), *(f"{name}: {why}" for name, why in missing.items())]))
     return 0

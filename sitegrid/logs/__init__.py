@@ -1,1 +1,1 @@
-"""What a recording of a real machine shows: whether it can be used, positions, and how far they are off."""
+"""Recordings of real machines: what of one is usable, its positions and ground, and how far they are off."""

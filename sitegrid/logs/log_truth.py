@@ -1,4 +1,4 @@
-"""The truth of a real log. Agents never read the file beside its manifest that describes it, `evaluation.toml`.
+"""What is known of a recording beside its readings: `truth.toml` beside the manifest, which agents never read.
 
 [truth]                                # the true track of the log, of `base_link` or of an antenna
 file = "truth.csv.gz"                  # in the data folder; keys and columns as those of a sensor in the manifest
@@ -6,6 +6,12 @@ mount = { xyz_m = [0.4, 0.0, 1.9] }    # where that antenna sits; default at `ba
 stamp = "t"
 x_m = "x"                              # metres in `map`; or lat_deg and lon_deg
 y_m = "y"
+[[ground]]                             # an area whose rolling resistance, gradient, or both are known
+name = "ramp"
+outline = [[0.0, 0.0], [20.0, 0.0], [20.0, 15.0]]    # corners in `map` [m]
+c_rr = 0.012
+grade_east = 0.05                      # rise over run
+grade_north = 0.0
 """
 
 from __future__ import annotations
@@ -25,6 +31,7 @@ from protocol.files import load_toml
 from protocol.machine.csv_file import (
     Column,
     CsvFile,
+    no_number,
     number_reader,
     opened_rows,
     parse_column,
@@ -35,10 +42,10 @@ from protocol.machine.csv_file import (
 from protocol.machine.log_columns import MAX_FAR_M
 from protocol.machine.log_folder import LogFolder
 from protocol.machine.machine_config import Mount
-from protocol.site.site_config import Projection
+from protocol.site.site_config import KnownGround, Projection
 from sitegrid.proof.tracks import Truth
 
-SIDE_FILE = "evaluation.toml"
+SIDE_FILE = "truth.toml"
 PLANAR, GEODETIC = ("x_m", "y_m"), ("lat_deg", "lon_deg")
 LIMITS = {"x_m": MAX_FAR_M, "y_m": MAX_FAR_M, "lat_deg": 90.0, "lon_deg": 180.0}
 GAP_NS = 2_000_000_000  # between two rows that are further apart nobody knows where the machine was
@@ -52,16 +59,70 @@ class LogTruth:
     lever_m: Floats
 
 
+@dataclass(frozen=True)
+class KnownArea:
+    """An area whose ground is known; what is not known of it is None.
+
+    outline: corners in `map` [m]. c_rr: rolling resistance [-]. grade_east, grade_north: rise over run.
+    """
+
+    name: str
+    outline: tuple[tuple[float, float], ...]
+    c_rr: float | None = None
+    grade_east: float | None = None
+    grade_north: float | None = None
+
+    def __post_init__(self) -> None:
+        self.inside_m(0.0, 0.0)  # refuses an outline that is no area, and a resistance that is none
+        if self.c_rr is None and not self.has_gradient:
+            raise ValueError(f"{self.name}: state c_rr, grade_east or grade_north, else nothing is known of it")
+
+    @property
+    def has_gradient(self) -> bool:
+        """Whether its gradient is known, east or north."""
+        return self.grade_east is not None or self.grade_north is not None
+
+    def inside_m(self, x_m: float, y_m: float) -> float:
+        """How far inside of the outline a place lies [m]; negative outside."""
+        return KnownGround(self.name, self.c_rr or 0.0, self.outline).inside_m(x_m, y_m)
+
+
 def read_log_truth(log: LogFolder, folder: Path) -> LogTruth | None:
-    """The truth that the side file in a folder describes, None without such a file."""
+    """The true track that the side file in a folder describes, None without one."""
+    described = section(_side_file(folder), "truth", str(folder / SIDE_FILE))
+    return _read(log, described, f"{folder / SIDE_FILE} [truth]") if described else None
+
+
+def require_overlap(truth: LogTruth, first_ns: int, last_ns: int) -> None:
+    """Refuse a truth that lasts at another time than the readings, from first_ns to last_ns; raises ConfigError."""
+    begins_s, ends_s = (float(truth.track.stamp_ns[i] - first_ns) * 1e-9 for i in (0, -1))
+    seconds = (last_ns - first_ns) * 1e-9
+    if ends_s < 0 or begins_s > seconds:
+        where = f"from {begins_s:.0f} to {ends_s:.0f} s of the log, which lasts from 0 to {seconds:.0f} s"
+        raise ConfigError(SIDE_FILE, f"the truth is {where}: look at its stamps and their unit")
+
+
+def read_known_ground(log: LogFolder, folder: Path) -> tuple[KnownArea, ...]:
+    """Areas of known ground, of the side file in a folder and of the site."""
+    of_site = [KnownArea(area.name, area.outline, area.c_rr) for area in log.site.known_ground]
+    described = from_table(_Ground, {"ground": _side_file(folder).get("ground", [])}, str(folder / SIDE_FILE))
+    return *described.ground, *of_site
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """The side file's [[ground]]."""
+
+    ground: tuple[KnownArea, ...] = ()
+
+
+def _side_file(folder: Path) -> dict[str, Any]:
+    """The tables of the side file, none without one."""
     where = folder / SIDE_FILE
-    if not where.is_file():
-        return None
-    table = load_toml(where)
-    described = section(table, "truth", str(where))
-    if table:
-        raise ConfigError(where, f"unknown key `{next(iter(table))}`; known: truth")
-    return _read(log, described, f"{where} [truth]")
+    table = load_toml(where) if where.is_file() else {}
+    if unknown := [name for name in table if name not in ("truth", "ground")]:
+        raise ConfigError(where, f"unknown key `{unknown[0]}`; known: truth, ground")
+    return table
 
 
 def _read(log: LogFolder, described: dict[str, Any], where: str) -> LogTruth:
@@ -85,6 +146,7 @@ def _rows(
     """Stamp and place of each row that counts, NaN where a row says so; raises LogFolderError with the line."""
     path, newest = log.data / file.file, 0
     stamp, readers = stamp_reader(time), [number_reader(column, name) for name, column in pair.items()]
+    numbers = [*file.at_least, *(name for column in (time, *pair.values()) for name in column.weights)]
     with opened_rows(file, log.data) as rows:
         for column in (time, *pair.values()):
             require(column.weights, rows, path)
@@ -95,7 +157,7 @@ def _rows(
             except RowError:
                 continue
             except (ValueError, TypeError, OverflowError):
-                raise LogFolderError(path, f"line {rows.line_num}: a value is missing, or is not a number") from None
+                raise LogFolderError(path, f"line {rows.line_num}: {no_number(row, numbers)}") from None
             if stamp_ns < newest:
                 raise LogFolderError(path, f"line {rows.line_num}: it is older than the row before it")
             for name, value in zip(pair, (a, b), strict=True):

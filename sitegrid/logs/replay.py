@@ -111,7 +111,7 @@ def replay(core: PoseSource, readings: Sequence[Reading], holdout: Holdout | Non
     poses: list[PoseBelief] = []
     smoothed: list[SmoothedPose] = []
     cpu_s = 0.0
-    for span in _spans(readings):
+    for span in spans(readings):
         seen = holdout.split(span) if holdout else span
         began_s = time.process_time()
         if isinstance(core, Positioning):
@@ -198,7 +198,7 @@ def covered(trace: Trace) -> float:
     return min(1.0, float(counts_s.sum()) / trace.seconds) if trace.seconds else 1.0
 
 
-def _spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:
+def spans(readings: Sequence[Reading]) -> Iterator[list[Reading]]:
     """Cut readings at the multiples of STEP_NS; one whose stamp goes back stays with those that it came with."""
     span: list[Reading] = []
     step = 0

@@ -6,6 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from protocol.errors import ConfigError, SitegridError
+from protocol.machine.log_folder import LogFolder
 from protocol.machine.machine_config import MachineConfig
 
 
@@ -39,6 +40,13 @@ def chosen(machine: MachineConfig, sensors: Collection[str] = (), gps: int | Col
     if isinstance(gps, int):
         return select(machine, gps=gps)
     return _using(machine, gps, [s.name for s in machine.sensors if s.kind == "gps"]) if gps else machine
+
+
+def refitted(log: LogFolder, machine: MachineConfig) -> LogFolder:
+    """The log with the sensors of this machine, of which others may be in use."""
+    sensors = {sensor.name: sensor for sensor in machine.sensors}
+    sources = tuple(replace(source, sensor=sensors[source.sensor.name]) for source in log.sources)
+    return replace(log, machine=machine, sources=sources)
 
 
 def _using(machine: MachineConfig, names: Collection[str], among: Sequence[str]) -> MachineConfig:

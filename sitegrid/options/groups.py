@@ -13,7 +13,7 @@ Subparsers: TypeAlias = "_SubParsersAction[ArgumentParser]"  # argparse has no p
 
 def add_command(commands: Subparsers, name: str, summary: str) -> ArgumentParser:
     """Add `sitegrid NAME`, with the options of every command."""
-    parser: ArgumentParser = commands.add_parser(name, help=summary, description=sentence(summary))
+    parser: ArgumentParser = commands.add_parser(name, description=sentence(summary))
     parser.add_argument("--json", action="store_true", help="print JSON for machines")
     parser.add_argument("--verbose", action="store_true", help="log normal events too, not only warnings and errors")
     return parser

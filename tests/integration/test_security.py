@@ -156,6 +156,7 @@ def test_a_machine_gets_its_acknowledgements_from_the_map_server(guarded: Guarde
         assert client.info(after=before + 200).journalled == before + 200
 
 
+@pytest.mark.nightly
 def test_a_follower_with_keys_answers_under_its_own_name_alone(guarded: Guarded):
     with guarded.session("loader-1") as session:
         assert is_taken(guarded, session, "loader-1")

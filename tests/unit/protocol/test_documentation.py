@@ -136,7 +136,7 @@ def test_example_of_a_log_of_ones_own_is_read(tmp_path):
     page = (ROOT / "docs" / "own-log.md").read_text()
     _, manifest, truth = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "log.toml").write_text(manifest)
-    (tmp_path / "evaluation.toml").write_text(truth)
+    (tmp_path / "truth.toml").write_text(truth)
     (tmp_path / "groundtruth.csv").write_text("1326030975000000,1,2,3,0,0,0\n")
     log = open_log(tmp_path)
     assert [source.file.file for source in log.sources] == ["gps.csv", "imu.csv", "wheels.csv"]

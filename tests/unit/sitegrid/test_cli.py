@@ -21,12 +21,15 @@ from sitegrid.process.lifetime import plain
 COMMANDS = sorted(path.stem for path in Path(commands.__path__[0]).rglob("[a-z]*.py"))
 
 
-def test_help_names_every_command(capsys):
+def test_help_lists_each_command_once_on_a_line_in_its_group(capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["--help"])
     assert end.value.code == 0
     text = capsys.readouterr().out
-    assert all(command in text for command in COMMANDS)
+    listed = re.findall(r"^  (\w+) +\w.*$", text.partition("run a site:")[2], re.MULTILINE)
+    assert listed == [command for group in commands.GROUPS.values() for command in group]
+    assert sorted(listed) == COMMANDS
+    assert re.findall(r"^(\w.*):$", text, re.MULTILINE)[2:] == list(commands.GROUPS)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -89,8 +92,9 @@ def test_errors_are_one_line_or_json(monkeypatch, capsys):
         ("agent", ["--spool", "x.db"], "scipy.linalg", "agent"),
         ("agent", ["--spool", "x.db"], "filterpy.kalman", "agent,paper"),
         ("demo", ["--out", "x"], "cv2", "demo"),
-        ("eval", ["physics"], "pybullet", "eval"),
         ("keys", ["list"], "cryptography", "security"),
+        ("log", ["run", "x"], "scipy", "agent"),
+        ("log", ["run", "x", "--picture", "x.png"], "cv2", "agent,server"),
         ("query", ["info"], "cryptography", "security"),
         ("server", ["--site-file", "x", "--store", "x"], "cryptography", "server,security"),
         ("sim", [], "numba", "sim"),

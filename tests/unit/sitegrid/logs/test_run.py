@@ -1,4 +1,4 @@
-"""Real logs: withheld fixes, truth, choice of sensors; on made-up logs, and on real ones where they are at hand."""
+"""Replays of logs: withheld fixes, truth, choice of sensors; made-up logs, and real ones where they are at hand."""
 
 import math
 from functools import partial
@@ -11,9 +11,9 @@ import pytest
 from agents.localisation.localiser import LocalisationConfig
 from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import open_log
-from sitegrid.logs import real_logs
+from sitegrid.logs import run as replayed
 from sitegrid.logs.log_truth import read_log_truth
-from sitegrid.logs.real_logs import Outage, Pattern, Periodic
+from sitegrid.logs.outages import WITHHOLD, Outage, Pattern, Periodic
 from sitegrid.logs.sensors import UnsupportedError, chosen
 from sitegrid.proof.figures import Report
 from tests.paths import ROOT
@@ -72,13 +72,13 @@ def circle(tmp_path: Path) -> Path:
     write(tmp_path / "gps2.csv", "t,x,y", [])
     gps = [GPS.format(i=i, use=use) for i, use in ((1, "true"), (2, "false"))]
     (tmp_path / "log.toml").write_text("".join([MANIFEST, *gps]))
-    (tmp_path / "evaluation.toml").write_text(SIDE)
+    (tmp_path / "truth.toml").write_text(SIDE)
     return tmp_path
 
 
 def run(folder: Path, *patterns: Pattern, data: Path | None = None, **choice: Any) -> Report:
     options, choose = LocalisationConfig(filter="ekf"), partial(chosen, **choice)
-    return real_logs.run(folder, data, options, patterns or real_logs.WITHHOLD, choose)
+    return replayed.run(folder, data, options, patterns or WITHHOLD, choose)
 
 
 @pytest.mark.slow
@@ -128,7 +128,7 @@ def test_wheels_in_another_unit_show_in_their_scale(circle: Path, scale: float):
 
 
 def test_without_a_side_file_there_is_no_truth(circle: Path):
-    (circle / "evaluation.toml").unlink()
+    (circle / "truth.toml").unlink()
     row = run(circle, Periodic(10.0, 1.0))["rows"][0]
     assert not any(name.startswith("truth") for name in row)
 
@@ -149,7 +149,7 @@ def test_bad_rows_are_named_with_their_lines_and_measurements_are_counted_by_sen
     report = run(circle, None)
     assert report["refused"] == {"not_finite": 1}
     assert report["first_refused"]["not_finite"].startswith("gps1.csv line 502: x_m: nan is not within 100 km")
-    listed = {row["measurement"]: row for row in real_logs.measurements(report["rows"])}
+    listed = {row["measurement"]: row for row in replayed.measurements(report["rows"])}
     assert set(listed) == {"gps-1", "gyro", "wheels"}
     assert listed["gps-1"]["used"] > 400
     assert listed["gps-1"]["nis"] is not None
@@ -170,7 +170,7 @@ def test_sensors_are_chosen_by_name_and_receivers_by_number_too(circle: Path):
     assert used(gps=("gps-2",)) == ["wheels", "gyro", "gps-2"]
     assert used(sensors=("gps-2", "wheels")) == ["wheels", "gps-2"]
     assert used(sensors=("gps-1", "gps-2", "wheels"), gps=1) == ["wheels", "gps-1"]
-    assert real_logs.receivers(chosen(machine, gps=2)) == 2
+    assert replayed.receivers(chosen(machine, gps=2)) == 2
 
 
 @pytest.mark.parametrize(

@@ -1,23 +1,27 @@
-"""Real logs: errors against fixes that were withheld, and against the truth where there is one."""
+"""A recording replayed: its positions against withheld fixes and the truth, its ground against known ground."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from agents.config import require_place
-from agents.holdout import NOTHING, Holdout, HoldoutConfig
+from agents.holdout import NOTHING, Holdout
 from agents.localisation.localiser import LocalisationConfig
 from agents.positioning import PipelineConfig, Positioning
 from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
-from sitegrid.logs.log_truth import LogTruth, read_log_truth
+from sitegrid.logs.check import missing_for_ground, missing_for_truth
+from sitegrid.logs.ground import compare, samples_of
+from sitegrid.logs.log_truth import LogTruth, read_known_ground, read_log_truth, require_overlap
+from sitegrid.logs.outages import WITHHOLD, Outage, Pattern
 from sitegrid.logs.replay import Trace, covered, errors, replay, score
+from sitegrid.logs.sensors import refitted
 from sitegrid.proof.figures import Report, Row, root_mean_square, rounded
 from sitegrid.proof.tracks import Truth
 
@@ -34,37 +38,15 @@ TRUTH_FIGURES = (
 
 
 @dataclass(frozen=True)
-class Outage:
-    """GPS is withheld once, for length_s from start_s on, counted from the first reading."""
+class Recording:
+    """A log with what is known beside its readings."""
 
-    start_s: float
-    length_s: float
-
-    def withholds(self, seconds: float) -> bool:
-        """Whether GPS is withheld so long after the first reading."""
-        return 0 <= seconds - self.start_s < self.length_s
-
-    def __str__(self) -> str:
-        return f"{self.start_s:g},{self.length_s:g}"
+    log: LogFolder
+    truth: LogTruth | None
+    readings: Sequence[Reading]
 
 
-@dataclass(frozen=True)
-class Periodic(HoldoutConfig):
-    """GPS is withheld for off_s of every period_s."""
-
-    def __str__(self) -> str:
-        return f"{self.off_s:g}/{self.period_s:g}"
-
-
-Pattern = Outage | Periodic | None  # of None, nothing is withheld
-WITHHOLD: tuple[Pattern, ...] = (None, Periodic(10.0, 1.0), Periodic(30.0, 10.0), Periodic(60.0, 30.0))
-
-
-def parse_pattern(kind: str, first_s: float, second_s: float) -> Pattern:
-    """What `--withhold` means: `/` off and period, `,` start and length."""
-    if kind == "/":
-        return Periodic(period_s=second_s, off_s=first_s)
-    return Outage(first_s, second_s) if kind == "," else None
+Draw = Callable[[Recording, Pattern, Trace], None]
 
 
 def run(
@@ -74,29 +56,44 @@ def run(
     patterns: Sequence[Pattern] = WITHHOLD,
     choose: Callable[[MachineConfig], MachineConfig] = lambda machine: machine,
     on_progress: Callable[[str], None] = lambda _: None,
+    draw: Draw | None = None,
 ) -> Report:
-    """Replay a log once per pattern of withheld GPS. refused: readings by reason, and where the first of each stands.
+    """Replay a log once per pattern of withheld GPS, and once more for its ground where some is known.
 
-    choose: which sensors of the machine are in use.
+    choose: which sensors of the machine are in use. draw: is given the trace of the first pattern. refused: readings by
+    reason, and where the first of each stands. missing: what cannot be compared, and why not.
     """
     log = open_log(manifest, data)
     log = refitted(log, choose(log.machine))
     require_place(log.machine, options)
-    truth = read_log_truth(log, manifest if manifest.is_dir() else manifest.parent)
-    readings = list(log.readings())
-    _require_time(log, truth, readings, patterns)
-    rows = []
+    folder = manifest if manifest.is_dir() else manifest.parent
+    truth, areas = read_log_truth(log, folder), read_known_ground(log, folder)
+    recording = Recording(log, truth, list(log.readings()))
+    _require_time(recording, patterns)
+    rows: list[Row] = []
     for pattern in patterns:
         on_progress(f"{log.name}: {pattern or 'none'}")
-        rows.append(_row(log, truth, options, readings, pattern))
-        if not rows[-1]["covered"]:
+        row, trace = _row(recording, options, pattern)
+        if draw and not rows:
+            draw(recording, pattern, trace)
+        rows.append(row)
+        if not row["covered"]:
             on_progress(
                 f"{log.name}: no pose, as the heading never showed: that takes wheels, fixes and 12 m of driving"
             )
+    missing = {"truth": missing_for_truth(truth), "ground": missing_for_ground(log.machine, areas)}
     described = {"log": log.name, "filter": options.filter, "profile": options.profile}
     used = [sensor.name for sensor in log.machine.sensors if sensor.use]
-    counted = {"readings": len(readings), "refused": dict(log.refused), "first_refused": dict(log.first_refused)}
-    return {**described, "gps": receivers(log.machine), "sensors": used, **counted, "rows": rows}
+    counted = {
+        "readings": len(recording.readings),
+        "refused": dict(log.refused),
+        "first_refused": dict(log.first_refused),
+    }
+    report = {**described, "gps": receivers(log.machine), "sensors": used, **counted, "rows": rows}
+    if areas and not missing["ground"]:
+        on_progress(f"{log.name}: ground")
+        report["ground"] = compare(samples_of(log, options, recording.readings), areas)
+    return {**report, "missing": {name: why for name, why in missing.items() if why}}
 
 
 def measurements(rows: Sequence[Row]) -> list[Row]:
@@ -112,52 +109,36 @@ def measurements(rows: Sequence[Row]) -> list[Row]:
     return listed
 
 
-def refitted(log: LogFolder, machine: MachineConfig) -> LogFolder:
-    """The log with the sensors of this machine, of which others may be in use."""
-    sensors = {sensor.name: sensor for sensor in machine.sensors}
-    sources = tuple(replace(source, sensor=sensors[source.sensor.name]) for source in log.sources)
-    return replace(log, machine=machine, sources=sources)
-
-
 def receivers(machine: MachineConfig) -> int:
     """How many GPS receivers are in use."""
     return sum(sensor.use and sensor.kind == "gps" for sensor in machine.sensors)
 
 
-def _require_time(
-    log: LogFolder, truth: LogTruth | None, readings: Sequence[Reading], patterns: Sequence[Pattern]
-) -> None:
+def _require_time(recording: Recording, patterns: Sequence[Pattern]) -> None:
     """Refuse what lies outside of the log's time."""
+    log, readings, truth = recording.log, recording.readings, recording.truth
     if not readings:
         raise LogFolderError(log.data, "no sensor in use has a reading")
-    first_ns, seconds = readings[0].stamp_ns, (readings[-1].stamp_ns - readings[0].stamp_ns) * 1e-9
+    seconds = (readings[-1].stamp_ns - readings[0].stamp_ns) * 1e-9
     for pattern in patterns:
         if isinstance(pattern, Outage) and pattern.start_s >= seconds:
             raise ConfigError(f"--withhold {pattern}", f"the log ends after {seconds:.0f} s")
     if truth:
-        begins_s, ends_s = (float(truth.track.stamp_ns[i] - first_ns) * 1e-9 for i in (0, -1))
-        if ends_s < 0 or begins_s > seconds:
-            where = f"from {begins_s:.0f} to {ends_s:.0f} s of the log, which lasts from 0 to {seconds:.0f} s"
-            raise LogFolderError(log.data, f"the truth is {where}: look at its stamps and their unit")
+        require_overlap(truth, readings[0].stamp_ns, readings[-1].stamp_ns)
 
 
-def _row(
-    log: LogFolder,
-    truth: LogTruth | None,
-    options: LocalisationConfig,
-    readings: Sequence[Reading],
-    pattern: Pattern,
-) -> Row:
-    """Errors [m] against the withheld fixes, and against the truth if known.
+def _row(recording: Recording, options: LocalisationConfig, pattern: Pattern) -> tuple[Row, Trace]:
+    """Errors [m] against the withheld fixes, and against the truth if known; and the trace that has them.
 
-    Of periodic outages those count from `agents.holdout.SETTLE_S` on, of a placed one all.
+    Errors of periodic outages count from `agents.holdout.SETTLE_S` on, those of a placed one all.
     """
+    log, truth = recording.log, recording.truth
     settle = {"settle_s": 0.0} if isinstance(pattern, Outage) else {}
     holdout = Holdout(log.site, log.machine, pattern, **settle) if pattern else None
     core = Positioning(log.site, log.machine, PipelineConfig(localisation=options))
-    trace = replay(core, readings, holdout)
+    trace = replay(core, recording.readings, holdout)
     consistency = core.localiser.consistency.items()
-    return {
+    row = {
         "withhold": str(pattern or "none"),
         **(holdout.report() if holdout else NOTHING),
         "covered": round(covered(trace), 4),
@@ -167,6 +148,7 @@ def _row(
         "consistency": {name: value.report for name, value in consistency},
         **(_against_truth(trace.moved(truth.lever_m), truth.track, pattern) if truth else {}),
     }
+    return row, trace
 
 
 def _against_truth(trace: Trace, truth: Truth, pattern: Pattern) -> Row:

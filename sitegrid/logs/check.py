@@ -1,0 +1,274 @@
+"""What of a recording is usable, and why the rest is not: manifest, files, clocks, rates, gaps.
+
+`examine` reads every file of the sensors in use. Functions that judge are pure; each of their findings is a line that
+says what to do.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+
+import numpy as np
+
+from agents.first_sample import UNIT, WHEELS
+from agents.stream_order import GAP_NS
+from protocol.arrays import Floats, Ints
+from protocol.errors import ConfigError, LogFolderError
+from protocol.machine.log_folder import LogFolder, open_log
+from protocol.machine.machine_config import ABSOLUTE, QUANTITIES, MachineConfig, SensorConfig
+from protocol.machine.readings import Gps, Imu, Reading, Torque
+from sitegrid.doctor import Finding, Level
+from sitegrid.logs.log_truth import SIDE_FILE, KnownArea, LogTruth, read_known_ground, read_log_truth, require_overlap
+from sitegrid.logs.speeds import Agreement, compare_speeds, places, wheel_distance
+from sitegrid.proof.figures import Row, rounded
+
+PAGE = "docs/log-folders.md"
+PAUSE = 5.0  # intervals: a longer one is a gap, if it lasts LEAST_GAP_S
+LEAST_GAP_S = 1.0
+REPEATS, HELD_S = 0.2, 10.0  # share of fixes that repeat the one before, and time at one place, of a sound receiver
+LAG_S, STUCK_S = 0.5, 10.0  # offset between two clocks, and standstill of moving wheels, above which they are named
+ADVICE = {
+    "below_least": "rows that the receiver itself calls bad; no harm if they are few",
+    "not_finite": "rows without a fix; no harm if they are few",
+    "out_of_range": "look at the unit of that column; variances of 0 mean unknown: give `std`, and no such columns",
+    "stamp_goes_back": "delete the row before it, if that has a stamp from the future; else sort the file by time",
+    "wrong_type": "numbers are expected; of dates and times, seconds",
+}
+
+
+@dataclass(frozen=True)
+class SensorData:
+    """What the file of a sensor holds. refused: rows by reason; first: where the first of each stands.
+
+    problem: why nothing can be used, else empty.
+    """
+
+    sensor: SensorConfig
+    readings: Sequence[Reading]
+    refused: dict[str, int]
+    first: dict[str, str]
+    problem: str = ""
+
+    @property
+    def stamps_ns(self) -> Ints:
+        """Stamps (n,) of the usable rows."""
+        return np.array([reading.stamp_ns for reading in self.readings], np.int64)
+
+
+@dataclass(frozen=True)
+class Examined:
+    """begins: time of the first reading, empty without one. rows: a table of the sensors. findings: what to know."""
+
+    begins: str
+    rows: list[Row]
+    findings: list[Finding]
+
+    @property
+    def ok(self) -> bool:
+        """Whether `sitegrid log run` can run it."""
+        return not any(one.level == Level.FAIL and one.check == "positions" for one in self.findings)
+
+
+def examine(manifest: Path, data: Path | None = None) -> Examined:
+    """Look at a log, and at what is known of it beside its manifest; raises ConfigError on the manifest."""
+    log, folder = open_log(manifest, data), manifest if manifest.is_dir() else manifest.parent
+    read = [_read(log, source.sensor) for source in log.sources if source.sensor.use]
+    unused = [SensorData(source.sensor, (), {}, {}) for source in log.sources if not source.sensor.use]
+    start_ns = min((int(one.stamps_ns[0]) for one in read if one.readings), default=0)
+    last_ns = max((int(one.stamps_ns[-1]) for one in read if one.readings), default=0)
+    rows = [_row(one, start_ns) for one in read] + [{**_row(one, 0), "usable": "use = false"} for one in unused]
+    barring = [*check_clocks(read), *check_places(log, read)]
+    is_barred = any(found.level == Level.FAIL for found in barring)
+    findings = [
+        *(found for one in read for found in check_sensor(one)),
+        *barring,
+        *(check_speeds(log, read) if not is_barred else ()),
+        check_positions(read, is_barred=is_barred),
+        *_compared(log, folder, start_ns, last_ns),
+    ]
+    return Examined(_time(start_ns) if start_ns else "", rows, findings)
+
+
+def check_sensor(data: SensorData) -> Iterator[Finding]:
+    """Rows that are refused, stamps that stand, gaps, fixes that repeat."""
+    name, stamps = data.sensor.name, data.stamps_ns
+    if data.problem:
+        worst = max(data.refused, key=lambda reason: data.refused[reason], default="")
+        yield Finding(Level.FAIL, name, data.problem, ADVICE.get(worst, ""))
+        return
+    for reason, count in data.refused.items():
+        what = f"{count} of {count + len(stamps)} rows refused ({reason}), first {data.first[reason]}"
+        yield Finding(Level.FAIL if count > len(stamps) else Level.WARN, name, what, ADVICE.get(reason, ""))
+    if _stands(data):
+        what = f"its stamps do not advance: {len(np.unique(stamps))} different in {len(stamps)} rows"
+        yield Finding(Level.FAIL, name, what, "export the time column with all its digits")
+        return
+    steps_s = np.diff(stamps) * 1e-9
+    if (longest := float(steps_s.max(initial=0.0))) * 1e9 > GAP_NS:
+        at_s = (stamps[steps_s.argmax()] - stamps[0]) * 1e-9
+        what = f"gaps: {len(_gaps(steps_s))}, the longest of {longest:.1f} s, {at_s:.0f} s after its first row"
+        yield Finding(Level.WARN, name, what, "positions rest on the other sensors until it is back")
+    share, held_s = _repeated(data.readings)
+    if share > REPEATS or held_s > HELD_S:
+        what = f"{share:.0%} of its fixes repeat the one before, one of them for {held_s:.0f} s"
+        yield Finding(Level.WARN, name, what, "keep one row per fix; a receiver that freezes is of no use meanwhile")
+
+
+def check_clocks(data: Sequence[SensorData]) -> Iterator[Finding]:
+    """Sensors whose time is not that of any other."""
+    spans = {one.sensor.name: one.stamps_ns[[0, -1]] for one in data if one.readings}
+    for name, (begin, end) in spans.items():
+        others = [span for other, span in spans.items() if other != name]
+        if others and not any(begin <= last and first <= end for first, last in others):
+            what = f"its stamps are from {_time(begin)} to {_time(end)}, when no other sensor has any"
+            yield Finding(Level.FAIL, name, what, "look at the unit of its stamp, and at `start_ns`, which is for all")
+
+
+def check_places(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding]:
+    """Fixes that are not on the site."""
+    for one in data:
+        if one.readings and _is_receiver(one.sensor):
+            far_m = np.abs(places(one.readings, log.site)[1]).max(axis=1)
+            if (share := float((far_m > log.site.extent_m).mean())) > 0:
+                what = f"{share:.0%} of its fixes are more than {log.site.extent_m / 1000:g} km from the site's origin"
+                advice = "look at the origin in [site], and whether latitude and longitude are exchanged"
+                yield Finding(Level.FAIL if share > 1 / 2 else Level.WARN, one.sensor.name, what, advice)
+
+
+def check_speeds(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding]:
+    """Wheels against fixes: clocks that are apart, units, wheels that stand while the machine moves."""
+    fixes = next((one for one in data if len(one.readings) > 1 and _is_receiver(one.sensor)), None)
+    for one in data:
+        if fixes and len(one.readings) > 1 and one.sensor.kind in WHEELS:
+            pair = places(fixes.readings, log.site), wheel_distance(one.readings, log.machine)
+            if agreement := compare_speeds(*pair):
+                yield from _judge(agreement, fixes.sensor.name, one.sensor.name)
+
+
+def _judge(agreement: Agreement, receiver: str, name: str) -> Iterator[Finding]:
+    """What is wrong with wheels of this name, or with the clock of the receiver."""
+    lag_s, share = agreement.lag_s, agreement.wheel_share
+    if lag_s and abs(lag_s) > LAG_S:
+        where = "ahead of" if lag_s > 0 else "behind"
+        what = f"its stamps are {abs(lag_s):.1f} s {where} those of {name}, by the speed"
+        yield Finding(Level.WARN, receiver, what, "bring both to one clock: GPS time is 18 s ahead of UTC")
+    elif agreement.stuck_s > STUCK_S:
+        what = f"the wheels stand for {agreement.stuck_s:.0f} s while {receiver} moves"
+        yield Finding(Level.WARN, name, what, "a dead sensor, or the machine was carried: cut that out")
+    elif not 1 / UNIT < share < UNIT and share >= 0:  # NaN of a machine that stands
+        what = f"the wheels turn {share:.2g} times as far as {receiver} goes"
+        yield Finding(Level.WARN, name, what, "look at the unit of the speed, `wheel_radius_m`, `ticks_per_rev`")
+
+
+def check_positions(data: Sequence[SensorData], *, is_barred: bool) -> Finding:
+    """Whether the sensors in use can locate the machine. is_barred: their clocks or places do not fit together."""
+    there = [one.sensor for one in data if one.readings and one.sensor.kind in QUANTITIES]
+    kinds, problem, advice = {sensor.kind for sensor in there}, "", ""
+    if not any(_is_receiver(sensor) for sensor in there):
+        problem, advice = "no usable GPS fixes", "add a receiver, or `sitegrid log run --set start=[x,y,heading]`"
+    elif not kinds & WHEELS:
+        problem, advice = "no usable wheel readings", "the heading needs an encoder or odometry"
+    elif is_barred or any(_stands(one) for one in data):
+        problem, advice = "readings do not fit together", "mend the stamps and places that are named above"
+    if problem:
+        return Finding(Level.FAIL, "positions", problem, advice)
+    named = ", ".join(sensor.name for sensor in there)
+    if "steering" in kinds or any(s.provides("rate") for s in there if s.kind in ("imu", "odometry")):
+        return Finding(Level.PASS, "positions", f"by {named}")
+    return Finding(Level.WARN, "positions", f"{named}: none shows the turn", "add a gyro or a steering angle")
+
+
+def missing_for_ground(machine: MachineConfig, areas: Sequence[KnownArea]) -> str:
+    """Why no ground can be compared, empty where it can."""
+    used = [sensor for sensor in machine.sensors if sensor.use]
+    if not any(sensor.kind == Imu.kind and sensor.provides("force") for sensor in used):
+        return "no IMU with forces, which gradient and rolling resistance need"
+    if not areas:
+        return f"no ground is known; describe areas as [[ground]] in {SIDE_FILE} beside the manifest ({PAGE})"
+    if any(sensor.kind == Torque.kind for sensor in used) or any(area.has_gradient for area in areas):
+        return ""
+    return "no torque sensor, which rolling resistance needs"
+
+
+def missing_for_truth(truth: LogTruth | None) -> str:
+    """Why positions cannot be compared with a truth, empty where they can."""
+    if truth:
+        return ""
+    return f"no true track is known; describe one as [truth] in {SIDE_FILE} beside the manifest ({PAGE})"
+
+
+def _compared(log: LogFolder, folder: Path, first_ns: int, last_ns: int) -> Iterator[Finding]:
+    """What can be compared with a truth and with known ground."""
+    try:
+        truth, areas = read_log_truth(log, folder), read_known_ground(log, folder)
+        if truth:
+            require_overlap(truth, first_ns, last_ns)
+    except (ConfigError, LogFolderError) as error:
+        yield Finding(Level.FAIL, "truth", str(error))
+        return
+    for check, why, there in (
+        ("truth", missing_for_truth(truth), "a true track is known"),
+        ("ground", missing_for_ground(log.machine, areas), f"known of {', '.join(area.name for area in areas)}"),
+    ):
+        yield Finding(Level.SKIP, check, f"not compared: {why}") if why else Finding(Level.PASS, check, there)
+
+
+def _read(log: LogFolder, sensor: SensorConfig) -> SensorData:
+    """Read the file of one sensor."""
+    sources = tuple(source for source in log.sources if source.sensor == sensor)
+    alone = replace(log, sources=sources, refused=Counter(), first_refused={})
+    try:
+        readings, problem = list(alone.readings()), ""
+    except LogFolderError as error:
+        readings, problem = [], str(error)
+    if not readings and not problem:
+        problem = "its file has no rows"
+    return SensorData(sensor, readings, alone.refused, alone.first_refused, problem)
+
+
+def _row(data: SensorData, start_ns: int) -> Row:
+    """A line of the table; times count from the first reading of the log."""
+    stamps, sensor = data.stamps_ns, data.sensor
+    row = {"sensor": sensor.name, "kind": sensor.kind, "usable": len(stamps), "refused": sum(data.refused.values())}
+    figures: dict[str, float | int | None] = dict.fromkeys(("begins_s", "ends_s", "rate_hz", "gaps", "longest_gap_s"))
+    if len(stamps) > 1:
+        steps_s = np.diff(stamps) * 1e-9
+        usual_s = float(np.median(steps_s))
+        begin, end = ((int(stamps[i]) - start_ns) * 1e-9 for i in (0, -1))
+        rate = 1 / usual_s if usual_s else None
+        values = begin, end, rate, len(_gaps(steps_s)), float(steps_s.max())
+        figures = rounded(dict(zip(figures, values, strict=True)), 2)
+    return {**row, **figures}
+
+
+def _gaps(steps_s: Floats) -> Floats:
+    """Intervals that are far longer than the usual one."""
+    return steps_s[steps_s > max(PAUSE * float(np.median(steps_s)), LEAST_GAP_S)]
+
+
+def _stands(data: SensorData) -> bool:
+    """Whether most of its stamps equal the one before."""
+    stamps = data.stamps_ns
+    return len(stamps) > 1 and bool((np.diff(stamps) == 0).mean() > 1 / 2)
+
+
+def _repeated(readings: Sequence[Reading]) -> tuple[float, float]:
+    """Share of fixes at the very place of the one before, and for how long the longest stays there [s]."""
+    fixes = [reading for reading in readings if isinstance(reading, Gps)]
+    held = [list(group) for _, group in groupby(fixes, key=attrgetter("lat_deg", "lon_deg"))]
+    longest_ns = max((group[-1].stamp_ns - group[0].stamp_ns for group in held), default=0)
+    return 1 - len(held) / len(fixes) if fixes else 0.0, longest_ns * 1e-9
+
+
+def _is_receiver(sensor: SensorConfig) -> bool:
+    return sensor.kind == Gps.kind and sensor.mode == ABSOLUTE
+
+
+def _time(stamp_ns: int) -> str:
+    return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
