@@ -75,14 +75,10 @@ class PipelineOutput:
 
 @dataclass(frozen=True)
 class GroundOutcome:
-    """One row on one recording: what the pipeline made of it, the truth, and their comparison from an instant on."""
+    """One row on one recording: what the pipeline made of it, and its comparison with the truth."""
 
-    drive: PlannedDrive
     row: GroundConfiguration
     output: PipelineOutput
-    track: LoadTrack
-    ground: TrueGround
-    from_ns: int
     comparison: Comparison
 
 
@@ -113,8 +109,7 @@ def judged(drive: PlannedDrive, row: GroundConfiguration, output: PipelineOutput
     """Compare the samples of one row on one recording with the truth."""
     track, ground = _truth(drive, cache)
     from_ns = int(track.stamp_ns[0]) + round(settle_s(drive.seconds) * 1e9)
-    comparison = compare(output.samples, track, ground, LAG_S, from_ns)
-    return GroundOutcome(drive, row, output, track, ground, from_ns, comparison)
+    return GroundOutcome(row, output, compare(output.samples, track, ground, LAG_S, from_ns))
 
 
 @lru_cache(maxsize=2)  # tasks come recording by recording
