@@ -1,1 +1,1 @@
-"""What all experiments share: recordings, tasks on all cores whose results are kept, figures, goals and pictures."""
+"""What all experiments share: recordings, tasks on all cores whose results are kept, goals and result pages."""

@@ -1,10 +1,9 @@
-"""What the commands of experiments share: options, and an experiment that is run, printed and drawn."""
+"""What the commands of experiments share: options, and an experiment that is run and printed."""
 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from typing import Any
 
 from lab.campaign.experiment import Runner
@@ -20,11 +19,11 @@ from sitegrid.proof.figures import Report
 
 DEFAULT_SEEDS, DEFAULT_S = 12, 1200.0
 QUICK = "a small version of its own, in about a minute: to see that all works"
-Work = Callable[[Runner], tuple[Report, Any]]  # a report, and what its pictures are made of
+Work = Callable[[Runner], tuple[Report, Any]]  # a report, and what it is made of
 
 
-def add_runs(parser: ArgumentParser, seconds: float | None = None, plots: str = "", *, cases: bool = False) -> None:
-    """Options of an experiment with seeds. seconds: of a recording, if it makes any; plots: what it draws, if any."""
+def add_runs(parser: ArgumentParser, seconds: float | None = None, *, cases: bool = False) -> None:
+    """Options of an experiment with seeds. seconds: of a recording, if it makes any; cases: whether it has some."""
     parser.add_argument("--seeds", type=count, default=DEFAULT_SEEDS, help="number of seeds (default %(default)s)")
     parser.add_argument("--first-seed", type=seed, default=0, help="first seed (default %(default)s)")
     out = "folder for recordings and results (default %(default)s)"
@@ -33,8 +32,6 @@ def add_runs(parser: ArgumentParser, seconds: float | None = None, plots: str = 
     if seconds is not None:
         length = "length of each recording in seconds (default %(default)g)"
         parser.add_argument("--seconds", type=positive, default=seconds, help=length)
-    if plots:
-        parser.add_argument("--plots", type=FOLDER, help=f"folder to draw {plots} into")
     if cases:
         parser.add_argument("--cases", type=_names, default=(), help="names, comma-separated; default all")
 
@@ -65,22 +62,18 @@ def perform(
     arguments: Namespace,
     title: str,
     work: Work,
-    plots: str = "",
     readable: Callable[[Report], Report] = lambda report: report,
 ) -> int:
-    """Run an experiment with its progress shown, draw what is asked for, and print its report; returns the exit code.
+    """Run an experiment with its progress shown, and print its report; returns the exit code.
 
-    plots: module whose `draw` makes the pictures. readable: of the report what people read.
+    readable: of the report what people read.
     """
     raise_interrupts()  # the bar hides the cursor of the terminal
     with Display(title, headless=arguments.json, kept=arguments.out) as display:
         runner = Runner(arguments.out, arguments.processes or cores(), display.show)
-        report, outcomes = work(runner)
+        report, _ = work(runner)
     if not arguments.json:
         note(f"recordings and results are in {arguments.out}")
-    if plots and arguments.plots:
-        pictures = import_module(plots)  # imported here: only pictures need matplotlib
-        report = {**report, "plots": list(map(str, pictures.draw(report, outcomes, runner, arguments.plots)))}
     show(arguments, report, readable)
     return 0
 

@@ -7,7 +7,6 @@ A page says where a table belongs, which report it is of and which table, and en
 
     <!-- table: roads.json made -->          command, commit, date, seeds and processor time
     <!-- table: roads.json goals -->         all goals, missed ones in bold
-    <!-- table: roads.json haul_road -->     all figures of the row of this case, seed by seed
     <!-- table: paper.json forecasts -->     a list of rows, with all columns of plain values
     <!-- table: paper.json rows table=maps machines=1: filter gps net_m paper.net_m -->
 
@@ -32,7 +31,6 @@ _BLOCK = re.compile(r"(<!-- table: (\S+) (.+?) -->\n)(.*?)(<!-- end -->)", re.DO
 NOT_MEASURED = "Not measured yet.\n"
 MADE, GOALS = "made", "goals"
 NAME = "case"  # of a row
-_NO_FIGURES = (NAME, "by_seed")
 _NESTED = (list, dict)
 
 
@@ -58,9 +56,7 @@ def _table(report: Report, what: str, path: Path) -> str:
     lists = {key: rows for key, rows in report.items() if isinstance(rows, list) and rows and isinstance(rows[0], dict)}
     if name in lists:
         return rows_table(_matching(lists[name], values, path), columns.split(), path)
-    if own := select(_cases(report), {NAME: name}):
-        return figures_table(own[0], report["seeds"])
-    known = ", ".join(dict.fromkeys([MADE, GOALS, *(row[NAME] for row in _cases(report)), *lists]))
+    known = ", ".join(dict.fromkeys([MADE, GOALS, *lists]))
     raise ConfigError(str(path), f"has no table `{name}`; known: {known}")
 
 
@@ -95,18 +91,6 @@ def goals_table(report: Report) -> str:
     head = ["row", "figure", "goal", "measured", f"seeds {', '.join(map(str, report.get('seeds', [])))}"]
     columns = len(head) if any(line[-1] for line in lines) else len(head) - 1
     return markdown(head[:columns], [line[:columns] for line in lines])
-
-
-def figures_table(row: Row, seeds: Sequence[int]) -> str:
-    """All figures of a row, and what each seed gave."""
-    each = row.get("by_seed", [])
-    names = dict.fromkeys([*row, *(name for own in each for name in own)])
-    lines = [
-        [f"`{name}`", text_of(row.get(name)), *(text_of(own.get(name)) for own in each)]
-        for name in names
-        if name not in _NO_FIGURES
-    ]
-    return markdown([row[NAME], "all", *(map(str, seeds) if each else ())], lines)
 
 
 def rows_table(rows: Sequence[Row], columns: Sequence[str], path: Path) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lab.campaign.command import DEFAULT_S, add_quick, add_runs, is_quick, perform, seeds_of
 from protocol.errors import ConfigError
-from sitegrid.options.outputs import OutputFile
+from sitegrid.options.outputs import FOLDER, OutputFile
 from sitegrid.proof.figures import Report
 
 if TYPE_CHECKING:
@@ -21,9 +21,10 @@ EXTRA = "lab"
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
-    drawn = "the maps, their wrong cells, tracks and errors of the first seed, and how sure maps are"
-    add_runs(parser, DEFAULT_S, drawn)
+    add_runs(parser, DEFAULT_S)
     add_quick(parser)
+    plots = "folder to draw the true maps, the plotted ones and their wrong cells into, of the first seed"
+    parser.add_argument("--plots", type=FOLDER, help=plots)
     tensor = (
         "file to write the map to that the paper plots, with the first seed: 2 x m x n x 3, x, y and value of each cell"
     )
@@ -43,9 +44,13 @@ def run(arguments: Namespace) -> int:
         report, outcomes = experiment.run(runner, plan)
         if arguments.tensor:
             experiment.write_map(outcomes, runner, arguments.tensor)
+        if arguments.plots:
+            from lab.paper.plots import draw  # imported here: only pictures need matplotlib
+
+            report["plots"] = list(map(str, draw(outcomes, runner, arguments.plots)))
         return report, outcomes
 
-    return perform(arguments, "machines drive, and plot what they drive on", work, "lab.paper.plots", readable)
+    return perform(arguments, "machines drive, and plot what they drive on", work, readable)
 
 
 def _plan(arguments: Namespace) -> Plan:

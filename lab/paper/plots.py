@@ -1,14 +1,15 @@
-"""Pictures like the paper's: true maps, plotted maps, wrong cells in white, tracks, errors over time, and reliability.
-
-Maps, tracks and errors are those of the first seed.
-"""
+"""Pictures like the paper's, of the first seed: true maps, plotted maps, and wrong cells in white."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("Agg")  # no screen is needed
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,49 +18,42 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from lab.calibration.drives import scene
-from lab.campaign import pictures
 from lab.campaign.experiment import Runner
-from lab.campaign.pictures import EAST, NORTH, ZONE_RGB, head
-from lab.campaign.recordings import load
 from lab.maps.cases import CELL_M
-from lab.maps.uncertainty import BINS
 from lab.paper.experiment import MapOutcome, Outcomes
-from lab.paper.maps import FORECASTS, OURS, PAPERS, SERVED, MapKind, samples_of
+from lab.paper.maps import OURS, PAPERS, SERVED, MapKind
 from mapserver.pictures.plotter import NamedLayers
 from protocol.arrays import AnyArray, Floats, Ints
-from protocol.machine.readings import Gps
 from protocol.site.ground_classes import SLOPE, UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
-from sitegrid.proof.figures import Report, Row
 from sitegrid.proof.map_score import true_layers
 
+DPI, PANEL_IN = 110, 3.1
+STYLE: Any = {"figure.constrained_layout.use": True, "font.size": 9, "legend.frameon": False, "savefig.bbox": "tight"}
+ZONE_RGB: Floats = np.array([zone.bgr[::-1] for zone in ZONES]) / 255  # as in the server's pictures
 GRADE_RGB = ZONE_RGB[:2]  # flat and slope, as in the paper
 UNKNOWN_RGB = (0.88, 0.88, 0.88)
 BEHIND_RGB, WRONG_RGB = (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)  # of difference maps: what was not plotted, what is wrong
 DARKNESS = 0.5  # of right cells there
-WINDOW_S = 120.0  # of errors over time that outages are marked in
-LAP_S = 180.0  # of tracks: about a lap, since many laps over each other show nothing
-TRUE_COLOUR, BELIEVED_COLOUR = "#D62728", "#1F77B4"  # red and blue, as the paper's tracks
-METHODS = {SERVED.merge: pictures.BLUE, **dict(zip(FORECASTS, (pictures.VERMILION, pictures.ORANGE), strict=True))}
-PANEL_IN = 3.1
 Titled = tuple[str, MapOutcome, MapKind]
 
 
-def draw(report: Report, outcomes: Outcomes, runner: Runner, folder: Path) -> list[Path]:
-    """Draw all pictures of a report into a folder; returns their paths."""
+def draw(outcomes: Outcomes, runner: Runner, folder: Path) -> list[Path]:
+    """Draw all pictures into a folder, each as NAME.png; returns their paths."""
     maps, fleets = (_shown(outcomes, several=several) for several in (False, True))
-    alone = [outcomes.all_of(source)[0] for source in outcomes.plan.sources if source.machines == 1]
     drawn: dict[str, Callable[[], Figure]] = {
         "truth": partial(draw_truth, maps[0][1], runner),
-        "maps": partial(draw_maps, maps, runner),
+        "maps": partial(draw_maps, maps),
         "differences": partial(draw_differences, maps, runner),
-        "fleet_maps": partial(draw_maps, fleets, runner),
+        "fleet_maps": partial(draw_maps, fleets),
         "fleet_differences": partial(draw_differences, fleets, runner),
-        "tracks": partial(draw_tracks, alone, runner),
-        "errors": partial(draw_errors, alone, runner),
     }
-    if report["forecasts"]:
-        drawn["reliability"] = partial(draw_reliability, report["forecasts"])
-    return pictures.draw_all(drawn, folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with mpl.rc_context(STYLE):
+        for name, picture in drawn.items():
+            figure = picture()
+            figure.savefig(folder / f"{name}.png", dpi=DPI)
+            plt.close(figure)
+    return [folder / f"{name}.png" for name in drawn]
 
 
 def _shown(outcomes: Outcomes, *, several: bool) -> list[Titled]:
@@ -98,7 +92,6 @@ def _rgb(classes: Ints, palette: Floats, unknown: AnyArray | tuple[float, ...] =
 
 def _image(axes: Axes, rgb: Floats) -> None:
     rows, columns = rgb.shape[:2]
-    axes.grid(visible=False)
     axes.imshow(rgb, origin="lower", extent=(0.0, columns * CELL_M, 0.0, rows * CELL_M), interpolation="nearest")
 
 
@@ -110,12 +103,16 @@ def _grid(count: int, rows: int) -> tuple[Figure, Any]:
 
 def _finish(figure: Figure, panels: Any, handles: Sequence[Any], title: str) -> Figure:
     for axes in panels[-1]:
-        axes.set_xlabel(EAST)
+        axes.set_xlabel("east [m]")
     for axes in panels[:, 0]:
-        axes.set_ylabel(NORTH)
+        axes.set_ylabel("north [m]")
     figure.legend(handles=list(handles), loc="outside lower center", ncols=len(handles))
-    head(figure, title, 10)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, weight="bold")
     return figure
+
+
+def _head(axes: Axes, text: str, size: float) -> None:
+    axes.set_title(text, loc="left", fontsize=size, weight="bold")
 
 
 def _key(*more: Patch) -> list[Patch]:
@@ -131,12 +128,12 @@ def draw_truth(outcome: MapOutcome, runner: Runner) -> Figure:
     parts = zip(panels[0], classes, (ZONE_RGB, GRADE_RGB), ("rolling resistance", "grade"), strict=True)
     for axes, kind, palette, name in parts:
         _image(axes, _rgb(kind, palette))
-        head(axes, name)
+        _head(axes, name, 10)
     figure.set_size_inches(2.2 * PANEL_IN + 2, 4.2)
     return _finish(figure, panels, _key(), "Ground truth")
 
 
-def draw_maps(maps: Sequence[Titled], _: Runner) -> Figure:
+def draw_maps(maps: Sequence[Titled]) -> Figure:
     """The maps as they were plotted: resistance above, grade below."""
     figure, panels = _grid(len(maps), 2)
     for column, (title, outcome, kind) in zip(panels.T, maps, strict=True):
@@ -144,7 +141,7 @@ def draw_maps(maps: Sequence[Titled], _: Runner) -> Figure:
             column, _classes(outcome.made.layers_of(kind)), (ZONE_RGB, GRADE_RGB), strict=True
         ):
             _image(axes, _rgb(classes, palette))
-        head(column[0], title, 8)
+        _head(column[0], title, 8)
     return _finish(figure, panels, _key(Patch(color=UNKNOWN_RGB, label="not known")), _seed("Plotted maps", maps))
 
 
@@ -166,7 +163,7 @@ def draw_differences(maps: Sequence[Titled], runner: Runner) -> Figure:
                 transform=axes.transAxes,
                 color="white",
             )
-        head(column[0], title, 8)
+        _head(column[0], title, 8)
     wrong = Patch(facecolor=WRONG_RGB, edgecolor="black", label="wrong class")
     handles = [wrong, Patch(color=BEHIND_RGB, label="not known")]
     return _finish(figure, panels, handles, _seed("Difference from the truth: resistance above, grade below", maps))
@@ -174,113 +171,3 @@ def draw_differences(maps: Sequence[Titled], runner: Runner) -> Figure:
 
 def _seed(title: str, maps: Sequence[Titled]) -> str:
     return f"{title}; seed {maps[0][1].drive.seed}"
-
-
-# --- tracks ----------------------------------------------------------------------------------------------------------
-
-
-def _places(outcome: MapOutcome, runner: Runner) -> tuple[Floats, Floats, Floats]:
-    """Seconds (n,), believed and true places (n, 2) of the samples of a lone machine, as known at once."""
-    (agent,) = outcome.source.agents
-    rows = samples_of(agent, outcome.drive, runner.cache).live
-    (track,) = scene(outcome.drive, runner.cache).tracks.values()
-    time_s = np.asarray(rows["stamp_ns"] - track.stamp_ns[0], float) * 1e-9
-    return time_s, np.stack([rows["x_m"], rows["y_m"]], axis=1), track.at(rows["stamp_ns"]).place_m
-
-
-def draw_tracks(alone: Sequence[MapOutcome], runner: Runner) -> Figure:
-    """True and believed tracks of each configuration: those of the paper's filter above, this project's below."""
-    profiles = _by_profile(alone)
-    figure, panels = _grid(max(map(len, profiles.values())), len(profiles))
-    for line, (profile, outcomes) in zip(panels, profiles.items(), strict=True):
-        for axes, outcome in zip(line, outcomes, strict=True):
-            time_s, believed_m, true_m = _places(outcome, runner)
-            last = time_s > time_s[-1] - LAP_S
-            believed_m, true_m = believed_m[last], true_m[last]
-            axes.plot(*true_m.T, color=TRUE_COLOUR, lw=1.0, label="truth")
-            axes.plot(*believed_m.T, color=BELIEVED_COLOUR, lw=0.7, label="believed at once")
-            head(axes, f"{_name(outcome)}, {profile}", 8)
-            axes.set_aspect("equal")
-    handles, _ = panels[0, 0].get_legend_handles_labels()
-    return _finish(figure, panels, handles, f"Tracks of load centres, the last {LAP_S:g} s; seed {alone[0].drive.seed}")
-
-
-def draw_errors(alone: Sequence[MapOutcome], runner: Runner) -> Figure:
-    """Errors over two minutes, with the times in which each receiver was lost."""
-    profiles = _by_profile(alone)
-    groups = next(iter(profiles.values()))
-    figure, panels = plt.subplots(len(groups), figsize=(pictures.WIDTH_IN, 2.1 * len(groups) + 0.6), squeeze=False)
-    seconds = alone[0].drive.seconds
-    start_s = max(0.0, (seconds - WINDOW_S) / 2)
-    for i, axes in enumerate(panels[:, 0]):
-        for profile, colour in zip(profiles, (pictures.VERMILION, pictures.BLUE), strict=False):
-            time_s, believed_m, true_m = _places(profiles[profile][i], runner)
-            axes.plot(time_s, np.hypot(*(believed_m - true_m).T), color=colour, lw=1.2, label=profile)
-        _mark_outages(axes, groups[i], runner)
-        head(axes, _name(groups[i]), 9)
-        axes.set(xlim=(start_s, min(start_s + WINDOW_S, seconds)), ylabel="error [m]")
-        axes.set_ylim(bottom=0)
-    panels[0, 0].legend(loc="upper right", ncols=4)
-    panels[-1, 0].set_xlabel("time [s]")
-    title = (
-        f"Distance from the truth, as known at once; seed {alone[0].drive.seed}. Grey: a receiver is lost, one row each"
-    )
-    head(figure, title, 9, "normal")
-    return figure
-
-
-def _mark_outages(axes: Axes, outcome: MapOutcome, runner: Runner) -> None:
-    """Grey spans where a receiver that is used gave no fix, those of each in a stripe of its own."""
-    recording = load(outcome.drive.folder(runner.cache))
-    first_ns = int(recording.truth.stamp_ns[0])
-    receivers = sorted({reading.sensor for reading in recording.readings if isinstance(reading, Gps)})
-    count = outcome.source.configuration.gps
-    for i, receiver in enumerate(receivers[:count]):
-        stamps = [reading.stamp_ns for reading in recording.readings if reading.sensor == receiver]
-        time_s = (np.array(stamps) - first_ns) * 1e-9
-        gap_s = np.diff(time_s)
-        for start in np.flatnonzero(gap_s > 1.5 * np.median(gap_s)):
-            axes.axvspan(time_s[start], time_s[start + 1], i / count, (i + 1) / count, color="grey", alpha=0.25, lw=0)
-
-
-def _by_profile(alone: Sequence[MapOutcome]) -> dict[str, list[MapOutcome]]:
-    profiles = dict.fromkeys(outcome.source.configuration.profile for outcome in alone)
-    return {name: [each for each in alone if each.source.configuration.profile == name] for name in profiles}
-
-
-def _name(outcome: MapOutcome) -> str:
-    row = outcome.source.configuration
-    return f"{row.filter.upper()}, {row.imu} IMU, {row.gps} GPS"
-
-
-# --- how far maps are believed ---------------------------------------------------------------------------------------
-
-
-def draw_reliability(forecasts: Sequence[Row]) -> Figure:
-    """Share of right cells over the confidence that was stated, and how many cells each bin has."""
-    sites = list(dict.fromkeys((row["scenario"], row["preset"]) for row in forecasts))
-    figure, panels = plt.subplots(
-        2, len(sites), figsize=(4.2 * len(sites) + 0.6, 5.6), squeeze=False, height_ratios=(3, 1)
-    )
-    for column, site in zip(panels.T, sites, strict=True):
-        here = [row for row in forecasts if (row["scenario"], row["preset"]) == site]
-        column[0].plot([0, 1], [0, 1], color="black", lw=0.8, ls=":")
-        for i, row in enumerate(here):
-            _draw_bins(column, row, i, len(here))
-        head(column[0], " ".join(site), 9)
-        column[0].set(xlim=(0, 1), ylim=(0, 1.02), ylabel="share that is right")
-        column[1].set(xlim=(0, 1), yscale="log", ylabel="cells", xlabel="confidence")
-        column[0].legend(loc="lower right")
-    head(
-        figure, "Reliability over driven cells, all seeds; on the dotted line confidence is what is right", 9, "normal"
-    )
-    return figure
-
-
-def _draw_bins(column: Any, row: Mapping[str, Any], i: int, count: int) -> None:
-    bins = [each for each in row["reliability"] if each["cells"]]
-    colour, wide = METHODS[row["method"]], 0.8 / BINS / count
-    label = f"{row['method']}: error {row['calibration_error']:.3f}"
-    column[0].plot([b["said"] for b in bins], [b["right"] for b in bins], "o-", color=colour, ms=3, label=label)
-    places = [(b["from"] + b["to"]) / 2 + (i - (count - 1) / 2) * wide for b in bins]
-    column[1].bar(places, [b["cells"] for b in bins], wide, color=colour)

@@ -80,7 +80,7 @@ def test_what_was_not_measured_is_said(tmp_path):
 
 
 def test_an_unknown_table_is_named_with_the_known_ones(folder):
-    known = "made, goals, haul_road, repairs, way_even, rows, ways, maps"
+    known = "made, goals, rows, ways, maps"
     with pytest.raises(ConfigError, match=f"`haul`; known: {known}"):
         filled(page("haul"), folder)
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lab.tests.fleet.scenes import made_scene
+from lab.tests.calibration.scenes import made_scene
 
 from lab.calibration.drives import Agent, Scene
 from lab.paper.maps import (
