@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lab.tests.calibration.scenes import made_scene
 
 from lab.calibration.drives import Agent, Scene
 from lab.paper.maps import (
@@ -24,6 +23,7 @@ from lab.paper.maps import (
     with_true_values,
 )
 from lab.positions.configurations import Configuration
+from lab.tests.calibration.scenes import made_scene
 from protocol.arrays import Table
 from sitegrid.proof.map_score import region_of, score, true_layers
 
