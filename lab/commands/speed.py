@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from argparse import REMAINDER, ArgumentParser, Namespace
 
-HELP = "measure speed and memory; `speed --help` lists what"
+from lab.speed.__main__ import LOADS, main
+
+HELP = "measure speed and memory"
 EXTRA = "lab"
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Options of the command: those of each benchmark, which it declares itself."""
-    parser.add_argument("benchmark", nargs=REMAINDER, metavar="NAME ...", help="a benchmark and its options")
+    """Options of the command: those of each load, which it declares itself."""
+    loads = f"what to measure, and its options: {', '.join(LOADS)}; `NAME --help` says more"
+    parser.add_argument("load", nargs=REMAINDER, metavar="NAME ...", help=loads)
 
 
 def run(arguments: Namespace) -> int:
-    """Run one benchmark."""
-    from lab.speed.__main__ import main
-
-    return main([*arguments.benchmark, *["--json"] * arguments.json])
+    """Run one load."""
+    return main([*arguments.load, *["--json"] * arguments.json])
