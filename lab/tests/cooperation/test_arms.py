@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lab.campaign.recordings import make
-from lab.cooperation.arms import ALWAYS, BAD, LOST, SLOW, STANDALONE, Arm, arms, logs_of
-from lab.cooperation.drives import TWO
+from lab.cooperation.drives import ALWAYS, BAD, LOST, SLOW, STANDALONE, TWO, Arm, arms, logs_of
 from protocol.machine.log_folder import open_log
 from protocol.machine.readings import Gps, Torque
 from protocol.site.site_config import Projection

@@ -5,7 +5,7 @@ import pytest
 
 from lab.campaign.goals import goals
 from lab.routes import experiment, ways
-from lab.routes.drives import seed_figures
+from lab.routes.legs import seed_figures
 from lab.routes.maps import KnownMap, true_squares
 from mapserver.routes.route import route
 from protocol.queries.route_requests import RouteQuery

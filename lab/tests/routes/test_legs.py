@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from lab.routes.drives import drives_of
-from lab.routes.legs import Leg, _laps, _spans, _stated_kg
+from lab.routes.legs import Leg, _laps, _spans, _stated_kg, drives_of
 from protocol.machine.samples import empty
 from protocol.queries.routing import RouteMachine
 from sitegrid.proof.tracks import LoadTrack
