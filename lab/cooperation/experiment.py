@@ -13,8 +13,7 @@ from lab.campaign.experiment import Runner, replay_task
 from lab.campaign.goals import goals
 from lab.campaign.summary import column, mean, median, strict, summary
 from lab.cooperation import live, scores
-from lab.cooperation.arms import Arm, arms
-from lab.cooperation.drives import TWO
+from lab.cooperation.drives import TWO, Arm, arms
 from lab.cooperation.live import LiveRun
 from lab.cooperation.maps import central_tasks
 from lab.cooperation.network import FIGURES, SHARE_PCT

@@ -20,8 +20,7 @@ import numpy as np
 
 from lab.campaign.experiment import Experiment, Task
 from lab.campaign.workers import ONE_THREAD, environment
-from lab.cooperation.arms import Arm, Link, logs_of
-from lab.cooperation.drives import SharedDrive
+from lab.cooperation.drives import Arm, Link, SharedDrive, logs_of
 from mapserver.config import TrustConfig
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import JournalRow

@@ -18,7 +18,7 @@ from lab.calibration import drives
 from lab.calibration.drives import Agent, AgentSamples
 from lab.calibration.solving import accused, calibrated, of_machine
 from lab.campaign.experiment import Task, read_result, replay_task
-from lab.cooperation.arms import Arm
+from lab.cooperation.drives import Arm
 from lab.cooperation.live import LiveRun
 from lab.cooperation.network import LAYERS
 from lab.maps.cases import CELL_M

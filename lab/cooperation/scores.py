@@ -13,8 +13,7 @@ from lab.calibration.drives import Scene, scene
 from lab.calibration.solving import served
 from lab.campaign.experiment import Experiment, Task, read_result, replay_task
 from lab.cooperation import live
-from lab.cooperation.arms import BAD, Arm
-from lab.cooperation.drives import SharedDrive, length_m
+from lab.cooperation.drives import BAD, Arm, SharedDrive, length_m
 from lab.cooperation.live import LiveRun
 from lab.cooperation.maps import Layers, Timeline, central_timeline
 from lab.cooperation.network import LAYERS, Network, figures, network

@@ -17,8 +17,7 @@ from lab.calibration.drives import Scene
 from lab.ground.truth import true_ground
 from lab.roads.drives import RoadDrive
 from lab.roads.repairs import UNTOUCHED, SegmentRepairs
-from lab.roads.score import Recorded
-from lab.roads.truth import TrueTrack
+from lab.roads.score import Recorded, TrueTrack
 from mapserver.change.validity import Ages, Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import VISIT_NS, FoldConfig, name_hash

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lab.roads.score import TARGET, Recorded, grid_of, tally_of
-from lab.roads.truth import TrueTraffic, true_passes, true_traffic
+from lab.roads.score import TARGET, Recorded, TrueTraffic, grid_of, tally_of, true_passes, true_traffic
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import name_hash
 from mapserver.query.views import read_cells, view_of

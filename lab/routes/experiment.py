@@ -13,7 +13,7 @@ from lab.campaign.summary import column, median, summary
 from lab.roads.drives import RoadDrive, planned
 from lab.roads.score import Recorded
 from lab.routes import ways
-from lab.routes.drives import judged_legs, seed_figures
+from lab.routes.legs import judged_legs, seed_figures
 from sitegrid.proof.figures import Report, Row, judge, rounded
 
 LONGER = 4.0 / 3.0  # times as long as the others: the check on how people drive

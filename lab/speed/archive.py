@@ -53,7 +53,7 @@ def run(samples: int, runs: int) -> Iterator[Row]:
         def folded(name: str) -> Figures:
             say(f"it is folded: {name}")
             with tempfile.TemporaryDirectory(dir=folder) as out:
-                figures = in_child("lab.speed.archive", name, str(folder / "archive"), out)
+                figures = in_child("lab.speed.archive", name, str(folder / "archive"), f"{out}/map")
             hashes.add(figures.pop("hash"))
             return figures
 

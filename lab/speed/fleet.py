@@ -13,11 +13,12 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from lab.speed.measure import ROOT, Figures, in_child, rows_of
-from lab.speed.site import SESSIONS, SITE, Machine, Site, fleet, send_all, session, settle, used
+from lab.speed.site import READY_S, SESSIONS, SITE, Machine, Site, fleet, send_all, session, settle, used
 from mapserver.journal.archive import write_file
 from mapserver.journal.location import JournalLocation
 from protocol.site.site_file import load_site
 from protocol.wire import keys
+from sitegrid.process.children import wait_until
 from sitegrid.proof.figures import Row
 from tests.memory import memory_mb
 from tests.site_work import BATCH, HOURS, START_NS, samples_of, write_store
@@ -33,7 +34,7 @@ GOALS = {
     ("saturated", "samples_per_s"): ">= 25000",
 }
 SITE_FILE = ROOT / "config" / "site.toml"
-LAG_S = 100.0  # from a place on the road to its sample: what comes before is not the usual traffic
+LAG_S = 100.0  # from a place on the road to its sample, which ends the time before the usual traffic
 SPEED = 1.0  # of the agent's drive: health and acknowledgements are by the clock
 
 
@@ -80,7 +81,7 @@ def _agent_link(folder: Path, seconds: float) -> Figures:
     """An agent that replays a simulated drive. Somebody listens to its pose and health: else they are never sent."""
     log, store, config = folder / "log", folder / "store", load_site(SITE_FILE)
     store.mkdir()
-    words = ("--record", log, "--machines", 1, "--seconds", SPEED * seconds + 2 * LAG_S, "--speed", 0)
+    words = ("--record", log, "--machines", 1, "--seconds", SPEED * seconds + 1.5 * LAG_S, "--speed", 0)
     in_child("sitegrid.cli", "sim", *map(str, words))
     with ExitStack() as opened:
         site = opened.enter_context(Site(store, config))
@@ -91,7 +92,7 @@ def _agent_link(folder: Path, seconds: float) -> Figures:
             listener.declare_subscriber(key, lambda _: None)
         replay = ("--driver", "replay", "--log", log / "loader-1" / "log.toml", "--speed", SPEED)
         site.start("agent", "agent", "--endpoint", link.endpoint, "--spool", folder / "spool.db", *replay)
-        time.sleep(LAG_S / SPEED)
+        wait_until(lambda: _acknowledged(store) > 0, READY_S, "the first sample of an agent")
         before, began_s = (link.carried("there"), link.carried("back"), _acknowledged(store)), time.monotonic()
         time.sleep(seconds)
         after, took_s = (link.carried("there"), link.carried("back"), _acknowledged(store)), time.monotonic() - began_s

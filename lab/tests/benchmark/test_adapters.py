@@ -10,7 +10,7 @@ import pytest
 from lab.benchmark import adapters
 from lab.benchmark.adapters import files
 from lab.benchmark.adapters.cell_filter import cell_filter
-from lab.benchmark.adapters.files import COLUMNS, enter, read_samples
+from lab.benchmark.adapters.files import COLUMNS, enter
 from lab.benchmark.entries import read_map
 from lab.benchmark.recordings import write_samples
 from protocol.machine.samples import empty
@@ -42,13 +42,6 @@ def recording(tmp_path: Path) -> Path:
 def entered(method, recording: Path) -> dict[str, np.ndarray]:
     enter(method, recording / "data", recording / "entry")
     return read_map(recording / "entry" / "site-1.csv", TruthMap(0.0, 0.0, GROUND, GROUND, GROUND))
-
-
-def test_samples_are_read_oldest_first(recording: Path):
-    read = read_samples(recording / "data" / "site-1" / "samples.csv")
-    assert list(read) == list(COLUMNS)
-    assert (np.diff(read["stamp_ns"]) > 0).all()
-    assert read["x_m"][0] == 33.5
 
 
 @pytest.mark.parametrize("name", ["cell_filter", "gaussian_process"])

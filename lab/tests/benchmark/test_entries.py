@@ -64,12 +64,6 @@ def test_places_outside_of_the_site_do_not_count(tmp_path: Path):
     assert np.nansum(layers["resistance"]) == 0.04
 
 
-@pytest.mark.parametrize("said", ["1.01", "-0.1"])
-def test_a_confidence_is_a_share(tmp_path: Path, said: str):
-    with pytest.raises(ConfigError, match=r"line 2: confidence .* is not between 0 and 1"):
-        read_map(written(tmp_path, f"{HEADER},confidence", f"10.5,20.5,0.04,0,0,{said}"), TRUTH)
-
-
 def test_a_file_without_its_columns_or_none_at_all_is_refused(tmp_path: Path):
     with pytest.raises(ConfigError, match="has no column grade_east, grade_north"):
         read_map(written(tmp_path, "x_m,y_m,resistance", "10.5,20.5,0.04"), TRUTH)

@@ -19,6 +19,7 @@ from sitegrid.process.lifetime import plain
 from sitegrid.proof.map_score import driven_cells, region_of, true_layers
 from tests.arithmetic import ARITHMETIC, arithmetic
 
+pytestmark = pytest.mark.timeout(900)  # agents replay two recordings, maybe on a busy machine
 PUBLISHED = recordings.published_hashes()
 STORED = Path(__file__).parent / "quick.json"
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from lab.campaign.recordings import make
-from lab.cooperation.arms import ALWAYS, BAD, LOST, SLOW, STANDALONE, Arm, arms, logs_of
-from lab.cooperation.drives import TWO
+from lab.cooperation.drives import ALWAYS, LOST, SLOW, STANDALONE, TWO, Arm, arms, logs_of
 from protocol.machine.log_folder import open_log
-from protocol.machine.readings import Gps, Torque
+from protocol.machine.readings import Gps
 from protocol.site.site_config import Projection
 from sim.sensors.presets import load_preset
 from tests.tcp_proxy import FAIR
@@ -56,15 +55,6 @@ def test_every_arm_has_a_name_of_its_own_and_no_more_machines_than_its_recording
         drive = each.drive(0)
         assert each.names(drive) == drive.machines[: each.machines]
         assert each.machines <= len(drive.machines)
-
-
-@pytest.mark.slow
-def test_a_bad_machine_reads_another_torque_and_believes_its_antennas_elsewhere(cache: Path, tmp_path: Path):
-    good, right, _ = readings(cache, tmp_path, "")
-    bad, wrong, _ = readings(cache, tmp_path, BAD)
-    torques = [[r.torque_nm for r in each if isinstance(r, Torque)] for each in (right, wrong)]
-    assert torques[1] == pytest.approx(np.multiply(torques[0], 1.6))
-    assert good.sensor("gps-1").mount.xyz_m != bad.sensor("gps-1").mount.xyz_m
 
 
 @pytest.mark.slow

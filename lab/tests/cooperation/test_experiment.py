@@ -10,7 +10,6 @@ from lab.cooperation.live import LiveRun
 from lab.cooperation.network import FIGURES
 from lab.cooperation.scores import Judging, Scored
 from lab.tests.cooperation.samples import driving
-from protocol.errors import SitegridError
 
 SEEDS = (0, 1)
 MINUTES = np.arange(1.0, 31.0)
@@ -138,8 +137,3 @@ def test_false_alarms_are_counted_over_all_that_was_watched():
     got = report(PLAN, outcomes(PLAN, {}))["false_alarms"]
     live = len(PLAN.arms) * len(SEEDS)
     assert got == {"count": live, "km2_days": 0.5 * live, "per_km2_day": 2.0}
-
-
-def test_recordings_that_are_too_short_are_refused():
-    with pytest.raises(SitegridError, match="seconds: 200 is too short; a round of all tours takes 300 s"):
-        Plan.full(SEEDS, 200.0)

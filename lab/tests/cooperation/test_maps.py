@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lab.cooperation.live import LiveRun, arrivals
-from lab.cooperation.maps import Timeline, facts_of
+from lab.cooperation.maps import Timeline
 from lab.tests.cooperation.samples import SECOND_NS, driving
 from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.fleet.decisions import SOLVER, CalibrationDecision
@@ -69,11 +69,6 @@ def test_a_map_has_what_was_stamped_by_then(run: LiveRun):
     assert maps[-1]["resistance"][30, 25] == pytest.approx(0.06, abs=0.006)
 
 
-def test_by_arrival_it_has_what_was_there_by_then(run: LiveRun):
-    maps = list(Timeline.of_run(run, arrived=True).maps(at(20, 34.5, 100), WINDOW))
-    assert [known(layers, 10) for layers in maps] == [0, 5, 20]
-
-
 def test_maps_step_by_step_are_those_made_at_once(run: LiveRun):
     line = Timeline.of_run(with_events(run, event(1, corrects("a", 0.004, 7.0))))
     stepped = list(line.maps(at(*range(2, 22, 3)), WINDOW))[-1]
@@ -100,18 +95,6 @@ def test_corrections_are_taken_off(run: LiveRun):
     (layers,) = Timeline.of_run(with_events(run, event(1, corrects("a", 0.008, 5.0)))).maps(at(30), WINDOW)
     assert layers["resistance"][10, 25] == pytest.approx(0.012, abs=0.002)
     assert layers["resistance"][30, 25] == pytest.approx(0.06, abs=0.006)
-
-
-def test_samples_of_some_machines_alone(run: LiveRun):
-    (layers,) = Timeline.of_run(run).of_machines(["b"]).maps(at(30), WINDOW)
-    assert (known(layers, 10), known(layers, 30)) == (0, 20)
-
-
-def test_nothing_was_decided_at_first():
-    assert [facts.number for _, facts in facts_of([])] == [0]
-    changes = {"id": 1, "kind": "change", "stamp_ns": 5, "body": {}}
-    assert len(facts_of([changes])) == 1  # no decision about a machine
-    assert [when for when, _ in facts_of([changes, event(2, excludes("b", 1.0))])] == [0, START_NS + SECOND_NS]
 
 
 def test_arrivals_are_in_the_time_of_each_machines_log():

@@ -5,8 +5,7 @@ import pytest
 
 from lab.roads.changes import CELLS, CELLS_REPAIRS, SEGMENTS, CellPasses, ChangedGround, Changes, changes, pooled
 from lab.roads.repairs import SegmentRepairs, TrueRepair, shown_at
-from lab.roads.score import Recorded, roads
-from lab.roads.truth import TrueTrack
+from lab.roads.score import Recorded, TrueTrack, roads
 from mapserver.roads.passes import MINUTE_NS
 from protocol.site.geometry import CellWindow
 from sitegrid.proof.figures import rounded

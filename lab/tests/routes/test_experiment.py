@@ -5,10 +5,9 @@ import pytest
 
 from lab.campaign.goals import goals
 from lab.routes import experiment, ways
-from lab.routes.drives import seed_figures
-from lab.routes.maps import KnownMap, true_squares
+from lab.routes.legs import seed_figures
+from lab.routes.maps import true_squares
 from mapserver.routes.route import route
-from protocol.queries.route_requests import RouteQuery
 from protocol.units import GRAVITY_MPS2
 from sim.truth import TruthMap
 from sitegrid.proof.figures import judge
@@ -70,12 +69,3 @@ def test_the_true_map_costs_what_it_must():
     assert totals.energy_high_j - totals.energy_low_j < 0.15 * totals.energy_j  # of drives, and of maps at their best
     with pytest.raises(ValueError, match="begins at the origin"):
         true_squares(TruthMap(1.0, 0.0, flat, flat, flat))
-
-
-def test_a_map_of_samples_answers_routes():
-    terrain = ways.drawn(np.random.default_rng(1), 40)
-    known = np.ones((40, 40), bool)
-    answers = KnownMap({"a": ways._samples(terrain, known)}).routes()
-    totals = answers.route(RouteQuery(((5.0, 5.0), (30.0, 30.0)), ways.SLOW)).totals
-    assert totals.unknown == 0.0
-    assert totals.energy_j > 0

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from lab.routes.drives import drives_of
-from lab.routes.legs import Leg, _laps, _spans, _stated_kg
-from protocol.machine.samples import empty
+from lab.routes.legs import Leg, _laps, _spans, drives_of
 from protocol.queries.routing import RouteMachine
 from sitegrid.proof.tracks import LoadTrack
 
@@ -57,13 +55,6 @@ def test_a_line_that_is_crossed_is_no_turn():
     laps = list(_laps(course, 0, len(speed)))
     whole = np.hypot(*along.T).sum()
     assert [course.driven_m[end] - course.driven_m[begin] for begin, end in laps] == pytest.approx([whole] * 2, abs=2.0)
-
-
-def test_the_mass_is_what_samples_of_the_leg_state():
-    rows = empty(5)
-    rows["stamp_ns"], rows["mass_kg"] = np.arange(5), [1e4, 2e4, np.nan, 3e4, 9e4]
-    assert _stated_kg(rows, np.array([1, 3]), 5e3) == 2.5e4
-    assert _stated_kg(rows, np.array([2, 2]), 5e3) == 5e3
 
 
 def test_legs_over_one_line_with_one_load_are_one_drive():
