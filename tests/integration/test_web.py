@@ -223,9 +223,10 @@ def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: W
         return [place["properties"]["machine"] for place in places]
 
     until(lambda: shown() == ["machine-0"], "a pose")
-    counted = web.get("/metrics").body.decode()
     for reason in ("wrong_machine", "out_of_range"):
-        assert f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}' in counted
+        counted = f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}'
+        until(lambda counted=counted: counted in web.get("/metrics").body.decode(), counted)
+    assert shown() == ["machine-0"]
 
 
 @pytest.mark.nightly
