@@ -37,10 +37,10 @@ SPEED = (
     "fleet --machines 50 --seconds 10 --hours 0.5",
     "live --seconds 20 --hours 0.5",
     "query --hours 0.5 --queries 20",
-    "restart --samples 1000000 --hours 0.5",
+    "restart --samples 200000 --hours 0.5",
     "filter --runs 1 --steps 300",
     "sim --runs 1 --seconds 5",
-    "archive --samples 1000000",
+    "archive --samples 200000",
 )
 OTHERS = tuple(word for path in (*COMPOSE, *FOLD, *TAKEOVER, *FOLLOWERS) for word in ("--ignore", path))
 

@@ -321,6 +321,7 @@ def test_pages_that_are_fast_slow_or_asleep_end_with_the_map_as_it_is(web: WebSi
         assert version >= (last, 0)
 
 
+@pytest.mark.nightly
 def test_a_page_goes_on_after_web_server_map_server_and_trust_were_others(tmp_path: Path):
     with Children(tmp_path) as children:
         web = WebSite(tmp_path, children)
