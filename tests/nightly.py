@@ -37,10 +37,10 @@ SPEED = (
     "fleet --machines 50 --seconds 10 --hours 0.5",
     "live --seconds 20 --hours 0.5",
     "query --hours 0.5 --queries 20",
-    "restart --samples 1000000 --hours 0.5",
+    "restart --samples 200000 --hours 0.5",
     "filter --runs 1 --steps 300",
     "sim --runs 1 --seconds 5",
-    "archive --samples 1000000",
+    "archive --samples 200000",
 )
 OTHERS = tuple(word for path in (*COMPOSE, *FOLD, *TAKEOVER, *FOLLOWERS) for word in ("--ignore", path))
 
@@ -70,14 +70,15 @@ def loads(*lines: str) -> tuple[tuple[str, ...], ...]:
 
 
 PARTS = (
-    Part("tests", 300, ((*TESTS, "-m", "nightly", "tests", *OTHERS),)),
+    Part("tests", 330, ((*TESTS, "-m", "nightly", "tests", *OTHERS),)),
     Part("chaos", 330, (("tests.chaos", "--json", "--seconds", "240"),)),
+    Part("worlds", 90, (("tests.delivery_simulation", "--seeds", "1000"), ("tests.fuzz", "--seconds", "30"))),
     Part("takeover", 180, ((*TESTS, *TAKEOVER), ("tests.takeover", "--count", "12"))),
     Part("compose", 180, ((*TESTS, *COMPOSE),)),
-    Part("fold", 270, ((*TESTS, "-m", "nightly", *FOLD),)),
+    Part("fold", 210, ((*TESTS, "-m", "nightly", *FOLD),)),
     Part("followers", 120, ((*TESTS, *FOLLOWERS), *loads("followers --machines 20 --seconds 5 --hours 0.2 --runs 1"))),
-    Part("lab", 330, ((*TESTS, "lab/tests"),)),
-    Part("speed", 210, loads(*SPEED)),
+    Part("lab", 300, ((*TESTS, "lab/tests"),)),
+    Part("speed", 180, loads(*SPEED)),
     Part("soak", 780, (("tests.soak",),)),
 )
 WEEKLY = (

@@ -78,8 +78,8 @@ class Tab:
         """What axe finds of a page that came without its own rules for scripts."""
         self.page.wait_for_timeout(400)  # its transitions
         self.page.evaluate(axe)
-        found = "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
-        return [fault for fault in self.page.evaluate(found) if fault[1] in ("serious", "critical")]
+        script = "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
+        return [fault for fault in self.page.evaluate(script) if fault[1] in ("serious", "critical")]
 
     def close(self) -> None:
         self.context.close()

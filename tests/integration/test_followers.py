@@ -180,6 +180,7 @@ def answered(client: Client, sender: Sender, run: Followed, *followers: str) -> 
     return [info.counters.get("queries_answered", 0) for info in infos]
 
 
+@pytest.mark.nightly
 def test_each_query_is_worked_by_one_process_and_by_another_while_one_dies(run: Followed, sender: Sender):
     server = run.serve()
     sender.send()

@@ -294,18 +294,6 @@ def test_the_profile_tells_each_place_by_pointer_and_keys(tab: Tab):
     tab.until("sitegrid.route.at === null")
 
 
-@pytest.mark.nightly
-def test_there_and_back_cost_different_things(tab: Tab, web: WebSite):
-    opened(tab, "r")
-    set_places(tab, (20, 10), (150, 10))
-    line = places(tab)
-    tab.page.locator("#turn").click()
-    tab.until(f"sitegrid.route.places[0][0] > 100 && {QUIET} && sitegrid.route.answer !== null")
-    assert places(tab) == line[::-1]
-    back = web.client.route(line[::-1], MACHINES["truck"])
-    assert tab.js("sitegrid.route.answer.totals.energy_j") == pytest.approx(back.totals.energy_j, rel=1e-6)
-
-
 def test_the_cheapest_line_between_two_clicks_is_beside_the_straight_one(tab: Tab, web: WebSite):
     panel = opened(tab, "r")
     tab.page.locator("#drive-cheapest").click()
@@ -327,22 +315,6 @@ def test_the_cheapest_line_between_two_clicks_is_beside_the_straight_one(tab: Ta
     tab.until(f"sitegrid.route.places.length === 1 && sitegrid.route.answer === null && {QUIET}")
     set_places(tab, (130, 10))
     assert "The straight line costs the same." in panel.inner_text()
-
-
-@pytest.mark.nightly
-def test_a_straight_line_is_compared_at_the_same_price_of_unknown_ground(tab: Tab, web: WebSite):
-    panel = opened(tab, "r")
-    tab.page.locator("#drive-cheapest").click()
-    tab.until(f"sitegrid.route.cheapest && {QUIET}")
-    set_places(tab, (25, 28), (25, 112))  # both off the roads
-    ends = places(tab)
-    cheapest, straight = web.client.way(*ends, MACHINES["truck"]), web.client.route(ends, MACHINES["truck"])
-    price = f"taken as {100 * cheapest.totals.unknown_resistance:.1f} %"
-    assert price in panel.locator(".unsure").inner_text()
-    more = round(100 * (straight.totals.energy_j / cheapest.totals.energy_j - 1))
-    cost = figure(straight.totals.energy_j / 3.6e6)
-    words = f"The straight line would cost {cost} kWh, {more} % more" if more else "The straight line costs the same"
-    assert f"{words}, with" in panel.inner_text()
 
 
 @pytest.mark.parametrize("cheapest", [False, True])

@@ -350,17 +350,49 @@ def as_machine(guarded: Guarded, name: str, mode: str) -> Iterator[zenoh.Session
         yield session
 
 
-def test_a_forged_pose_reaches_nobody(guarded: Guarded):
+POSE, OTHERS_POSE = keys.pose(SITE, "loader-1"), keys.pose(SITE, "loader-2")
+CORRECTIONS = keys.corrections(SITE, "base-1")
+# Who listens to what; who forges it, under which keys; and who may say it, under which.
+FORGED = {
+    "pose": (
+        ("guest", keys.poses_all(SITE)),
+        {"loader-1": (OTHERS_POSE, keys.poses_all(SITE), f"sitegrid/{SITE}/**"), "base-1": (POSE,)},
+        ("loader-1", POSE),
+    ),
+    "change": (("guest", keys.changed(SITE)), {"loader-1": (keys.changed(SITE),)}, ("server", keys.changed(SITE))),
+    "correction": (
+        ("loader-2", keys.corrections_all(SITE)),
+        {"loader-1": (CORRECTIONS,), "sim": (CORRECTIONS,), "base-1": (keys.corrections(SITE, "base-2"),)},
+        ("base-1", CORRECTIONS),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", FORGED)
+def test_what_is_forged_reaches_nobody(guarded: Guarded, what: str):
+    (listener, key), forgers, (owner, own) = FORGED[what]
+    with contextlib.ExitStack() as opened:
+        sessions = {name: opened.enter_context(guarded.session(name)) for name in {listener, owner, *forgers}}
+        received = opened.enter_context(listening(sessions[listener], key))
+        for name, forged in forgers.items():
+            for each in forged:
+                sessions[name].put(each, b"forged")
+            answers(sessions[name], keys.map_query(SITE, "info"))  # what was put before it has been judged
+        put_until(received, b"true", lambda: sessions[owner].put(own, b"true"))
+        assert set(received) == {b"true"}, guarded.still_works()
+
+
+def test_nobody_ends_what_another_shows_and_a_base_sends_no_samples(guarded: Guarded):
     with (
         guarded.session("guest") as guest,
         guarded.session("loader-1") as loader,
+        guarded.session("base-1") as base,
         listening(guest, keys.poses_all(SITE)) as received,
     ):
-        for key in (keys.pose(SITE, "loader-2"), keys.poses_all(SITE), f"sitegrid/{SITE}/**"):
-            loader.put(key, b"forged")
-        loader.delete(keys.pose(SITE, "loader-1"))
-        put_until(received, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
+        loader.delete(POSE)
+        put_until(received, b"own", lambda: loader.put(POSE, b"own"))
         assert set(received) == {b"own"}, guarded.still_works()
+        assert not acknowledged(base, keys.ingest(SITE, "base-1"), guarded.batch("base-1"))
 
 
 def test_nobody_shows_presence_in_anothers_name(guarded: Guarded):
@@ -375,40 +407,6 @@ def test_nobody_shows_presence_in_anothers_name(guarded: Guarded):
         assert present() == {keys.alive(SITE, "loader-2")}, guarded.still_works()
         for token in tokens:
             token.undeclare()
-
-
-def test_a_forged_change_of_the_map_reaches_nobody(guarded: Guarded):
-    with (
-        guarded.session("guest") as guest,
-        guarded.session("loader-1") as loader,
-        guarded.session("server") as server,
-        listening(guest, keys.changed(SITE)) as received,
-    ):
-        loader.put(keys.changed(SITE), b"forged")
-        assert answers(loader, keys.map_query(SITE, "info"))
-        put_until(received, b"true", lambda: server.put(keys.changed(SITE), b"true"))
-        assert set(received) == {b"true"}, guarded.still_works()
-
-
-def test_only_a_base_publishes_corrections_and_only_its_own(guarded: Guarded):
-    own, others = keys.corrections(SITE, "base-1"), keys.corrections(SITE, "base-2")
-    with (
-        guarded.session("loader-1") as loader,
-        guarded.session("loader-2") as listener,
-        guarded.session("base-1") as base,
-        guarded.session("sim") as sim,
-        guarded.session("guest") as guest,
-        listening(listener, own) as heard,
-        listening(guest, keys.corrections_all(SITE)) as guest_heard,
-    ):
-        for forger in (loader, sim):
-            forger.put(own, b"forged")
-        base.put(others, b"forged")
-        base.put(keys.pose(SITE, "loader-1"), b"forged")
-        put_until(heard, b"true", lambda: base.put(own, b"true"))
-        put_until(guest_heard, b"true", lambda: base.put(own, b"true"))
-        assert set(heard) == set(guest_heard) == {b"true"}, guarded.still_works()
-        assert not acknowledged(base, keys.ingest(SITE, "base-1"), guarded.batch("base-1"))
 
 
 def test_nobody_listens_to_what_is_not_theirs(guarded: Guarded):

@@ -129,6 +129,7 @@ def test_two_sites_do_not_mix(tmp_path, children: Children):
         assert (run.audit().lost, run.audit().unrecorded) == (0, 0)
 
 
+@pytest.mark.nightly
 def test_an_agent_runs_on_without_a_router_and_catches_up(site_run: SiteRun, children: Children, tmp_path):
     recording = ("--record", tmp_path / "logs", "--seconds", 60, "--machines", 1, "--world", "fast")
     assert said("sim", *recording).code == 0

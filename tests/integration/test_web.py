@@ -223,9 +223,10 @@ def test_a_pose_under_the_key_of_another_machine_is_counted_and_not_shown(web: W
         return [place["properties"]["machine"] for place in places]
 
     until(lambda: shown() == ["machine-0"], "a pose")
-    counted = web.get("/metrics").body.decode()
     for reason in ("wrong_machine", "out_of_range"):
-        assert f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}' in counted
+        counted = f'sitegrid_web_poses_refused_total{{site="{NAME}",reason="{reason}"}}'
+        until(lambda counted=counted: counted in web.get("/metrics").body.decode(), counted)
+    assert shown() == ["machine-0"]
 
 
 @pytest.mark.nightly
@@ -320,6 +321,7 @@ def test_pages_that_are_fast_slow_or_asleep_end_with_the_map_as_it_is(web: WebSi
         assert version >= (last, 0)
 
 
+@pytest.mark.nightly
 def test_a_page_goes_on_after_web_server_map_server_and_trust_were_others(tmp_path: Path):
     with Children(tmp_path) as children:
         web = WebSite(tmp_path, children)
