@@ -206,7 +206,7 @@ def past_of(writer: Writer) -> Past:
 
 
 @contextmanager
-def refused(reason: Refusal, match: str = "") -> Iterator[None]:
+def refused(reason: str, match: str | None = None) -> Iterator[None]:
     """What is within is refused, for this reason and in these words."""
     with pytest.raises((QueryError, MessageError), match=match) as caught:
         yield
