@@ -25,7 +25,7 @@ from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Admission, JournalRow
 from mapserver.past.past import Past
 from protocol.arrays import Table
-from protocol.errors import MessageError, QueryError, Refusal
+from protocol.errors import MessageError, QueryError
 from protocol.machine.samples import empty
 from protocol.site.geometry import CellWindow
 from protocol.site.site_config import SiteConfig
@@ -206,7 +206,7 @@ def past_of(writer: Writer) -> Past:
 
 
 @contextmanager
-def refused(reason: Refusal, match: str = "") -> Iterator[None]:
+def refused(reason: str, match: str | None = None) -> Iterator[None]:
     """What is within is refused, for this reason and in these words."""
     with pytest.raises((QueryError, MessageError), match=match) as caught:
         yield

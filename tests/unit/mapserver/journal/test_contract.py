@@ -324,7 +324,8 @@ class Faults:
             if self.mode == "answer lost":
                 real(*words)
             if self.mode != "full" and isinstance(journal, PostgresJournal):
-                journal._session._lose("the connection was cut")
+                with journal._session._turn:  # its own thread may be asking just now
+                    journal._session._lose("the connection was cut")
             raise UnwrittenError(journal.where, "the disk is full")
 
         setattr(target, name, faulty)
