@@ -24,8 +24,8 @@ def said(readings: list[Reading], config: PipelineConfig | None = None) -> list[
     """All that is said during a stream of readings, one after the other."""
     pipeline, first = Pipeline(SITE, VEHICLE, config or PipelineConfig(LocalisationConfig("ekf"))), FirstSample(VEHICLE)
     sentences = []
-    for i in range(0, len(readings), 40):
-        bundle = readings[i : i + 40]
+    for i in range(0, len(readings), 15):
+        bundle = readings[i : i + 15]
         first.take(bundle)
         if len(pipeline.step(bundle).pending):
             first.sampled()

@@ -70,7 +70,7 @@ def test_a_reference_holds_the_heading_of_a_machine_without_gps() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong_deg", [8.0, -25.0])
+@pytest.mark.parametrize("wrong_deg", [pytest.param(8.0, marks=pytest.mark.nightly), -25.0])
 def test_an_error_larger_than_stated_is_learnt_and_does_no_harm(wrong_deg: float) -> None:
     """While fixes show the heading, and in the two minutes without them that follow."""
     vehicle = of_ahrs()
@@ -84,16 +84,16 @@ def test_an_error_larger_than_stated_is_learnt_and_does_no_harm(wrong_deg: float
 
 
 @pytest.mark.slow
-def test_a_reference_that_jumps_is_refused_then_learnt_anew() -> None:
+@pytest.mark.parametrize("fixes_s", [pytest.param(1000.0, marks=pytest.mark.nightly), 60.0])
+def test_a_reference_that_jumps_is_refused_then_learnt_anew(fixes_s: float) -> None:
     """A load of steel beside the sensor: 60 degrees at once, with GPS and without."""
     vehicle = of_ahrs()
     made = drive(LAPS, vehicle)
-    for fixes_s in (1000.0, 60.0):
-        located = localiser(vehicle, filter="ekf")
-        located.run(turned(until(with_ahrs(made, variance=STATED), fixes_s), math.radians(60), 90.0))
-        assert located.counters["ahrs_gated"] >= 15
-        assert located.counters["ahrs_relocked"] == 1
-        assert off_rad(located, made) < 0.05
+    located = localiser(vehicle)
+    located.run(turned(until(with_ahrs(made, variance=STATED), fixes_s), math.radians(60), 90.0))
+    assert located.counters["ahrs_gated"] >= 15
+    assert located.counters["ahrs_relocked"] == 1
+    assert off_rad(located, made) < 0.05
 
 
 def test_without_readings_its_error_becomes_what_it_was_at_first() -> None:
