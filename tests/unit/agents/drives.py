@@ -218,6 +218,29 @@ def noisy(readings: Iterable[Reading], seed: int, *, torque: float = 1.0, force_
     return noised
 
 
+def moved(
+    readings: Iterable[Reading], north_m: float, *sensors: str, from_s: float = 0.0, to_s: float = math.inf
+) -> list[Reading]:
+    """Fixes of these receivers lie further north from a time on, until another."""
+
+    def is_moved(r: Reading) -> bool:
+        return r.sensor in (sensors or ("gps-1",)) and after(r, from_s) and not after(r, to_s)
+
+    return [
+        replace(r, lat_deg=r.lat_deg + north_m / 111_200) if isinstance(r, Gps) and is_moved(r) else r for r in readings
+    ]
+
+
+def biased(readings: Iterable[Reading], radps: float) -> list[Reading]:
+    """Gyros are off about the vertical."""
+    return [replace(r, gyro_z_radps=r.gyro_z_radps + radps) if isinstance(r, Imu) else r for r in readings]
+
+
+def thinned(readings: Iterable[Reading], every_ms: int = 50) -> list[Reading]:
+    """Fewer of the fast readings, which save time where they show nothing more."""
+    return [r for r in readings if not isinstance(r, Imu | Torque) or r.stamp_ns % (every_ms * 1_000_000) == 0]
+
+
 S_BEND = (Leg(4, 0.5), Leg(5), Leg(4, 0, 0.25), Leg(5), Leg(4, 0, -0.3), Leg(8))
 
 
@@ -297,5 +320,6 @@ class RunLocaliser(Localiser):
 
 
 def localiser(vehicle: MachineConfig, step_s: float = STEP_S, **options: Any) -> RunLocaliser:
-    """Of a made-up drive, whose wheels do not slip."""
-    return RunLocaliser(vehicle, PROJECTION, LocalisationConfig(slip=0.0, slip_soft=0.0, **options), step_s=step_s)
+    """Of a made-up drive, whose wheels do not slip; by the quicker filter unless another is named."""
+    config = LocalisationConfig(**{"filter": "ekf", "slip": 0.0, "slip_soft": 0.0, **options})
+    return RunLocaliser(vehicle, PROJECTION, config, step_s=step_s)

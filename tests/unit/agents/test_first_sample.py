@@ -11,21 +11,21 @@ from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from protocol.machine.readings import Encoder, Gps, Reading
-from tests.unit.agents.drives import SITE, VEHICLE, Leg, drive
+from tests.unit.agents.drives import SITE, VEHICLE, Leg, drive, thinned
 
 pytestmark = pytest.mark.slow
 NO_SAMPLE = "no sample after 30 s of readings: "
-DRIVEN = drive([Leg(4, 0.5), Leg(32)], VEHICLE).readings
+DRIVEN = thinned(drive([Leg(4, 0.5), Leg(32)], VEHICLE).readings)
 DRIVEN_FIXES = [reading for reading in DRIVEN if isinstance(reading, Gps)]
-STANDING = drive([Leg(36)], VEHICLE).readings
+STANDING = thinned(drive([Leg(36)], VEHICLE).readings)
 
 
 def said(readings: list[Reading], config: PipelineConfig | None = None) -> list[str]:
     """All that is said during a stream of readings, one after the other."""
     pipeline, first = Pipeline(SITE, VEHICLE, config or PipelineConfig(LocalisationConfig("ekf"))), FirstSample(VEHICLE)
     sentences = []
-    for i in range(0, len(readings), 40):
-        bundle = readings[i : i + 40]
+    for i in range(0, len(readings), 15):
+        bundle = readings[i : i + 15]
         first.take(bundle)
         if len(pipeline.step(bundle).pending):
             first.sampled()
@@ -63,14 +63,14 @@ def test_what_is_missing_is_said_once(readings: list[Reading], missing: str):
 
 
 def test_the_proof_of_a_heading_has_its_time():
-    stopped = drive([Leg(20), Leg(4, 0.5), Leg(5), Leg(4, -0.5), Leg(30)], VEHICLE).readings
+    stopped = thinned(drive([Leg(20), Leg(4, 0.5), Leg(5), Leg(4, -0.5), Leg(30)], VEHICLE).readings)
     assert said([r for r in stopped if r.stamp_ns < stopped[0].stamp_ns + 2 * WAIT_NS]) == []
     sentence = "no sample after 60 s of readings: the heading is not proven until fixes agree with it for 30 s and 12 m"
     assert said(stopped) == [sentence]
 
 
 def test_wheels_in_another_unit_are_named():
-    driven = drive([Leg(4, 0.5), Leg(64)], VEHICLE).readings
+    driven = thinned(drive([Leg(4, 0.5), Leg(64)], VEHICLE).readings)
     ticks = [
         replace(r, left_ticks=3.6 * r.left_ticks, right_ticks=3.6 * r.right_ticks)
         for r in driven
@@ -93,6 +93,4 @@ def test_nothing_is_said_of_a_machine_that_has_all_nor_before_the_time():
     assert said(DRIVEN) == []
     early = [r for r in STANDING if r.stamp_ns < STANDING[0].stamp_ns + WAIT_NS]
     assert said(early) == []
-    assert said([*early[:200], *(replace(r, stamp_ns=r.stamp_ns + WAIT_NS) for r in early[200:])]) == [], (
-        "a clock is set"
-    )
+    assert said([*early[:80], *(replace(r, stamp_ns=r.stamp_ns + WAIT_NS) for r in early[80:])]) == [], "a clock is set"

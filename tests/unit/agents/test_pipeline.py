@@ -1,8 +1,6 @@
 import csv
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +13,10 @@ from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig, Positioning
 from agents.sampling import joined
-from protocol.arrays import Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import KINDS, Encoder, Gps, Imu, Reading, Torque, columns
-from protocol.machine.samples import SAMPLE_DTYPE, check_samples
+from protocol.machine.samples import check_samples
 from protocol.site.site_config import KnownGround, SiteConfig
 from sim.config import SimConfig
 from sim.recorder import record
@@ -29,6 +26,7 @@ from tests.unit.agents.drives import (
     START,
     START_NS,
     VEHICLE,
+    Drive,
     Ground,
     Leg,
     changed_sensor,
@@ -108,31 +106,11 @@ def test_made_up_drive_gives_right_samples() -> None:
     settled = rows[40:]
     assert np.median(settled["c_rr"]) == pytest.approx(0.04, abs=0.004)
     assert np.abs(settled["grade_e"]).max() < 0.05
-    ahead = [
-        math.dist((r["x_m"] - 1.5 * math.cos(a[2]), r["y_m"] - 1.5 * math.sin(a[2])), a[:2])
-        for r in settled
-        for a in [made.at(int(r["stamp_ns"]))]
-    ]
-    assert max(ahead) < 0.6
+    assert max(off_m(made, row) for row in settled) < 0.6
 
 
-def test_trouble_is_counted(base: Base) -> None:
-    pending, final, health = base
-    assert len(pending) > len(final) > 0
-    assert health["aligned"]
-    assert health["counters"]["gps-1_gated"] > 0
-    assert health["counters"]["standstill_used"] > 0
-    assert 0 < health["position_std_m"] < 5
-
-
-def test_every_sample_is_plausible(base: Base) -> None:
-    for made in base[:2]:
-        rows = np.frombuffer(made, SAMPLE_DTYPE)
-        check_samples(rows, 20_000)
-        assert (np.diff(rows["stamp_ns"]) > 0).all()
-
-
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
 def test_any_cutting_of_the_stream_gives_the_same_samples(
     vehicle: MachineConfig, recorded: list[Reading], base: Base, seed: int
 ) -> None:
@@ -175,14 +153,14 @@ def same(a: PoseBelief | None, b: PoseBelief | None) -> bool:
 
 
 @pytest.mark.slow
-def test_readings_of_unknown_sensors_are_counted_and_change_nothing(
+def test_strange_and_doubled_readings_are_counted_and_change_nothing(
     vehicle: MachineConfig, recorded: list[Reading], base: Base
 ) -> None:
     strangers = [replace(recorded[100], sensor="stranger"), Encoder("imu-3", recorded[100].stamp_ns, 0.0, 0.0)]
-    *samples, health = run(vehicle, [*recorded[:101], *strangers, *recorded[101:]])
+    *samples, health = run(vehicle, [*recorded[:101], *strangers, *recorded[101:900], *recorded[850:]])
     assert samples == [*base[:2]]
-    assert health["counters"].pop("reading_unknown_sensor") == 2
-    assert health == base[2]
+    assert health["counters"]["reading_unknown_sensor"] == 2
+    assert health["counters"]["reading_duplicate"] + health["counters"]["reading_late"] >= 50
 
 
 def test_an_imu_without_accelerometer_invents_no_slope(vehicle: MachineConfig, recorded: list[Reading]) -> None:
@@ -192,14 +170,6 @@ def test_an_imu_without_accelerometer_invents_no_slope(vehicle: MachineConfig, r
     assert len(rows) > 50
     assert np.isnan(rows["grade_e"]).all()
     assert np.isnan(rows["grade_n"]).all()
-
-
-def test_doubled_readings_are_counted_and_change_nothing(
-    vehicle: MachineConfig, recorded: list[Reading], base: Base
-) -> None:
-    *samples, health = run(vehicle, [*recorded[:900], *recorded[850:]])
-    assert samples == [*base[:2]]
-    assert health["counters"]["reading_duplicate"] + health["counters"]["reading_late"] >= 50
 
 
 @pytest.mark.slow
@@ -323,7 +293,7 @@ def test_samples_are_final_once_the_lag_is_over_at_the_smoothed_place(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_every_sample_becomes_final_whatever_happens(
     vehicle: MachineConfig, recorded: list[Reading], seed: int
 ) -> None:
@@ -350,67 +320,52 @@ def test_every_sample_becomes_final_whatever_happens(
 
 # --- sensors that fail -----------------------------------------------------------------------------------------------
 
-LONG = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.4), Leg(3, -0.4)] * 6, Leg(6)]  # 48 s
-FAIL_S, HEAL_S = 18.0, 30.0
+LONG = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.4), Leg(3, -0.4)] * 5]  # 36 s
+FAIL_S, HEAL_S = 10.0, 22.0
 
 
-@cache
-def long_drive() -> Any:
-    return drive(LONG, VEHICLE, ground=Ground(0.05, 0.1))
+def failing(kind: type[Reading], **broken: float) -> tuple[Drive, list[Reading]]:
+    """A drive on which readings of a kind are broken for 12 s, or away."""
+    made = drive(LONG, VEHICLE, ground=Ground(0.05, 0.1))
+    fails = [isinstance(r, kind) and FAIL_S < seconds(r) < HEAL_S for r in made.readings]
+    readings = [replace(r, **broken) if f else r for r, f in zip(made.readings, fails, strict=True) if broken or not f]
+    return made, readings  # type: ignore[return-value]
 
 
-def failing(fault: Callable[[Reading], Reading | None]) -> list[Reading]:
-    readings = (fault(r) if FAIL_S < seconds(r) < HEAL_S else r for r in long_drive().readings)
-    return [r for r in readings if r]
+def off_m(made: Drive, row: np.void) -> float:
+    """How far a sample lies from where the load centre was."""
+    x, y, heading = made.at(int(row["stamp_ns"]))
+    return math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y))
 
 
 def seconds(reading: Reading) -> float:
     return (reading.stamp_ns - START_NS) * 1e-9
 
 
-def without(kind: type[Reading]) -> Callable[[Reading], Reading | None]:
-    return lambda r: None if isinstance(r, kind) else r
-
-
-def torque_times(factor: float) -> Callable[[Reading], Reading | None]:
-    return lambda r: replace(r, torque_nm=r.torque_nm * factor) if isinstance(r, Torque) else r
-
-
-def torque_stuck(r: Reading) -> Reading | None:
-    return replace(r, torque_nm=20_000.0) if isinstance(r, Torque) else r
-
-
-FAULTS: dict[str, tuple[Callable[[Reading], Reading | None], str]] = {
-    "torque silent": (without(Torque), "no_torque"),
-    "wheels silent": (without(Encoder), "no_wheels"),
-    "torque stuck": (torque_stuck, "torque_frozen"),
-}
-
-
-@cache
-def with_fault(name: str) -> tuple[Table, Pipeline, str]:
-    """All samples, the pipeline at the end, and the fault that it reported a second before the sensor healed."""
-    readings = failing(FAULTS[name][0])
-    pipeline = Pipeline(SITE, VEHICLE, PipelineConfig())
-    rows = [pipeline.step([r for r in readings if seconds(r) < HEAL_S - 1]).pending]
-    fault = pipeline.health()["ground"]["fault"]
-    rows += [pipeline.step([r for r in readings if seconds(r) >= HEAL_S - 1]).pending, pipeline.finish().pending]
-    return np.concatenate(rows), pipeline, fault
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_sensor_that_fails_costs_the_resistance_and_nothing_else(name: str) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "broken", "reason"), [(Encoder, {}, "no_wheels"), (Torque, {"torque_nm": 20_000.0}, "torque_frozen")]
+)
+def test_sensor_that_fails_costs_the_resistance_and_nothing_else(
+    kind: type[Reading], broken: dict[str, float], reason: str
+) -> None:
     """Places and gradients go on; the reason is counted and, while it lasts, reported; then resistance is back."""
-    _, reason = FAULTS[name]
-    rows, pipeline, fault = with_fault(name)
+    made, readings = failing(kind, **broken)
+    pipeline = Pipeline(SITE, VEHICLE, STARTED)
+    samples = [pipeline.step([r for r in readings if seconds(r) < HEAL_S - 1]).pending]
+    fault = pipeline.health()["ground"]["fault"]
+    samples += [pipeline.step([r for r in readings if seconds(r) >= HEAL_S - 1]).pending, pipeline.finish().pending]
+    rows = np.concatenate(samples)
     assert fault == reason
     check_samples(rows, SITE.extent_m)
     at_s = (rows["stamp_ns"] - START_NS) * 1e-9
     failed = rows[(at_s > FAIL_S + 4) & (at_s < HEAL_S)]
     assert len(failed) == pytest.approx(2 * (HEAL_S - FAIL_S - 4) * 2.6, rel=0.2)  # one each 0.5 m at 2.6 m/s
+    assert failed["distance_m"].sum() == pytest.approx((HEAL_S - FAIL_S - 4) * 2.6, rel=0.15)
     assert np.isnan(failed["c_rr"]).all()
     slope = np.hypot(failed["grade_e"], failed["grade_n"])
     assert slope == pytest.approx(math.tan(0.1), abs=0.08 if reason == "no_wheels" else 0.02)
+    assert max(off_m(made, row) for row in failed) < 2.5
     assert pipeline.health()["without_resistance"][reason] >= len(failed) - 2
     back = rows[at_s > HEAL_S + 5]
     assert np.isfinite(back["c_rr"]).sum() > 20
@@ -419,56 +374,11 @@ def test_sensor_that_fails_costs_the_resistance_and_nothing_else(name: str) -> N
 
 
 @pytest.mark.slow
-def test_torque_in_a_wrong_unit_costs_the_resistance_and_nothing_else() -> None:
-    """In kNm where Nm are meant: known for sure once the machine has driven 20 s."""
-    legs = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.6), Leg(3, -0.6)] * 7]
-    readings = [torque_times(0.001)(r) for r in drive(legs, VEHICLE, ground=Ground(0.05, 0.1)).readings]
-    pipeline = Pipeline(SITE, VEHICLE, PipelineConfig())
-    rows = pipeline.step([r for r in readings if r]).pending
-    assert pipeline.health()["ground"]["fault"] == "torque_implausible"
-    late = rows[rows["stamp_ns"] > START_NS + 30 * SECOND]
-    assert np.isnan(late["c_rr"]).all()
-    assert np.hypot(late["grade_e"], late["grade_n"]) == pytest.approx(math.tan(0.1), abs=0.02)
-    assert pipeline.health()["without_resistance"]["torque_implausible"] >= len(late)
-
-
-@pytest.mark.slow
 def test_torque_a_thousand_times_too_large_moves_no_position() -> None:
-    made = long_drive()
-    rows = Pipeline(SITE, VEHICLE, PipelineConfig()).step(failing(torque_times(1000.0))).pending
-    for row in rows:
-        x, y, heading = made.at(int(row["stamp_ns"]))
-        assert math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y)) < 3
-
-
-@pytest.mark.slow
-def test_with_an_accelerometer_in_g_only_the_place_is_sampled_and_it_is_reported() -> None:
-    def in_g(r: Reading) -> Reading | None:
-        if not isinstance(r, Imu):
-            return r
-        return replace(r, force_x_mps2=r.force_x_mps2 / 9.81, force_z_mps2=r.force_z_mps2 / 9.81)
-
-    pipeline = Pipeline(SITE, VEHICLE, STARTED)
-    rows = pipeline.step([r for r in failing(in_g) if seconds(r) < HEAL_S]).pending
-    assert pipeline.health()["ground"]["fault"] == "accelerometer"
-    assert pipeline.health()["without_resistance"]["accelerometer"] > 40
-    late = rows[rows["stamp_ns"] > START_NS + (FAIL_S + 0.3) * SECOND]
-    assert len(late) > 40
-    assert np.isnan(late["grade_e"]).all()
-    assert np.isnan(late["c_rr"]).all()
-    assert (late["mass_kg"] == VEHICLE.mass_kg).all()
-
-
-def test_samples_go_on_when_wheels_fall_silent() -> None:
-    """By the filter's speed: one sample per half a metre all the same, at the right places."""
-    made = long_drive()
-    rows, _, _ = with_fault("wheels silent")
-    silent = rows[(rows["stamp_ns"] > START_NS + 19 * SECOND) & (rows["stamp_ns"] < START_NS + 29 * SECOND)]
-    assert silent["distance_m"].sum() == pytest.approx(10 * 2.6, rel=0.15)
-    for row in silent:
-        x, y, heading = made.at(int(row["stamp_ns"]))
-        off = math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y))
-        assert off < 2.5
+    made = drive(LONG, VEHICLE, ground=Ground(0.05, 0.1))
+    wrong = [replace(r, torque_nm=1000 * r.torque_nm) if isinstance(r, Torque) else r for r in made.readings]
+    rows = Pipeline(SITE, VEHICLE, STARTED).step(wrong).pending
+    assert max(off_m(made, row) for row in rows) < 3
 
 
 # --- what is carried on ----------------------------------------------------------------------------------------------
@@ -585,24 +495,21 @@ def test_sensors_whose_stamps_are_late_by_their_delay_are_as_ones_in_time(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("early_s", [0.02, 3.0])
 def test_sensor_whose_stamps_are_too_early_is_as_one_in_time(
-    vehicle: MachineConfig, recorded: list[Reading], base: Base, early_s: float
+    vehicle: MachineConfig, recorded: list[Reading], base: Base
 ) -> None:
     """A negative delay; by more than any window too, for a reading comes when it was true whatever its stamp says."""
-    early = [replace(r, stamp_ns=r.stamp_ns - round(early_s * 1e9)) if r.sensor == "gps-1" else r for r in recorded]
-    assert run(changed_sensor(vehicle, "gps-1", delay_s=-early_s), early) == base
+    early = [replace(r, stamp_ns=r.stamp_ns - 3 * SECOND) if r.sensor == "gps-1" else r for r in recorded]
+    assert run(changed_sensor(vehicle, "gps-1", delay_s=-3.0), early) == base
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [(0.0, 0.0), (8.4, 49.01)], ids=["equator", "swapped"])
-def test_fixes_far_from_the_site_are_refused_and_counted(place: tuple[float, float]) -> None:
+def test_fixes_far_from_the_site_are_refused_and_counted() -> None:
     """A receiver without a fix yet states the equator; they would turn the heading that is found from fixes."""
     made = drive(S_BEND, VEHICLE)
     first = {r.stamp_ns for r in [r for r in made.readings if isinstance(r, Gps)][:25]}
     lost = [
-        replace(r, lat_deg=place[0], lon_deg=place[1]) if isinstance(r, Gps) and r.stamp_ns in first else r
-        for r in made.readings
+        replace(r, lat_deg=0.0, lon_deg=0.0) if isinstance(r, Gps) and r.stamp_ns in first else r for r in made.readings
     ]
     pipeline = Positioning(SITE, VEHICLE, PipelineConfig())
     pipeline.step(lost)

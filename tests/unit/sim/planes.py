@@ -22,7 +22,11 @@ from sim.worlds.world import World
 LOADER, TRUCK = load_model("wheel_loader"), load_model("dump_truck")
 GRADE_15 = math.tan(math.radians(15))
 BOTH = pytest.mark.parametrize("model", [LOADER, TRUCK], ids=lambda m: m.name)
-EACH = pytest.mark.parametrize("kind", [FastWorld, BulletWorld], ids=["fast", "pybullet"])
+# Laws that hold in both worlds. PyBullet is slow: where few of them and its recorded bytes show a fault too, by night.
+EACH_ALWAYS = pytest.mark.parametrize("kind", [FastWorld, BulletWorld], ids=["fast", "pybullet"])
+EACH = pytest.mark.parametrize(
+    "kind", [FastWorld, pytest.param(BulletWorld, marks=pytest.mark.nightly)], ids=["fast", "pybullet"]
+)
 MIDDLE = ((500.0, 500.0, 0.0),)
 
 

@@ -76,7 +76,7 @@ def test_a_kill_loses_nothing(folder):
 
 def test_each_flip_in_the_log_is_named_counted_and_declared_to_the_server(killed, tmp_path):
     rng, size, counted = random.Random(1), (killed / "spool.db-wal").stat().st_size, 0
-    for i in range(60):
+    for i in range(30):
         folder = Path(shutil.copytree(killed, tmp_path / str(i)))
         content = bytearray((folder / "spool.db-wal").read_bytes())
         content[rng.randrange(size)] ^= 1 << rng.randrange(8)
@@ -93,7 +93,7 @@ def test_each_flip_in_the_log_is_named_counted_and_declared_to_the_server(killed
             assert watermark == 400
             assert f"{gone} recorded samples are gone" in spool.damage
             counted += 1
-    assert counted > 50
+    assert counted > 25
 
 
 def test_what_is_gone_is_counted_once_and_kept(folder):
@@ -148,7 +148,7 @@ def test_samples_with_a_new_identity_are_not_gone(tmp_path):
         assert (spool.counters()["gone"], len(deliver(spool)[0])) == (0, 30)
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.4, 0.9])
+@pytest.mark.parametrize("kept", [0.0, 0.9])
 def test_a_mark_that_is_torn_or_behind_is_no_alarm(folder, kept):
     mark = mark_path(folder / "spool.db")
     mark.write_bytes(mark.read_bytes()[: int(mark.stat().st_size * kept)])

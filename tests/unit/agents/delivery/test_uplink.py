@@ -1,6 +1,5 @@
 import itertools
 import math
-import random
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -31,7 +30,7 @@ from agents.delivery.uplink_thread import linger, perform
 from mapserver.ingest.admission import GapError, admit, judge
 from protocol.errors import MessageError, Refusal, StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, content_hash
-from protocol.wire.codec import decode_batch, decode_reply, encode_reply
+from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from tests.unit.agents.drives import SITE, made_up_samples
 
@@ -155,11 +154,6 @@ def test_first_payload_of_an_empty_spool_is_a_question() -> None:
     assert d.payload() is None
 
 
-def test_samples_need_no_question() -> None:
-    d = Delivery(5)
-    assert len(d.batch().rows) == 5
-
-
 def test_question_is_asked_until_somebody_answers() -> None:
     d = Delivery()
     for _ in range(3):
@@ -177,13 +171,6 @@ def test_held_uplink_sends_nothing() -> None:
     assert d.payload() is None
     d.uplink.held = ""
     assert len(d.batch().rows) == 5
-
-
-def test_empty_spool_has_nothing_to_send() -> None:
-    d = met()
-    assert d.payload() is None
-    d.spool.record(ROWS[:1])
-    assert len(d.batch().rows) == 1
 
 
 def test_nothing_is_deleted_before_the_acknowledgement() -> None:
@@ -209,14 +196,6 @@ def test_batch_is_halved_on_a_time_out_and_doubled_on_success() -> None:
     assert d.uplink.counters["timeouts"] == 2
 
 
-def test_batch_is_never_less_than_one_sample() -> None:
-    d = met(500, first_batch=4)
-    for _ in range(20):
-        d.payload()
-        d.reply(None)
-    assert len(d.batch().rows) == 1
-
-
 @pytest.mark.parametrize(("asked_s", "least_s"), [(0.3, 0.3), (4.0, 4.0), (3000.0, 5.0)])
 def test_a_machine_comes_again_when_the_server_has_room_and_not_all_at_once(asked_s: float, least_s: float) -> None:
     """As often as it is asked to, and never much later than by itself."""
@@ -236,10 +215,10 @@ def test_a_machine_comes_again_when_the_server_has_room_and_not_all_at_once(aske
 def test_pause_doubles_up_to_its_bound_and_starts_anew_after_success(reply: Refused | None) -> None:
     d = met(5, backoff_s=0.2, max_backoff_s=1.5)
     pauses = []
-    for _ in range(2000):
+    for _ in range(60):
         d.payload()
         pauses.append(d.reply(reply))
-    for pause, most in zip(pauses, (0.2, 0.4, 0.8, *[1.5] * 1997), strict=True):
+    for pause, most in zip(pauses, (0.2, 0.4, 0.8, *[1.5] * 57), strict=True):
         assert most / 2 <= pause <= most
     d.batch()
     d.reply(Ack(5, 1))
@@ -273,9 +252,10 @@ def test_missing_server_leaves_the_batch_as_it_is() -> None:
     assert len(d.batch().rows) == 64
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate_bps", "delay_s", "jitter_s"),
-    [(300e3, 0.05, 0.0), (300e3, 0.3, 0.2), (30e3, 0.1, 0.1), (1e6, 0.05, 0.1), (10e6, 0.02, 0.0), (300e3, 1.6, 0.0)],
+    [(300e3, 0.3, 0.2), (30e3, 0.1, 0.1), (10e6, 0.02, 0.0), (300e3, 1.6, 0.0)],
 )
 def test_batch_fits_the_link(rate_bps: float, delay_s: float, jitter_s: float) -> None:
     """The link is used well, an exchange takes about a third of the time-out, and few run into it."""
@@ -298,22 +278,6 @@ def test_batch_fits_the_link(rate_bps: float, delay_s: float, jitter_s: float) -
     assert np.median(late) < max(1.2, 1.2 * delay_s + 0.5) if rate_bps > 100e3 else max(late) < TIMEOUT_S
     share = sent * SAMPLE_DTYPE.itemsize * 8 / rate_bps / now_s
     assert sent == 60_000 or share > (0.6 if delay_s < 0.2 else 0.15)
-
-
-def test_link_that_gets_slower_costs_few_time_outs() -> None:
-    d = met(max_samples=100_000)
-    d.spool.record(made_up_samples(60_000))
-    rates, timeouts = [10e6] * 8 + [100e3] * 20, 0
-    for rate_bps in rates:
-        payload = d.payload()
-        need_s = 0.05 + 8 * len(payload) / rate_bps
-        if need_s < TIMEOUT_S:
-            d.reply(Ack(decode_batch(payload, 1e9).last_seq, 1), need_s)
-        else:
-            d.reply(None)
-            timeouts += 1
-    assert timeouts <= 5
-    assert need_s < TIMEOUT_S / 2
 
 
 def test_server_that_lost_samples_is_told_so() -> None:
@@ -348,7 +312,7 @@ def test_gap_that_names_no_expected_sample_quarantines_nothing() -> None:
     assert d.counter("put_aside") == 0
 
 
-@pytest.mark.parametrize("bad", [0, 7, 19])
+@pytest.mark.parametrize("bad", [0, 19])
 def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
     rows = ROWS[:20].copy()
     rows["c_rr"][bad] = 99.0
@@ -367,15 +331,6 @@ def test_refused_batch_is_bisected_to_the_one_bad_sample(bad: int) -> None:
     assert d.spool.counters() == {"depth": 0, "pending": 0, "dropped": 0, "put_aside": 1, "recorded": 20, "gone": 0}
     assert d.quarantined == [(bad + 1, content_hash(rows[bad]))]
     assert d.uplink.counters["refused_out_of_range"] >= 1
-
-
-def test_bisection_halves() -> None:
-    d = met(16, first_batch=16)
-    sizes = []
-    for _ in range(4):
-        sizes.append(len(d.batch().rows))
-        d.reply(Refused(Refusal.NOT_FINITE, "c_rr[0]"))
-    assert sizes == [16, 8, 4, 2]
 
 
 @pytest.mark.parametrize("reason", sorted(BLOCKING | PASSING))
@@ -495,68 +450,6 @@ def test_rows_of_another_store_are_compared_with_none(tmp_path: Path) -> None:
     d.spool.close()
 
 
-def test_full_spool_declares_what_it_dropped() -> None:
-    d = Delivery(5, max_samples=10)
-    server = Server()
-    d.spool.record(ROWS[5:20])
-    while payload := d.payload():
-        d.reply(server.answer(payload))
-    assert server.lost == 10
-    assert sorted(seq for _, seq, _ in server.accepted) == list(range(11, 21))
-
-
-def exchange(d: Delivery, server: Server, rng: random.Random, quality: float) -> None:
-    """One round over a link that loses requests and replies, and repeats requests."""
-    payload = d.payload()
-    if payload is None:
-        return
-    arrivals = [payload for _ in range(rng.choice((1, 1, 1, 2))) if rng.random() < quality]
-    answers = [decode_reply(encode_reply(server.answer(arrival))) for arrival in arrivals]
-    d.reply(rng.choice(answers) if answers and rng.random() < quality else None)
-
-
-@pytest.mark.parametrize("first_seed", range(0, 50, 25))
-def test_lossy_link_delivers_every_sample_exactly_once(first_seed: int) -> None:
-    for seed in range(first_seed, first_seed + 25):
-        rng = random.Random(seed)
-        server = Server()
-        d = Delivery(first_batch=rng.choice((1, 4, 16)), max_batch=32)
-        waiting = list(ROWS[:120])
-        for _ in itertools.count():
-            while waiting and rng.random() < 0.5:
-                n = rng.randint(1, 9)
-                d.spool.record(ROWS[120 - len(waiting) :][: min(n, len(waiting))])
-                waiting = waiting[n:]
-            exchange(d, server, rng, quality=0.6)
-            if not waiting and not d.counter("depth"):
-                break
-        assert set(server.accepted.values()) == {1}, f"seed={seed}"
-        expected = [(d.spool.spool_id, i + 1, content_hash(row)) for i, row in enumerate(ROWS[:120])]
-        assert sorted(server.accepted) == sorted(expected), f"seed={seed}"
-        assert server.lost == 0, f"seed={seed}"
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_agent_that_is_killed_again_and_again_delivers_every_sample_exactly_once(tmp_path: Path, seed: int) -> None:
-    rng = random.Random(seed)
-    server = Server()
-    recorded = 0
-    for _ in range(12):
-        d = Delivery(spool=Spool(tmp_path / "spool.db", SpoolConfig()), first_batch=8)
-        for _ in range(rng.randint(0, 6)):
-            if recorded < 120:
-                recorded += len(ROWS[recorded : recorded + 5])
-                d.spool.record(ROWS[recorded - 5 : recorded])
-            exchange(d, server, rng, quality=0.7)
-        d.spool._db.close()  # without a checkpoint, as a kill leaves it
-    d = Delivery(spool=Spool(tmp_path / "spool.db", SpoolConfig()))
-    while not d.spool.is_settled():
-        exchange(d, server, rng, quality=0.9)
-    assert sorted(h for _, _, h in server.accepted) == sorted(content_hash(r) for r in ROWS[:recorded]), f"seed={seed}"
-    assert set(server.accepted.values()) <= {1}, f"seed={seed}"
-    d.spool.close()
-
-
 def test_failing_disk_pauses_the_uplink_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Acknowledged samples that cannot be deleted are sent once more; pauses grow meanwhile."""
     d = met(5)
@@ -665,14 +558,6 @@ def test_nothing_is_deleted_on_the_word_of_another_store(store: str):
     assert d.batch().first_seq == 6  # it sends the same again, until a server with the right store answers
     d.reply(Ack(8, 2, store=FIRST))
     assert (d.counter("depth"), d.uplink.problem) == (0, "")
-
-
-def test_another_store_that_refuses_keeps_the_samples_waiting():
-    d = bound_to_first()
-    d.batch()
-    assert d.reply(Refused(Refusal.OTHER_STORE, "store a... is not this one")) > 0
-    assert (d.counter("depth"), d.counter("put_aside")) == (3, 0)
-    assert d.uplink.problem == "store a... is not this one"
 
 
 def test_a_store_that_replaces_another_learns_what_it_lacks():

@@ -67,14 +67,17 @@ def replay(folder: Path, speed: float) -> tuple[list[Reading], list[float], Time
     return readings, at, time_, empty
 
 
-@pytest.mark.parametrize("speed", [0.0, 1.0, 10.0])
-def test_replay_hands_on_every_reading_in_order(folder: Path, speed: float) -> None:
-    assert replay(folder, speed)[0] == list(open_log(folder).readings())
+def test_replay_as_fast_as_possible_hands_on_every_reading_in_order_and_never_waits(folder: Path) -> None:
+    readings, _, time_, _ = replay(folder, 0.0)
+    assert readings == list(open_log(folder).readings())
+    assert time_.waits == []
 
 
 @pytest.mark.parametrize("speed", [1.0, 10.0])
 def test_replay_keeps_pace(folder: Path, speed: float) -> None:
-    readings, at, _, empty = replay(folder, speed)
+    readings, at, time_, empty = replay(folder, speed)
+    assert readings == list(open_log(folder).readings())
+    assert max(time_.waits) <= 0.2, "no longer than a read may take"
     due = [(r.stamp_ns - readings[0].stamp_ns) * 1e-9 / speed for r in readings]
     early = [d - a for d, a in zip(due, at, strict=True)]
     assert max(early) <= 0.05 / speed + 1e-6  # at most what is handed on together
@@ -82,25 +85,16 @@ def test_replay_keeps_pace(folder: Path, speed: float) -> None:
     assert empty or speed > 1  # the silence is longer than a read may take
 
 
-@pytest.mark.parametrize("speed", [0.0, 1.0])
-def test_replay_hands_on_readings_with_too_early_stamps_when_they_were_true(tmp_path: Path, speed: float) -> None:
+def test_replay_hands_on_readings_with_too_early_stamps_when_they_were_true(tmp_path: Path) -> None:
     """And with the same pauses as if their stamps were right."""
     made = drive([Leg(3, 0.5)], VEHICLE).readings
     write_log(tmp_path / "right", "lot", SITE, VEHICLE, made)
     early = [replace(r, stamp_ns=r.stamp_ns - 700_000_000) if r.sensor == "gps-1" else r for r in made]
     write_log(tmp_path / "early", "lot", SITE, changed_sensor(VEHICLE, "gps-1", delay_s=-0.7), early)
-    right, early = (replay(tmp_path / name, speed) for name in ("right", "early"))
+    right, early = (replay(tmp_path / name, 1.0) for name in ("right", "early"))
     mended = [replace(r, stamp_ns=r.stamp_ns + 700_000_000) if r.sensor == "gps-1" else r for r in early[0]]
     assert mended == right[0]
     assert early[1] == pytest.approx(right[1])
-
-
-def test_replay_as_fast_as_possible_never_waits(folder: Path) -> None:
-    assert replay(folder, 0.0)[2].waits == []
-
-
-def test_replay_never_waits_longer_than_a_read_may_take(folder: Path) -> None:
-    assert max(replay(folder, 1.0)[2].waits) <= 0.2
 
 
 def test_replay_counts_rows_that_were_refused(folder: Path, tmp_path: Path) -> None:
@@ -113,11 +107,6 @@ def test_replay_counts_rows_that_were_refused(folder: Path, tmp_path: Path) -> N
         pass
     expected = {"log_out_of_range": 1, "log_not_finite": 1, "log_stamp_goes_back": 1, "log_wrong_type": 1}
     assert driver.counters() == expected
-
-
-def test_replay_of_an_empty_log_ends_at_once(tmp_path: Path) -> None:
-    write_log(tmp_path, "lot", SITE, VEHICLE, [])
-    assert Replay(open_log(tmp_path), 1.0, lambda: 0.0, lambda _: None).read(0.2) is None
 
 
 # --- Zenoh -----------------------------------------------------------------------------------------------------------
@@ -255,26 +244,22 @@ def run_agent(session: Any, folder: Path, config: AgentConfig, driver: Given, *,
         agent.close()
 
 
-@pytest.mark.parametrize("linger_s", [3.0, 0.0])
-def test_agent_lingers_for_the_last_samples(sessions: tuple[Any, Any], tmp_path: Path, linger_s: float) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize(("linger_s", "stopped"), [(3.0, False), (3.0, True)])
+def test_agent_lingers_for_the_last_samples_unless_it_is_stopped(
+    sessions: tuple[Any, Any], tmp_path: Path, linger_s: float, stopped: bool
+) -> None:
     """Nobody acknowledges: the samples stay in the spool, and the report says so."""
     config = AgentConfig(linger_s=linger_s, uplink=UplinkConfig(timeout_s=0.2))
     driver = Given(drive([Leg(4, 0.5), Leg(14)], VEHICLE).readings)
-    report, time_ = run_agent(sessions[1], tmp_path, config, driver)
+    report, time_ = run_agent(sessions[1], tmp_path, config, driver, stopped=stopped)
     assert driver.closed
     assert report["samples"] > 20
     assert report["spool"]["depth"] == report["samples"]
     assert report["delivered"] is False
-    assert sum(time_.waits) == pytest.approx(linger_s, abs=0.06)
+    assert sum(time_.waits) == pytest.approx(0.0 if stopped else linger_s, abs=0.06)
     assert report["spool"]["pending"] == 0
     assert len(read_audit(tmp_path / "audit.txt")) == report["samples"]
-
-
-def test_agent_that_is_stopped_does_not_linger(sessions: tuple[Any, Any], tmp_path: Path) -> None:
-    driver = Given(drive([Leg(4, 0.5), Leg(14)], VEHICLE).readings)
-    report, time_ = run_agent(sessions[1], tmp_path, AgentConfig(), driver, stopped=True)
-    assert report["delivered"] is False
-    assert time_.waits == []
 
 
 OUT_AND_BACK = (Leg(4, 0.5), Leg(14), Leg(4, -0.5), Leg(2), Leg(4, -0.5), Leg(14), Leg(4, 0.5), Leg(3))

@@ -84,7 +84,7 @@ def test_gyros_carry_the_slope_through_a_change(
 
 def test_both_gyro_biases_are_estimated() -> None:
     slope = SlopeFilter()
-    for _ in range(12_000):
+    for _ in range(8000):
         slope.update(STEP_S, (0.0015, 0.002, 0.0), force(0.2, -0.1), STANDING)
     assert angles(slope) == pytest.approx((0.2, -0.1), abs=1e-3)
     slope.update(10.0, (0.0015, 0.002, 0.0), force(0.2, -0.1), None)  # nothing but the gyros for 10 s
@@ -148,8 +148,7 @@ def bends(slope: SlopeFilter, slip: float, speed_mps: float, seconds: int) -> li
     return shown
 
 
-@pytest.mark.parametrize("speed_mps", [3.0, -3.0])
-@pytest.mark.parametrize("slip", [0.0, 0.01, 0.03])
+@pytest.mark.parametrize(("slip", "speed_mps"), [(0.0, 3.0), (0.01, -3.0), (0.03, 3.0)])
 def test_tyres_that_slip_in_a_bend_are_no_slope(slip: float, speed_mps: float) -> None:
     """At 1.2 m/s2 a slip of 0.03 is felt as a slope ahead of 0.4 %: without it in the state, 0.3 % of that remain."""
     slope = SlopeFilter()
@@ -179,7 +178,7 @@ def test_wheels_that_slip_and_grip_again_are_no_slope(jump_mps: float) -> None:
     assert worst < 4e-3
 
 
-@pytest.mark.parametrize("knock", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("knock", [0.02, 0.5])
 def test_a_knock_to_the_gyros_is_soon_no_slope(knock: float) -> None:
     """One reading of up to 50 rad/s: the wheels, which never slip for long, then speak against the slope."""
     slope = started()

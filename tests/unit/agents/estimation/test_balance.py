@@ -8,9 +8,9 @@ import pytest
 
 from agents.estimation.balance import front_share, squat_rad
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Encoder, Imu, Odometry, Payload, Torque
+from protocol.machine.readings import Encoder, Imu, Payload, Torque
 from protocol.units import GRAVITY_MPS2
-from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, changed_sensor, drive, machine, noisy
+from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, changed_sensor, drive, machine
 from tests.unit.agents.ground import balances
 
 FORWARDS = [Leg(2), Leg(4, 0.5), Leg(10)]
@@ -26,8 +26,7 @@ def loader(mount: Mount | None = None, **options: float) -> MachineConfig:
 
 
 @pytest.mark.parametrize("legs", [FORWARDS, REVERSE], ids=["forwards", "reverse"])
-@pytest.mark.parametrize("c_rr", [0.008, 0.25])
-@pytest.mark.parametrize("ahead_deg", [0.0, 15.0, -15.0])
+@pytest.mark.parametrize(("c_rr", "ahead_deg"), [(0.008, 0.0), (0.25, 15.0), (0.05, -15.0)])
 def test_what_is_left_is_the_rolling_resistance(legs: list[Leg], c_rr: float, ahead_deg: float) -> None:
     last = balances(VEHICLE, drive(legs, VEHICLE, ground=Ground(c_rr, math.radians(ahead_deg))).readings)[-1]
     direction = 1.0 if legs is FORWARDS else -1.0
@@ -37,12 +36,6 @@ def test_what_is_left_is_the_rolling_resistance(legs: list[Leg], c_rr: float, ah
     assert last.slope_x == pytest.approx(math.radians(ahead_deg), abs=3e-3)
     assert last.sine_x == pytest.approx(math.sin(math.radians(ahead_deg)), abs=3e-3)
     assert last.speed_mps == pytest.approx(direction * 2.0, abs=0.02)
-
-
-def test_distance_counts_up_in_reverse_too() -> None:
-    steps = balances(VEHICLE, drive([*FORWARDS, Leg(8, -0.5), Leg(5)], VEHICLE).readings)
-    assert (np.diff([b.distance_m for b in steps]) >= 0).all()
-    assert steps[-1].distance_m == pytest.approx(4 + 20 + 4 + 4 + 10, abs=0.3)
 
 
 def test_a_step_ends_every_50_ms() -> None:
@@ -67,7 +60,7 @@ def test_a_load_does_not_rotate() -> None:
     assert balances(rigid, made)[-1].unbalanced == pytest.approx(0.04 + 0.1 * 0.5 / GRAVITY_MPS2, abs=1e-3)
 
 
-@pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 90.0), (180.0, 0.0, 0.0), (90.0, 0.0, -90.0), (10.0, -20.0, 30.0)])
+@pytest.mark.parametrize("rpy_deg", [(180.0, 0.0, 0.0), (10.0, -20.0, 30.0)])
 def test_mounting_is_turned_back(rpy_deg: tuple[float, float, float]) -> None:
     vehicle = machine(Mount((0.4, 0.0, 0.9), rpy_deg))
     last = balances(vehicle, drive(FORWARDS, vehicle, ground=Ground(0.05, 0.2, 0.1)).readings)[-1]
@@ -113,12 +106,6 @@ def test_a_wheel_beside_the_middle_is_no_slope_in_a_bend() -> None:
     assert max(abs(b.slope_x) for b in balances(vehicle, readings)[100:]) < 6e-3
 
 
-def test_centripetal_acceleration_of_a_bend_is_no_slope() -> None:
-    last = balances(VEHICLE, drive([Leg(2), Leg(4, 0.5), Leg(10, 0.0, 0.3)], VEHICLE).readings)[-1]
-    assert last.slope_y == pytest.approx(0.0, abs=2e-3)
-    assert last.slope_x == pytest.approx(0.0, abs=2e-3)
-
-
 def test_turning_across_a_slope_keeps_slopes_and_resistance_right() -> None:
     """The wheels' share of the force is off by up to g sin(15 deg) if the slope does not turn with the machine."""
     ground = Ground(0.04, left_rad=math.radians(15))
@@ -144,8 +131,9 @@ def test_bent_machine_on_a_side_slope_climbs_with_its_front_axle(bend_rad: float
     assert straight.unbalanced == pytest.approx(0.04 + extra, abs=1e-3)
 
 
-@pytest.mark.parametrize("legs", [FORWARDS, REVERSE], ids=["forwards", "reverse"])
-@pytest.mark.parametrize(("on_front", "share"), [(1.5 / 3.3, -0.5 + 1.5 / 3.3), (0.7, 0.2)])
+@pytest.mark.parametrize(
+    ("legs", "on_front", "share"), [(FORWARDS, 1.5 / 3.3, -0.5 + 1.5 / 3.3), (REVERSE, 0.7, 0.2)], ids=["ahead", "back"]
+)
 def test_axles_on_a_curve_stand_on_two_slopes(legs: list[Leg], on_front: float, share: float) -> None:
     """By hand: 0.01 rad per metre over 3.3 m; the front axle's load is on its steeper half where it is concave."""
     vehicle = loader(axle_stiffness_npm=0.0, cog_height_m=0.0, load_centre_m=3.3 * on_front)
@@ -166,13 +154,6 @@ def test_bent_machine_uphill_climbs_less() -> None:
     assert last.unbalanced == pytest.approx(0.04 * math.cos(0.2), abs=1e-3)
 
 
-def test_share_of_the_load_on_the_front_axle() -> None:
-    vehicle = loader(cog_height_m=0.0)
-    assert balances(vehicle, drive(FORWARDS, vehicle).readings)[-1].on_front == pytest.approx(1.5 / 3.3, abs=1e-3)
-    bare = machine()
-    assert balances(bare, drive(FORWARDS, bare).readings)[-1].on_front == 0.0
-
-
 def test_payload_counts_as_mass_and_moves_weight_to_the_front() -> None:
     vehicle = loader()
     legs = [Leg(2), Leg(4, 0.5, payload_kg=4000, bend_rad=0.4), Leg(6, payload_kg=4000, bend_rad=0.4)]
@@ -183,9 +164,8 @@ def test_payload_counts_as_mass_and_moves_weight_to_the_front() -> None:
     assert abs(not_weighed.unbalanced - 0.04) > 0.01
 
 
-@pytest.mark.parametrize("accel_mps2", [0.0, 0.8])
-@pytest.mark.parametrize("payload_kg", [0.0, 4000.0])
-def test_squat_is_no_slope_and_no_resistance(accel_mps2: float, payload_kg: float) -> None:
+@pytest.mark.parametrize(("payload_kg", "accel_mps2"), [(0.0, 0.8), (4000.0, 0.0), (4000.0, 0.8)])
+def test_squat_is_no_slope_and_no_resistance(payload_kg: float, accel_mps2: float) -> None:
     """A full bucket lowers the nose by 0.9 degrees, which would be 0.015 of c_rr and of slope."""
     vehicle = loader()
     legs = [Leg(2), Leg(4, 0.5, payload_kg=payload_kg), Leg(12, accel_mps2, payload_kg=payload_kg)]
@@ -242,16 +222,6 @@ def test_ages_of_wheels_and_torque_and_silent_wheels_that_stand() -> None:
     assert (never.wheels_s, never.torque_s) == (math.inf, math.inf)
 
 
-def test_odometry_counts_as_wheels() -> None:
-    vehicle = replace(machine(), sensors=(*machine().sensors[:2], SensorConfig("wheels", "odometry")))
-    made = drive(FORWARDS, machine(), without=("wheels",))
-    speeds = [Odometry("wheels", t, float(v), 0.0, 0.0) for t, v in zip(made.stamps_ns, made.speed_mps, strict=True)]
-    both = sorted([*(r for r in made.readings if r.sensor != "gps-1"), *speeds], key=lambda r: r.stamp_ns)
-    last = balances(vehicle, both)[-1]
-    assert last.wheels_s < 0.02
-    assert last.unbalanced == pytest.approx(0.04, abs=1e-3)
-
-
 @pytest.mark.parametrize(
     "options", [{"frame": FRONT}, {"measures": ("rate",)}], ids=["front frame", "no accelerometer"]
 )
@@ -278,14 +248,6 @@ def test_pause_of_the_imu_spoils_no_step() -> None:
     assert max(b.dt_s for b in steps) < 0.07
     assert not [b for b in steps if silent[0] < b.stamp_ns < silent[1]]
     assert steps[-1].unbalanced == pytest.approx(0.04, abs=1e-3)
-
-
-def test_noise_of_the_readings_averages_out_over_steps() -> None:
-    """The raw balance has the density that the estimators are told of, or less."""
-    made = drive([Leg(2), Leg(4, 0.5), Leg(60)], VEHICLE)
-    raw = np.array([b.unbalanced for b in balances(VEHICLE, noisy(made.readings, 1))][100:])
-    assert raw.mean() == pytest.approx(0.04, abs=2e-3)
-    assert raw.std() * math.sqrt(0.05) < 0.005
 
 
 def test_payload_reading_is_kept_until_the_next() -> None:
@@ -318,8 +280,11 @@ def test_share_on_the_front_axle(payload_kg: float, force_mps2: float, share: fl
     assert front_share(replace(LOADER, wheelbase_m=0.0), payload_kg, force_mps2) == 0.0
 
 
-def test_empty_machine_at_rest_stands_level() -> None:
+@pytest.mark.parametrize("unknown", ["wheelbase_m", "axle_stiffness_npm"])
+def test_without_data_there_is_no_squat_and_none_at_rest_or_beyond_gravity(unknown: str) -> None:
+    assert squat_rad(replace(LOADER, **{unknown: 0.0}), 4000, 2.0) == 0.0  # type: ignore[arg-type]
     assert squat_rad(LOADER, 0.0, 0.0) == 0.0
+    assert math.isfinite(squat_rad(LOADER, 4000, 30.0))
 
 
 def test_payload_ahead_of_the_front_axle_lowers_the_nose() -> None:
@@ -348,13 +313,3 @@ def test_on_a_slope_less_weight_presses_the_tyres() -> None:
     squat = squat_rad(rear_heavy, 0.0, GRAVITY_MPS2 * math.sin(slope_rad))
     weight_n = 17_500 * GRAVITY_MPS2
     assert squat == pytest.approx(weight_n * (2 / 3 - 1 / 3) * (math.cos(slope_rad) - 1) / (1.8e6 * 3.0))
-
-
-@pytest.mark.parametrize("unknown", ["wheelbase_m", "axle_stiffness_npm"])
-def test_without_data_there_is_no_squat(unknown: str) -> None:
-    assert squat_rad(replace(LOADER, **{unknown: 0.0}), 4000, 2.0) == 0.0  # type: ignore[arg-type]
-    assert squat_rad(MachineConfig("loader-1"), 4000, 2.0) == 0.0
-
-
-def test_force_beyond_gravity_is_survived() -> None:
-    assert math.isfinite(squat_rad(LOADER, 4000, 30.0))

@@ -102,8 +102,7 @@ def course(calibration: Calibration | None = None, **options: object) -> Course:
 # --- there and back --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("zero", [0.004, -0.008])
-@pytest.mark.parametrize("c_rr", [0.01, 0.06, 0.25])
+@pytest.mark.parametrize(("zero", "c_rr"), [(0.004, 0.25), (-0.008, 0.01)])
 def test_flat_ground_there_and_back_shows_the_zero(zero: float, c_rr: float) -> None:
     on = course(zero=zero, c_rr=lambda _: c_rr, noise=NOISE, seed=1)
     on.there_and_back(40, 6)
@@ -126,13 +125,6 @@ def test_a_slope_shows_the_scale_too(scale: float) -> None:
     assert calibration.scale == pytest.approx(scale, abs=0.012)
     corrected = [calibration.corrected(on._balance(d, 2.0)) * d for d in (1.0, -1.0)]
     assert np.mean(corrected) == pytest.approx(0.04, abs=0.02)
-
-
-def test_changes_of_the_ground_do_not_matter() -> None:
-    """Each place against itself; c_rr changes every 4 m."""
-    on = course(zero=0.005, c_rr=lambda x: 0.02 + 0.06 * (int(x / 4) % 2), noise=NOISE, seed=3)
-    on.there_and_back(40, 6)
-    assert on.calibrator.calibration.zero == pytest.approx(0.005, abs=0.0015)
 
 
 def test_one_direction_alone_shows_nothing() -> None:
@@ -161,25 +153,13 @@ def test_a_passage_counts_once() -> None:
     assert 2 * pairs - 6 <= on.calibrator.counters["pairs"] <= 2 * pairs + 6
 
 
-def test_each_passage_there_pairs_with_one_back() -> None:
-    on = course(zero=0.004)
-    on.drive(20)
-    on.wait(1)
-    on.drive(20, -1.0)
-    pairs = on.calibrator.counters["pairs"]
-    on.wait(1)
-    on.place.x_m = 20.0  # back again, and never there
-    on.drive(20, -1.0)
-    assert on.calibrator.counters["pairs"] <= pairs + 4
-
-
 @pytest.mark.parametrize(
     ("change", "pairs"),
     [
         ({}, True),
         ({"y_m": 0.5}, True),
         ({"y_m": 0.9}, False),
-        ({"angle_rad": 0.1}, True),
+        ({"angle_rad": 0.1 + 4 * math.pi}, True),  # full turns of dead reckoning are none
         ({"angle_rad": 0.3}, False),
         ({"wait_s": 90.0}, True),
         ({"wait_s": 150.0}, False),
@@ -206,16 +186,7 @@ def test_turning_round_makes_no_pair() -> None:
     assert not on.calibrator.counters["pairs"]
 
 
-def test_full_turns_of_dead_reckoning_are_no_turn() -> None:
-    on = course(zero=0.004)
-    on.drive(10)
-    on.place.angle_rad = 4 * math.pi
-    on.wait(1)
-    on.drive(10, -1.0)
-    assert on.calibrator.counters["pairs"] >= 15
-
-
-@pytest.mark.parametrize("speed_mps", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("speed_mps", [0.5, 3.0])
 def test_speed_on_the_return_does_not_matter(speed_mps: float) -> None:
     on = course(zero=0.004)
     on.drive(20)
@@ -263,12 +234,6 @@ def test_interrupted_stretches_are_not_used() -> None:
             on.drive(0.4, direction)  # shorter than a stretch
             on.calibrator.interrupt()
     assert not on.calibrator.counters["pairs"]
-
-
-def test_a_stretch_is_half_a_metre() -> None:
-    on = course(zero=0.004)
-    on.there_and_back(20)
-    assert on.calibrator.counters["pairs"] == pytest.approx(37, abs=3)
 
 
 # --- known ground ----------------------------------------------------------------------------------------------------

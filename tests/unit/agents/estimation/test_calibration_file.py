@@ -11,14 +11,12 @@ from protocol.errors import StoreError
 KNOWN = Calibration(0.0031, -0.02, ((1e-6, -2e-7), (-2e-7, 1e-4)), 1_767_225_600_000_000_000, 41)
 
 
-def test_what_was_saved_is_loaded_exactly(tmp_path: Path) -> None:
+def test_what_was_saved_is_loaded_exactly_and_only_its_owner_reads_it(tmp_path: Path) -> None:
+    assert load(tmp_path / "c.json", "loader-1") is None
     save(tmp_path / "c.json", "loader-1", KNOWN)
     assert load(tmp_path / "c.json", "loader-1") == KNOWN
     assert [path.name for path in tmp_path.iterdir()] == ["c.json"]
-
-
-def test_no_file_is_no_calibration(tmp_path: Path) -> None:
-    assert load(tmp_path / "c.json", "loader-1") is None
+    assert (tmp_path / "c.json").stat().st_mode & 0o777 == 0o600
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"version": 2}', "\x00\xff", "[" * 100_000])
@@ -69,11 +67,6 @@ def test_no_flipped_bit_is_used(tmp_path: Path) -> None:
             assert "c.json" in str(error)  # noqa: PT017 # blanks between values may be anything that is blank
             refused += 1
     assert refused > 0.9 * 8 * len(whole)
-
-
-def test_only_its_owner_reads_it(tmp_path: Path) -> None:
-    save(tmp_path / "c.json", "loader-1", KNOWN)
-    assert (tmp_path / "c.json").stat().st_mode & 0o777 == 0o600
 
 
 def test_a_folder_that_is_not_there_is_an_error_of_ours(tmp_path: Path) -> None:

@@ -96,9 +96,9 @@ def points(corners: tuple[Place, ...]) -> Iterator[tuple[Place, Place]]:
             yield (x0 + ahead[0] * i * step, y0 + ahead[1] * i * step), ahead
 
 
-@pytest.mark.parametrize("height", [level, ramp])
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-@pytest.mark.parametrize("zero", [ZERO, -0.004])
+@pytest.mark.parametrize(
+    ("height", "direction", "zero"), [(level, 1.0, -0.004), (ramp, 1.0, ZERO), (ramp, -1.0, -0.004)]
+)
 def test_a_closed_tour_shows_the_zero_absolutely_in_either_direction(
     height: Height, direction: float, zero: float
 ) -> None:

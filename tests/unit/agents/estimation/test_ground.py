@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.estimation import ground, plausibility
+from agents.estimation import ground
 from agents.estimation.calibration import SCALE_STD, ZERO_STD, Calibration
 from agents.estimation.ground import ESTIMATORS, NOTHING_KNOWN, EstimationConfig, GroundEstimate, GroundEstimator
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Reading, Torque
 from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, drive, machine, noisy
-from tests.unit.agents.ground import STEADY, EstimatorRun
+from tests.unit.agents.ground import EstimatorRun
 
 SLOPE_RAD = math.radians(15)
 STAND, START = Leg(2), Leg(4, 0.5)
@@ -39,8 +39,8 @@ def weighing(**options: Any) -> MachineConfig:
 
 
 @pytest.mark.parametrize("legs", [FORWARDS, REVERSE], ids=["forwards", "reverse"])
-@pytest.mark.parametrize("c_rr", [0.008, 0.25])
-@pytest.mark.parametrize("ahead_rad", [0.0, SLOPE_RAD, -SLOPE_RAD])
+@pytest.mark.slow
+@pytest.mark.parametrize(("c_rr", "ahead_rad"), [(0.008, 0.0), (0.25, SLOPE_RAD), (0.05, -SLOPE_RAD)])
 def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad: float) -> None:
     """Positive slope is uphill ahead, also when the machine drives down it backwards."""
     made = drive(legs, VEHICLE, ground=Ground(c_rr, ahead_rad))
@@ -52,8 +52,7 @@ def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad:
         assert estimate.reason == "", estimator
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("turn_radps", [0.0, 0.2])
+@pytest.mark.parametrize(("estimator", "turn_radps"), [("kalman", 0.2), ("rls", 0.0)])
 def test_slope_across_the_driving_direction(estimator: str, turn_radps: float) -> None:
     """A machine that turns on a plane takes its slope from another side; the bend's own acceleration is no slope."""
     ground = Ground(0.04, left_rad=SLOPE_RAD)
@@ -76,11 +75,10 @@ def test_accelerating_does_not_change_the_resistance(estimator: str) -> None:
     assert np.abs(np.array(values) - 0.05).max() < 0.004
 
 
-@pytest.mark.parametrize("ahead_rad", [0.0, 0.15])
-def test_border_between_two_grounds_is_found_where_it_is(ahead_rad: float) -> None:
+def test_border_between_two_grounds_is_found_where_it_is() -> None:
     """Within half a metre, asked 1.5 s later."""
     border_ns = START_NS + 10 * 10**9
-    run = EstimatorRun(VEHICLE).feed(two_grounds(VEHICLE, 0.02, 0.25, border_ns, ahead_rad=ahead_rad))
+    run = EstimatorRun(VEHICLE).feed(two_grounds(VEHICLE, 0.02, 0.25, border_ns, ahead_rad=0.15))
     for stamp_ns, estimate in run.estimates:
         off_s = (stamp_ns - border_ns) * 1e-9
         if abs(off_s) > 0.25 and stamp_ns > START_NS + 8 * 10**9 and not estimate.reason:
@@ -99,51 +97,15 @@ def two_grounds(vehicle: MachineConfig, a: float, b: float, border_ns: int, **op
 @pytest.mark.parametrize(("mass", "stated_kg"), [("message", 22_500.0), ("known", 17_500.0), ("estimated", math.nan)])
 def test_estimates_state_the_mass_as_it_is_weighed(mass: str, stated_kg: float) -> None:
     vehicle = weighing()
-    made = drive([replace(leg, payload_kg=5000) for leg in FORWARDS], vehicle)
-    assert last_estimate(vehicle, made, mass=mass).mass_kg == pytest.approx(stated_kg, nan_ok=True)
-
-
-def test_payload_is_weighed_unless_the_mass_is_taken_as_known() -> None:
-    vehicle = weighing()
-    legs = [replace(leg, payload_kg=5000) for leg in FORWARDS]
-    made = drive(legs, vehicle, ground=Ground(0.06, 0.1))
-    assert last_estimate(vehicle, made).c_rr == pytest.approx(0.06, abs=0.003)
-    wrong = 5 / 17.5 * (0.06 * math.cos(0.1) + math.sin(0.1)) / math.cos(0.1)
-    assert last_estimate(vehicle, made, mass="known").c_rr == pytest.approx(0.06 + wrong, abs=0.005)
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_health_says_what_the_machine_carries(estimator: str) -> None:
-    vehicle = weighing()
-    run = EstimatorRun(vehicle, EstimationConfig(estimator=estimator))
-    run.feed(drive([replace(leg, payload_kg=5000) for leg in FORWARDS], vehicle).readings)
-    assert run.estimator.health()["payload_kg"] == 5000
-
-
-@pytest.mark.slow
-def test_mass_that_nobody_weighs_is_estimated_from_forces() -> None:
-    loaded = replace(VEHICLE, mass_kg=1.2 * VEHICLE.mass_kg)
-    legs = [STAND, START, *[Leg(2, 0.7), Leg(2, -0.7)] * 12]
-    made = drive(legs, loaded, ground=Ground(0.05))
-    errors = {}
-    for mass in ("known", "estimated"):
-        run = EstimatorRun(VEHICLE, EstimationConfig(mass=mass)).feed(made.readings)
-        errors[mass] = np.nanmean([abs(e.c_rr - 0.05) for e in run.between(40, 55)])
-    assert errors["estimated"] < 0.006
-    assert errors["known"] > 2 * errors["estimated"]
+    made = drive([replace(leg, payload_kg=5000) for leg in FORWARDS], vehicle, ground=Ground(0.06, 0.1))
+    estimate = last_estimate(vehicle, made, mass=mass)
+    assert estimate.mass_kg == pytest.approx(stated_kg, nan_ok=True)
+    if mass != "estimated":
+        wrong = 5 / 17.5 * (0.06 + math.tan(0.1)) if mass == "known" else 0.0
+        assert estimate.c_rr == pytest.approx(0.06 + wrong, abs=0.005)
 
 
 # --- how sure it is --------------------------------------------------------------------------------------------------
-
-
-def test_variance_grows_with_the_drive_force() -> None:
-    """By the scale error of torque and mass that nothing is known of."""
-    flat, steep = (last_estimate(VEHICLE, drive(FORWARDS, VEHICLE, ground=Ground(0.02, a))) for a in (0.0, SLOPE_RAD))
-    assert steep.c_rr_var > 3 * flat.c_rr_var
-    share = math.sin(SLOPE_RAD) + 0.02 * math.cos(SLOPE_RAD)
-    steep_var = (ZERO_STD**2 + (SCALE_STD * share) ** 2) / math.cos(SLOPE_RAD) ** 2
-    expected = steep_var - (ZERO_STD**2 + (SCALE_STD * 0.02) ** 2)
-    assert steep.c_rr_var - flat.c_rr_var == pytest.approx(expected, rel=0.05)
 
 
 def test_variance_has_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,7 +124,7 @@ def test_variance_has_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", ["kalman", pytest.param("rls", marks=pytest.mark.nightly)])
 def test_normalised_errors_are_about_one(estimator: str) -> None:
     """Machines with sensors as bad as they are taken to be, on a slope and without anything learnt of them."""
     vehicle, errors = machine(), []
@@ -205,17 +167,6 @@ def test_nothing_is_known_before_the_imu_speaks() -> None:
     assert run.estimator.newest_ns == 0
 
 
-def test_without_torque_there_is_a_slope_but_no_resistance() -> None:
-    run = EstimatorRun(VEHICLE).feed(
-        drive(FORWARDS, VEHICLE, ground=Ground(0.04, SLOPE_RAD), without=("torque",)).readings
-    )
-    assert math.isnan(run.last.c_rr)
-    assert math.isnan(run.last.c_rr_var)
-    assert run.last.reason == "no_torque"
-    assert run.last.slope_x == pytest.approx(math.tan(SLOPE_RAD), abs=0.004)
-    assert run.estimator.fault == "no_torque"
-
-
 @pytest.mark.parametrize(("kind", "reason"), [(Torque, "no_torque"), (Encoder, "no_wheels")])
 def test_sensor_that_falls_silent_is_missed_and_welcomed_back(kind: type[Reading], reason: str) -> None:
     made = drive([*FORWARDS, Leg(10)], VEHICLE)
@@ -243,26 +194,14 @@ def test_accelerometer_in_g_is_no_accelerometer() -> None:
     assert run.estimator.health()["fault"] == "accelerometer"
 
 
-@pytest.mark.parametrize("factor", [1000.0, 0.001])
-def test_torque_in_a_wrong_unit_is_noticed(factor: float) -> None:
-    legs = [STAND, START, *[Leg(3, 0.6), Leg(3, -0.6)] * 10]
+def test_torque_in_a_wrong_unit_is_noticed() -> None:
+    legs = [STAND, START, *[Leg(3, 0.6), Leg(3, -0.6)] * 5]
     made = [
-        replace(r, torque_nm=r.torque_nm * factor) if isinstance(r, Torque) else r
-        for r in drive(legs, VEHICLE).readings
+        replace(r, torque_nm=r.torque_nm * 0.001) if isinstance(r, Torque) else r for r in drive(legs, VEHICLE).readings
     ]
     run = EstimatorRun(VEHICLE).feed(made)
     assert run.last.reason == "torque_implausible"
     assert run.estimator.fault == "torque_implausible"
-
-
-def test_torque_that_is_stuck_is_noticed() -> None:
-    made = drive([STAND, START, Leg(3), *[Leg(3, 0.6), Leg(3, -0.6)] * 4], VEHICLE).readings
-    stuck = [
-        replace(r, torque_nm=9000.0) if isinstance(r, Torque) and r.stamp_ns > START_NS + 8 * 10**9 else r for r in made
-    ]
-    run = EstimatorRun(VEHICLE).feed(stuck)
-    assert "torque_frozen" in {e.reason for e in run.between(10, 30)}
-    assert "torque_frozen" not in {e.reason for e in EstimatorRun(VEHICLE).feed(made).between(0, 40)}
 
 
 def test_fault_of_the_moment_is_none() -> None:
@@ -303,16 +242,6 @@ def test_change_of_slope_blurs_slope_and_resistance() -> None:
     for e in estimates:
         assert np.isnan([e.c_rr, e.c_rr_var, e.slope_x, e.slope_y, e.slope_var]).all()
         assert e.mass_kg == VEHICLE.mass_kg
-
-
-@pytest.mark.parametrize(("speed_mps", "axles"), [(2.0, (0.4, 3.3, 2.1)), (-2.0, (0.6, 3.3, 1.2))])
-def test_step_states_which_axle_leads(speed_mps: float, axles: tuple[float, float, float]) -> None:
-    """Its share of the load, how far the other one is behind, and the load centre."""
-    estimator = GroundEstimator(machine(wheelbase_m=3.3, load_centre_m=1.2), EstimationConfig())
-    step = estimator._balance_step(replace(STEADY, speed_mps=speed_mps, on_front=0.4), 0.1, 0.04, 1.0)
-    assert (step.lead_share, step.wheelbase_m, step.lead_m) == pytest.approx(axles)
-    bare = GroundEstimator(machine(), EstimationConfig())._balance_step(STEADY, 0.1, 0.04, 1.0)
-    assert (bare.lead_share, bare.wheelbase_m) == (1.0, 0.0)
 
 
 # --- calibration -----------------------------------------------------------------------------------------------------
@@ -359,16 +288,6 @@ def test_zero_is_found_by_the_work_cycle() -> None:
 
 
 @pytest.mark.slow
-def test_known_ground_shows_the_zero_without_a_way_back() -> None:
-    readings = off(drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(10)], VEHICLE).readings, 0.06)
-    run = EstimatorRun(VEHICLE, known_c_rr=0.04).feed(readings)
-    health = run.estimator.health()["calibration"]
-    assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)
-    assert health["known_ground"] > 100
-    assert np.mean([e.c_rr for e in run.between(58, 66) if not e.reason]) == pytest.approx(0.04, abs=0.002)
-
-
-@pytest.mark.slow
 def test_new_calibration_takes_effect_at_a_standstill_only() -> None:
     made = drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(6)], VEHICLE).readings
     run = EstimatorRun(VEHICLE, known_c_rr=0.04).feed(off(made, 0.06))
@@ -376,6 +295,9 @@ def test_new_calibration_takes_effect_at_a_standstill_only() -> None:
     assert np.mean(first) == pytest.approx(0.04 - 0.06 / GRAVITY_MPS2, abs=1e-3)
     assert np.ptp(first) < 2e-3
     assert run.estimator.calibration.passages > 100
+    health = run.estimator.health()["calibration"]
+    assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)
+    assert health["known_ground"] > 100
 
 
 @pytest.mark.slow
@@ -396,7 +318,7 @@ def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", ["kalman", pytest.param("rls", marks=pytest.mark.nightly)])
 def test_a_machine_that_drives_round_and_round_finds_its_zero_and_applies_it_as_it_drives(estimator: str) -> None:
     """At 2 m/s round a circle of 20 m; it never stands again. Where the calibration changes the ground does not."""
     readings = off(drive([STAND, START, Leg(150, turn_radps=0.1)], VEHICLE).readings, 0.06)
@@ -450,37 +372,6 @@ def test_what_is_found_is_handed_on() -> None:
     assert again.calibration.zero == calibration.zero
     assert again.health()["calibration"]["zero"] == calibration.zero
     assert again.health()["calibration"]["passages"] == calibration.passages
-
-
-@pytest.mark.slow
-def test_scale_is_found_on_slopes() -> None:
-    flat, steep = cycles(VEHICLE, 3), cycles(VEHICLE, 3, ahead_rad=0.2)
-    shift = flat[-1].stamp_ns - START_NS + 10**9
-    turned = {r.sensor: r for r in flat if isinstance(r, Encoder)}["wheels"]
-    later = [
-        replace(
-            r,
-            stamp_ns=r.stamp_ns + shift,
-            left_ticks=r.left_ticks + turned.left_ticks,
-            right_ticks=r.right_ticks + turned.right_ticks,
-        )
-        if isinstance(r, Encoder)
-        else replace(r, stamp_ns=r.stamp_ns + shift)
-        for r in steep
-    ]
-    health = EstimatorRun(VEHICLE).feed(off([*flat, *later], 0.03, torque=1.05)).estimator.health()["calibration"]
-    assert health["scale"] == pytest.approx(0.05 / 1.05, abs=0.012)
-    assert health["zero"] == pytest.approx(-0.03 / GRAVITY_MPS2, abs=0.002)
-    assert health["scale_std"] < 0.02
-
-
-@pytest.mark.slow
-def test_nothing_is_learnt_of_moments_that_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    readings = off(cycles(VEHICLE, 1), 0.06)
-    some = EstimatorRun(VEHICLE).feed(readings)
-    monkeypatch.setattr(plausibility, "MIN_SPEED_MPS", 1.9)  # the machine is hardly ever so fast
-    few = EstimatorRun(VEHICLE).feed(readings)
-    assert few.estimator.calibration.passages < some.estimator.calibration.passages
 
 
 # --- options ---------------------------------------------------------------------------------------------------------

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from agents.estimation.calibration import FLOOR, SCALE_STD, ZERO_STD, ZERO_WALK, Calibration, Calibrator
-from agents.estimation.closed_tours import Tour
 from agents.estimation.ground import EstimationConfig
 from agents.estimation.offers import AHEAD_NS, TOO_OLD_NS, Offers, intersected
 from protocol.wire.messages import CalibrationOffer
@@ -128,13 +127,6 @@ def test_an_offer_that_contradicts_what_is_measured_is_refused_and_counted() -> 
     calibrator.take(replace(OFFER, zero=0.006), START_NS)
     assert calibrator.calibration == before
     assert calibrator.counters == {"refused_offer_off": 1}
-
-
-def test_tours_go_on_from_an_offer() -> None:
-    calibrator = own()
-    calibrator.take(OFFER, START_NS)
-    calibrator.add_tour(Tour(START_NS + S, 0.002, 1e-3, 300.0))
-    assert 0.002 < calibrator.calibration.zero < OFFER.zero
 
 
 @pytest.mark.parametrize("seed", range(5))

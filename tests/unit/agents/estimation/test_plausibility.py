@@ -181,8 +181,7 @@ def test_torque_in_a_wrong_unit_is_implausible(gain: float) -> None:
     assert judged.index("torque_implausible") * 0.05 < 25
 
 
-@pytest.mark.parametrize("gain", [0.8, 1.0, 1.25])
-@pytest.mark.parametrize("offset", [-0.03, 0.03])
+@pytest.mark.parametrize(("gain", "offset"), [(0.8, -0.03), (1.25, 0.03)])
 def test_scales_and_zeros_as_sensors_have_them_are_believed(gain: float, offset: float) -> None:
     assert set(reasons(at_work(120, gain, offset))) == {""}
 

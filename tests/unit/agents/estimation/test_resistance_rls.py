@@ -47,35 +47,6 @@ def test_it_is_the_algorithm_of_the_paper() -> None:
         assert squares.variance == pytest.approx(p, rel=1e-9), f"{seed=}"
 
 
-def test_with_one_parameter_it_is_least_squares_with_forgetting() -> None:
-    """The mean with exponential weights, once the start is forgotten."""
-    seed, n, forget = 2, 400, 0.3
-    rng = np.random.default_rng(seed)
-    h, y = rng.uniform(0.5, 1.5, n), 0.05 + 0.01 * rng.standard_normal(n)
-    squares = MultipleForgetting(np.array([1.0]), np.ones(1), np.array([forget]), np.full(1, 1e9))
-    for i in range(n):
-        squares.update(STEP_S, float(h[i] * y[i]), h[i : i + 1])
-    weights = forget ** (STEP_S * np.arange(n)[::-1]) * h**2
-    assert squares.parameters[0] == pytest.approx((weights * y).sum() / weights.sum(), rel=1e-6), f"{seed=}"
-
-
-def test_with_equal_factors_and_separate_excitation_it_is_ordinary_least_squares() -> None:
-    """Where only one regressor is not zero at a time, sharing the denominator changes nothing."""
-    seed, n, forget = 3, 300, 0.8
-    rng = np.random.default_rng(seed)
-    hs = np.where(np.arange(n)[:, None] % 2 == [0, 1], rng.uniform(0.5, 1.5, (n, 2)), 0.0)
-    ys = hs @ [0.3, 0.05] + 0.01 * rng.standard_normal(n)
-    squares = MultipleForgetting(np.zeros(2), np.ones(2), np.full(2, forget), np.full(2, 1e9))
-    P, theta, factor = np.eye(2), np.zeros(2), forget**STEP_S
-    for y, h in zip(ys, hs, strict=True):
-        squares.update(STEP_S, float(y), h)
-        gain = P @ h / (factor + h @ P @ h)
-        theta = theta + gain * (y - h @ theta)
-        P = (P - np.outer(gain, h @ P)) / factor
-    assert squares.parameters == pytest.approx(theta, rel=1e-9), f"{seed=}"
-    assert squares.variance == pytest.approx(np.diag(P), rel=1e-9), f"{seed=}"
-
-
 def test_factors_mean_the_same_at_any_rate() -> None:
     estimates = []
     for dt_s in (0.02, 0.1):
@@ -91,25 +62,6 @@ def test_variance_stays_below_its_bound_without_excitation() -> None:
     for _ in range(1000):
         squares.update(STEP_S, 0.0, np.zeros(2))
     assert squares.variance.tolist() == [3.0, 5.0]
-
-
-def test_a_mass_that_stays_and_a_ground_that_jumps_are_both_followed() -> None:
-    """Parameters with factors of their own: what the paper is about."""
-    seed, scale = 4, 0.1
-    rng = np.random.default_rng(seed)
-    n = round(400 / STEP_S)
-    hs = np.column_stack([0.1 + 0.15 * np.sin(0.3 * np.arange(n)), np.ones(n)])
-    truth = np.where(np.arange(n) // 800 % 2, 0.08, 0.03)  # every 40 s
-    ys = scale * hs[:, 0] + truth + white_noise(0.002, n, rng)
-    squares = MultipleForgetting(np.zeros(2), np.ones(2), np.array([0.999, 0.6]), np.full(2, 1e9))
-    errors = []
-    for i in range(n):
-        squares.update(STEP_S, float(ys[i]), hs[i])
-        if i > n // 2 and i % 800 > 200:  # 10 s after a jump
-            errors.append(squares.parameters - [scale, truth[i]])
-    rms = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert rms[0] < 0.02, f"{seed=}"
-    assert rms[1] < 0.004, f"{seed=}"
 
 
 def test_wrong_mass_is_found_where_forces_vary_faster_than_the_ground() -> None:

@@ -24,14 +24,11 @@ from tests.unit.agents.drives import (
     after,
     drive,
     localiser,
-    noisy,
 )
 
 DOPPLER = SensorConfig("doppler", "gps_velocity", Mount(LEVER_M))
 WITH_DOPPLER = replace(VEHICLE, sensors=(*VEHICLE.sensors, DOPPLER))
 LAYOUT = Layout(imus=1, wheel_scale=True, receivers=1)
-WHEEL_SCALE = LAYOUT.wheel_scales.start
-FILTERS = pytest.mark.parametrize("engine", ["ekf", "ukf"])
 LONG = (*S_BEND, Leg(10), Leg(6, 0, 0.25), Leg(20))
 
 
@@ -65,8 +62,8 @@ def larger_wheels(readings: Sequence[Reading], scale: float) -> list[Reading]:
     ]
 
 
-def end_error_m(vehicle: MachineConfig, made: Drive, readings: Sequence[Reading], engine: str = "ekf") -> float:
-    poses = localiser(vehicle, filter=engine).run(readings)
+def end_error_m(vehicle: MachineConfig, made: Drive, readings: Sequence[Reading]) -> float:
+    poses = localiser(vehicle, filter="ekf").run(readings)
     return math.dist((poses[-1].x_m, poses[-1].y_m), made.at(poses[-1].stamp_ns)[:2])
 
 
@@ -102,38 +99,15 @@ def test_a_stated_error_has_a_least_value_and_a_configured_one_counts_as_it_is()
 # --- in the filter ---------------------------------------------------------------------------------------------------
 
 
-@FILTERS
 @pytest.mark.slow
-def test_it_holds_the_position_while_fixes_are_away_and_the_wheels_are_wrong(engine: str) -> None:
+def test_it_holds_the_position_while_fixes_are_away_and_the_wheels_are_wrong() -> None:
     """A scale that is wrong by a tenth is outside of what the filter takes wheels for before it has seen them."""
     made = drive(LONG, WITH_DOPPLER)
     blind = silenced(larger_wheels(made.readings, 1.1), 20.0)
-    alone = end_error_m(WITH_DOPPLER, made, blind, engine)
-    aided = end_error_m(WITH_DOPPLER, made, merged(blind, doppler(made)), engine)
+    alone = end_error_m(WITH_DOPPLER, made, blind)
+    aided = end_error_m(WITH_DOPPLER, made, merged(blind, doppler(made)))
     assert aided < 1.0
     assert aided < 0.5 * alone
-
-
-@pytest.mark.slow
-def test_it_shows_the_scale_of_the_wheels_sooner_than_fixes_do() -> None:
-    made = drive((Leg(4, 0.5), Leg(8), Leg(4, 0, 0.2), Leg(6)), WITH_DOPPLER)
-    readings = larger_wheels(noisy(made.readings, seed=2), 1.04)
-    off = {}
-    for name, more in (("fixes", []), ("both", doppler(made, std_mps=0.05))):
-        located = localiser(WITH_DOPPLER, filter="ekf")
-        located.run(merged(readings, more))
-        assert located.belief
-        off[name] = (abs(located.belief.x[WHEEL_SCALE] - 0.04), located.belief.P[WHEEL_SCALE, WHEEL_SCALE])
-    assert off["both"][0] < 0.01
-    assert off["both"][1] < 0.25 * off["fixes"][1]
-
-
-@pytest.mark.slow
-def test_ekf_and_ukf_agree() -> None:
-    made = drive(S_BEND, WITH_DOPPLER)
-    readings = merged(noisy(made.readings, seed=3), doppler(made, seed=3, std_mps=0.1))
-    ekf, ukf = (localiser(WITH_DOPPLER, filter=engine).run(readings)[-1] for engine in ("ekf", "ukf"))
-    assert math.dist((ekf.x_m, ekf.y_m), (ukf.x_m, ukf.y_m)) < 0.05
 
 
 @pytest.mark.slow

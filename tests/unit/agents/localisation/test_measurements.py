@@ -86,19 +86,6 @@ def fix_at(attitude: tuple[float, float, float], lever_m: tuple[float, float, fl
     return list(predicted(measurement, x))
 
 
-@pytest.mark.parametrize(
-    ("attitude", "expected"),
-    [
-        ((0.0, 0.0, 0.0), (11.0, 22.0)),
-        ((0.0, 0.0, math.pi / 2), (8.0, 21.0)),  # facing north: ahead is north, left is west
-        ((math.pi / 2, 0.0, 0.0), (11.0, 17.0)),  # on its right side: what was up points right
-        ((0.0, math.pi / 2, 0.0), (13.0, 22.0)),  # nose down: what was up points ahead
-    ],
-)
-def test_antenna_turns_with_the_body(attitude: tuple[float, float, float], expected: tuple[float, float]) -> None:
-    assert fix_at(attitude, (1.0, 2.0, 3.0)) == pytest.approx(expected)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_antenna_is_where_the_rotation_of_the_attitude_puts_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -155,15 +142,6 @@ def test_an_imu_at_rest_on_a_slope_shows_roll_and_pitch_and_no_acceleration(engi
     assert belief.x[[ROLL, PITCH]] == pytest.approx([roll, pitch], abs=0.01)
     assert belief.x[YAW] == pytest.approx(0.0, abs=1e-6)
     assert belief.x[ACCELERATION] == pytest.approx(np.zeros(3), abs=1e-3)
-
-
-def test_an_accelerometer_measures_the_bend_and_its_own_lever_arm() -> None:
-    """At 5 m/s and 0.2 rad/s 1 m/s2 to the left; 2 m ahead of the centre 0.08 m/s2 backwards besides."""
-    x = np.zeros(PAPER.n)
-    x[VELOCITY.start], x[YAW_RATE] = 5.0, 0.2
-    assert predicted(imu(np.zeros(3), np.zeros(3), np.array([2.0, 0.0, 0.0])), x)[3:] == pytest.approx(
-        [-0.08, 1.0, GRAVITY_MPS2]
-    )
 
 
 @pytest.mark.parametrize("seed", range(3))

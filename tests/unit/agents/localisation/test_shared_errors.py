@@ -62,7 +62,7 @@ def test_before_any_fix_the_share_is_what_is_likely_of_receivers() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("receivers", [2, 3])
+@pytest.mark.parametrize("receivers", [2, pytest.param(3, marks=pytest.mark.nightly)])
 def test_over_all_shares_the_mean_is_right_and_better_with_time(receivers: int) -> None:
     """Of shares drawn as the estimator expects them, the mean of what is left is zero: a law of every posterior."""
     true = np.concatenate([np.zeros(20), (np.arange(20) + 0.5) / 20])
@@ -124,6 +124,7 @@ def test_fixes_that_come_late_or_after_a_long_gap_are_no_trouble() -> None:
     assert 0.5 < estimate(gap, 2).share < 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_share_that_changes_is_followed_within_an_hour() -> None:
     errors = np.concatenate([slow_errors(1, 900, 2, 0.95), slow_errors(2, 3600, 2, 0.0)])

@@ -58,7 +58,10 @@ def follow(
             estimator.add_correction(late.pop(0))
 
 
-@pytest.mark.parametrize(("share", "off"), [(0.0, 0.1), (0.5, 0.12), (0.8, 0.05), (0.95, 0.02)])
+@pytest.mark.parametrize(
+    ("share", "off"),
+    [(0.0, 0.1), (0.8, 0.05), *(pytest.param(*row, marks=pytest.mark.nightly) for row in ((0.5, 0.12), (0.95, 0.02)))],
+)
 @pytest.mark.slow
 def test_share_is_found_in_ten_minutes_and_not_overstated(share: float, off: float) -> None:
     shares = []

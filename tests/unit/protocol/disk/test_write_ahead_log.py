@@ -74,21 +74,20 @@ def test_every_flip_before_the_last_transaction_is_damage(tmp_path, db):
     end = len(log_of(tmp_path))
     fill(db, rng, 1)
     log, dropped = log_of(tmp_path), 0
-    for _ in range(150):
+    for _ in range(60):
         at = rng.randrange(end)
         bad = flipped(log, at, rng.randrange(8))
         held = scan(bad)
         assert held.damaged_at is not None, at
         assert held.damaged_at <= at
         dropped += recovered_rows(tmp_path, bad) < 16
-    assert dropped == 150, "SQLite itself says nothing, and drops rows each time"
+    assert dropped == 60, "SQLite itself says nothing, and drops rows each time"
 
 
-@pytest.mark.parametrize("at", range(HEADER))
-def test_a_flip_in_the_header_is_damage(tmp_path, db, at):
+def test_a_flip_in_the_header_is_damage(tmp_path, db):
     fill(db, random.Random(3), 4)
-    for bit in range(8):
-        held = scan(flipped(log_of(tmp_path), at, bit))
+    for at in range(HEADER):
+        held = scan(flipped(log_of(tmp_path), at, at % 8))
         assert (held.recovered, held.damaged_at) == (0, 0)
         assert held.frames > 4
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.errors import QueryError, Refusal
+from protocol.errors import QueryError
 from protocol.queries.parameters import selector_of, split_selector
-from protocol.queries.places import MAX_CORNERS, MAX_PLACES, check_outline
+from protocol.queries.places import MAX_CORNERS, check_outline
 from protocol.queries.requests import Freshness, PointsQuery, RegionQuery, When, encode_query, parse_query
 from protocol.queries.route_requests import RouteQuery
 from protocol.queries.routing import MACHINES, NamedMachine, machine_of
@@ -90,48 +90,6 @@ def touch(a, b, c, d) -> bool:
 
     apart = turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
     return apart or on(a, b, c) or on(a, b, d) or on(c, d, a) or on(c, d, b)
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "reason", "words"),
-    [
-        ("points", {}, Refusal.MISSING_FIELD, "`places` is missing"),
-        ("points", {"places": "1,2,3"}, Refusal.OUT_OF_RANGE, "`places`: 3 numbers"),
-        ("points", {"places": "1,nan"}, Refusal.NOT_FINITE, "`places`"),
-        ("points", {"places": "1,x"}, Refusal.WRONG_TYPE, "`places`"),
-        ("points", {"places": ",".join(["1"] * (2 * MAX_PLACES + 2))}, Refusal.TOO_LARGE, "10001 places, over 10000"),
-        ("points", {"places": "1,2", "bounds": "0,0,1,1"}, Refusal.UNKNOWN_PARAMETER, "`bounds`"),
-        ("region", {"polygon": "0,0,1,1"}, Refusal.OUT_OF_RANGE, "2 corners; an outline has at least three"),
-        ("region", {"polygon": "0,0,1,1,2"}, Refusal.OUT_OF_RANGE, "`polygon`: 5 numbers"),
-        (
-            "region",
-            {"polygon": "0,0,9,9,9,0,0,9"},
-            Refusal.OUT_OF_RANGE,
-            "sides from corners 1 and 3 on cross each other",
-        ),
-        ("region", {"polygon": "0,0,9,0,5,0,5,5"}, Refusal.OUT_OF_RANGE, "turns back on itself at corner 2"),
-        ("region", {"polygon": "0,0,9,0,9,0,5,5"}, Refusal.OUT_OF_RANGE, "corners 2 and 3 are the same"),
-        ("region", {"polygon": "0,0,9,0,9,5,0,0"}, Refusal.OUT_OF_RANGE, "corners 4 and 1 are the same"),
-        ("region", {"polygon": "0,0,inf,0,9,5"}, Refusal.NOT_FINITE, "`polygon`"),
-        ("region", {"polygon": "1,2," * MAX_CORNERS + "1,2"}, Refusal.TOO_LARGE, f"over {MAX_CORNERS}"),
-        ("region", {"polygon": "0,0,9,0,9,5", "bounds": "0,0,1,1"}, Refusal.OUT_OF_RANGE, "given with `bounds`"),
-        ("region", {"bounds": "0,0,1,1", "resolution": "0"}, Refusal.OUT_OF_RANGE, "`resolution`: 0 m"),
-        ("region", {"bounds": "0,0,1,1", "resolution": "2000"}, Refusal.OUT_OF_RANGE, "`resolution`: 2000 m"),
-        ("region", {"bounds": "0,0,1,1", "resolution": "nan"}, Refusal.NOT_FINITE, "`resolution`"),
-        ("route", {"line": "0,0,9,9", "machine": "No Name"}, Refusal.OUT_OF_RANGE, "`machine`: 'No Name' is no name"),
-        (
-            "route",
-            {"line": "0,0,9,9", "machine": "truck-1", "mass": "0"},
-            Refusal.OUT_OF_RANGE,
-            "`mass`: 0 is not positive",
-        ),
-        ("route", {"line": "0,0,9,9", "machine": "truck-1", "efficiency": "2"}, Refusal.OUT_OF_RANGE, "`efficiency`"),
-    ],
-)
-def test_what_is_no_place_or_outline_is_refused_by_name(name, parameters, reason, words):
-    with pytest.raises(QueryError, match=words) as caught:
-        parse_query(name, parameters)
-    assert caught.value.reason == reason
 
 
 def test_no_places_and_no_numbers_are_refused_where_a_query_is_made():

@@ -1,10 +1,10 @@
 import math
 import re
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import MessageError, QueryError, Refusal
@@ -110,6 +110,8 @@ def test_a_command_without_reason_and_wait_is_complete():
     ],
 )
 def test_bad_command_is_refused_by_name(parameters, reason, words):
+    with pytest.raises(QueryError, match="command `shutdown` is not known; known: trust, accept"):
+        parse_command("shutdown", {})
     with pytest.raises(QueryError) as caught:
         parse_command("trust", parameters)
     assert caught.value.reason == reason
@@ -130,12 +132,6 @@ def test_a_store_is_accepted_by_its_id_and_with_a_reason():
         assert caught.value.reason == reason
 
 
-def test_unknown_command_is_refused():
-    with pytest.raises(QueryError, match="command `shutdown` is not known; known: trust, accept") as caught:
-        parse_command("shutdown", {})
-    assert caught.value.reason == Refusal.UNKNOWN_QUERY
-
-
 def test_what_divides_parameters_survives_in_a_text():
     assert quoted("a;b=c %&?#/é") == "a%3Bb%3Dc%20%25%26%3F%23%2F%C3%A9"
     assert split_selector("a=1;b=x=y;c;;d=") == {"a": "1", "b": "x=y", "c": "", "d": ""}
@@ -149,75 +145,6 @@ def test_bounds_of_an_answer_can_be_asked_again():
     assert parse_query("region", encode_query(query)).bounds == Bounds(0.0, -1.0, 2.0, 0.0)
     point = PointQuery(np.float64(1.5), np.float32(0.5))
     assert parse_query("point", encode_query(point)) == PointQuery(1.5, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "reason", "words"),
-    [
-        ("weather", {}, Refusal.UNKNOWN_QUERY, "weather"),
-        ("point", {"x": "1", "y": "2", "colour": "red"}, Refusal.UNKNOWN_PARAMETER, "colour"),
-        ("info", {"layers": "resistance"}, Refusal.UNKNOWN_PARAMETER, "layers"),
-        ("region", {"bounds": "0,0,1,1", "x": "1"}, Refusal.UNKNOWN_PARAMETER, "`x`"),
-        ("point", {"x": "1"}, Refusal.MISSING_FIELD, "`y`"),
-        ("point", {"x": "here", "y": "2"}, Refusal.WRONG_TYPE, "`x`"),
-        ("point", {"x": "", "y": "2"}, Refusal.WRONG_TYPE, "`x`"),
-        ("point", {"x": "nan", "y": "2"}, Refusal.NOT_FINITE, "`x`"),
-        ("point", {"x": "1", "y": "-inf"}, Refusal.NOT_FINITE, "`y`"),
-        ("point", {"x": "1e16", "y": "0"}, Refusal.NOT_FINITE, "`x`"),
-        ("changed", {}, Refusal.UNKNOWN_QUERY, "changed"),  # events are heard there
-        ("history", {"x": "0", "y": "0", "as_of": "1"}, Refusal.UNKNOWN_PARAMETER, "as_of"),
-        ("machines", {"machine": "a"}, Refusal.UNKNOWN_PARAMETER, "machine"),
-        ("changes", {"wait": "1"}, Refusal.UNKNOWN_PARAMETER, "wait"),
-        ("changes", {"after": "-1"}, Refusal.OUT_OF_RANGE, "after"),
-        ("changes", {"after": "0.5"}, Refusal.OUT_OF_RANGE, "after"),
-        ("point", {"x": "1", "y": "2", "as_of": "1.5"}, Refusal.WRONG_TYPE, "as_of"),
-        ("point", {"x": "1", "y": "2", "as_of": ""}, Refusal.WRONG_TYPE, "as_of"),
-        ("point", {"x": "1", "y": "2", "as_of": "-1"}, Refusal.WRONG_TYPE, "as_of"),
-        ("point", {"x": "1", "y": "2", "as_of": "0"}, Refusal.OUT_OF_RANGE, "as_of"),
-        ("point", {"x": "1", "y": "2", "as_of": str(MAX_STAMP_NS + 1)}, Refusal.OUT_OF_RANGE, "as_of"),
-        ("point", {"x": "1", "y": "2", "as_of": "9" * 5000}, Refusal.OUT_OF_RANGE, "as_of"),
-        ("region", {"bounds": "0,0,1,1", "minus": "-2h"}, Refusal.WRONG_TYPE, "minus"),
-        ("region", {"bounds": "0,0,1,1", "minus": "0"}, Refusal.OUT_OF_RANGE, "minus"),
-        ("history", {"x": "1"}, Refusal.MISSING_FIELD, "`y`"),
-        ("history", {"x": "1", "y": "2", "from": "2", "to": "1"}, Refusal.OUT_OF_RANGE, "`from`"),
-        ("history", {"x": "1", "y": "2", "from": "x"}, Refusal.WRONG_TYPE, "`from`"),
-        ("history", {"x": "1", "y": "2", "to": "0"}, Refusal.OUT_OF_RANGE, "`to`"),
-        ("history", {"x": "1", "y": "2", "span": "0.5"}, Refusal.OUT_OF_RANGE, "`span`"),
-        ("history", {"x": "1", "y": "2", "span": "1e10"}, Refusal.OUT_OF_RANGE, "`span`"),
-        ("history", {"x": "1", "y": "2", "span": "nan"}, Refusal.NOT_FINITE, "`span`"),
-        ("region", {}, Refusal.MISSING_FIELD, "bounds"),
-        ("region", {"bounds": "0,0,1"}, Refusal.MISSING_FIELD, "bounds"),
-        ("region", {"bounds": "0,0,1,1,1"}, Refusal.MISSING_FIELD, "bounds"),
-        ("region", {"bounds": "0,0,nan,1"}, Refusal.NOT_FINITE, "bounds"),
-        ("region", {"bounds": "1,0,0,1"}, Refusal.OUT_OF_RANGE, "west"),
-        ("region", {"bounds": "0,1,1,1"}, Refusal.OUT_OF_RANGE, "south"),
-        ("info", {"after": "-1"}, Refusal.OUT_OF_RANGE, "after"),
-        ("info", {"after": "1.5"}, Refusal.OUT_OF_RANGE, "after"),
-        ("info", {"after": "soon"}, Refusal.WRONG_TYPE, "after"),
-        ("info", {"after": "1", "wait": "61"}, Refusal.OUT_OF_RANGE, "wait"),
-        ("info", {"after": "1", "wait": "-1"}, Refusal.OUT_OF_RANGE, "wait"),
-    ],
-)
-def test_bad_query_is_refused_by_name(name, parameters, reason, words):
-    with pytest.raises(QueryError) as caught:
-        parse_query(name, parameters)
-    assert caught.value.reason == reason
-    assert words in str(caught.value)
-
-
-NAMES = ["x", "y", "bounds", "layers", "as_of", "minus", "from", "to", "span", "after", "wait"]
-
-
-@settings(max_examples=40)
-@given(
-    st.sampled_from(["point", "region", "history", "machines", "changes", "info", "x"]),
-    st.dictionaries(st.sampled_from(NAMES) | st.text(max_size=3), st.text() | st.integers().map(str)),
-)
-def test_any_parameters(name, parameters):
-    try:
-        parse_query(name, parameters)
-    except QueryError as error:
-        assert error.reason in set(Refusal)  # noqa: PT017 - any outcome but another error is right
 
 
 @given(
@@ -411,11 +338,11 @@ def test_fields_of_a_newer_server_are_ignored():
     assert codec.decode_info(codec.encode_info({**asdict(INFO), "site": site, "load": 0.5})) == INFO
 
 
-@pytest.mark.parametrize("name", [item.name for item in fields(answers.MapInfo)])
-def test_info_without_a_field_is_refused(name):
-    table = {key: value for key, value in asdict(INFO).items() if key != name}
-    with pytest.raises(MessageError, match=f"info.{name}: missing"):
-        codec.decode_info(codec.encode_info(table))
+def test_info_without_a_field_is_refused():
+    for name in asdict(INFO):
+        table = {key: value for key, value in asdict(INFO).items() if key != name}
+        with pytest.raises(MessageError, match=f"info.{name}: missing"):
+            codec.decode_info(codec.encode_info(table))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -30,14 +31,9 @@ def test_scale_is_one_at_the_origin_and_near_it():
     projection, geod = Projection(PAPER), Geod(ellps="WGS84")
     for x, y in [(100.0, 0.0), (0.0, 100.0), (-70.0, 70.0)]:
         lat, lon, _ = projection.to_geodetic(x, y)
-        _, _, metres = geod.inv(8.4, 49.0, lon, lat)
+        azimuth, _, metres = geod.inv(8.4, 49.0, lon, lat)
         assert metres == pytest.approx(math.hypot(x, y), abs=1e-4)
-
-
-def test_east_and_north_grow_as_they_should():
-    projection = Projection(PAPER)
-    assert projection.to_map(49.0, 8.401, 110.0)[0] == pytest.approx(73.2, abs=0.5)
-    assert projection.to_map(49.001, 8.4, 110.0)[1] == pytest.approx(111.2, abs=0.5)
+        assert azimuth == pytest.approx(math.degrees(math.atan2(x, y)), abs=1e-3)
 
 
 @pytest.mark.parametrize("change", [{"origin_lat_deg": 49.0001}, {"origin_lon_deg": 8.5}, {"origin_height_m": 0.0}])
@@ -47,17 +43,13 @@ def test_frame_tells_origins_apart(change):
 
 @pytest.mark.parametrize("change", [{"name": "other"}, {"cell_m": 0.5}, {"extent_m": 99.0}, {"clock": "wall"}])
 def test_frame_depends_on_nothing_else(change):
+    assert re.fullmatch("[0-9a-f]{8}", PAPER.frame)
     assert dataclasses.replace(PAPER, **change).frame == PAPER.frame
 
 
 @pytest.mark.parametrize("number", [int, np.float64, np.int64])
 def test_frame_does_not_depend_on_the_type_of_a_number(number):
     assert SiteConfig("s", number(49), number(8), number(110)).frame == SiteConfig("s", 49.0, 8.0, 110.0).frame
-
-
-def test_frame_is_eight_hex_digits():
-    assert len(PAPER.frame) == 8
-    int(PAPER.frame, 16)
 
 
 @pytest.mark.parametrize(
@@ -113,8 +105,8 @@ HOOK = KnownGround("hook", 0.012, ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (6.0, 9.0
 )
 def test_how_far_inside_of_known_ground_a_place_is(area, place, metres):
     assert area.inside_m(*place) == pytest.approx(metres)
-    backwards = dataclasses.replace(area, outline=area.outline[::-1])
-    assert backwards.inside_m(*place) == pytest.approx(metres)
+    for same in (area.outline[::-1], (*area.outline, area.outline[0])):
+        assert dataclasses.replace(area, outline=same).inside_m(*place) == pytest.approx(metres)
 
 
 @given(st.floats(-20, 30), st.floats(-20, 30))
@@ -123,12 +115,6 @@ def test_known_ground_has_the_same_inside_as_its_parts(x, y):
     inside = (0 < x < 9 and 0 < y < 3) or (6 < x < 9 and 0 < y < 9)
     if abs(HOOK.inside_m(x, y)) > 1e-6:
         assert (HOOK.inside_m(x, y) > 0) == inside
-
-
-def test_outline_that_repeats_its_first_corner_is_the_same():
-    closed = dataclasses.replace(SQUARE, outline=(*SQUARE.outline, SQUARE.outline[0]))
-    for place in ((5.0, 4.0), (12.0, 5.0), (-3.0, -3.0)):
-        assert closed.inside_m(*place) == pytest.approx(SQUARE.inside_m(*place))
 
 
 @pytest.mark.parametrize(
@@ -152,7 +138,3 @@ def test_known_ground_of_a_site_file(tmp_path):
     path.write_text(f"{head}known_ground = [{area.replace('c_rr', 'crr')}]\n")
     with pytest.raises(ConfigError, match="crr"):
         load_site(path)
-
-
-def test_frame_does_not_depend_on_known_ground():
-    assert dataclasses.replace(PAPER, known_ground=(SQUARE,)).frame == PAPER.frame

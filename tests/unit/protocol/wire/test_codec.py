@@ -1,4 +1,6 @@
 import dataclasses
+import itertools
+import math
 import struct
 
 import msgpack
@@ -9,9 +11,8 @@ from hypothesis import strategies as st
 
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, Encoder, Imu, columns
-from protocol.machine.samples import COLUMNS, OPTIONAL, SAMPLE_DTYPE, empty
+from protocol.machine.samples import COLUMNS, LIMITS, OPTIONAL, SAMPLE_DTYPE, empty
 from protocol.queries import answer_codec as answers
-from protocol.queries.answers import PointAnswer, Region
 from protocol.wire import codec, correction_codec, keys
 from protocol.wire.codec import decode_batch, encode_batch
 from protocol.wire.messages import Ack, Health, Pose, Refused, SampleBatch, SensorBundle
@@ -54,18 +55,12 @@ def refusal(data: bytes, decode=lambda data: decode_batch(data, EXTENT_M)) -> Me
 # --- one clear error for each kind of bad batch ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("keep", [0, 1, 10, 100, 200])
-def test_truncated_batch_is_refused(keep):
-    assert refusal(changed()[:keep]).reason is Refusal.NOT_MSGPACK
-
-
-def test_trailing_bytes_are_refused():
-    assert refusal(changed() + b"\x00").reason is Refusal.NOT_MSGPACK
-
-
-@pytest.mark.parametrize("data", [b"\xc0", b"\x93\x01\x02\x03", b"\xa3abc", msgpack.packb(1.5)])
-def test_what_is_no_map_is_refused(data):
+@pytest.mark.parametrize(
+    "data", [b"", changed()[:10], changed()[:-1], changed() + b"\x00", b"\xc0", b"\x93\x01\x02\x03", b"\xa3abc"]
+)
+def test_what_is_cut_off_goes_on_or_is_no_map_is_refused(data):
     assert refusal(data).reason is Refusal.NOT_MSGPACK
+    assert refusal(bytes(10 * 2**20)).reason is Refusal.TOO_LARGE, "and unread"
 
 
 @pytest.mark.parametrize(
@@ -97,6 +92,7 @@ def test_what_is_no_map_is_refused(data):
         ({"cols": []}, Refusal.WRONG_TYPE, "cols"),
         ({"cols": {}}, Refusal.MISSING_FIELD, "stamp_ns"),
         ({"cols": {"stamp_ns": "text"}}, Refusal.WRONG_TYPE, "stamp_ns"),
+        ({"cols": msgpack.unpackb(changed())["cols"] | {"applied_zero": 0.001}}, Refusal.WRONG_TYPE, "applied_zero"),
     ],
 )
 def test_wrong_field_is_named(fields, reason, field):
@@ -106,7 +102,7 @@ def test_wrong_field_is_named(fields, reason, field):
 
 
 @pytest.mark.parametrize("column", COLUMNS)
-@pytest.mark.parametrize("change", [-8, -1, 1, 8])
+@pytest.mark.parametrize("change", [-1, 8])
 def test_column_of_another_length_is_named(column, change):
     cols = msgpack.unpackb(changed())["cols"]
     cols[column] = cols[column][:change] if change < 0 else cols[column] + bytes(change)
@@ -114,48 +110,30 @@ def test_column_of_another_length_is_named(column, change):
     assert (error.reason, error.field) == (Refusal.COLUMN_LENGTH, f"cols.{column}")
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "reason"),
-    [
-        ("stamp_ns", 0, Refusal.OUT_OF_RANGE),
-        ("stamp_ns", -5, Refusal.OUT_OF_RANGE),
-        ("x_m", np.nan, Refusal.NOT_FINITE),
-        ("y_m", np.inf, Refusal.NOT_FINITE),
-        ("x_m", 1e6, Refusal.OUTSIDE_SITE),
-        ("y_m", -1e6, Refusal.OUTSIDE_SITE),
-        ("cov_xx_m2", -1.0, Refusal.COVARIANCE),
-        ("cov_yy_m2", -1e-6, Refusal.COVARIANCE),
-        ("cov_xx_m2", np.nan, Refusal.NOT_FINITE),
-        ("cov_xy_m2", 2.0, Refusal.COVARIANCE),
-        ("cov_xy_m2", -2.0, Refusal.COVARIANCE),
-        ("cov_xx_m2", 0.0, Refusal.COVARIANCE),
-        ("heading_rad", 8.0, Refusal.OUT_OF_RANGE),
-        ("heading_rad", np.nan, Refusal.NOT_FINITE),
-        ("speed_mps", -np.inf, Refusal.NOT_FINITE),
-        ("distance_m", -0.1, Refusal.OUT_OF_RANGE),
-        ("c_rr", np.nan, Refusal.NOT_FINITE),
-        ("c_rr", np.inf, Refusal.NOT_FINITE),
-        ("c_rr", 6.0, Refusal.OUT_OF_RANGE),
-        ("c_rr_var", np.nan, Refusal.NOT_FINITE),
-        ("c_rr_var", -1.0, Refusal.OUT_OF_RANGE),
-        ("grade_e", np.nan, Refusal.NOT_FINITE),
-        ("grade_n", -6.0, Refusal.OUT_OF_RANGE),
-        ("grade_var", np.inf, Refusal.NOT_FINITE),
-        ("applied_zero", np.nan, Refusal.NOT_FINITE),
-        ("applied_zero", 0.201, Refusal.OUT_OF_RANGE),
-        ("applied_scale", -np.inf, Refusal.NOT_FINITE),
-        ("applied_scale", -0.51, Refusal.OUT_OF_RANGE),
-        ("mass_kg", np.inf, Refusal.NOT_FINITE),
-        ("mass_kg", 0.0, Refusal.OUT_OF_RANGE),
-        ("mass_kg", 1.1e6, Refusal.OUT_OF_RANGE),
-    ],
-)
-def test_bad_value_is_named_with_its_row(column, value, reason):
-    error = refusal(with_value(column, 3, value))
-    assert (error.reason, error.row) == (reason, 3)
-    partner = {"cov_xx_m2": "cov_xy_m2", "c_rr_var": "c_rr"}  # named for the pair
-    assert error.field in (column, partner.get(column))
-    assert f"{error.field}[3]" in str(error)
+GROUPED = {"c_rr_var": "c_rr", "grade_n": "grade_e", "grade_var": "grade_e"}  # NaN together, or not at all
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_bad_value_is_named_with_its_row(column):
+    low, high = LIMITS.get(column, (-EXTENT_M, EXTENT_M))
+    beyond = {"x": Refusal.OUTSIDE_SITE, "y": Refusal.OUTSIDE_SITE, "cov": Refusal.COVARIANCE}.get(
+        column.split("_")[0], Refusal.OUT_OF_RANGE
+    )
+    bad = [(0, beyond), (-5, beyond)] if column == "stamp_ns" else [(low - 0.1, beyond), (1.01 * high + 1, beyond)]
+    bad += [(-np.inf, Refusal.NOT_FINITE)] * (column != "stamp_ns")
+    for value, reason in bad:
+        error = refusal(with_value(column, 3, value))
+        assert (error.reason, error.row, error.field) == (reason, 3, column), value
+        assert f"{column}[3]" in str(error)
+    if column not in ("stamp_ns", "mass_kg"):
+        error = refusal(with_value(column, 3, np.nan))
+        assert (error.reason, error.row, error.field) == (Refusal.NOT_FINITE, 3, GROUPED.get(column, column))
+
+
+def test_covariance_that_is_none_and_a_place_far_away_are_refused_in_one_line():
+    for column, value in (("cov_xy_m2", 2.0), ("cov_xy_m2", -2.0), ("cov_xx_m2", 0.0)):
+        assert refusal(with_value(column, 3, value)).field == "cov_xy_m2"
+    assert str(refusal(with_value("x_m", 0, 1e6))) == "x_m[0]: 1000000.0: beyond 20000 m of the origin"
 
 
 @pytest.mark.parametrize("missing", [("applied_zero",), ("applied_scale",), ("mass_kg",), tuple(OPTIONAL)])
@@ -167,24 +145,6 @@ def test_a_calibration_that_is_not_stated_is_none_and_a_mass_unknown(missing, ni
         expected[name] = {"applied_zero": 0.0, "applied_scale": 0.0, "mass_kg": np.nan}[name]
     got = decode_batch(changed(cols=cols | (dict.fromkeys(missing) if nil else {})), EXTENT_M)
     assert got.rows.tobytes() == expected.tobytes()
-
-
-def test_a_calibration_that_is_no_column_is_refused():
-    cols = {**msgpack.unpackb(changed())["cols"], "applied_zero": 0.001}
-    assert (refusal(changed(cols=cols)).reason, refusal(changed(cols=cols)).field) == (
-        Refusal.WRONG_TYPE,
-        "applied_zero",
-    )
-
-
-def test_ten_megabytes_are_refused_unread():
-    error = refusal(bytes(10 * 2**20))
-    assert error.reason is Refusal.TOO_LARGE
-
-
-def test_position_a_thousand_kilometres_away_is_refused_in_one_line():
-    error = refusal(with_value("x_m", 0, 1_000_000.0))
-    assert str(error) == "x_m[0]: 1000000.0: beyond 20000 m of the origin"
 
 
 def test_row_count_of_a_message_reserves_no_memory():
@@ -330,15 +290,12 @@ def test_malformed_bundle_is_refused_whole(fields, reason, field):
     assert (error.reason, error.field) == (reason, field)
 
 
-def test_bundle_counter_starts_at_one():
+def test_bundle_has_a_counter_from_one_on_and_groups_that_are_maps():
     data = codec.encode_bundle(SensorBundle("m-1", 0, ()))
     assert refusal(data, codec.decode_bundle).field == "counter"
-
-
-@pytest.mark.parametrize("group", [1, [], "x", None])
-def test_group_that_is_no_map_is_refused(group):
-    data = codec.pack({"machine": "m-1", "counter": 1, "sensors": [group]})
-    assert refusal(data, codec.decode_bundle).field == "sensors"
+    for group in (1, [], None):
+        data = codec.pack({"machine": "m-1", "counter": 1, "sensors": [group]})
+        assert refusal(data, codec.decode_bundle).field == "sensors"
 
 
 @pytest.mark.parametrize(
@@ -379,18 +336,11 @@ def test_correction_of_any_length_but_its_own_is_refused(golden):
 def test_live_messages_carry_a_plausible_stamp(stamp):
     pose = Pose("m-1", stamp, *[0.0] * 7)
     assert refusal(codec.encode_pose(pose), codec.decode_pose).field == "stamp_ns"
-    if stamp:  # the health of an agent that has read nothing yet carries 0
-        assert refusal(codec.encode_health(Health("m-1", stamp, {})), codec.decode_health).field == "stamp_ns"
-
-
-def test_agent_that_has_read_nothing_shows_its_health():
-    waiting = Health("m-1", 0, {"readings": 0})
-    assert codec.decode_health(codec.encode_health(waiting)) == waiting
-
-
-def test_pose_that_is_nowhere_is_refused():
-    error = refusal(codec.encode_pose(Pose("m-1", T0, float("nan"), *[0.0] * 6)), codec.decode_pose)
-    assert (error.reason, error.field) == (Refusal.NOT_FINITE, "x_m")
+    health = Health("m-1", stamp, {"readings": 0})
+    if stamp:
+        assert refusal(codec.encode_health(health), codec.decode_health).field == "stamp_ns"
+    else:  # an agent that has read nothing yet
+        assert codec.decode_health(codec.encode_health(health)) == health
 
 
 @pytest.mark.parametrize(
@@ -399,6 +349,7 @@ def test_pose_that_is_nowhere_is_refused():
         ({}, "m-2", Refusal.WRONG_MACHINE, "machine"),
         ({}, "*", Refusal.WRONG_MACHINE, "machine"),
         ({"x_m": 100.1}, "m-1", Refusal.OUT_OF_RANGE, "x_m"),
+        ({"x_m": math.nan}, "m-1", Refusal.NOT_FINITE, "x_m"),
         ({"heading_rad": 8.0}, "m-1", Refusal.OUT_OF_RANGE, "heading_rad"),
         ({"cov_yy_m2": 1e7}, "m-1", Refusal.OUT_OF_RANGE, "cov_yy_m2"),
         ({"cov_xy_m2": 0.3}, "m-1", Refusal.COVARIANCE, "cov_xy_m2"),
@@ -425,20 +376,16 @@ DECODERS = {
     "info": answers.decode_info,
     "error": answers.decode_error,
 }
-RECORDS = (SampleBatch, Ack, Refused, SensorBundle, Pose, Health, PointAnswer, Region)
-FIELDS = ["v", "n", "cols", "ack", "sensors", "sensor", "kind", "info", "columns", "rows", "west_m", "south_m"]
-FIELDS += sorted({field.name for record in RECORDS for field in dataclasses.fields(record)} - {*FIELDS})
-plain = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5)
-plain |= st.binary(max_size=16) | st.sampled_from(["m-1", "encoder", 1, 0])
-wild = st.recursive(
-    plain,
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.dictionaries(st.sampled_from([*FIELDS, *COLUMNS]) | st.binary(max_size=3), inner, max_size=6)
-    ),
-    max_leaves=12,
+WILD = (
+    b"\x91" * 5000 + b"\xc0",  # lists in lists
+    b"\x81\xa1a" * 5000 + b"\xc0",  # maps in maps
+    b"\xc7\x0c\xff" + b"\xff" * 12,  # a time stamp that is none
+    b"\xd4\x05\x00",  # an extension type
+    b"\xd6\xff" + bytes(4),  # a time stamp
+    b"\xa2\xff\xfe",  # no UTF-8
+    b"\x81\x91\x01\x01",  # a list as a key
+    b"\xc1",  # never used
 )
-messages = st.fixed_dictionaries({"v": st.just(1)}, optional=dict.fromkeys(FIELDS[1:], wild))
 
 
 def attempt(decode, data: bytes) -> None:
@@ -448,38 +395,9 @@ def attempt(decode, data: bytes) -> None:
         assert isinstance(error.reason, Refusal)  # noqa: PT017 - any outcome but another error is right
 
 
-@settings(max_examples=200)
-@given(st.binary(max_size=200))
-def test_any_bytes(data):
-    for decode in DECODERS.values():
-        attempt(decode, data)
-
-
-@pytest.mark.slow
-@settings(max_examples=200)
-@given(messages)
-def test_any_message(message):
-    data = msgpack.packb(message)
-    for decode in DECODERS.values():
-        attempt(decode, data)
-
-
 @pytest.mark.parametrize("name", DECODERS)
-@pytest.mark.parametrize(
-    "inside",
-    [
-        b"\x91" * 5000 + b"\xc0",  # lists in lists
-        b"\x81\xa1a" * 5000 + b"\xc0",  # maps in maps
-        b"\xc7\x0c\xff" + b"\xff" * 12,  # a time stamp that is none
-        b"\xd4\x05\x00",  # an extension type
-        b"\xd6\xff" + bytes(4),  # a time stamp
-        b"\xa2\xff\xfe",  # no UTF-8
-        b"\x81\x91\x01\x01",  # a list as a key
-        b"\xc1",  # never used
-    ],
-)
-def test_wild_content(name, inside):
-    for field in FIELDS[1:]:
+def test_wild_content(name):
+    for field, inside in itertools.product(("machine", "cols", "sensors", "layers", "site"), WILD):
         attempt(DECODERS[name], b"\x82\xa1v\x01" + msgpack.packb(field) + inside)
 
 
@@ -492,21 +410,6 @@ def test_flipped_bits_of_valid_messages(golden, name):
             flipped = bytearray(data)
             flipped[bit // 8] ^= 1 << bit % 8
             attempt(DECODERS[name], bytes(flipped))
-
-
-@given(st.integers(0, 8 * 426 - 1), st.integers(0, 8 * 426 - 1))
-def test_flipped_bits_of_a_batch_with_samples(golden, one, other):
-    data = bytearray(golden.GOLDEN["batch.bin"].encode(golden.BATCH))
-    for bit in (one, other):
-        data[bit // 8] ^= 1 << bit % 8
-    attempt(DECODERS["batch"], bytes(data))
-
-
-def test_every_prefix_of_a_message_is_refused(golden):
-    for entry in golden.GOLDEN.values():
-        data = entry.encode(entry.record)
-        for end in range(0, len(data), 7):
-            refusal(data[:end], entry.decode)
 
 
 def test_a_number_beyond_64_bits_is_the_greatest_and_anything_else_is_refused():

@@ -1,51 +1,17 @@
-import itertools
 import math
-from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
 from sim.operators.driver import bend
 from sim.scenario.ground import build_terrain
-from sim.scenario.tables import Scenario
-from sim.simulator import Simulator
-from sim.state import FleetState, stack
-
-EVERY = 10  # steps between two states that are kept
-
-
-@dataclass(frozen=True)
-class Driven:
-    """What happened: states (k, n, ...), payloads (k, n), and how far from its route each joint was (k, n) [m]."""
-
-    scenario: Scenario
-    states: FleetState
-    payload_kg: Floats
-    off_m: Floats
-    joint_m: Floats
-
-
-def drive(config: SimConfig, seconds: float) -> Driven:
-    with closing(Simulator(config)) as simulator:
-        states, payloads, off, joints = [], [], [], []
-        lines = [np.vstack([leg.points for leg in route.legs]) for route, _, _ in simulator.scenario.journeys()]
-        for i in range(round(seconds * 100)):
-            state = simulator.step()
-            if i % EVERY:
-                continue
-            joint = simulator._crew.joint_m(state)
-            states.append(state)
-            payloads.append(simulator._drivers.payload_kg)
-            joints.append(joint)
-            if i % 50 == 0:
-                off.append([np.hypot(*(line - at).T).min() for line, at in zip(lines, joint, strict=True)])
-        return Driven(simulator.scenario, stack(states), np.array(payloads), np.array(off), np.array(joints))
+from sim.state import FleetState
+from tests.unit.sim.drives import Driven, drive
 
 
 @cache
@@ -66,12 +32,6 @@ def loading() -> Driven:
     return drive(SimConfig(scenario="loading", world="fast", seed=1), 450.0)
 
 
-def nearest_m(driven: Driven) -> float:
-    """The least distance between the joints of two machines."""
-    pairs = itertools.combinations(np.moveaxis(driven.joint_m, 1, 0), 2)
-    return min(float(np.hypot(*(one - other).T).min()) for one, other in pairs)
-
-
 @pytest.mark.parametrize("steer", [0.1, -0.4, 0.6])
 @pytest.mark.parametrize(("rear", "front"), [(1.65, 1.65), (3.0, 1.2)])
 def test_bend_is_the_articulation_of_the_joints_circle(steer: float, rear: float, front: float) -> None:
@@ -81,7 +41,7 @@ def test_bend_is_the_articulation_of_the_joints_circle(steer: float, rear: float
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("world", ["pybullet", "fast"])
+@pytest.mark.parametrize("world", [pytest.param("pybullet", marks=pytest.mark.nightly), "fast"])
 def test_nobody_gets_stuck_or_lost(world: str) -> None:
     driven = paper(world)
     states = driven.states
@@ -96,18 +56,8 @@ def test_nobody_gets_stuck_or_lost(world: str) -> None:
 
 
 @pytest.mark.slow
-def test_three_machines_see_all_zones_and_the_slope() -> None:
-    driven = paper("fast")
-    x, y, metres = driven.states.x_m, driven.states.y_m, abs(driven.states.speed_mps) * 0.1
-    zones = build_terrain(driven.scenario.ground, 5).zone(x, y)
-    assert np.bincount(zones.ravel(), metres.ravel(), minlength=5).min() > 80
-    (ramp,) = driven.scenario.ground.ramp
-    assert metres[(x > ramp.foot_m[0]) & (x < ramp.top_m[0])].sum() > 80
-
-
-@pytest.mark.slow
 def test_drivers_keep_their_speed_and_slow_down_in_curves() -> None:
-    states = paper("pybullet").states
+    states = paper("fast").states
     straight = abs(states.articulation_rad[300:]) < 0.02
     assert np.median(states.speed_mps[300:][straight]) == pytest.approx(4.0, abs=0.15)
     tight = abs(states.articulation_rad) > 0.3
@@ -144,7 +94,7 @@ def test_loaders_at_work_get_round_over_all_soils_in_each_others_company(loading
     assert ((np.diff((payload > 2000).astype(int), axis=0) == 1).sum(axis=0) >= 2).all()  # two cycles, each of them
     assert (payload.min(axis=0) == 0).all()
     assert payload.max(axis=0) == pytest.approx([4000.0] * 4)
-    assert nearest_m(loading) > 6.0
+    assert loading.nearest_m > 6.0
     ramp = abs(loading.states.grade_e) > 0.2
     for machine in range(4):
         backwards = speed[:, machine] < -1.0
@@ -157,6 +107,7 @@ def test_loaders_at_work_get_round_over_all_soils_in_each_others_company(loading
     assert loading.off_m.max() < 0.6
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_each_of_the_loaders_routes_can_be_driven_alone(tmp_path: Path) -> None:
     """Machines that neither collide nor give way are alone."""
@@ -172,20 +123,10 @@ def test_each_of_the_loaders_routes_can_be_driven_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_loaded_trucks_are_slower_uphill(quarry: Driven) -> None:
-    states = quarry.states
-    uphill = (abs(states.pitch_rad[:, :4]) > math.radians(4)) & (states.pitch_rad[:, :4] < 0)
-    loaded = quarry.payload_kg[:, :4] > 20e3
-    assert (uphill & loaded).sum() > 50
-    assert (uphill & ~loaded).sum() > 50
-    assert np.median(states.speed_mps[:, :4][uphill & loaded]) < np.median(states.speed_mps[:, :4][uphill & ~loaded])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("machines", [5, 9])
+@pytest.mark.parametrize("machines", [5, pytest.param(9, marks=pytest.mark.nightly)])
 def test_machines_give_way(machines: int) -> None:
     driven = drive(SimConfig(world="fast", machines=machines, seed=2), 200.0)
-    assert nearest_m(driven) > 5.0  # half as far, and frames would touch
+    assert driven.nearest_m > 5.0  # half as far, and frames would touch
     assert (abs(driven.states.speed_mps).sum(axis=0) * 0.1 > 550).all()
 
 
@@ -196,6 +137,7 @@ def test_without_give_way_machines_drive_on() -> None:
     assert driven.states.speed_mps[100:].min() > 1.0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_machines_do_not_touch_in_pybullet() -> None:
     """Contact shows as a jolt: nothing else on the site shakes a frame so hard."""

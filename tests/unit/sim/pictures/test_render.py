@@ -26,8 +26,7 @@ def test_machine_ground_and_sky_are_in_the_picture() -> None:
     assert yellow.sum() > 100
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(4, 5), (3, 9), (7, 2)])
-@pytest.mark.parametrize(("width", "height"), [(160, 90), (90, 120)])
+@pytest.mark.parametrize(("rows", "columns", "width", "height"), [(3, 9, 90, 120), (7, 2, 160, 90)])
 def test_overview_sees_the_whole_site_and_fills_its_frame(rows, columns, width, height, monkeypatch) -> None:
     monkeypatch.setattr(render_module, "TEXEL_M", 5.0)
     flat = plane(GRAVEL)

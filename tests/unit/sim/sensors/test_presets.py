@@ -59,13 +59,6 @@ def test_weighing_systems_are_as_good_as_their_makers_state_and_worse_on_a_bad_d
     assert load_preset("harsh").payload == PayloadNoise(1, 150.0, 0.05)
 
 
-def test_a_scenario_changes_single_values_of_a_base() -> None:
-    mine = parse_preset({"name": "foggy", "base": "paper", "gps": {"scale": 1.4, "rate_hz": 10}}, "here")
-    paper = load_preset("paper")
-    assert mine == replace(paper, name="foggy", gps=replace(paper.gps, scale=1.4, rate_hz=10))
-    assert load_preset("paper") == paper
-
-
 @pytest.mark.parametrize(
     ("table", "words"),
     [
@@ -90,11 +83,6 @@ def test_broken_presets_are_refused_by_name(table: dict[str, Any], words: list[s
     for word in ("scenario.toml [[preset]] 1", *words):
         assert word in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-def test_unknown_preset_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match=r"'gold'.*known: dgps, paper, standalone, rtk, harsh"):
-        load_preset("gold")
 
 
 @pytest.mark.parametrize("kind", [f.name for f in fields(DGPS) if f.name != "name"])

@@ -27,6 +27,7 @@ def test_head_on_collision_stays_finite_and_nobody_passes_through() -> None:
     assert abs(run.roll_rad).max() < 0.2
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_wheels_carry_what_the_machine_carries() -> None:
     grade, models = 0.1, (LOADER, TRUCK)
@@ -59,6 +60,7 @@ def front_link(world: BulletWorld) -> Front:
     return Front(rate, frames.velocity_mps[0, 1] + np.cross(rate, arm), rotation)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("ahead", [150, 370])
 @BOTH
 def test_front_frame_moves_as_the_rear_frame_and_the_joint_imply(model: MachineModel, ahead: int) -> None:

