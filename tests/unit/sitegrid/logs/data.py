@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import accumulate
 from pathlib import Path
 
 RADIUS_M, RATE_RADPS = 20.0, 0.1
@@ -31,9 +32,12 @@ def moves(t: float) -> bool:
     return not (t < 4 or 17 <= t < 23 or 41 <= t < 44 or 60 <= t < 68)
 
 
+DRIVEN_S = [0.0, *accumulate(0.1 * moves(i / 10) for i in range(10 * SECONDS))]
+
+
 def at(t: float) -> tuple[float, float]:
     """A place on the circle; a fix is 5 cm off, another way each time, so that none repeats the one before."""
-    turned = RATE_RADPS * sum(moves(s / 10) for s in range(round(t * 10))) * 0.1
+    turned = RATE_RADPS * DRIVEN_S[round(t * 10)]
     off_m = 0.05 * math.sin(100 * t)
     return 100 + RADIUS_M * math.cos(turned) + off_m, 50 + RADIUS_M * math.sin(turned)
 
