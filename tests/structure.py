@@ -252,8 +252,8 @@ def _listed(root: Path, *patterns: str) -> list[Path]:
 
 
 def _spread(values: Sequence[int]) -> dict[str, int]:
-    p90 = statistics.quantiles(values, n=10, method="inclusive")[-1] if len(values) > 1 else values[0]
-    return {"median": round(statistics.median(values)), "p90": round(p90), "max": max(values)}
+    p90 = statistics.quantiles(values, n=10, method="inclusive")[-1] if len(values) > 1 else sum(values)
+    return {"median": round(statistics.median(values or [0])), "p90": round(p90), "max": max(values, default=0)}
 
 
 def _shown(value: Any) -> str:
