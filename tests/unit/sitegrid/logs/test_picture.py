@@ -1,5 +1,6 @@
 """The picture of a replayed log: what is in it, and where."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from tests.unit.sitegrid.logs.data import START_S, at, write_circle
 @pytest.fixture
 def recording(tmp_path: Path) -> Recording:
     log = open_log(write_circle(tmp_path))
-    return Recording(log, None, list(log.readings()))
+    return Recording(log, list(log.readings()))
 
 
 def trace(error_m: float = 0.0, n: int = 400) -> Trace:
@@ -46,7 +47,7 @@ def test_track_fixes_ellipses_and_axes_are_drawn(recording: Recording) -> None:
 
 def test_truth_and_withheld_fixes_have_colours_of_their_own(recording: Recording) -> None:
     off = Truth(trace(3.0).stamp_ns, trace(3.0).position_m)
-    known = Recording(recording.log, LogTruth(off, np.zeros(3)), recording.readings)
+    known = replace(recording, truth=LogTruth(off, np.zeros(3)))
     assert {pictures.WITHHELD, pictures.TRUTH} <= colours(picture(known, Outage(20.0, 20.0), trace()))
 
 
@@ -74,7 +75,7 @@ def test_stray_fixes_do_not_make_the_rest_small(recording: Recording, tmp_path: 
     near = picture(recording, None, trace())
     rows = (tmp_path / "gps.csv").read_text() + "80,9000,9000\n"
     (tmp_path / "gps.csv").write_text(rows)
-    strays = Recording(recording.log, None, list(recording.log.readings()))
+    strays = replace(recording, readings=list(recording.log.readings()))
     assert picture(strays, None, trace()).shape == near.shape
 
 
