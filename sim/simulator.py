@@ -38,7 +38,7 @@ START_NS = 1_767_225_600_000_000_000  # stamp of the start, 2026-01-01T00:00:00Z
 class Simulator:
     """Simulates the machines of one site; the same config gives the same readings, bit for bit.
 
-    site, machines: what agents may know. truth_map, tracks(): what only an evaluation may see; former_truth_maps: the
+    site, machines: what agents may know. truth_map, tracks(): what only a comparison may see; former_truth_maps: the
     ground before each change so far, with the simulated second of that change. close() ends the world.
     """
 

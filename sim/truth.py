@@ -1,4 +1,4 @@
-"""The true ground and the machines' true tracks, kept apart from what sensors read; for evaluation only."""
+"""The true ground and the machines' true tracks, kept apart from what sensors read; for comparisons only."""
 
 from __future__ import annotations
 

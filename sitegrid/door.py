@@ -97,10 +97,9 @@ def build_parser(commands: ModuleType = commands, program: str = "sitegrid") -> 
 
 def _listed(groups: Mapping[str, Sequence[str]], modules: Mapping[str, ModuleType]) -> str:
     """Commands in groups, a line each."""
-    listed = (
-        f"{title}:\n" + "\n".join(f"  {w:<10} {modules[w].HELP}" for w in words) for title, words in groups.items()
-    )
-    return "\n\n".join(listed)
+    width = max(map(len, modules))
+    lines = {title: [f"  {word:<{width}}  {modules[word].HELP}" for word in words] for title, words in groups.items()}
+    return "\n\n".join("\n".join([f"{title}:", *listed]) for title, listed in lines.items())
 
 
 def _extra_for(error: ModuleNotFoundError, extra: str, beside: Mapping[str, str] = BESIDE) -> str:

@@ -1,39 +1,80 @@
-"""The house in figures: `python -m tests.structure [FOLDER]` prints a table of any checkout (lab/results/house.md)."""
+"""The house in figures: `python -m tests.structure [FOLDER] [--json]` prints those of any checkout.
+
+Figures come from the files that git tracks, and nothing of the checkout is imported: an older one can be measured.
+"""
 
 from __future__ import annotations
 
+import argparse
 import ast
+import json
 import re
 import statistics
 import subprocess
-import sys
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
+from tests.import_levels import layering
 from tests.paths import ROOT
 
-PACKAGES = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 CONFIGS = ("agent", "server", "sim")
+AREAS = PRODUCT, LABORATORY, LABORATORY_TESTS, TESTS = ("product", "laboratory", "laboratory's tests", "tests")
+# Folders and pages that the laboratory has, or had before it was one folder.
+OF_LABORATORY = {"lab", "evaluation", "benchmarks", "benchmark", "results"}
+ADDS_FLAG = {"add_argument", "add"}
+COMMENT = re.compile(r"^(?: *|.* {2})# (.*)$", re.MULTILINE)  # as the formatter leaves them
 
 
 @dataclass(frozen=True)
 class Module:
-    """A file of code: its path in the checkout, its lines, and the lines of each of its functions."""
+    """A file of code: its path in the checkout, its lines, and the lines of each of its functions.
+
+    words: of docstrings and comments. constants: numeric ones at the module's level. flags: options of the command line
+    that it declares. imports: modules of the checkout, as the first level of the module imports them.
+    """
 
     path: Path
     lines: int
     functions: tuple[int, ...]
     docstring: str
+    words: int
+    constants: int
+    flags: frozenset[str]
+    imports: frozenset[str]
+
+    @property
+    def name(self) -> str:
+        """As Python calls it."""
+        return ".".join(self.path.with_suffix("").parts).removesuffix(".__init__")
+
+    @property
+    def area(self) -> str:
+        """Which part of the house it belongs to."""
+        is_laboratory, is_test = is_of_laboratory(self.path), "tests" in self.path.parts
+        return AREAS[2 * is_test + (is_laboratory != is_test)]
 
 
-def modules(root: Path, *packages: str) -> list[Module]:
-    """All modules of packages, `__init__` too."""
-    listed = subprocess.run(["git", "ls-files", *packages], cwd=root, capture_output=True, check=True, text=True)
-    paths = [Path(name) for name in listed.stdout.split() if name.endswith(".py") and (root / name).exists()]
-    return [_module(root, path) for path in paths]
+def is_of_laboratory(path: Path) -> bool:
+    """Whether a module or a page is the laboratory's."""
+    return bool(OF_LABORATORY & set(path.with_suffix("").parts))
+
+
+def packages(root: Path) -> tuple[str, ...]:
+    """The packages of a checkout but `tests`, in the order of their layers where that is known."""
+    there = {path.parts[0] for path in _listed(root, "*/__init__.py") if len(path.parts) == 2} - {"tests"}
+    linted = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
+    return tuple(name for name in linted["root_packages"] if name in there)
+
+
+@cache
+def modules(root: Path, *folders: str) -> list[Module]:
+    """All modules of folders, `__init__` too."""
+    return [_module(root, path) for path in _listed(root, *folders) if path.suffix == ".py"]
 
 
 def crowds(everything: list[Module]) -> Counter[Path]:
@@ -53,46 +94,175 @@ def is_description(option: str) -> bool:
     return option.startswith(("machine.", "sensor."))
 
 
-def table(root: Path) -> str:
-    """What stands in lab/results/house.md."""
-    rows = ["package     modules  lines  module: median / p90 / max  functions  function: median / p90 / max"]
-    every = []
-    for package in (*PACKAGES, "tests"):
-        of_package = modules(root, package)
-        every += of_package if package != "tests" else []
-        rows.append(_row(package, of_package))
-    rows.insert(-1, _row("product", every))
-    counts = {name: len(options(root, name)) for name in CONFIGS}
-    described = len([option for option in options(root, "agent") if is_description(option)])
-    counts["agent"] -= described
-    shown = ", ".join(f"{name} {n}" for name, n in counts.items())
-    rows.append(f"options: {sum(counts.values())} ({shown}), and {described} that describe a machine and its sensors")
-    contracts = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
-        "contracts"
-    ]
-    rows.append(f"import contracts: {len(contracts)}")
-    folder, crowd = crowds(every).most_common(1)[0]
-    rows.append(f"fullest folder: {folder} with {crowd} modules")
-    return "\n".join(rows)
+def figures(root: Path) -> dict[str, Any]:
+    """All figures of a checkout: by area, by package, and of the whole."""
+    everything = modules(root, *packages(root), "tests")
+    by_area = {area: [module for module in everything if module.area == area] for area in AREAS}
+    code = by_area[PRODUCT] + by_area[LABORATORY]
+    names = {name: options(root, name) for name in CONFIGS}
+    described = {option for option in names["agent"] if is_description(option)}
+    contracts = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
+    folder, crowd = crowds(by_area[PRODUCT]).most_common(1)[0]
+    return {
+        "areas": {area: _of_area(of_area) for area, of_area in by_area.items() if of_area},
+        "packages": {name: _sizes([m for m in code if m.path.parts[0] == name]) for name in packages(root)},
+        "document_words": _document_words(root),
+        "options": {name: len(options - described) for name, options in names.items()} | {"described": len(described)},
+        "import_contracts": len(contracts["contracts"]),
+        "fullest_folder": {"folder": str(folder), "modules": crowd},
+    }
+
+
+def table(found: Mapping[str, Any]) -> str:
+    """Figures for people: a column per area, then a line per package."""
+    areas = found["areas"]
+    shown = {area: {name: _shown(value) for name, value in values.items()} for area, values in areas.items()}
+    for area, words in found["document_words"].items():
+        shown[area]["words in documents"] = str(words)
+    rows = [["", *shown], *([name, *(of.get(name, "-") for of in shown.values())] for name in shown[PRODUCT])]
+    sizes = [[name, *map(_shown, values.values())] for name, values in found["packages"].items()]
+    head = ["package", *next(iter(found["packages"].values()))]
+    counts = dict(found["options"])
+    described = counts.pop("described")
+    by_file = ", ".join(f"{name} {n}" for name, n in counts.items())
+    full = found["fullest_folder"]
+    return "\n".join(
+        [
+            *_columns(rows),
+            "",
+            *_columns([head, *sizes]),
+            "",
+            f"options: {sum(counts.values())} ({by_file}), and {described} that describe a machine and its sensors",
+            f"import contracts: {found['import_contracts']}",
+            f"fullest folder: {full['folder']} with {full['modules']} modules",
+        ]
+    )
+
+
+# --- the figures of modules ------------------------------------------------------------------------------------------
+
+
+def _of_area(of_area: Sequence[Module]) -> dict[str, Any]:
+    imports = {module.name: module.imports for module in of_area}
+    levels, circles = layering(imports)
+    flags = {flag for module in of_area for flag in module.flags}
+    return {
+        **_sizes(of_area),
+        "numeric constants": sum(module.constants for module in of_area),
+        "flags": len(flags),
+        "words in docstrings and comments": sum(module.words for module in of_area),
+        "import levels": levels,
+        "import circles": circles,
+    }
+
+
+def _sizes(of_package: Sequence[Module]) -> dict[str, Any]:
+    lines = [module.lines for module in of_package]
+    functions = [size for module in of_package for size in module.functions]
+    return {
+        "modules": len(lines),
+        "lines": sum(lines),
+        "lines of a module": _spread(lines),
+        "functions": len(functions),
+        "lines of a function": _spread(functions),
+    }
 
 
 def _module(root: Path, path: Path) -> Module:
     text = (root / path).read_text(encoding="utf-8")
     tree = ast.parse(text)
-    functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
+    nodes = list(ast.walk(tree))
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     sizes = tuple((f.end_lineno or f.lineno) - f.lineno + 1 for f in functions)
-    return Module(path, text.count("\n"), sizes, ast.get_docstring(tree) or "")
+    return Module(
+        path,
+        text.count("\n"),
+        sizes,
+        ast.get_docstring(tree) or "",
+        words=sum(len(prose.split()) for prose in _prose(nodes, text)),
+        constants=sum(map(_constants, tree.body)),
+        flags=frozenset(_flags(nodes)),
+        imports=frozenset(_imports(root, tree)),
+    )
 
 
-def _row(name: str, of_package: list[Module]) -> str:
-    lines = [module.lines for module in of_package]
-    functions = [size for module in of_package for size in module.functions]
-    return f"{name:<11} {len(lines):>7} {sum(lines):>6}  {_spread(lines):<26} {len(functions):>9}  {_spread(functions)}"
+def _prose(nodes: Sequence[ast.AST], text: str) -> Iterator[str]:
+    """Docstrings and comments."""
+    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    yield from (ast.get_docstring(node, clean=False) or "" for node in nodes if isinstance(node, documented))
+    yield from COMMENT.findall(text)
 
 
-def _spread(values: list[int]) -> str:
-    p90 = statistics.quantiles(values, n=10, method="inclusive")[-1]
-    return f"{statistics.median(values):.0f} / {p90:.0f} / {max(values)}"
+def _constants(statement: ast.stmt) -> int:
+    """How many names in capitals it gives numbers, or what is calculated from numbers."""
+    if isinstance(statement, ast.AnnAssign):
+        targets: list[ast.expr] = [statement.target]
+    elif isinstance(statement, ast.Assign):
+        targets = statement.targets
+    else:
+        return 0
+    named = [node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
+    return sum(name.upper() == name for name in named) if _is_numeric(statement.value) else 0
+
+
+def _is_numeric(value: ast.expr | None) -> bool:
+    """Whether a number stands in it, and neither a text nor a call."""
+    nodes = list(ast.walk(value)) if value else []
+    constants = [node.value for node in nodes if isinstance(node, ast.Constant)]
+    numbers = [constant for constant in constants if type(constant) in (int, float, complex)]
+    return bool(numbers) and len(numbers) == len(constants) and not any(isinstance(n, ast.Call) for n in nodes)
+
+
+def _flags(nodes: Sequence[ast.AST]) -> Iterator[str]:
+    """Options of the command line that are declared there."""
+    for call in (node for node in nodes if isinstance(node, ast.Call)):
+        function = call.func
+        name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+        texts = [arg.value for arg in call.args if isinstance(arg, ast.Constant)] if name in ADDS_FLAG else []
+        yield from (text for text in texts if isinstance(text, str) and text.startswith("--"))
+
+
+def _imports(root: Path, tree: ast.Module) -> Iterator[str]:
+    """What it imports outside of functions, for types too: full names of modules of the checkout."""
+    blocks = [tree.body, *(node.body for node in tree.body if isinstance(node, ast.If))]
+    for node in (statement for block in blocks for statement in block):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inner = root / node.module.replace(".", "/") / alias.name
+                is_module = inner.is_dir() or inner.with_suffix(".py").is_file()
+                yield f"{node.module}.{alias.name}" if is_module else node.module
+
+
+# --- documents, files, layout ----------------------------------------------------------------------------------------
+
+
+def _document_words(root: Path) -> dict[str, int]:
+    words = {PRODUCT: 0, LABORATORY: 0}
+    for path in _listed(root, "*.md"):
+        words[LABORATORY if is_of_laboratory(path) else PRODUCT] += len((root / path).read_text().split())
+    return words
+
+
+def _listed(root: Path, *patterns: str) -> list[Path]:
+    """Files that git tracks and that are there."""
+    listed = subprocess.run(["git", "ls-files", *patterns], cwd=root, capture_output=True, check=True, text=True)
+    return [Path(name) for name in listed.stdout.splitlines() if (root / name).exists()]
+
+
+def _spread(values: Sequence[int]) -> dict[str, int]:
+    p90 = statistics.quantiles(values, n=10, method="inclusive")[-1] if len(values) > 1 else sum(values)
+    return {"median": round(statistics.median(values or [0])), "p90": round(p90), "max": max(values, default=0)}
+
+
+def _shown(value: Any) -> str:
+    return " / ".join(map(str, value.values())) if isinstance(value, dict) else str(value)
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
 
 
 def _names(values: object, prefix: str) -> Iterator[str]:
@@ -106,5 +276,12 @@ def _names(values: object, prefix: str) -> Iterator[str]:
         yield prefix.removeprefix(".")
 
 
+PACKAGES = packages(ROOT)
+
 if __name__ == "__main__":
-    print(table(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT))
+    parser = argparse.ArgumentParser(prog="python -m tests.structure", description="The house in figures.")
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT, help="a checkout (default: this one)")
+    parser.add_argument("--json", action="store_true", help="print JSON for machines")
+    arguments = parser.parse_args()
+    measured = figures(arguments.folder)
+    print(json.dumps(measured) if arguments.json else table(measured))

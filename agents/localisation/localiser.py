@@ -88,7 +88,7 @@ class HeadingRefutedError(ArithmeticError):
 class Localiser:
     """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order.
 
-    engine: the filter; an evaluation may put one that watches it in its place, before the first reading. is_weighed:
+    engine: the filter; an experiment may put one that watches it in its place, before the first reading. is_weighed:
     whether the machine's load is known. is_proven: whether poses may become samples.
     """
 

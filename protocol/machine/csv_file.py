@@ -164,7 +164,7 @@ def no_number(row: Row, names: Iterable[str]) -> str:
             float(row[name])
         except (ValueError, TypeError):
             return f"{name}: {row[name]!r:.40} is not a number" if row[name] else f"{name}: a value is missing"
-    return "a value is not a number"
+    return "its stamp is not a number"  # as NaN, which is a number elsewhere
 
 
 def open_text(path: Path) -> IO[str]:

@@ -67,7 +67,7 @@ def _run(arguments: Namespace) -> int:
     from agents.localisation.localiser import LocalisationConfig
     from protocol.config import from_table
     from sitegrid.logs import outages
-    from sitegrid.logs.run import measurements, run
+    from sitegrid.logs.run import measurements, read_recording, run
     from sitegrid.logs.sensors import chosen
 
     draw = None
@@ -79,7 +79,8 @@ def _run(arguments: Namespace) -> int:
     options = from_table(LocalisationConfig, named, "--set")
     patterns = [outages.parse_pattern(*words) for words in arguments.withhold or ()] or outages.WITHHOLD
     choose = partial(chosen, sensors=arguments.sensors, gps=arguments.gps)
-    report = run(arguments.manifest, arguments.data, options, patterns, choose, on_progress=note, draw=draw)
+    recording = read_recording(arguments.manifest, arguments.data, choose)
+    report = run(recording, options, patterns, on_progress=note, draw=draw)
     if arguments.json:
         say(plain(report))
     else:

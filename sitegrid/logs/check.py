@@ -228,7 +228,7 @@ def _read(log: LogFolder, sensor: SensorConfig) -> SensorData:
     except LogFolderError as error:
         readings, problem = [], str(error)
     if not readings and not problem:
-        problem = "its file has no rows"
+        problem = "its file has no rows; `use = false` leaves it out"
     return SensorData(sensor, readings, alone.refused, alone.first_refused, problem)
 
 

@@ -18,7 +18,7 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from sitegrid.logs.check import missing_for_ground, missing_for_truth
 from sitegrid.logs.ground import compare, samples_of
-from sitegrid.logs.log_truth import LogTruth, read_known_ground, read_log_truth, require_overlap
+from sitegrid.logs.log_truth import KnownArea, LogTruth, read_known_ground, read_log_truth, require_overlap
 from sitegrid.logs.outages import WITHHOLD, Outage, Pattern
 from sitegrid.logs.replay import Trace, covered, errors, replay, score
 from sitegrid.logs.sensors import refitted
@@ -35,42 +35,55 @@ TRUTH_FIGURES = (
     "smoothed_net_m",
     "smoothed_coverage95",
 )
+NO_POSE = "no pose, as the heading never showed: that takes wheels, fixes and 12 m of driving"
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A log with what is known beside its readings."""
+    """A log, its readings, and what is known beside them."""
 
     log: LogFolder
-    truth: LogTruth | None
     readings: Sequence[Reading]
+    truth: LogTruth | None = None
+    areas: Sequence[KnownArea] = ()
 
 
 Draw = Callable[[Recording, Pattern, Trace], None]
 
 
+def read_recording(
+    manifest: Path, data: Path | None, choose: Callable[[MachineConfig], MachineConfig] = lambda machine: machine
+) -> Recording:
+    """Read a log with the sensors that `choose` leaves in use. Errors name the file."""
+    log = open_log(manifest, data)
+    log = refitted(log, choose(log.machine))
+    folder = manifest if manifest.is_dir() else manifest.parent
+    truth, areas = read_log_truth(log, folder), read_known_ground(log, folder)
+    readings = list(log.readings())
+    if not readings:
+        raise LogFolderError(log.data, "no sensor in use has a reading")
+    if truth:
+        require_overlap(truth, readings[0].stamp_ns, readings[-1].stamp_ns)
+    return Recording(log, readings, truth, areas)
+
+
 def run(
-    manifest: Path,
-    data: Path | None,
+    recording: Recording,
     options: LocalisationConfig,
     patterns: Sequence[Pattern] = WITHHOLD,
-    choose: Callable[[MachineConfig], MachineConfig] = lambda machine: machine,
     on_progress: Callable[[str], None] = lambda _: None,
     draw: Draw | None = None,
 ) -> Report:
     """Replay a log once per pattern of withheld GPS, and once more for its ground where some is known.
 
-    choose: which sensors of the machine are in use. draw: is given the trace of the first pattern. refused: readings by
-    reason, and where the first of each stands. missing: what cannot be compared, and why not.
+    draw: is given the trace of the first pattern. refused: readings by reason, and where the first of each stands.
+    missing: what cannot be compared, and why not.
     """
-    log = open_log(manifest, data)
-    log = refitted(log, choose(log.machine))
+    log = recording.log
     require_place(log.machine, options)
-    folder = manifest if manifest.is_dir() else manifest.parent
-    truth, areas = read_log_truth(log, folder), read_known_ground(log, folder)
-    recording = Recording(log, truth, list(log.readings()))
     _require_time(recording, patterns)
     rows: list[Row] = []
+    report = {**_described(recording, options), "rows": rows}
     for pattern in patterns:
         on_progress(f"{log.name}: {pattern or 'none'}")
         row, trace = _row(recording, options, pattern)
@@ -78,22 +91,30 @@ def run(
             draw(recording, pattern, trace)
         rows.append(row)
         if not row["covered"]:
-            on_progress(
-                f"{log.name}: no pose, as the heading never showed: that takes wheels, fixes and 12 m of driving"
-            )
-    missing = {"truth": missing_for_truth(truth), "ground": missing_for_ground(log.machine, areas)}
-    described = {"log": log.name, "filter": options.filter, "profile": options.profile}
-    used = [sensor.name for sensor in log.machine.sensors if sensor.use]
-    counted = {
+            on_progress(f"{log.name}: {NO_POSE}")
+    missing = {
+        "truth": missing_for_truth(recording.truth),
+        "ground": missing_for_ground(log.machine, recording.areas),
+    }
+    if not missing["ground"]:
+        on_progress(f"{log.name}: ground")
+        report["ground"] = compare(samples_of(log, options, recording.readings), recording.areas)
+    return {**report, "missing": {name: why for name, why in missing.items() if why}}
+
+
+def _described(recording: Recording, options: LocalisationConfig) -> Report:
+    """What is replayed: the log, its sensors, its readings."""
+    log = recording.log
+    return {
+        "log": log.name,
+        "filter": options.filter,
+        "profile": options.profile,
+        "gps": receivers(log.machine),
+        "sensors": [sensor.name for sensor in log.machine.sensors if sensor.use],
         "readings": len(recording.readings),
         "refused": dict(log.refused),
         "first_refused": dict(log.first_refused),
     }
-    report = {**described, "gps": receivers(log.machine), "sensors": used, **counted, "rows": rows}
-    if areas and not missing["ground"]:
-        on_progress(f"{log.name}: ground")
-        report["ground"] = compare(samples_of(log, options, recording.readings), areas)
-    return {**report, "missing": {name: why for name, why in missing.items() if why}}
 
 
 def measurements(rows: Sequence[Row]) -> list[Row]:
@@ -115,16 +136,11 @@ def receivers(machine: MachineConfig) -> int:
 
 
 def _require_time(recording: Recording, patterns: Sequence[Pattern]) -> None:
-    """Refuse what lies outside of the log's time."""
-    log, readings, truth = recording.log, recording.readings, recording.truth
-    if not readings:
-        raise LogFolderError(log.data, "no sensor in use has a reading")
-    seconds = (readings[-1].stamp_ns - readings[0].stamp_ns) * 1e-9
+    """Refuse an outage behind the log's end."""
+    seconds = (recording.readings[-1].stamp_ns - recording.readings[0].stamp_ns) * 1e-9
     for pattern in patterns:
         if isinstance(pattern, Outage) and pattern.start_s >= seconds:
             raise ConfigError(f"--withhold {pattern}", f"the log ends after {seconds:.0f} s")
-    if truth:
-        require_overlap(truth, readings[0].stamp_ns, readings[-1].stamp_ns)
 
 
 def _row(recording: Recording, options: LocalisationConfig, pattern: Pattern) -> tuple[Row, Trace]:

@@ -18,7 +18,7 @@ from protocol.site.site_config import Projection, SiteConfig
 
 STEP_S, WINDOW_S = 0.2, 3.0
 MAX_LAG_S = 60.0  # a larger offset between two clocks is looked for by their first and last stamps
-SURE, GAIN = 0.5, 0.1  # least correlation of the best lag, and by how much it must exceed that of lag 0
+SURE, GAIN = 0.5, 0.05  # least correlation of the best lag, and by how much it must exceed that of lag 0
 STANDS_MPS, DRIVES_MPS = 0.05, 0.7  # wheels that stand; fixes that move by more than their noise
 
 
@@ -45,7 +45,9 @@ def compare_speeds(fixes: tuple[Floats, Floats], wheels: tuple[Floats, Floats]) 
     by_fixes, by_wheels = _speed(times, *fixes), _speed(times, wheels[0], wheels[1][:, None])
     moves = by_fixes > DRIVES_MPS
     share = float(by_wheels[moves].sum() / by_fixes[moves].sum()) if moves.any() else math.nan
-    return Agreement(_lag_s(by_fixes, by_wheels), share, float((by_wheels[moves] < STANDS_MPS).sum()) * STEP_S)
+    return Agreement(
+        _lag_s(_capped(by_fixes), _capped(by_wheels)), share, float((by_wheels[moves] < STANDS_MPS).sum()) * STEP_S
+    )
 
 
 def places(readings: Sequence[Reading], site: SiteConfig) -> tuple[Floats, Floats]:
@@ -80,13 +82,21 @@ def _speed(times: Floats, known_s: Floats, places: Floats) -> Floats:
     return speeds
 
 
+def _capped(speeds: Floats) -> Floats:
+    """Without peaks, which a jump of fixes makes."""
+    return np.minimum(speeds, np.percentile(speeds, 95))
+
+
 def _lag_s(fixes: Floats, wheels: Floats) -> float | None:
-    """The lag of two speeds that correlates best, 0 where that is hardly better than none; None where none does."""
+    """The lag of two speeds that correlates best, 0 where that is hardly better than none; None where none does.
+
+    It is looked for up to half of the time that both have; one at the end of that is none.
+    """
     most = min(round(MAX_LAG_S / STEP_S), len(fixes) // 2)
     lags = range(-most, most + 1)
     found = np.array([_correlation(fixes[max(k, 0) : len(fixes) + min(k, 0)], wheels[max(-k, 0) :]) for k in lags])
     best = int(found.argmax())
-    if found[best] < SURE:
+    if found[best] < SURE or best in (0, len(lags) - 1):
         return None
     return float(lags[best] * STEP_S) if found[best] > found[most] + GAIN else 0.0
 

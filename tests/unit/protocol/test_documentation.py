@@ -8,6 +8,7 @@ from dataclasses import fields
 
 import pytest
 
+from agents.holdout import FIGURES
 from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.machine.log_folder import open_log
@@ -22,8 +23,10 @@ from protocol.site.site_config import KnownGround
 from protocol.units import _NS, _UNITS
 from protocol.wire import codec
 from protocol.wire.messages import Pose
-from sitegrid.logs.log_truth import read_log_truth
-from tests.paths import DOCS, ROOT
+from sitegrid.logs.ground import FIGURES as GROUND
+from sitegrid.logs.log_truth import read_known_ground, read_log_truth
+from sitegrid.logs.run import TRUTH_FIGURES
+from tests.paths import DOCS
 
 CALIBRATION = (cal.CalibrationAnswer, cal.MachineCalibration, cal.CorrectedSpan)
 WIRE, LOGS = ((DOCS / name).read_text() for name in ("protocol.md", "log-folders.md"))
@@ -133,8 +136,8 @@ def test_example_of_a_manifest_is_read(tmp_path):
 
 
 def test_example_of_a_log_of_ones_own_is_read(tmp_path):
-    page = (ROOT / "docs" / "own-log.md").read_text()
-    _, manifest, truth = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    page = LOGS[LOGS.index("\n## A log of your own\n") :]
+    manifest, truth = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "log.toml").write_text(manifest)
     (tmp_path / "truth.toml").write_text(truth)
     (tmp_path / "groundtruth.csv").write_text("1326030975000000,1,2,3,0,0,0\n")
@@ -142,6 +145,24 @@ def test_example_of_a_log_of_ones_own_is_read(tmp_path):
     assert [source.file.file for source in log.sources] == ["gps.csv", "imu.csv", "wheels.csv"]
     read = read_log_truth(log, tmp_path)
     assert read.track.position_m.tolist() == [[2.0, 1.0]]
+
+
+def test_examples_of_known_ground_are_read(tmp_path):
+    (tmp_path / "log.toml").write_text(re.search(r"```toml\n(.*?)```", LOGS, re.DOTALL)[1])
+    sides = [side for side in re.findall(r"```toml\n(.*?)```", LOGS, re.DOTALL) if "[[ground]]" in side]
+    areas = []
+    for side in sides:
+        (tmp_path / "truth.toml").write_text(side)
+        areas += read_known_ground(open_log(tmp_path), tmp_path)
+    assert [(area.name, area.c_rr, area.has_gradient) for area in areas] == [
+        ("ramp", 0.02, True),
+        ("gravel", 0.02, False),
+    ]
+
+
+def test_every_figure_of_a_replay_is_documented():
+    figures = [*FIGURES, *GROUND, *(f"truth_{name}" for name in TRUTH_FIGURES)]
+    assert undocumented(figures, LOGS) == []
 
 
 def test_example_of_known_ground_is_read():

@@ -136,13 +136,32 @@ def test_a_column_that_is_not_there_is_named_with_those_that_are(
     assert str(caught.value) == f"{tmp_path / 'wheels.csv'}: {problem}"
 
 
+def test_blanks_behind_a_delimiter_belong_neither_to_a_name_nor_to_a_value(tmp_path: Path) -> None:
+    log = opened(tmp_path, 't, v, w\n0, 1, 0\n1, "2", 0\n')
+    assert speeds(log) == [(1.0, 0.0), (2.0, 0.0)]
+    assert not log.refused
+
+
+def test_two_columns_of_one_name_are_refused_where_the_manifest_names_them(tmp_path: Path) -> None:
+    with pytest.raises(LogFolderError, match=r"wheels\.csv: has 2 columns `v`; name its columns by `names`"):
+        list(opened(tmp_path, "t,v,w,v\n0,1,0,2\n").readings())
+    assert speeds(opened(tmp_path, "t,v,w,x,x\n0,1,0,2,3\n")) == [(1.0, 0.0)]
+
+
+def test_a_value_that_is_missing_or_no_number_is_named_with_its_column(tmp_path: Path) -> None:
+    log = opened(tmp_path, "t,v,w\n0,1,0\n2025-06-15T15:06:40.013Z,1,0\n2,,0\n3,1\n")
+    assert speeds(log) == [(1.0, 0.0)]
+    assert log.refused == {"wrong_type": 3}
+    assert log.first_refused["wrong_type"].endswith("line 3: t: '2025-06-15T15:06:40.013Z' is not a number")
+
+
 def test_the_first_bad_row_of_each_reason_is_named_with_its_line(tmp_path: Path) -> None:
     text = "# a comment\n0 1 0.5\n1 x 0.5\n2 y 0.5\n\n3 500 0\n2 1 0\n1 1 0\n"
     log = opened(tmp_path, text, 'names = ["t", "v", "w"]\ndelimiter = " "')
     assert len(speeds(log)) == 2
     assert log.refused == {"wrong_type": 2, "out_of_range": 1, "stamp_goes_back": 1}
     assert log.first_refused == {
-        "wrong_type": "wheels.csv line 3: a value is missing, or is not a number",
+        "wrong_type": "wheels.csv line 3: v: 'x' is not a number",
         "out_of_range": "wheels.csv line 6: wheels.speed_x_mps: 500.0 is not between -100 and 100",
         "stamp_goes_back": "wheels.csv line 8: it is older than the row before it",
     }

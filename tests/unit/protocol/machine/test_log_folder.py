@@ -211,3 +211,8 @@ def test_sensors_are_merged_in_the_order_of_time(tmp_path):
     stamps = [r.stamp_ns for r in open_log(tmp_path).readings()]
     assert stamps == sorted(stamps)
     assert len(stamps) == 35
+
+
+def test_a_folder_without_a_manifest_is_told_what_it_lacks(tmp_path):
+    with pytest.raises(ConfigError, match=r"has no log\.toml that describes its files; docs/log-folders\.md"):
+        open_log(tmp_path)

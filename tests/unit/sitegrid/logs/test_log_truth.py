@@ -97,9 +97,9 @@ def test_without_a_side_file_there_is_none(tmp_path: Path) -> None:
     ("rows", "problem"),
     [
         ("t,x,y\n0,0,0\n1,1,0\n0.5,2,0\n", "truth.csv: line 4: it is older than the row before it"),
-        ("t,x,y\n0,0,0\n1,east,0\n", "truth.csv: line 3: a value is missing, or is not a number"),
-        ("t,x,y\n0,0,0\n1,1\n", "truth.csv: line 3: a value is missing, or is not a number"),
-        ("t,x,y\nnan,0,0\n", "truth.csv: line 2: a value is missing, or is not a number"),
+        ("t,x,y\n0,0,0\n1,east,0\n", "truth.csv: line 3: x: 'east' is not a number"),
+        ("t,x,y\n0,0,0\n1,1\n", "truth.csv: line 3: y: a value is missing"),
+        ("t,x,y\nnan,0,0\n", "truth.csv: line 2: its stamp is not a number"),
         ("t,x,y\n0,4e5,0\n", "truth.csv: line 2: x_m: 400000.0 is beyond 100000"),
         ("t,x\n0,0\n", "truth.csv: has no column `y`; it has t, x"),
         ("t,x,y\n", "truth.csv: has no row that counts"),
@@ -115,7 +115,7 @@ def test_a_truth_that_cannot_be_is_refused_with_its_line(tmp_path: Path, rows: s
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        ('file = "truth.csv"', 'file = "lost.csv"', "lost.csv: cannot be read"),
+        ('file = "truth.csv"', 'file = "lost.csv"', "lost.csv: is not there; `--data` names the folder"),
         ('file = "truth.csv"', "", "key `file` is missing"),
         ("[truth]", "[truht]", "unknown key `truht`; known: truth"),
         ('y_m = "y"', "", "its columns are stamp, x_m, y_m, or stamp, lat_deg, lon_deg; not stamp, x_m"),

@@ -78,7 +78,7 @@ def circle(tmp_path: Path) -> Path:
 
 def run(folder: Path, *patterns: Pattern, data: Path | None = None, **choice: Any) -> Report:
     options, choose = LocalisationConfig(filter="ekf"), partial(chosen, **choice)
-    return replayed.run(folder, data, options, patterns or WITHHOLD, choose)
+    return replayed.run(replayed.read_recording(folder, data, choose), options, patterns or WITHHOLD)
 
 
 @pytest.mark.slow
