@@ -9,7 +9,7 @@ journal, as one that was restored beside the first, or a replica that was promot
 two servers both take batches, each by its own database; the one with the lower epoch ends, and none begins whose
 database does not know of an epoch that another server writes with.
 
-A query that must be answered, and no token: a server that was killed never keeps its successor waiting (decision 0020).
+A query that must be answered, and no token: a server that was killed never keeps its successor waiting (decision 0005).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Whom a client asks: a follower of the site for what is read from the map, else its map server; each question of one.
 
 Plain queryables on one key all work on every question, and of those that are complete Zenoh asks one, always the same
-(docs/decisions/0049-followers.md). So each follower answers on keys of its own, and shows a liveliness token as long as
+(docs/decisions/0028-followers.md). So each follower answers on keys of its own, and shows a liveliness token as long as
 it does. A client stays with one follower: what it reads never goes back in time because another one is behind.
 """
 

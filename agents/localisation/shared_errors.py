@@ -22,7 +22,8 @@ from protocol.arrays import Floats, Ints
 
 CANDIDATES = np.concatenate([[0.0], (np.arange(16) + 0.5) / 16])
 # Before any fix: as likely nothing as something, whatever it is (Jeffreys 1961, Theory of Probability, 5.0). Receivers
-# without corrections share nearly all, with a reference station's about half, amid reflections less: docs/evidence.md
+# without corrections share nearly all, with a reference station's about half, amid reflections less
+# (docs/how-the-map-comes-about.md, measured facts)
 PRIOR = np.array([0.5] + [0.5 / 16] * 16)
 MOST_SHARED = 0.99  # a configured share counts up to here: errors that are wholly the same have no definite covariance
 MEMORY_S = 1800.0  # how long differences count: shares change with reflections, from place to place

@@ -21,7 +21,7 @@ WEIGHT_UNITS_PER_M = 4096
 COUNT_MAX = np.iinfo(np.uint32).max
 
 # c_rr votes: centres spaced evenly in log(c_rr); 24 bins separate 0.04 from 0.06 by two bins, 8 bins do not
-# (docs/evidence.md).
+# (docs/how-the-map-comes-about.md).
 RESISTANCE_BINS = 24
 RESISTANCE_CENTRES = np.geomspace(0.004, 0.4, RESISTANCE_BINS)
 # Gradient votes: centres every 1/32 over +-0.5 [m/m].

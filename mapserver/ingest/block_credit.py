@@ -2,7 +2,7 @@
 
 A block costs memory for as long as the map lives, and a sample of 80 bytes opens up to four: scattered over a site,
 each would cost 14 kB. What is refused is never journalled, so the map stays a function of the journal. Credit is not
-kept: after a start of the server each machine has that of a new one (docs/decisions/0072-credit-for-new-ground.md).
+kept: after a start of the server each machine has that of a new one (docs/decisions/0011-credit-for-new-ground.md).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The archive: journal rows that are old enough, in one Parquet file per hour of reception (docs/archive.md).
+"""The archive: journal rows that are old enough, in one Parquet file per hour of reception (docs/operation.md).
 
 A file is made under a temporary name, synced, renamed, and read back; only then does the journal forget its rows. A
 crash at any point leaves either a temporary file, which is removed, or a file whose rows the journal still has: it is

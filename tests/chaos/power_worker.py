@@ -63,7 +63,7 @@ def drive(rng: np.random.Generator, n: int, first_ns: int) -> Table:
 
 
 def use_spool(folder: Path, promises: Promises, seed: int, steps: int, *, careless: bool = False) -> None:
-    """Record, make final and acknowledge by chance. careless: with the setting that loses rows (docs/evidence.md)."""
+    """Record, make final and acknowledge by chance. careless: with the setting that loses rows."""
     rng, chance, spool, waiting = np.random.default_rng(seed), random.Random(seed), None, empty()
     for step in range(steps):
         with suppress(StoreError, sqlite3.Error):  # a disk that fails: nothing was promised

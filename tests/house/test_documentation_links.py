@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.paths import DOCS, ROOT
 from tests.structure import PACKAGES
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
+PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")), *DOCS.rglob("*.md")]
 TOP = "|".join((*PACKAGES, "tests", "docs", "config", r"\.ci"))
 PATH = re.compile(rf"`((?:{TOP})/(?:[\w.*-]+/)*(?:[\w*-]+\.(?:py|md|toml|urdf|c|bin|png|jpg))?)`")
 MODULE = re.compile(rf"`((?:{'|'.join(PACKAGES)})(?:\.[A-Za-z_]\w*)+)`")

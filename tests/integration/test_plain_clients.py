@@ -1,6 +1,6 @@
 """Clients by another hand (`tests/clients/`) against real processes that are killed: 0 lost, 0 double.
 
-The count is their own: plain SQL on the journal, as docs/archive.md describes it.
+The count is their own: plain SQL on the journal, as docs/operation.md describes it.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from tests.tcp_proxy import FAIR, Proxy, Weather
 FENCED = 3
 ROWS, FILL_BATCH = 100, 100  # of a commit, and samples of a row, of what was there before
 SITE = SiteConfig("pit", 48.0, 11.0)
-_HEAD = struct.Struct("<qqQqB")  # of a record, as docs/design.md has it; nothing of the product is used to look at rows
+_HEAD = struct.Struct("<qqQqB")  # of a record (docs/operation.md); nothing of the product is used to look at rows
 
 
 @dataclass

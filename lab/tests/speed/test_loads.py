@@ -22,7 +22,7 @@ from mapserver.journal.location import JournalLocation
 from protocol.errors import Refusal
 from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused
-from tests.paths import DOCS
+from tests.paths import ROOT
 from tests.site_work import START_NS, batches, samples_of, seconds_of, write_store
 
 # The smallest size of each load, and cases that it must have.
@@ -258,7 +258,7 @@ def test_a_store_with_a_snapshot_and_a_tail_holds_the_same_grid_as_folding_all_o
 
 
 def test_the_page_of_many_sites_has_the_tables_that_follow_from_what_was_measured():
-    page = (DOCS / "scaling.md").read_text()
+    page = (ROOT / "lab" / "results" / "sums.md").read_text()
     assert [table.splitlines()[0] for table in scaling.tables() if table not in page] == []
     small, large = scaling.Needs(10, 10), scaling.Needs(1000, 500)
     assert (large.sites, large.samples) == (2, pytest.approx(100 * small.samples))

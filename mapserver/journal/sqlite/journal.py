@@ -2,7 +2,8 @@
 
 One journal row is one admitted batch. Row and watermark are written in one transaction, so that exactly-once is
 decided here. `synchronous=NORMAL` lost acknowledged rows in 398 of 400 simulated power cuts, FULL none
-(docs/evidence.md). Rows up to `archived_row` have moved to Parquet files (archive.py); history.py reads both as one.
+(docs/how-the-map-comes-about.md). Rows up to `archived_row` have moved to Parquet files (archive.py); history.py reads
+both as one.
 """
 
 from __future__ import annotations
