@@ -7,7 +7,8 @@ from pathlib import Path
 from tests.paths import DOCS, ROOT
 from tests.structure import PACKAGES
 
-PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")), *DOCS.rglob("*.md")]
+LAB = [page for page in (ROOT / "lab").rglob("*.md") if page.name != "house.md"]  # which names files of other times
+PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")), *DOCS.rglob("*.md"), *LAB]
 TOP = "|".join((*PACKAGES, "tests", "docs", "config", r"\.ci"))
 PATH = re.compile(rf"`((?:{TOP})/(?:[\w.*-]+/)*(?:[\w*-]+\.(?:py|md|toml|urdf|c|bin|png|jpg))?)`")
 MODULE = re.compile(rf"`((?:{'|'.join(PACKAGES)})(?:\.[A-Za-z_]\w*)+)`")
