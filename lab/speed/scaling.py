@@ -1,7 +1,7 @@
 """What a number of machines needs, as sums of what was measured of one: `python -m lab.speed.scaling`.
 
 It prints the tables of lab/results/sums.md, in Markdown. Measured figures stand on lab/results/speed.md and
-fleet-calibration.md; assumed ones are nobody's: put in your own.
+calibration.md; assumed ones are nobody's: put in your own.
 """
 
 from __future__ import annotations
