@@ -107,16 +107,22 @@ def _signals_are_put_back() -> Iterator[None]:
 # Processor time is reported and fails nothing: it doubles on a loaded machine, and a library's first use costs some.
 MOST_CPU_S = 4.0  # of a test that is not marked; `make quick` leaves out what takes longer than about half a second
 CPU_S = "cpu_s"
-OF_WORKERS = pytest.StashKey[float]()
+BEGAN_S, OF_WORKERS = pytest.StashKey[float](), pytest.StashKey[float]()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Begin to count the processor time of a test."""
+    item.stash[BEGAN_S] = _cpu_s()
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Note the processor time of each test."""
-    began_s = _cpu_s()
-    outcome = yield
-    item.user_properties.append((CPU_S, round(_cpu_s() - began_s, 2)))
-    return outcome
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, object, object]:
+    """Note it once what the test started is ended; what tests share is the first's, and its end the last's."""
+    try:
+        return (yield)
+    finally:
+        item.user_properties.append((CPU_S, round(_cpu_s() - item.stash[BEGAN_S], 2)))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -134,11 +140,13 @@ def pytest_testnodedown(node: Any) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """Print what all took, and name the tests that took long and do not say so."""
-    for report in terminalreporter.stats.get("passed", []):
+    for report in terminalreporter.stats.get("", []):
         taken_s = dict(report.user_properties).get(CPU_S, 0.0)
         if taken_s > MOST_CPU_S and not {"slow", "processes", "nightly"} & report.keywords.keys():
             terminalreporter.line(f"{report.nodeid} took {taken_s:.1f} s of processor time: mark it slow")
-    minutes, seconds = divmod(round(_cpu_s() + config.stash.get(OF_WORKERS, 0.0)), 60)
+    times = os.times()
+    of_children_s = max(times.children_user + times.children_system, config.stash.get(OF_WORKERS, 0.0))
+    minutes, seconds = divmod(round(times.user + times.system + of_children_s), 60)
     terminalreporter.line(f"processor time {minutes}:{seconds:02}")
 
 
