@@ -174,7 +174,7 @@ def test_a_snapshot_under_the_name_of_an_earlier_row_is_passed_over(tmp_path):
 
 def test_a_snapshot_beyond_the_journal_is_passed_over(tmp_path):
     save(tmp_path, 3), save(tmp_path, 8)
-    assert snapshot.load_newest(tmp_path, 7, 1.0, FOLD)[0] == 3
+    assert [snapshot.load_newest(tmp_path, row, 1.0, FOLD)[0] for row in (8, 7, 3)] == [8, 3, 3]
     assert snapshot.load_newest(tmp_path, 2, 1.0, FOLD)[0] == 0
 
 
