@@ -25,7 +25,7 @@ def _circles(edges: Mapping[str, Sequence[str]]) -> list[list[str]]:
     order: dict[str, int] = {}
     lowest: dict[str, int] = {}
     stack: list[str] = []
-    found: list[list[str]] = []
+    components: list[list[str]] = []
 
     def visit(name: str) -> None:
         order[name] = lowest[name] = len(order)
@@ -37,10 +37,10 @@ def _circles(edges: Mapping[str, Sequence[str]]) -> list[list[str]]:
                 lowest[name] = min(lowest[name], lowest[other])
         if lowest[name] == order[name]:
             cut = stack.index(name)
-            found.append(stack[cut:])
+            components.append(stack[cut:])
             del stack[cut:]
 
     for name in edges:
         if name not in order:
             visit(name)
-    return found
+    return components

@@ -113,19 +113,19 @@ def figures(root: Path) -> dict[str, Any]:
     }
 
 
-def table(found: Mapping[str, Any]) -> str:
+def table(measured: Mapping[str, Any]) -> str:
     """Figures for people: a column per area, then a line per package."""
-    areas = found["areas"]
+    areas = measured["areas"]
     shown = {area: {name: _shown(value) for name, value in values.items()} for area, values in areas.items()}
-    for area, words in found["document_words"].items():
+    for area, words in measured["document_words"].items():
         shown[area]["words in documents"] = str(words)
-    rows = [["", *shown], *([name, *(of.get(name, "-") for of in shown.values())] for name in shown[PRODUCT])]
-    sizes = [[name, *map(_shown, values.values())] for name, values in found["packages"].items()]
-    head = ["package", *next(iter(found["packages"].values()))]
-    counts = dict(found["options"])
+    rows = [["", *shown], *([name, *(column.get(name, "-") for column in shown.values())] for name in shown[PRODUCT])]
+    sizes = [[name, *map(_shown, values.values())] for name, values in measured["packages"].items()]
+    head = ["package", *next(iter(measured["packages"].values()))]
+    counts = dict(measured["options"])
     described = counts.pop("described")
     by_file = ", ".join(f"{name} {n}" for name, n in counts.items())
-    full = found["fullest_folder"]
+    full = measured["fullest_folder"]
     return "\n".join(
         [
             *_columns(rows),
@@ -133,7 +133,7 @@ def table(found: Mapping[str, Any]) -> str:
             *_columns([head, *sizes]),
             "",
             f"options: {sum(counts.values())} ({by_file}), and {described} that describe a machine and its sensors",
-            f"import contracts: {found['import_contracts']}",
+            f"import contracts: {measured['import_contracts']}",
             f"fullest folder: {full['folder']} with {full['modules']} modules",
         ]
     )

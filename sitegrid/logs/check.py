@@ -84,9 +84,9 @@ def examine(manifest: Path, data: Path | None = None) -> Examined:
     last_ns = max((int(one.stamps_ns[-1]) for one in read if one.readings), default=0)
     rows = [_row(one, start_ns) for one in read] + [{**_row(one, 0), "usable": "use = false"} for one in unused]
     barring = [*check_clocks(read), *check_places(log, read)]
-    is_barred = any(found.level == Level.FAIL for found in barring)
+    is_barred = any(finding.level == Level.FAIL for finding in barring)
     findings = [
-        *(found for one in read for found in check_sensor(one)),
+        *(finding for one in read for finding in check_sensor(one)),
         *barring,
         *(check_speeds(log, read) if not is_barred else ()),
         check_positions(read, is_barred=is_barred),

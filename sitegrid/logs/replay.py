@@ -130,15 +130,6 @@ def replay(core: PoseSource, readings: Sequence[Reading], holdout: Holdout | Non
     return Trace(**vars(_track(poses)), first_ns=first_ns, last_ns=last_ns, cpu_s=cpu_s, smoothed=_track(smoothed))
 
 
-def continued(first: Trace, rest: Trace) -> Trace:
-    """One trace of a replay in two parts, the second of which has nothing smoothed of the first."""
-    new = rest.stamp_ns > (first.stamp_ns[-1] if len(first.stamp_ns) else 0)
-    tracks = [(getattr(first, name), getattr(rest, name)[new]) for name in vars(NOWHERE)]
-    track = Track(*map(np.concatenate, tracks))
-    cpu_s = first.cpu_s + rest.cpu_s
-    return Trace(**vars(track), first_ns=first.first_ns, last_ns=rest.last_ns, cpu_s=cpu_s, smoothed=rest.smoothed)
-
-
 def errors(track: Track, truth: Truth) -> Floats:
     """Errors (n, 2) [m] of a track; NaN where the truth is not known."""
     return track.position_m - truth.at(track.stamp_ns)

@@ -94,11 +94,13 @@ def _lag_s(fixes: Floats, wheels: Floats) -> float | None:
     """
     most = min(round(MAX_LAG_S / STEP_S), len(fixes) // 2)
     lags = range(-most, most + 1)
-    found = np.array([_correlation(fixes[max(k, 0) : len(fixes) + min(k, 0)], wheels[max(-k, 0) :]) for k in lags])
-    best = int(found.argmax())
-    if found[best] < SURE or best in (0, len(lags) - 1):
+    correlations = np.array(
+        [_correlation(fixes[max(k, 0) : len(fixes) + min(k, 0)], wheels[max(-k, 0) :]) for k in lags]
+    )
+    best = int(correlations.argmax())
+    if correlations[best] < SURE or best in (0, len(lags) - 1):
         return None
-    return float(lags[best] * STEP_S) if found[best] > found[most] + GAIN else 0.0
+    return float(lags[best] * STEP_S) if correlations[best] > correlations[most] + GAIN else 0.0
 
 
 def _correlation(a: Floats, b: Floats) -> float:

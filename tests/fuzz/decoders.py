@@ -49,7 +49,7 @@ from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.messages import SampleBatch
 from protocol.wire.offer_codec import decode_offer, encode_offer
 from sim.config import load_sim
-from sitegrid.logs.log_truth import read_log_truth
+from sitegrid.logs.log_truth import read_known_ground, read_log_truth
 from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml
 from tests.fuzz.messages import messages
 from tests.fuzz.mutations import files, texts
@@ -252,6 +252,12 @@ def _identity(path: Path) -> None:
 MACHINE = MachineConfig("loader-1", sensors=(SensorConfig("imu-1", "imu"), SensorConfig("gps-1", "gps")))
 METRES = b'''x_m = { columns = { lat_deg = 0.5, lon_deg = 0.5 }, offset = 1.5, unit = "mm" }
 y_m = "height_m"'''
+GROUND = b"""[[ground]]
+name = "pad"
+outline = [[0.0, 0.0], [20.0, 0.0], [20.0, 15.0]]
+c_rr = 0.012
+grade_east = 0.05
+"""
 TRUTH = b"""[truth]
 file = "truth.csv"
 names = ["t", "x", "y", "fix"]
@@ -287,7 +293,7 @@ def _logs() -> Iterator[Decoder]:
     yield Decoder("manifest", (manifest, converted, metres), partial(_log, log, "log.toml"), errors, texts, str(log))
     (judged / "truth.csv").write_bytes(PLACES)
     (plain / "truth.toml").write_bytes(TRUTH)
-    yield Decoder("truth", (TRUTH,), partial(_truth, judged, "truth.toml"), errors, texts, str(judged))
+    yield Decoder("truth", (TRUTH, GROUND), partial(_truth, judged, "truth.toml"), errors, texts, str(judged))
     yield Decoder("truth_csv", (PLACES,), partial(_truth, plain, "truth.csv"), errors[1:], texts, "truth.csv")
     yield Decoder("csv", (csv,), partial(_log, plain, "imu-1.csv"), errors[1:], texts, "imu-1.csv")
     yield Decoder("csv_gzip", seeds, partial(_log, packed, "imu-1.csv.gz"), errors[1:], files, "imu-1.csv.gz")
@@ -303,7 +309,9 @@ def _log(folder: Path, file: str, data: bytes) -> None:
 def _truth(folder: Path, file: str, data: bytes) -> None:
     """Of a log, described beside it and read."""
     (folder / file).write_bytes(data)
-    truth = read_log_truth(open_log(folder), folder)
+    log = open_log(folder)
+    assert all(area.c_rr is not None or area.has_gradient for area in read_known_ground(log, folder))
+    truth = read_log_truth(log, folder)
     assert truth is None or (np.diff(truth.track.stamp_ns) >= 0).all()
 
 

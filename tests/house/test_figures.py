@@ -57,23 +57,23 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def test_modules_are_counted_where_they_belong(checkout: Path) -> None:
-    found = figures(checkout)
+    measured = figures(checkout)
     assert packages(checkout) == ("core", "lab")
-    counted = {area: (of["modules"], of["functions"]) for area, of in found["areas"].items()}
+    counted = {area: (values["modules"], values["functions"]) for area, values in measured["areas"].items()}
     assert counted == {PRODUCT: (3, 1), LABORATORY: (1, 0), LABORATORY_TESTS: (2, 1), TESTS: (1, 2)}
-    assert found["packages"]["core"]["lines"] == sum(
+    assert measured["packages"]["core"]["lines"] == sum(
         FILES[f"core/{name}.py"].count("\n") for name in ("__init__", "a", "b")
     )
-    assert found["document_words"] == {PRODUCT: 5, LABORATORY: 2}
-    assert found["options"] == {"agent": 1, "server": 1, "sim": 1, "described": 0}
+    assert measured["document_words"] == {PRODUCT: 5, LABORATORY: 2}
+    assert measured["options"] == {"agent": 1, "server": 1, "sim": 1, "described": 0}
 
 
 def test_constants_flags_and_words_are_counted(checkout: Path) -> None:
-    of = figures(checkout)["areas"][PRODUCT]
-    assert of["numeric constants"] == 4  # A, B, C and SIZES; no text, and nothing that is calculated by a call
-    assert of["flags"] == 2
-    assert of["words in docstrings and comments"] == 3 + 4 + 2 + 2
-    assert (of["import levels"], of["import circles"]) == (2, 0)
+    product = figures(checkout)["areas"][PRODUCT]
+    assert product["numeric constants"] == 4  # A, B, C and SIZES; no text, and nothing that is calculated by a call
+    assert product["flags"] == 2
+    assert product["words in docstrings and comments"] == 3 + 4 + 2 + 2
+    assert (product["import levels"], product["import circles"]) == (2, 0)
 
 
 def test_a_file_that_git_does_not_track_does_not_count(checkout: Path) -> None:

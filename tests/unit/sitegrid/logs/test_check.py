@@ -21,7 +21,7 @@ def circle(tmp_path: Path) -> Path:
 
 def said(examined: Examined, check: str) -> str:
     """All lines about a subject, which are one line each."""
-    lines = [str(found) for found in examined.findings if found.check == check]
+    lines = [str(finding) for finding in examined.findings if finding.check == check]
     assert all("\n" not in line for line in lines)
     return "\n".join(lines)
 
@@ -38,7 +38,7 @@ def test_a_sound_log_is_a_table_of_its_sensors_and_what_it_is_good_for(circle: P
     assert (gps["sensor"], gps["kind"], gps["usable"], gps["refused"]) == ("gps-1", "gps", 160, 0)
     assert (gps["begins_s"], gps["ends_s"], gps["rate_hz"], gps["gaps"]) == (0.0, 79.5, 2.0, 0)
     assert (wheels["rate_hz"], wheels["longest_gap_s"]) == (10.0, 0.1)
-    assert [str(found.level) for found in examined.findings] == ["PASS", "-", "-"]
+    assert [str(finding.level) for finding in examined.findings] == ["PASS", "-", "-"]
     assert said(examined, "positions") == "PASS  positions     by gps-1, wheels"
 
 
@@ -177,4 +177,4 @@ def test_what_can_be_compared_is_said(circle: Path, side: str, subject: str, lin
 def test_no_sensor_is_blamed_where_the_machine_only_stands(circle: Path) -> None:
     edit(circle / "gps.csv", lambda rows: joined([[t, f"{100 + i % 7 / 10}", "50"] for i, (t, *_) in enumerate(rows)]))
     edit(circle / "odom.csv", lambda rows: joined([[t, "0", "0"] for t, _, _ in rows]))
-    assert not [found for found in examine(circle).findings if found.level == Level.WARN]
+    assert not [finding for finding in examine(circle).findings if finding.level == Level.WARN]

@@ -86,11 +86,11 @@ def test_an_area_that_cannot_be_is_refused_in_one_line(tmp_path: Path, described
 def test_the_machine_is_not_told_what_it_is_compared_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = log_of(tmp_path)
     area = KnownGround("pad", 0.01, ((0.0, 0.0), (200.0, 0.0), (200.0, 200.0)))
-    told = replace(log, site=replace(log.site, known_ground=(area,)))
+    informed = replace(log, site=replace(log.site, known_ground=(area,)))
     sites = []
     pipeline = ground.Pipeline
     monkeypatch.setattr(ground, "Pipeline", lambda site, *rest: sites.append(site) or pipeline(site, *rest))
-    samples_of(told, LocalisationConfig(filter="ekf"), [])
+    samples_of(informed, LocalisationConfig(filter="ekf"), [])
     assert sites == [log.site]
 
 

@@ -24,38 +24,38 @@ def fixes(metres: np.ndarray, noise_m: float = 0.3) -> np.ndarray:
 
 @pytest.mark.parametrize("lag_s", [-25.0, -1.0, 0.0, 1.0, 18.0, 30.0])
 def test_the_offset_of_two_clocks_shows_in_the_speeds(lag_s: float) -> None:
-    found = compare_speeds((TIMES + lag_s, fixes(driven())), (TIMES, driven()))
-    assert found
-    assert found.lag_s == pytest.approx(lag_s, abs=0.3)
+    agreement = compare_speeds((TIMES + lag_s, fixes(driven())), (TIMES, driven()))
+    assert agreement
+    assert agreement.lag_s == pytest.approx(lag_s, abs=0.3)
 
 
 def test_a_steady_drive_shows_no_offset() -> None:
-    found = compare_speeds((TIMES, fixes(3.0 * TIMES)), (TIMES, 3.0 * TIMES))
-    assert found
-    assert found.lag_s is None
-    assert found.wheel_share == pytest.approx(1.0, abs=0.02)
+    agreement = compare_speeds((TIMES, fixes(3.0 * TIMES)), (TIMES, 3.0 * TIMES))
+    assert agreement
+    assert agreement.lag_s is None
+    assert agreement.wheel_share == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.6])
 def test_the_scale_of_wheels_is_that_of_their_distance(scale: float) -> None:
-    found = compare_speeds((TIMES, fixes(driven())), (TIMES, scale * driven()))
-    assert found
-    assert found.wheel_share == pytest.approx(scale, rel=0.05)
-    assert found.stuck_s < 3
+    agreement = compare_speeds((TIMES, fixes(driven())), (TIMES, scale * driven()))
+    assert agreement
+    assert agreement.wheel_share == pytest.approx(scale, rel=0.05)
+    assert agreement.stuck_s < 3
 
 
 def test_wheels_that_stand_while_the_machine_moves_are_timed() -> None:
     stuck = np.minimum(4.0 * TIMES, 4.0 * 50.0)
-    found = compare_speeds((TIMES, fixes(4.0 * TIMES)), (TIMES, stuck))
-    assert found
-    assert found.stuck_s == pytest.approx(70.0, abs=4.0)
+    agreement = compare_speeds((TIMES, fixes(4.0 * TIMES)), (TIMES, stuck))
+    assert agreement
+    assert agreement.stuck_s == pytest.approx(70.0, abs=4.0)
 
 
 def test_a_machine_that_stands_and_a_short_log_show_nothing() -> None:
-    found = compare_speeds((TIMES, fixes(0 * TIMES, noise_m=0.05)), (TIMES, 0 * TIMES))
-    assert found
-    assert math.isnan(found.wheel_share)
-    assert found.stuck_s == 0
+    agreement = compare_speeds((TIMES, fixes(0 * TIMES, noise_m=0.05)), (TIMES, 0 * TIMES))
+    assert agreement
+    assert math.isnan(agreement.wheel_share)
+    assert agreement.stuck_s == 0
     assert compare_speeds((TIMES[:40], fixes(driven()[:40])), (TIMES[:40], driven()[:40])) is None
 
 
