@@ -16,9 +16,10 @@ from lab.calibration.cases import CASES, PAPER, FleetCase
 from lab.calibration.drives import Agent, FleetDrive, planned, scene
 from lab.calibration.solving import MAPS, CaseResult, solved
 from lab.campaign.experiment import Runner, replay_task
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.campaign.summary import column, mean, median, summary
-from sitegrid.proof.figures import Report, Row, judge, root_mean_square, rounded
+from sitegrid.proof.figures import Report, Row, root_mean_square, rounded
 
 LOADERS = 4  # of a drive of the paper's site with the usual sensors
 DIGITS = 4

@@ -11,6 +11,7 @@ import numpy as np
 
 from lab.calibration.cases import FleetCase, Rows, Tampered, cells, tampered, truth_places
 from lab.calibration.drives import Scene
+from lab.campaign.true_maps import region_of, window_of
 from lab.maps.cases import CELL_M
 from lab.maps.methods import folded
 from mapserver.config import ServerConfig
@@ -22,7 +23,7 @@ from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.trust.auditor import Auditor
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints, Table
 from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
-from sitegrid.proof.map_score import border_distance, driven_cells, region_of, window_of
+from sitegrid.proof.map_score import border_distance, driven_cells
 
 MAPS = ("before", "after", "oracle")
 FIGURES = ("wrong_pct", "interior_pct", "slope_pct")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from lab.campaign.code import ROOT
-from sitegrid.proof.figures import Goal
+from lab.campaign.figures import Goal
 
 FILE = ROOT / "lab" / "goals.toml"
 

@@ -24,8 +24,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lab.campaign.figures import select
 from protocol.errors import ConfigError
-from sitegrid.proof.figures import Report, Row, select
+from sitegrid.proof.figures import Report, Row
 
 _BLOCK = re.compile(r"(<!-- table: (\S+) (.+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 NOT_MEASURED = "Not measured yet.\n"

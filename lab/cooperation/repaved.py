@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lab.calibration.drives import Scene
+from lab.campaign.true_maps import window_of
 from lab.cooperation.drives import SharedDrive
 from lab.cooperation.maps import Layers, Timeline
 from lab.cooperation.network import SHARE_PCT, Network, network
@@ -18,7 +19,6 @@ from protocol.site.ground_classes import resistance_class
 from sim.scenario.ground import Point
 from sim.simulator import START_NS
 from sitegrid.proof.figures import Row
-from sitegrid.proof.map_score import window_of
 from sitegrid.proof.tracks import LoadTrack
 
 PASSES = 12  # that are looked at, at most

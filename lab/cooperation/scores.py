@@ -12,6 +12,7 @@ from lab.calibration.cases import GAIN, Rows, gain
 from lab.calibration.drives import Scene, scene
 from lab.calibration.solving import served
 from lab.campaign.experiment import Experiment, Task, read_result, replay_task
+from lab.campaign.true_maps import region_of, true_layers, window_of
 from lab.cooperation import live
 from lab.cooperation.drives import BAD, Arm, SharedDrive, length_m
 from lab.cooperation.live import LiveRun
@@ -27,7 +28,7 @@ from protocol.arrays import AnyArray, Floats
 from protocol.site.ground_classes import UNKNOWN, resistance_class
 from sim.simulator import START_NS
 from sitegrid.proof.figures import Row
-from sitegrid.proof.map_score import DrivenScore, region_of, score_driven, true_layers, window_of
+from sitegrid.proof.map_score import DrivenScore, score_driven
 
 STEP_S = 15.0  # between two maps over time
 AFTER_S = 30.0  # of a recording's end, when all its samples become final and are sent

@@ -17,6 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from lab.campaign.experiment import Experiment, Runner, Task
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.maps.cases import CASES, CELL_M, MapCase, parking_place
 from lab.maps.methods import METHODS, Layers, in_order, merge_hard, soft_votes
@@ -24,7 +25,7 @@ from lab.maps.samples import LANE_M, SPEED_MPS, MapScene, simulate
 from protocol.arrays import Bools, Ints
 from protocol.site.geometry import CellWindow
 from protocol.site.ground_classes import UNKNOWN, resistance_class, wrong_percent
-from sitegrid.proof.figures import Report, Row, judge, rounded
+from sitegrid.proof.figures import Report, Row, rounded
 
 SERVER = "soft_votes"
 RESISTANCE, GRADE = ("resistance",), ("grade_east", "grade_north")

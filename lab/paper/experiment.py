@@ -14,8 +14,10 @@ import numpy as np
 from lab.calibration import drives
 from lab.calibration.drives import scene
 from lab.campaign.experiment import Runner
+from lab.campaign.figures import half_width, judge
 from lab.campaign.goals import goals
 from lab.campaign.recordings import PAPER, PlannedDrive
+from lab.campaign.true_maps import pooled_by_border, region_of, true_layers
 from lab.maps.uncertainty import Believed, coverage_pct, forecast_row, layers_forecast, pooled
 from lab.paper import maps
 from lab.paper.drives import QUICK, RECOMMENDED, MapSource, Plan
@@ -29,8 +31,8 @@ from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from protocol.errors import SitegridError
 from protocol.site.ground_classes import resistance_class
 from sitegrid.logs.replay import Score
-from sitegrid.proof.figures import Report, Row, half_width, judge, rounded
-from sitegrid.proof.map_score import driven_cells, pooled_by_border, region_of, score, score_driven, true_layers
+from sitegrid.proof.figures import Report, Row, rounded
+from sitegrid.proof.map_score import driven_cells, score, score_driven
 
 LEAST_S = 60.0  # of a recording: a heading is known after some seconds, calibration needs ground that is driven again
 PLACES = ("rmse_x_m", "rmse_y_m", "net_m")

@@ -18,13 +18,13 @@ from lab.calibration.drives import Agent, AgentSamples, Scene, scene
 from lab.calibration.solving import as_correction, served, true_errors
 from lab.campaign.experiment import Experiment, Task, read_result, replay_task
 from lab.campaign.recordings import PlannedDrive
+from lab.campaign.true_maps import window_of
 from lab.maps.methods import SERVER_LAYERS, Layers, folded, hits_of, in_order, last_write, merge_hard
 from lab.maps.uncertainty import Forecast, by_frequency, by_mean
 from mapserver.fleet.correction import corrected
 from protocol.arrays import Bools, Floats, Floats32, Table
 from sim.truth import TruthMap
 from sitegrid.proof.figures import root_mean_square
-from sitegrid.proof.map_score import window_of
 
 PLOTTED = ("resistance", "grade_east", "grade_north")  # all that `last_write` has
 LAYERS = (*SERVER_LAYERS, "resistance_class", "resistance_std", "grade_std")

@@ -19,13 +19,13 @@ from matplotlib.patches import Patch
 
 from lab.calibration.drives import scene
 from lab.campaign.experiment import Runner
+from lab.campaign.true_maps import true_layers
 from lab.maps.cases import CELL_M
 from lab.paper.experiment import MapOutcome, Outcomes
 from lab.paper.maps import OURS, PAPERS, SERVED, MapKind
 from mapserver.pictures.plotter import NamedLayers
 from protocol.arrays import AnyArray, Floats, Ints
 from protocol.site.ground_classes import SLOPE, UNKNOWN, ZONES, resistance_class, slope_class, wrong_percent
-from sitegrid.proof.map_score import true_layers
 
 DPI, PANEL_IN = 110, 3.1
 STYLE: Any = {"figure.constrained_layout.use": True, "font.size": 9, "legend.frameon": False, "savefig.bbox": "tight"}

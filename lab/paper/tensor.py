@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.campaign.true_maps import region_of
 from mapserver.pictures.plotter import NamedLayers
 from protocol.arrays import Floats
 from protocol.files import whole_file
 from sim.truth import TruthMap
-from sitegrid.proof.map_score import region_of
 
 
 def tensor(layers: NamedLayers, truth: TruthMap) -> Floats:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from lab.calibration.drives import Scene
+from lab.campaign.true_maps import window_of
 from lab.ground.truth import true_ground
 from lab.roads.drives import RoadDrive
 from lab.roads.repairs import UNTOUCHED, SegmentRepairs
@@ -30,7 +31,7 @@ from protocol.arrays import Bools, Ints
 from protocol.site.geometry import CellWindow
 from sim.scenario.file import load_scenario
 from sitegrid.proof.figures import Row
-from sitegrid.proof.map_score import TRACK_STEP_M, window_of
+from sitegrid.proof.map_score import TRACK_STEP_M
 
 SEGMENTS, CELLS, CELLS_REPAIRS = "segments", "cells", "cells, repairs"
 STEP_S = 15.0  # between two maps over time

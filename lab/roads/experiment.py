@@ -10,13 +10,14 @@ from pathlib import Path
 from lab.calibration import drives
 from lab.calibration.drives import Agent, AgentSamples, scene
 from lab.campaign.experiment import Experiment, Runner, Task, read_result, replay_task
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.campaign.summary import column, median, summary
 from lab.roads.changes import ChangedGround, Changes, changes, pooled
 from lab.roads.drives import RoadDrive, planned
 from lab.roads.repairs import SegmentRepairs, repair_figures
 from lab.roads.score import Recorded, kept_after, road_figures, roads, traffic_figures
-from sitegrid.proof.figures import Report, Row, judge, rounded
+from sitegrid.proof.figures import Report, Row, rounded
 
 REPAIRS_S = 1500.0 / 900.0  # times as long as the other recordings: passes before, and after
 DIGITS = 3

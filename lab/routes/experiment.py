@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from lab.calibration import drives as fleets
 from lab.calibration.drives import Agent, scene
 from lab.campaign.experiment import Runner, replay_task
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.campaign.summary import column, median, summary
 from lab.roads.drives import RoadDrive, planned
 from lab.roads.score import Recorded
 from lab.routes import ways
 from lab.routes.legs import judged_legs, seed_figures
-from sitegrid.proof.figures import Report, Row, judge, rounded
+from sitegrid.proof.figures import Report, Row, rounded
 
 LONGER = 4.0 / 3.0  # times as long as the others: the check on how people drive
 DIGITS = 2

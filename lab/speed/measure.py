@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from lab.campaign.figures import Goal
 from protocol.arrays import Table
 from protocol.machine.samples import empty
-from sitegrid.proof.figures import Goal, Row
+from sitegrid.proof.figures import Row
 from tests.site_work import START_NS
 
 ROOT = Path(__file__).parents[2]

@@ -5,18 +5,16 @@ Wrong cells are counted by their distance from the nearest border between two ki
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from mapserver.pictures.plotter import NamedLayers
-from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
-from protocol.queries.answers import MapVersion, Region
-from protocol.site.geometry import CellWindow
+from protocol.arrays import Bools, Floats, Ints
+from protocol.queries.answers import Region
 from protocol.site.ground_classes import UNKNOWN, resistance_class, slope_class, wrong_percent
-from sim.truth import TruthMap
 from sitegrid.proof.figures import Row
 
 EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)  # of the bins of distances; the last bin is open
@@ -46,28 +44,6 @@ class DrivenScore:
     by_border: list[Row]
 
 
-def window_of(truth: TruthMap) -> CellWindow:
-    """The cells of a true map."""
-    rows, columns = truth.c_rr.shape
-    return CellWindow(round(truth.west_m / truth.cell_m), round(truth.south_m / truth.cell_m), columns, rows)
-
-
-def region_of(truth: TruthMap, layers: Mapping[str, AnyArray]) -> Region:
-    """Layers of the cells of a true map, as an answer of a map server has them."""
-    rows, columns = truth.c_rr.shape
-    x_m, y_m = (
-        np.asarray(corner_m + (np.arange(n) + 0.5) * truth.cell_m, np.float64)
-        for corner_m, n in ((truth.west_m, columns), (truth.south_m, rows))
-    )
-    shown = {name: np.asarray(values, np.float32) for name, values in layers.items()}
-    return Region(x_m, y_m, truth.cell_m, shown, MapVersion("", 0, 0), 0)
-
-
-def true_layers(truth: TruthMap) -> dict[str, Floats32]:
-    """The layers of a true map by their names."""
-    return {"resistance": truth.c_rr, "grade_east": truth.grade_east, "grade_north": truth.grade_north}
-
-
 def score(region: Region, truth: NamedLayers) -> MapScore:
     """Compare a map with true layers of the same cells (resistance, grade_east, grade_north)."""
     (resistance, slope), (true, true_slope) = _classes(region), _classes(truth)
@@ -79,7 +55,7 @@ def score_driven(region: Region, truth: NamedLayers, tracks_m: Iterable[Floats])
     """Compare a map with true layers of the same cells where machines truly were.
 
     Cells that are known but were never passed, because a position was wrong, do not count. tracks_m: true places
-    (n, 2) of each machine's load centre, as `lab.ground.truth.read_load_track` has them.
+    (n, 2) of each machine's load centre, as `sitegrid.proof.tracks.read_load_track` has them.
     """
     (resistance, slope), (true, true_slope) = _classes(region), _classes(truth)
     driven = driven_cells(region, tracks_m) & (true != UNKNOWN)
@@ -118,24 +94,6 @@ def by_border_distance(estimated: Ints, true: Ints, border_m: Floats) -> list[Ro
         counts = {"cells": int(here.sum()), "known_pct": _known_percent(estimated[here]), "wrong_pct": wrong}
         bins.append({"from_m": low, "to_m": high, **counts})
     return bins
-
-
-def pooled_by_border(seeds: Sequence[Sequence[Row]]) -> list[Row]:
-    """Bins of distances (`by_border_distance`) of several seeds in one: all cells, and which of the known are wrong."""
-    return [_pooled(bins) for bins in zip(*seeds, strict=True)]
-
-
-def _pooled(bins: Sequence[Row]) -> Row:
-    known = np.array([row["cells"] * row["known_pct"] / 100 if row["cells"] else 0.0 for row in bins])
-    wrong = np.array([row["wrong_pct"] if n else 0.0 for row, n in zip(bins, known, strict=True)])
-    cells = sum(row["cells"] for row in bins)
-    return {
-        "from_m": bins[0]["from_m"],
-        "to_m": bins[0]["to_m"],
-        "cells": cells,
-        "known_pct": 100 * float(known.sum()) / cells if cells else np.nan,
-        "wrong_pct": float((known * wrong).sum() / known.sum()) if known.sum() else np.nan,
-    }
 
 
 def border_distance(classes: Ints, cell_m: float) -> Floats:

@@ -12,11 +12,12 @@ from lab.benchmark.recordings import FULL, QUICK, part_hash
 from lab.benchmark.scores import FIGURES, Entry, figures_of, summarise
 from lab.calibration.drives import Scene, scene
 from lab.campaign.experiment import Runner
+from lab.campaign.true_maps import region_of, true_layers
 from lab.tests.calibration.scenes import made_scene
 from protocol.errors import ConfigError
 from sitegrid.door import run
 from sitegrid.process.lifetime import plain
-from sitegrid.proof.map_score import driven_cells, region_of, true_layers
+from sitegrid.proof.map_score import driven_cells
 from tests.arithmetic import ARITHMETIC, arithmetic
 
 pytestmark = pytest.mark.timeout(900)  # agents replay two recordings, maybe on a busy machine

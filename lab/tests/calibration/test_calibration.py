@@ -12,12 +12,12 @@ from lab.calibration.cases import CASES, RAMP_STEPS, FleetCase, tampered
 from lab.calibration.drives import Scene, planned, spoiled
 from lab.calibration.experiment import row_of
 from lab.calibration.solving import FIGURES, MAPS, CaseResult, JudgedMap, calibrated, judged, solved, true_errors
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.tests.calibration.scenes import ROUTES, made_scene, track, truth
 from protocol.arrays import Table
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Torque
-from sitegrid.proof.figures import judge
 from tests.unit.mapserver.fleet.drives import RAMP, Errors, drive
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from lab.campaign import goals as module
+from lab.campaign.figures import Goal
 from lab.campaign.goals import goals
-from sitegrid.proof.figures import Goal
 
 FILE = """
 [[a]]

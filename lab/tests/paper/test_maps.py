@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lab.calibration.drives import Agent, Scene
+from lab.campaign.true_maps import region_of, true_layers
 from lab.paper.maps import (
     AS_SENT,
     AS_TRUE,
@@ -25,7 +26,7 @@ from lab.paper.maps import (
 from lab.positions.configurations import Configuration
 from lab.tests.calibration.scenes import made_scene
 from protocol.arrays import Table
-from sitegrid.proof.map_score import region_of, score, true_layers
+from sitegrid.proof.map_score import score
 
 EAST_M, NORTH_M = 6.0, -2.0  # that the places which are known at once are off
 

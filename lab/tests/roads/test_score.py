@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import kendalltau
 
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.campaign.summary import chosen
 from lab.roads import experiment
@@ -11,7 +12,6 @@ from lab.roads.drives import BAD, planned
 from lab.roads.score import Recorded, kendall, kept_after, roads
 from protocol.errors import ConfigError
 from sim.scenario.file import load_scenario
-from sitegrid.proof.figures import judge
 from tests.unit.mapserver.roads.drives import along, passes
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.routes import experiment, ways
 from lab.routes.legs import seed_figures
@@ -10,7 +11,6 @@ from lab.routes.maps import true_squares
 from mapserver.routes.route import route
 from protocol.units import GRAVITY_MPS2
 from sim.truth import TruthMap
-from sitegrid.proof.figures import judge
 
 LEG = {
     "length_m": 500.0,

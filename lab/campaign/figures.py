@@ -1,0 +1,66 @@
+"""What experiments make of figures: intervals over seeds, rows that are chosen, and goals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from scipy import stats
+
+from protocol.arrays import Floats
+from sitegrid.proof.figures import CONFIDENCE, Row
+
+
+def half_width(sample: Floats) -> float | None:
+    """Half-width of the 95 % interval of a mean, by Student's t; None of a single value."""
+    n = len(sample)
+    if n < 2:
+        return None
+    quantile = float(stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1))
+    return quantile * float(sample.std(ddof=1)) / math.sqrt(n)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A limit for one figure of the rows that have these values.
+
+    A figure that must not exceed its limit counts by its size, so that a bias may be negative.
+    """
+
+    row: Mapping[str, Any]
+    figure: str
+    relation: Literal["<=", ">="]
+    limit: float
+
+    def is_met(self, value: float | None) -> bool:
+        """Whether a value keeps the limit; what is not known (None, NaN) does not."""
+        if value is None:
+            return False
+        return bool(abs(value) <= self.limit if self.relation == "<=" else value >= self.limit)
+
+
+def judge(goals: Sequence[Goal], rows: Sequence[Row]) -> list[Row]:
+    """Compare rows with the goals that concern them; `name`: of the figure.
+
+    `row`: the values that choose it, and the names by which it differs from others that they choose.
+    """
+    out = []
+    for goal in goals:
+        chosen = select(rows, goal.row)
+        apart = [key for key, value in chosen[0].items() if isinstance(value, str)] if len(chosen) > 1 else []
+        apart = [key for key in apart if len({row[key] for row in chosen}) > 1]
+        for row in chosen:
+            named = (*goal.row.values(), *(row[key] for key in apart))
+            value, limit = row[goal.figure], f"{goal.relation} {goal.limit:g}"
+            met = goal.is_met(value)
+            out.append(
+                {"row": " ".join(map(str, named)), "name": goal.figure, "goal": limit, "value": value, "met": met}
+            )
+    return out
+
+
+def select(rows: Iterable[Row], values: Mapping[str, Any]) -> list[Row]:
+    """The rows that have these values."""
+    return [row for row in rows if values.items() <= row.items()]
