@@ -60,6 +60,7 @@ def test_run_prints_rows_and_what_it_cannot_compare_and_draws(circle: Path, caps
     assert list(report["missing"]) == ["ground"]
 
 
+@pytest.mark.slow
 def test_a_log_needs_the_extra_of_agents_alone() -> None:
     code = "import sys, sitegrid.logs.check, sitegrid.logs.run; print(*sorted(sys.modules))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
