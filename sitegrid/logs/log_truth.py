@@ -1,4 +1,4 @@
-"""What is known of a recording beside its readings: `truth.toml` beside the manifest, which agents never read.
+"""What is known of a recording beside its readings: `evaluation.toml` beside the manifest, which agents never read.
 
 [truth]                                # the true track of the log, of `base_link` or of an antenna
 file = "truth.csv.gz"                  # in the data folder; keys and columns as those of a sensor in the manifest
@@ -45,7 +45,7 @@ from protocol.machine.machine_config import Mount
 from protocol.site.site_config import KnownGround, Projection
 from sitegrid.proof.tracks import Truth
 
-SIDE_FILE = "truth.toml"
+SIDE_FILE = "evaluation.toml"
 PLANAR, GEODETIC = ("x_m", "y_m"), ("lat_deg", "lon_deg")
 LIMITS = {"x_m": MAX_FAR_M, "y_m": MAX_FAR_M, "lat_deg": 90.0, "lon_deg": 180.0}
 GAP_NS = 2_000_000_000  # between two rows that are further apart nobody knows where the machine was

@@ -1,4 +1,4 @@
-"""The true track of a machine, as a simulation or a log's `truth.toml` has it."""
+"""The true track of a machine, as a simulation or a log's `evaluation.toml` has it."""
 
 from __future__ import annotations
 

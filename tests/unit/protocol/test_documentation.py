@@ -139,7 +139,7 @@ def test_example_of_a_log_of_ones_own_is_read(tmp_path):
     page = LOGS[LOGS.index("\n## A log of your own\n") :]
     manifest, truth = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "log.toml").write_text(manifest)
-    (tmp_path / "truth.toml").write_text(truth)
+    (tmp_path / "evaluation.toml").write_text(truth)
     (tmp_path / "groundtruth.csv").write_text("1326030975000000,1,2,3,0,0,0\n")
     log = open_log(tmp_path)
     assert [source.file.file for source in log.sources] == ["gps.csv", "imu.csv", "wheels.csv"]
@@ -152,7 +152,7 @@ def test_examples_of_known_ground_are_read(tmp_path):
     sides = [side for side in re.findall(r"```toml\n(.*?)```", LOGS, re.DOTALL) if "[[ground]]" in side]
     areas = []
     for side in sides:
-        (tmp_path / "truth.toml").write_text(side)
+        (tmp_path / "evaluation.toml").write_text(side)
         areas += read_known_ground(open_log(tmp_path), tmp_path)
     assert [(area.name, area.c_rr, area.has_gradient) for area in areas] == [
         ("ramp", 0.02, True),

@@ -48,11 +48,11 @@ def test_run_prints_rows_and_what_it_cannot_compare_and_draws(circle: Path, caps
     assert cli.main([*words, "--picture", str(circle / "log.png")]) == 0
     said = capsys.readouterr()
     assert (circle / "log.png").read_bytes().startswith(b"\x89PNG")
-    assert "\ntruth: no true track is known; describe one as [truth] in truth.toml" in said.out
+    assert "\ntruth: no true track is known; describe one as [truth] in evaluation.toml" in said.out
     assert "\nground: no IMU with forces, which gradient and rolling resistance need" in said.out
     assert "measurement" in said.out
     assert said.err == "circle: none\n"
-    (circle / "truth.toml").write_text(TRUTH)
+    (circle / "evaluation.toml").write_text(TRUTH)
     (circle / "true.csv").write_text((circle / "gps.csv").read_text())
     assert cli.main([*words, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -82,11 +82,16 @@ REFUSED = {  # what is written to which file, words of the command, what is said
         ["run"],
         "no sensor in use",
     ),
-    "another sensor": ("truth.toml", "", ["run", "--sensors", "gps-9"], "has no 'gps-9', but gps-1, wheels"),
-    "truth without columns": ("truth.toml", "[truth]\nfile = 'true.csv'\n", ["run"], "its columns are stamp, x_m, y_m"),
-    "truth of another table": ("truth.toml", "[turth]\n", ["run"], "unknown key `turth`; known: truth, ground"),
-    "an option that is none": ("truth.toml", "", ["run", "--set", "sart=[0,0,0]"], "--set: unknown key `sart`"),
-    "an outage behind the end": ("truth.toml", "", ["run", "--withhold", "900,5"], "the log ends after 80 s"),
+    "another sensor": ("evaluation.toml", "", ["run", "--sensors", "gps-9"], "has no 'gps-9', but gps-1, wheels"),
+    "truth without columns": (
+        "evaluation.toml",
+        "[truth]\nfile = 'true.csv'\n",
+        ["run"],
+        "its columns are stamp, x_m, y_m",
+    ),
+    "truth of another table": ("evaluation.toml", "[turth]\n", ["run"], "unknown key `turth`; known: truth, ground"),
+    "an option that is none": ("evaluation.toml", "", ["run", "--set", "sart=[0,0,0]"], "--set: unknown key `sart`"),
+    "an outage behind the end": ("evaluation.toml", "", ["run", "--withhold", "900,5"], "the log ends after 80 s"),
 }
 
 

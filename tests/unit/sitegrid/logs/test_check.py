@@ -156,7 +156,7 @@ def test_a_compressed_log_that_lies_apart_from_its_manifest_is_read(circle: Path
 @pytest.mark.parametrize(
     ("side", "subject", "line"),
     [
-        ("", "truth", r"-.*no true track is known; describe one as \[truth\] in truth.toml"),
+        ("", "truth", r"-.*no true track is known; describe one as \[truth\] in evaluation.toml"),
         ('[truth]\nfile = "true.csv"\nstamp = "t"\nx_m = "x"\ny_m = "y"', "truth", "PASS"),
         ('[truth]\nfile = "lost.csv"\nstamp = "t"\nx_m = "x"\ny_m = "y"', "truth", "FAIL.*lost.csv: is not there"),
         (
@@ -168,7 +168,7 @@ def test_a_compressed_log_that_lies_apart_from_its_manifest_is_read(circle: Path
     ],
 )
 def test_what_can_be_compared_is_said(circle: Path, side: str, subject: str, line: str) -> None:
-    (circle / "truth.toml").write_text(side)
+    (circle / "evaluation.toml").write_text(side)
     (circle / "true.csv").write_text("t,x,y\n0,1,2\n1,2,3\n")
     (circle / "late.csv").write_text("t,x,y\n900,1,2\n901,2,3\n")
     assert re.match(line, said(examine(circle), subject))

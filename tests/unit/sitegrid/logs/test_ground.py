@@ -52,7 +52,7 @@ def test_ground_that_no_sample_shows_has_no_mean() -> None:
 def log_of(folder: Path, side: str = "", known: str = "") -> LogFolder:
     write_circle(folder)
     (folder / "log.toml").write_text(MANIFEST.replace('name = "yard",', f'name = "yard", {known}'))
-    (folder / "truth.toml").write_text(side)
+    (folder / "evaluation.toml").write_text(side)
     return open_log(folder)
 
 
@@ -109,7 +109,7 @@ LEVEL = replace(PAD, grade_east=None)
     [
         (TORQUE, [PAD], "no IMU with forces"),
         (IMU.replace("file", 'measures = ["rate"]\nfile'), [PAD], "no IMU with forces"),
-        (IMU, [], "no ground is known; describe areas as [[ground]] in truth.toml"),
+        (IMU, [], "no ground is known; describe areas as [[ground]] in evaluation.toml"),
         (IMU, [LEVEL], "no torque sensor"),
         (IMU, [LEVEL, RAMP], ""),
         (IMU + TORQUE, [LEVEL], ""),

@@ -31,7 +31,7 @@ METRES = 'stamp = "t"\nx_m = "x"\ny_m = "y"'
 def truth_of(folder: Path, rows: str, described: str = METRES) -> LogTruth | None:
     (folder / "log.toml").write_text(MANIFEST)
     (folder / "truth.csv").write_text(rows)
-    (folder / "truth.toml").write_text(f'[truth]\nfile = "truth.csv"\n{described}\n')
+    (folder / "evaluation.toml").write_text(f'[truth]\nfile = "truth.csv"\n{described}\n')
     return read_log_truth(open_log(folder), folder)
 
 
@@ -128,7 +128,7 @@ def test_a_truth_that_cannot_be_is_refused_with_its_line(tmp_path: Path, rows: s
 )
 def test_a_wrong_side_file_is_refused_in_one_line(tmp_path: Path, old: str, new: str, problem: str) -> None:
     truth_of(tmp_path, "t,x,y\n0,0,0\n")
-    side = tmp_path / "truth.toml"
+    side = tmp_path / "evaluation.toml"
     assert old in side.read_text()
     side.write_text(side.read_text().replace(old, new, 1))
     with pytest.raises((ConfigError, LogFolderError)) as caught:

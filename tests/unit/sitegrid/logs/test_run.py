@@ -72,7 +72,7 @@ def circle(tmp_path: Path) -> Path:
     write(tmp_path / "gps2.csv", "t,x,y", [])
     gps = [GPS.format(i=i, use=use) for i, use in ((1, "true"), (2, "false"))]
     (tmp_path / "log.toml").write_text("".join([MANIFEST, *gps]))
-    (tmp_path / "truth.toml").write_text(SIDE)
+    (tmp_path / "evaluation.toml").write_text(SIDE)
     return tmp_path
 
 
@@ -128,7 +128,7 @@ def test_wheels_in_another_unit_show_in_their_scale(circle: Path, scale: float):
 
 
 def test_without_a_side_file_there_is_no_truth(circle: Path):
-    (circle / "truth.toml").unlink()
+    (circle / "evaluation.toml").unlink()
     row = run(circle, Periodic(10.0, 1.0))["rows"][0]
     assert not any(name.startswith("truth") for name in row)
 
