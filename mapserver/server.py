@@ -23,9 +23,8 @@ from mapserver.journal import records
 from mapserver.journal.location import JournalLocation
 from mapserver.past.past import Past
 from mapserver.query import road_maps, routes
-from mapserver.query.answer_pool import AnswerPool
 from mapserver.query.answering import Answers
-from mapserver.query.queryable import MapQueryable, Replies, question
+from mapserver.query.queryable import AnswerPool, MapQueryable, Replies, question
 from mapserver.query.server_source import Commands, ServerSource
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import ConfigError, QueryError, Refusal

@@ -19,7 +19,7 @@ from sim.operators.driver import DRIVER_STEPS, LOOK_OUT_STEPS, at_start, drive, 
 from sim.operators.habits import draw_habits
 from sim.scenario.ground import build_terrain, with_zone
 from sim.scenario.tables import Scenario
-from sim.sensors.base_receiver import BaseReceiver
+from sim.sensors.gps import BaseReceiver
 from sim.sensors.noise import generator
 from sim.sensors.rigs import draw_bodies
 from sim.sensors.sensors import FleetReadings, Sensors

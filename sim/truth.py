@@ -12,8 +12,7 @@ import numpy as np
 
 from protocol.arrays import Floats32, Table
 from protocol.errors import StoreError
-from sim.terrain.soil import C_RR
-from sim.terrain.terrain import Terrain
+from sim.terrain.terrain import C_RR, Terrain
 
 TRACK_EVERY = 10  # steps: 10 Hz
 # Column of a track -> what it takes from the state record [m, rad, m/s, kg, -, m/m]

@@ -24,7 +24,7 @@ from protocol.queries.answer_codec import decode_alive, decode_error
 from protocol.queries.answers import FollowerState, ServerAlive
 from protocol.queries.origin import SERVER, Origin, decode_origin
 from protocol.queries.parameters import selector_of, text_of
-from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.wire import keys
 

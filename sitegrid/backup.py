@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapserver.ingest.decisions import calibrations
-from mapserver.ingest.losses import lacking
+from mapserver.ingest.map_info import lacking
 from mapserver.ingest.store_folder import hold_place, is_in_use
 from mapserver.journal import archived_decisions
 from mapserver.journal.history import History, read_history

@@ -35,8 +35,7 @@ from protocol.queries.parameters import Freshness
 from protocol.queries.pieces import Progress, joined
 from protocol.queries.places import Place
 from protocol.queries.reasons import CellReasons, decode_why
-from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
-from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
+from protocol.queries.roads import Segments, SegmentsQuery, Worklist, WorklistQuery, decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import LOADER, NamedMachine, RouteAnswer, RouteMachine, decode_answer, machine_of
 from protocol.site.geometry import Bounds

@@ -24,12 +24,19 @@ from pathlib import Path
 import numpy as np
 
 from agents.delivery.audit import AuditLog
-from agents.delivery.spool_file import checksum, checksum_of, connect, make_or_check, transaction, why_unusable
-from agents.delivery.spool_mark import RunEnd, runs_cut_short
+from agents.delivery.spool_file import (
+    RunEnd,
+    checksum,
+    checksum_of,
+    connect,
+    make_or_check,
+    runs_cut_short,
+    transaction,
+    why_unusable,
+)
 from agents.delivery.uplink import Head
 from protocol.arrays import Table
-from protocol.disk.high_water_mark import HighWaterMark, mark_path
-from protocol.disk.traces import Traces, look_beside
+from protocol.disk.high_water_mark import HighWaterMark, Traces, look_beside, mark_path
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE, empty
 

@@ -1,12 +1,18 @@
-"""The spool's file: its tables, how it is opened, and transactions that leave nothing half done."""
+"""The spool's file: its tables, how it is opened, and transactions that leave nothing half done.
+
+Its mark has, by run, the last seq that was recorded and the last that was acknowledged, and tells what is gone where
+the file does not reach it.
+"""
+
+from __future__ import annotations
 
 import sqlite3
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
-from agents.delivery.spool_mark import RunEnd
 from protocol.files import make_private
 
 SCHEMA = 7
@@ -19,6 +25,7 @@ _TABLES = (
     "INSERT INTO meta VALUES ('newest', '0'), ('dropped', '0'), ('recorded', '0'), ('gone', '0')",
     f"PRAGMA user_version={SCHEMA}",
 )
+_ACKNOWLEDGED = " acknowledged"  # after the name of a run
 
 
 def connect(path: Path, kind: type[sqlite3.Connection] = sqlite3.Connection) -> sqlite3.Connection:
@@ -75,3 +82,39 @@ def transaction(db: sqlite3.Connection) -> Iterator[None]:
     finally:
         if db.in_transaction:  # SQLite itself has rolled back after some errors of the disk
             db.execute("ROLLBACK")
+
+
+@dataclass(frozen=True)
+class RunEnd:
+    """How far a run went: the last seq recorded, and the last acknowledged."""
+
+    spool_id: int
+    recorded: int
+    acknowledged: int
+
+    def values(self) -> dict[str, int]:
+        """As a mark has it."""
+        name = f"{self.spool_id:016x}"
+        return {name: self.recorded, name + _ACKNOWLEDGED: self.acknowledged}
+
+
+def run_ends(mark: Mapping[str, int]) -> list[RunEnd]:
+    """Undo `RunEnd.values`: the runs in the order in which they began."""
+    names = [name for name in mark if not name.endswith(_ACKNOWLEDGED)]
+    return [RunEnd(int(name, 16), mark[name], mark.get(name + _ACKNOWLEDGED, 0)) for name in names]
+
+
+def runs_cut_short(there: Iterable[RunEnd], mark: Mapping[str, int]) -> list[tuple[RunEnd, int]]:
+    """Runs that went further than the file says, each with how many of its samples are gone.
+
+    there: the file's runs, in order. Only its last one can be short, and those after it are not there at all.
+    """
+    *earlier, last = [*there] or [RunEnd(0, 0, 0)]
+    known = {run.spool_id for run in earlier}
+    short = []
+    for end in run_ends(mark):
+        kept = last.recorded if end.spool_id == last.spool_id else 0
+        gone = end.recorded - max(kept, end.acknowledged)
+        if end.spool_id not in known and gone > 0:
+            short.append((end, gone))
+    return short

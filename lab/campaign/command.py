@@ -10,11 +10,10 @@ from lab.campaign.experiment import Runner
 from lab.campaign.provenance import made_by
 from lab.campaign.workers import cores
 from protocol.errors import ConfigError
-from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import count, positive, seed
+from sitegrid.options.values import FOLDER, count, positive, seed
 from sitegrid.process.lifetime import note, plain, raise_interrupts, say, tell
 from sitegrid.process.progress import Display
-from sitegrid.process.tables import lines
+from sitegrid.process.streams import lines
 from sitegrid.proof.figures import Report
 
 DEFAULT_SEEDS, DEFAULT_S = 12, 1200.0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lab.campaign.command import add_processes, show
 from sitegrid.options.groups import add_action
-from sitegrid.options.outputs import FOLDER
+from sitegrid.options.values import FOLDER
 from sitegrid.process.lifetime import raise_interrupts, tell
 from sitegrid.process.progress import Display
 from sitegrid.proof.figures import Report

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lab.campaign.command import DEFAULT_S, add_quick, add_runs, is_quick, perform, seeds_of
 from protocol.errors import ConfigError
-from sitegrid.options.outputs import FOLDER, OutputFile
+from sitegrid.options.values import FOLDER, OutputFile
 from sitegrid.proof.figures import Report
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any, Protocol, cast
 
 from lab.speed.measure import Goals, judged, machine
-from sitegrid.process.tables import table
+from sitegrid.process.streams import table
 from sitegrid.proof.figures import Row
 
 

@@ -25,9 +25,8 @@ from mapserver.evidence.grid import Grid, warm_up
 from mapserver.evidence.pages import CompactPages
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES
 from mapserver.ingest.store import Store
-from mapserver.journal.history import History
+from mapserver.journal.history import History, fold_history
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
-from mapserver.journal.refold import fold_history
 from protocol.queries.answer_codec import decode_machines
 from protocol.wire import keys
 from protocol.wire.messages import SampleBatch

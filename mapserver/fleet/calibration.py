@@ -12,11 +12,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mapserver.fleet.applied_part import FAULT_SIGMAS, FAULTY_SIGMAS, Applied, applied_part, beyond_data_sheet
 from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
 from mapserver.fleet.ledger import EPOCH_NS, EPOCHS, Stated, newest, stated
-from mapserver.fleet.machine_state import MachineState, is_surer
-from mapserver.fleet.observability import CommonScale, Observed, observe
+from mapserver.fleet.observability import (
+    FAULT_SIGMAS,
+    FAULTY_SIGMAS,
+    Applied,
+    CommonScale,
+    MachineState,
+    Observed,
+    applied_part,
+    beyond_data_sheet,
+    is_surer,
+    observe,
+)
 from mapserver.fleet.passages import sound
 from mapserver.fleet.solver import SCALE_STD, Estimate, Prior, Problem, against, estimate, problem
 from protocol.arrays import Floats, Table

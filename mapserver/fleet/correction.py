@@ -12,13 +12,16 @@ above is (1 - applied scale) of the drive force over weight, so that what was me
 correction takes off the difference alone: it does not matter who calibrated when.
 
 Only + - * / and a table of headings: kernels and machines would differ in the last bit of a sine, and so would maps.
+
+Corrections of one machine in the order of time: what covers what, and what lies at a time.
 """
 
 from __future__ import annotations
 
 import hashlib
+from bisect import bisect_right
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -43,6 +46,7 @@ LAST_NS = 2**62  # a correction without an end ends then
 DIGITS = 5  # a correction is rounded to 1e-5 before it is used: it is a fact, not a solver's floats
 _C_LOW, _C_HIGH = LIMITS["c_rr"]
 _GRADE_LOW, _GRADE_HIGH = LIMITS["grade_e"]
+VALUES = ("zero", "scale", "across", "most_share")
 
 
 @dataclass(frozen=True)
@@ -221,3 +225,35 @@ def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, unit
                     row.c_rr = np.float32(min(max(c_rr, _C_LOW), _C_HIGH))
             row.grade_e = np.float32(min(max(east + (zero * ahead_e + across * ahead_n), _GRADE_LOW), _GRADE_HIGH))
             row.grade_n = np.float32(min(max(north + (zero * ahead_n - across * ahead_e), _GRADE_LOW), _GRADE_HIGH))
+
+
+def values(one: Correction) -> tuple[float, ...]:
+    """What a correction does to a sample, by VALUES."""
+    return one.zero, one.scale, one.across, one.most_share
+
+
+def paint(spans: list[Correction], one: Correction) -> None:
+    """Put a correction over those of one machine, which are in order of time; what it covers of them goes.
+
+    Neighbours that do the same become one, as sure as the later: else they would grow without an end.
+    """
+    first = bisect_right(spans, one.from_ns, key=lambda other: other.to_ns)
+    end = first
+    while end < len(spans) and spans[end].from_ns < one.to_ns:
+        end += 1
+    left = [replace(other, to_ns=one.from_ns) for other in spans[first:end] if other.from_ns < one.from_ns]
+    right = [replace(other, from_ns=one.to_ns) for other in spans[first:end] if other.to_ns > one.to_ns]
+    before, after = spans[max(first - 1, 0) : first], spans[end : end + 1]
+    joined: list[Correction] = []
+    for each in [*before, *left, one, *right, *after]:
+        if joined and joined[-1].to_ns == each.from_ns and values(joined[-1]) == values(each):
+            joined[-1] = replace(each, from_ns=joined[-1].from_ns)
+        else:
+            joined.append(each)
+    spans[first - len(before) : end + len(after)] = joined
+
+
+def at(spans: Sequence[Correction], stamp_ns: int) -> Correction | None:
+    """The correction that a time has, of those of one machine in order of time."""
+    index = bisect_right(spans, stamp_ns, key=lambda one: one.from_ns) - 1
+    return spans[index] if index >= 0 and stamp_ns < spans[index].to_ns else None

@@ -13,14 +13,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mapserver.fleet.applied_part import FAULT_SIGMAS
 from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, UNCORRECTED, Correction, Corrections
+from mapserver.fleet.correction import (
+    ANY_SHARE,
+    LAST_NS,
+    LEVEL_SHARE,
+    UNCORRECTED,
+    VALUES,
+    Correction,
+    Corrections,
+    paint,
+)
 from mapserver.fleet.hysteresis import Hysteresis
 from mapserver.fleet.ledger import EPOCH_NS, NOTHING_STATED, Stated
-from mapserver.fleet.machine_state import state_of
-from mapserver.fleet.observability import OBSERVED
-from mapserver.fleet.spans import VALUES, paint
+from mapserver.fleet.observability import FAULT_SIGMAS, OBSERVED, state_of
 
 KIND = "calibration"
 VERSION = 1  # of the event

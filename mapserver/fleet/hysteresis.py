@@ -11,9 +11,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from mapserver.fleet.correction import ANY_SHARE, Correction
+from mapserver.fleet.correction import ANY_SHARE, Correction, at, values
 from mapserver.fleet.ledger import EPOCH_NS, NOTHING_STATED, Stated
-from mapserver.fleet.spans import at, values
 
 IN_A_ROW = 2  # solves that have to differ from what counts; one, of a new machine of which nothing counts
 LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better

@@ -20,13 +20,11 @@ from mapserver.evidence import snapshot
 from mapserver.follower.replica import Replica
 from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.journal.facts import Facts
-from mapserver.journal.history import History, read_history
+from mapserver.journal.history import History, fold_history, read_history, release_memory
 from mapserver.journal.journal import JournalReader, JournalState
 from mapserver.journal.location import JournalLocation
-from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Selection
-from mapserver.past.anew import FoldedAnew, fold_anew
-from mapserver.past.past import Past
+from mapserver.past.past import FoldedAnew, Past, fold_anew
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.site.site_config import SiteConfig
 

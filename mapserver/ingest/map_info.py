@@ -1,17 +1,28 @@
-"""What `info` says of a map and its process, whether the process writes or follows."""
+"""What `info` says of a map and its process, and what machines sent and a store has lost: by machine and number."""
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from mapserver.evidence.grid import Grid
+from mapserver.evidence.snapshot import rows_on_disk
+from mapserver.ingest.store_folder import is_in_use
 from mapserver.journal.facts import Facts
+from mapserver.journal.journal import Journal
+from mapserver.journal.location import JournalLocation
+from mapserver.journal.rows import MachineTotals, Progress
+from mapserver.journal.shortfall import KIND, Shortfall, beyond, compare, marked, missing
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
+
+log = logging.getLogger("mapserver.ingest.map_info")
 
 
 def map_info(
@@ -36,3 +47,39 @@ def map_info(
         "version": package_version(),
         "server": {"host": socket.gethostname(), "pid": os.getpid()},
     }
+
+
+def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shortfall]:
+    """Say what was acknowledged and was not in a journal that has just been opened; returns all that ever was.
+
+    snapshot_rows: of the snapshots beside it; one that the journal does not reach proves that it was longer.
+    """
+    shortfall, newest = journal.shortfall, max(snapshot_rows, default=0)
+    if newest > max(journal.last_row, shortfall.expected_row if shortfall else 0):
+        shortfall = beyond(journal.last_row, newest)
+        journal.note_shortfall(shortfall)
+    if shortfall:
+        log.error("acknowledged samples are missing journal=%s shortfall=%r", journal.where, str(shortfall))
+    return [Shortfall.from_event(event) for event in journal.events(KIND)]
+
+
+def lacking(location: JournalLocation) -> Shortfall | None:
+    """What a journal lacks of what was acknowledged, as long as no start of a server has named it.
+
+    It may be in use: what proves that it was longer is looked at before it, and is never ahead of it. StoreError where
+    it cannot be read.
+    """
+    newest = max(rows_on_disk(location.folder), default=0)
+    traces = location.traces(in_use=is_in_use(location.folder))
+    with location.reader() as journal:
+        last_row, events, watermarks = journal.last_row, journal.events(), journal.watermarks()
+    shortfall = compare(traces, marked(last_row, len(events), watermarks))
+    return beyond(last_row, newest) if newest > last_row and not shortfall else shortfall
+
+
+def by_machine(progress: Journal | Progress, shortfalls: Sequence[Shortfall]) -> dict[str, dict[str, int]]:
+    """What each machine sent: spools, samples, samples that it declared lost, newest stamp, and what is missing."""
+    gone = missing(shortfalls, progress.watermarks()) if shortfalls else Counter()
+    sent = progress.machines()
+    names = dict.fromkeys([*sent, *gone])
+    return {name: {**vars(sent.get(name, MachineTotals())), "missing": gone[name]} for name in names}

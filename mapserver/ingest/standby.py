@@ -11,11 +11,10 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.decisions import Decisions
 from mapserver.journal.facts import NO_FACTS, Facts
-from mapserver.journal.history import History, read_history
+from mapserver.journal.history import History, fold_samples, pieces, read_history, release_memory
 from mapserver.journal.journal import JournalQueries, JournalReader, JournalState
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.records import last_checksum
-from mapserver.journal.refold import fold_samples, pieces, release_memory
 from mapserver.journal.rows import JournalRows, Selection
 from protocol.errors import StoreError
 from protocol.site.site_config import SiteConfig

@@ -23,15 +23,14 @@ from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.block_credit import BlockCredit
 from mapserver.ingest.decisions import Decision, Decisions, plain
-from mapserver.ingest.losses import by_machine, name_shortfalls
+from mapserver.ingest.map_info import by_machine, name_shortfalls
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store_folder import hold
 from mapserver.ingest.store_state import state_of
 from mapserver.journal.facts import Facts
-from mapserver.journal.history import History, read_history
+from mapserver.journal.history import History, fold_history, read_history, release_memory
 from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.location import JournalLocation
-from mapserver.journal.refold import fold_history, release_memory
 from mapserver.journal.rows import Admission, Selection
 from mapserver.past import checkpoints
 from protocol.errors import MessageError, Refusal

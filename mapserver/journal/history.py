@@ -1,15 +1,37 @@
-"""History: archive and journal as one."""
+"""History: archive and journal as one; and long folds of it on several threads.
+
+A history is folded anew after a decision about a machine, and when a store is opened.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import ctypes
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain
+from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mapserver.evidence.grid import Grid
+from mapserver.evidence.workers import ALONE, Workers
 from mapserver.journal.archive import Archive
 from mapserver.journal.journal import ArchivedError, JournalQueries
 from mapserver.journal.records import checksum_of, record
 from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
+from protocol.arrays import Table
+
+# Kernels run beside each other, what is Python between them does not. Not more are tried: lab/results/refold.md
+THREADS = min(2, len(os.sched_getaffinity(0)))
+PIECE = 16_384  # samples
+AHEAD = 24  # pieces that are read ahead: about as many as are folded at once, while nothing is taken
+Samples = tuple[Table, NDArray[np.uint64]]  # and the hashes of their machines' names
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -51,3 +73,77 @@ def history_rows(
 ) -> Iterator[JournalRow]:
     """As `read_history`, one by one."""
     return chain.from_iterable(read_history(history, after, until, selection))
+
+
+class _StoppedError(Exception):
+    """A fold is not wanted any more."""
+
+
+@contextmanager
+def lent(count: int) -> Iterator[Workers]:
+    """Lend so many threads to a grid (`Grid.bulk`)."""
+    if count == 1:
+        yield ALONE
+        return
+    with ThreadPoolExecutor(count, thread_name_prefix="fold") as pool:
+        yield Workers(count, pool.map)
+
+
+def fold_history(
+    grid: Grid,
+    history: History,
+    after: int = 0,
+    until: int = LAST,
+    selection: Selection = ALL,
+    stopped: Callable[[], bool] = lambda: False,
+    threads: int = THREADS,
+) -> bool:
+    """Fold the selected samples of rows after < row <= until, and settle the grid.
+
+    Whether it came to the end: where `stopped` says so it ends early, and the grid is of no use.
+    """
+    return fold_samples(grid, pieces(read_history(history, after, until, selection), selection), stopped, threads)
+
+
+def fold_samples(
+    grid: Grid,
+    pieces: Generator[Samples, None, None],
+    stopped: Callable[[], bool] = lambda: False,
+    threads: int = THREADS,
+) -> bool:
+    """As `fold_history`, of any samples, piece by piece."""
+    try:
+        with lent(threads) as workers, grid.bulk(workers), closing(ahead(pieces) if threads > 1 else pieces) as coming:
+            for samples, names in coming:
+                grid.fold_all(samples, names)
+                if stopped():
+                    raise _StoppedError  # past what ends a fold in order, which takes its time
+    except _StoppedError:
+        return False
+    return True
+
+
+def ahead(pieces: Iterator[T]) -> Generator[T, None, None]:
+    """Have the next pieces made on another thread while one is used."""
+    with ThreadPoolExecutor(1, thread_name_prefix="read") as pool:
+        try:
+            coming = deque(pool.submit(next, pieces, None) for _ in range(AHEAD))
+            while (piece := coming.popleft().result()) is not None:
+                coming.append(pool.submit(next, pieces, None))
+                yield piece
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def pieces(history: Iterable[JournalRows], selection: Selection) -> Generator[Samples, None, None]:
+    """Samples of rows in pieces, none of them long, so that those read ahead take little memory."""
+    for rows in history:
+        samples, names = rows.selected(selection)
+        for first in range(0, len(samples), PIECE):
+            yield samples[first : first + PIECE], names[first : first + PIECE]
+
+
+def release_memory() -> None:
+    """Give back to the system what a long fold has freed: the C library would keep it, for each thread apart."""
+    with suppress(OSError, AttributeError):  # glibc has it
+        ctypes.CDLL(None).malloc_trim(0)

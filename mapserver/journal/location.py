@@ -12,7 +12,7 @@ from mapserver.journal.journal import Journal, JournalQueries, JournalReader, Wa
 from mapserver.journal.postgres import MARK_FILE
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
-from protocol.disk.traces import Traces, look_beside
+from protocol.disk.high_water_mark import Traces, look_beside
 from protocol.disk.write_ahead_log import LogScan
 from protocol.errors import ConfigError, one_line
 

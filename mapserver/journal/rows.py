@@ -1,4 +1,8 @@
-"""What a journal holds, as values: admitted batches, rows, watermarks, events; which rows to read; checksums."""
+"""What a journal holds, as values: admitted batches, rows, watermarks, events; which rows to read; checksums.
+
+`Progress` is how far all spools have come, and what that comes to for each machine: kept up to date, never counted
+anew.
+"""
 
 from __future__ import annotations
 
@@ -244,3 +248,44 @@ def extent_checksum(row: int, first_ns: int, last_ns: int, *box: float) -> int:
 def checksum(*values: object) -> int:
     """CRC-32 of plain values, bytes among them."""
     return zlib.crc32(repr(values).encode())
+
+
+class Progress:
+    """Watermarks of all spools. samples: that all machines sent."""
+
+    def __init__(self, watermarks: Mapping[SpoolKey, Watermark]) -> None:
+        self._watermarks: dict[SpoolKey, Watermark] = {}
+        self._machines: dict[str, MachineTotals] = {}
+        self.samples = 0
+        for (machine, spool_id), watermark in watermarks.items():
+            self.put(machine, spool_id, watermark)
+
+    def watermark(self, machine: str, spool_id: int) -> Watermark:
+        """Progress of one spool."""
+        return self._watermarks.get((machine, spool_id), Watermark())
+
+    def known(self, spool: SpoolKey) -> Watermark | None:
+        """Progress of one spool, None for one that there is not."""
+        return self._watermarks.get(spool)
+
+    def watermarks(self) -> dict[SpoolKey, Watermark]:
+        """Progress of all spools."""
+        return dict(self._watermarks)
+
+    def machines(self) -> dict[str, MachineTotals]:
+        """What each machine sent."""
+        return dict(self._machines)
+
+    def put(self, machine: str, spool_id: int, after: Watermark) -> None:
+        """Replace a watermark."""
+        before, totals = self._watermarks.get((machine, spool_id)), self._machines.get(machine, MachineTotals())
+        self._watermarks[machine, spool_id] = after
+        known = before or Watermark()
+        samples = (after.seq - after.lost) - (known.seq - known.lost)
+        self.samples += samples
+        self._machines[machine] = MachineTotals(
+            spools=totals.spools + (before is None),
+            samples=totals.samples + samples,
+            lost=totals.lost + after.lost - known.lost,
+            newest_ns=max(totals.newest_ns, after.newest_ns),
+        )

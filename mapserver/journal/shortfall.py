@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mapserver.journal.rows import Event, SpoolKey, Watermark
-from protocol.disk.traces import Traces
+from protocol.disk.high_water_mark import Traces
 
 KIND = "shortfall"
 ROW, EVENT = "row", "event"  # names of a mark; the others are those of spools

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from mapserver.journal.progress import Progress
 from mapserver.journal.queries import TableQueries
 from mapserver.journal.records import extent_of, record
 from mapserver.journal.rows import (
@@ -16,6 +15,7 @@ from mapserver.journal.rows import (
     Event,
     JournalRow,
     MachineTotals,
+    Progress,
     SpoolKey,
     Watermark,
     checksum,

@@ -3,6 +3,10 @@
 A map of the past is the nearest checkpoint before it, and the samples that this one lacks: those stamped since it was
 closed, and late ones, stamped before but journalled after it was made. A fold commutes, so the map is the fold of all
 samples up to that time, bit for bit, whichever checkpoint it begins with, and also with none.
+
+So is a map folded again with other facts (`fold_anew`), beside the one that goes on, in a process that writes or
+follows. It begins with the newest checkpoint whose evidence the facts leave as it is, else with nothing. What comes in
+meanwhile is folded in rounds, until a few rows are left.
 """
 
 from __future__ import annotations
@@ -21,9 +25,8 @@ from mapserver.evidence.grid import Grid
 from mapserver.evidence.snapshot import parameters
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.facts import NO_FACTS, Facts
-from mapserver.journal.history import History, read_history
+from mapserver.journal.history import THREADS, History, fold_history, fold_samples, lent, read_history
 from mapserver.journal.journal import JournalReader
-from mapserver.journal.refold import THREADS, lent
 from mapserver.journal.rows import LAST, JournalRows, Selection
 from mapserver.journal.stamp_index import StampIndex
 from mapserver.past.checkpoint_file import Checkpoint, DamagedError, Header
@@ -32,6 +35,8 @@ from protocol.arrays import Table
 from protocol.site.geometry import Bounds, CellWindow, GridGeometry
 
 NamedSamples = tuple[Table, NDArray[np.uint64]]  # and the hashes of their machines' names
+FEW_ROWS = 8  # may be left to whoever goes on with the map: some ms
+MOST_ROUNDS = 20  # where batches come in as fast as they are folded, whoever goes on has to make them wait
 
 
 @dataclass(frozen=True)
@@ -151,3 +156,35 @@ def reach_of(window: CellWindow, cell_m: float, config: FoldConfig) -> Bounds:
     reach_m = 3 * math.hypot(config.std_cap_m, STD_FLOOR_M) + cell_m
     inner = GridGeometry(cell_m).bounds(window)
     return Bounds(inner.west_m - reach_m, inner.south_m - reach_m, inner.east_m + reach_m, inner.north_m + reach_m)
+
+
+@dataclass(frozen=True)
+class FoldedAnew:
+    """A grid up to a journal row, and how many rounds it took."""
+
+    grid: Grid
+    row: int
+    rounds: int
+
+
+def fold_anew(past: Past, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> FoldedAnew | None:
+    """Fold the map with these facts, up to a row that few are behind; None where `stopped` said so."""
+    begun = _begun(past, reader, facts, stopped)
+    if begun is None:
+        return None
+    (grid, row), history, selection, rounds = begun, History(reader, past.archive), Selection.by(facts), 0
+    while (last := reader.last_row) - row > FEW_ROWS and rounds < MOST_ROUNDS:
+        if not fold_history(grid, history, row, last, selection, stopped):
+            return None
+        row, rounds = last, rounds + 1
+    return FoldedAnew(grid, row, rounds)
+
+
+def _begun(past: Past, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> tuple[Grid, int] | None:
+    """The map up to a journal row that a checkpoint makes quick, or an empty one; None where it is not wanted."""
+    last = reader.last_row
+    grid, base = past.nearest(reader, LAST, None, facts)
+    if base is None:
+        return grid, 0
+    samples = past.lacking(reader, base, Selection.by(facts), last)
+    return (grid, last) if fold_samples(grid, samples, stopped) else None

@@ -47,8 +47,7 @@ from protocol.queries.requests import (
     When,
     WhyQuery,
 )
-from protocol.queries.road_requests import RoadQuery, SegmentsQuery, WorklistQuery
-from protocol.queries.roads import encode_segments, encode_worklist
+from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery, encode_segments, encode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import encode_answer
 from protocol.site.geometry import Bounds, CellWindow, GridGeometry

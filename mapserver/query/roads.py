@@ -13,12 +13,11 @@ from mapserver.roads.loss import Losses, losses
 from mapserver.roads.repairs import Repair
 from mapserver.roads.segments import Segments
 from mapserver.roads.tally import HOUR_NS
-from mapserver.roads.trend import DAY_NS, Daily, daily, trends
-from mapserver.roads.worklist import litres, ranked, seconds
+from mapserver.roads.worklist import DAY_NS, Daily, daily, litres, ranked, seconds, trends
 from protocol.arrays import Floats, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import roads as answers
-from protocol.queries.road_requests import RoadQuery, SegmentsQuery, WorklistQuery
+from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.site.geometry import Bounds
 
 MOST_SEGMENTS = 10_000  # of one answer: 250 km of roads, 3 MB

@@ -14,9 +14,8 @@ from mapserver.evidence.timeline import Block
 from mapserver.query.block_layers import SQUARE_CELLS, BlockLayers, Look, place_square, squares_of
 from mapserver.query.named_machines import NamedMachines
 from mapserver.query.source import MapSource
-from mapserver.routes.ground import Squares, squares_at
+from mapserver.routes.ground import Squares, squares_at, steps
 from mapserver.routes.least_cost import Cell, Terrain, cost_of, least_cost_line, reaches
-from mapserver.routes.line import steps
 from mapserver.routes.prices import PRICED, Prices, around, bare
 from mapserver.routes.route import LAYERS, STEP_M, route
 from protocol.arrays import Bools, Floats, Floats32, Ints

@@ -10,8 +10,7 @@ import numba
 import numpy as np
 
 from mapserver.routes.drive import Drive, drive, smoothed
-from mapserver.routes.ground import Squares, squares_at
-from mapserver.routes.line import Steps, limits, steps
+from mapserver.routes.ground import Squares, Steps, limits, squares_at, steps
 from mapserver.routes.prices import EAST, NORTH, RESISTANCE, Prices
 from protocol.arrays import Bools, Floats
 from protocol.errors import QueryError, Refusal

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
-from mapserver.fleet.machine_state import MachineState
+from mapserver.fleet.observability import MachineState
 from mapserver.journal.rows import JournalRows
 from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
 from mapserver.trust.comparison import ComparedMap, Difference, compare, reverse

@@ -10,8 +10,7 @@ from math import hypot, log, sqrt
 
 import numpy as np
 
-from mapserver.fleet.applied_part import FAULT_SIGMAS
-from mapserver.fleet.machine_state import MachineState
+from mapserver.fleet.observability import FAULT_SIGMAS, MachineState
 from mapserver.trust.comparison import CELLS_PER_DRAW, ZERO_ERROR, Difference, Gain
 from mapserver.trust.shift import Shift
 from protocol.arrays import Ints

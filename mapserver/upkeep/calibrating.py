@@ -1,7 +1,8 @@
 """The job that calibrates machines: follows the samples, solves now and then in site time, and has the result decided.
 
 What it remembers are the ledgers of the machines. A server that starts makes them anew, from the journal and archive of
-the last days.
+the last days. The site's now is that of what machines sent lately (`SiteClock`): a clock that is wrong counts while it
+is wrong, and not a day longer.
 """
 
 from __future__ import annotations
@@ -9,23 +10,25 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mapserver.evidence.fold_config import is_foldable
 from mapserver.fleet.calibration import Calibration, calibrate, epochs_of_each, groups, joined
-from mapserver.fleet.correction import Correction
+from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, Correction, Corrections
+from mapserver.fleet.decisions import PERSON, CalibrationDecision
 from mapserver.fleet.ledger import Ledger
-from mapserver.fleet.machine_state import MachineState, remembered_of
+from mapserver.fleet.observability import MachineState, remembered_of
 from mapserver.ingest.writer import Writer
 from mapserver.journal.rows import JournalRows, Selection
 from mapserver.past.past import Past
 from mapserver.past.plan import DAY_NS
-from mapserver.upkeep.site_clock import SiteClock
 from protocol.errors import StoreError
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
+from protocol.queries.calibration import CorrectedSpan, MachineCalibration
+from protocol.queries.commands import CalibrateCommand
 
 SPAN_NS = 2 * DAY_NS  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
 AHEAD_NS = 600 * 10**9  # of the site's now: machines' clocks, and what is on its way, differ by less
@@ -35,6 +38,8 @@ TURN_SAMPLES = 200_000  # read in one turn, in about 0.2 s
 Decide = Callable[[Calibration, int], object]
 Group = tuple[str, ...]
 log = logging.getLogger("mapserver.upkeep.calibrating")
+RECENT = 10  # marks; a machine that was silent for longer says nothing of now, though its clock may have been ahead
+MOST_SPANS = 100  # of an answer: the last day of a machine at work
 
 
 class Calibrating:
@@ -188,3 +193,73 @@ class Calibrating:
             log.info("calibration machines=%d epochs=%d: so many of each are remembered", len(self._ledgers), epochs)
         for ledger in self._ledgers.values():
             ledger.epochs = epochs
+
+
+class SiteClock:
+    """Site time for a job that looks now and then, which is marked each time.
+
+    A machine is as far as what came in of it last, so that it falls back with the machine's clock.
+    """
+
+    def __init__(self) -> None:
+        self._marks = 0
+        self._last_ns: dict[str, int] = {}  # by machine, of what came in last
+        self._since: dict[str, int] = {}  # by machine, behind which mark that came in
+        self._marked_ns: dict[str, int] = {}  # by machine, its last at the last mark, or its first stamp of all
+
+    def add(self, machine: str, oldest_ns: int, last_ns: int) -> None:
+        """Take samples of a machine into account, by the oldest stamp and that of what came in last."""
+        self._marked_ns.setdefault(machine, oldest_ns)
+        self._last_ns[machine], self._since[machine] = last_ns, self._marks
+
+    def now_ns(self, without: Collection[str] = ()) -> int:
+        """The newest stamp of all machines but some [ns], of those that sent anything of late; 0 for none."""
+        since = {name: mark for name, mark in self._since.items() if name not in without} or self._since
+        last = max(since.values(), default=0)
+        return max((self._last_ns[name] for name, mark in since.items() if mark > last - RECENT), default=0)
+
+    def passed_ns(self, without: Collection[str] = ()) -> int:
+        """Site time since the last mark [ns], by the machine that went on furthest, or was set back."""
+        names = (name for name, mark in self._since.items() if mark == self._marks and name not in without)
+        return max((abs(self._last_ns[name] - self._marked_ns[name]) for name in names), default=0)
+
+    def mark(self) -> None:
+        """Begin to count anew what has passed."""
+        self._marked_ns |= self._last_ns
+        self._marks += 1
+
+
+def calibration_of(
+    machine: str, decision: CalibrationDecision | None, state: MachineState | None, corrections: Corrections
+) -> MachineCalibration:
+    """What is known of a machine.
+
+    decision: its newest one. state: of the last solve. corrections: those that count in the map.
+    """
+    spans = corrections.spans_of(machine)[-MOST_SPANS:]
+    return MachineCalibration(
+        name=machine,
+        by=decision.by if decision else "",
+        reason=decision.reason if decision else "",
+        since_ns=decision.stamp_ns if decision else 0,
+        zero=state.zero if state else None,
+        zero_std=state.zero_std if state else None,
+        scale=state.scale / (1 + state.scale) if state else None,
+        scale_std=state.scale_std / (1 + state.scale) ** 2 if state else None,
+        across=state.across if state else None,
+        across_std=state.across_std if state else None,
+        zero_by=state.zero_by if state else (),
+        scale_by=state.scale_by if state else (),
+        spans=tuple(
+            CorrectedSpan(one.from_ns, one.to_ns, one.zero, one.scale, one.across, one.most_share) for one in spans
+        ),
+    )
+
+
+def decided_by_person(command: CalibrateCommand, stamp_ns: int) -> CalibrationDecision:
+    """What a person decides about all samples of a machine. stamp_ns: the site's now."""
+    values = {name: round(value, DIGITS) for name, value in command.values.items()}
+    usual = {"zero": 0.0, "scale": 0.0, "across": 0.0, "most_share": ANY_SHARE}
+    whole = Correction(command.machine, 0, LAST_NS, covariance=(), **{**usual, **values})
+    corrections = () if command.auto else (whole,)
+    return CalibrationDecision(command.machine, PERSON, command.reason, stamp_ns, corrections)

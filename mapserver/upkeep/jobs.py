@@ -21,7 +21,7 @@ from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.evidence.timeline import Block, TimedPage
 from mapserver.fleet.correction import UNCORRECTED, Corrections
-from mapserver.fleet.machine_state import MachineState
+from mapserver.fleet.observability import MachineState
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer

@@ -20,10 +20,9 @@ from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
+from mapserver.journal.history import release_memory
 from mapserver.journal.journal import FencedError, UnwrittenError
-from mapserver.journal.refold import release_memory
-from mapserver.past.anew import fold_anew
-from mapserver.past.past import Past
+from mapserver.past.past import Past, fold_anew
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError

@@ -9,12 +9,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from mapserver.fleet.correction import Corrections
-from mapserver.fleet.machine_state import MachineState, state_of
+from mapserver.fleet.observability import MachineState, state_of
 from mapserver.ingest.writer import Writer
 from mapserver.past.past import Past
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
-from mapserver.upkeep.calibrating import Calibrating
-from mapserver.upkeep.calibration_state import calibration_of, decided_by_person
+from mapserver.upkeep.calibrating import Calibrating, calibration_of, decided_by_person
 from mapserver.upkeep.checkpointing import Checkpointing
 from mapserver.upkeep.jobs import Archiving, Audit, ChangeSearch, Job, Publish
 from mapserver.upkeep.refolding import Refolding

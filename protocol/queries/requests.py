@@ -12,7 +12,7 @@ from protocol.queries import parameters as ps
 from protocol.queries.answers import MapVersion
 from protocol.queries.parameters import ANY_ROW, Freshness
 from protocol.queries.places import MAX_CORNERS, Place, check_count, check_outline, refusal, take_places, text_of_places
-from protocol.queries.road_requests import (
+from protocol.queries.roads import (
     SEGMENTS,
     WORKLIST,
     RoadQuery,

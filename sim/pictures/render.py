@@ -15,7 +15,7 @@ from protocol.site.ground_classes import ZONES
 from sim.machines.model import FOLDER, MachineModel
 from sim.state import FleetState
 from sim.terrain.terrain import Terrain
-from sim.worlds.pybullet_import import pybullet
+from sim.worlds.bullet_client import pybullet
 
 MESH_M, MAX_NODES = 1.0, 60_000  # between the nodes of the drawn ground; of a large site it is more
 TEXEL_M, MAX_TEXELS = 0.1, 6_000_000  # size of a texel, likewise

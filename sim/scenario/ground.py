@@ -9,8 +9,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_between
-from sim.terrain.soil import SOILS
-from sim.terrain.terrain import Terrain
+from sim.terrain.terrain import SOILS, Terrain
 
 FILLET_M = 2.0  # length over which the foot and the crown of a ramp are rounded
 ROUGHNESS_LENGTH_M = 1.2

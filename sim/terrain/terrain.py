@@ -1,4 +1,7 @@
-"""The ground: height on a grid of nodes, bilinear in between, and the soil's zone on a grid of cells (numba)."""
+"""The ground: height on a grid of nodes, bilinear in between, and the soil's zone on a grid of cells (numba).
+
+Its five materials are the paper's zones, with a traction and a slip stiffness that are assumed.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import numba
 import numpy as np
 
 from protocol.arrays import Floats, Ints
+from protocol.site.ground_classes import ZONES
 
 _compiled = numba.njit(cache=True, inline="always", error_model="numpy")
 
@@ -102,3 +106,24 @@ def _zones(grid: TerrainGrid, x: Floats, y: Floats) -> Ints:
     for i in range(x.size):
         indices[i] = zone(grid, x[i], y[i])
     return indices
+
+
+@dataclass(frozen=True)
+class Soil:
+    """One material [-]. traction: peak drive force over load. slip_stiffness: that force per unit of slip."""
+
+    name: str
+    c_rr: float
+    traction: float
+    slip_stiffness: float
+
+
+CONCRETE, GRAVEL, DRY_DIRT, WET_DIRT, SAND = range(5)
+
+_GRIP = ((0.80, 15.0), (0.60, 9.0), (0.60, 7.0), (0.45, 5.0), (0.55, 3.0))
+SOILS = tuple(Soil(zone.name, zone.c_rr, *grip) for zone, grip in zip(ZONES, _GRIP, strict=True))
+
+# Columns of the table above, to be indexed by arrays of zones.
+C_RR = np.array([s.c_rr for s in SOILS])
+TRACTION = np.array([s.traction for s in SOILS])
+SLIP_STIFFNESS = np.array([s.slip_stiffness for s in SOILS])

@@ -1,10 +1,15 @@
-"""The only calls of PyBullet's physics: it moves the frames of machines under given forces, without ground."""
+"""The only calls of PyBullet's physics: it moves the frames of machines under given forces, without ground.
+
+PyBullet is imported without the line about its build that it writes to standard error.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +21,6 @@ from protocol.machine.machine_config import BASE, FRONT
 from protocol.units import GRAVITY_MPS2
 from sim.machines.model import PAYLOAD, WHEELS, MachineModel
 from sim.machines.urdf import rigid_urdf
-from sim.worlds.pybullet_import import pybullet
 
 OSCILLATION_NM = 2000.0  # friction of the joint that lets all wheels touch
 FRAMES = 3  # that are watched: rear frame, front frame, and the carrier of the rear wheels
@@ -163,3 +167,27 @@ def rotations(quaternions: Floats) -> Floats:
     squares = quaternions[..., :, None] * quaternions[..., None, :]
     flat: Floats = squares.reshape(-1, 16) @ _ROTATIONS
     return flat.reshape(*quaternions.shape[:-1], 3, 3)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Send what libraries write to standard error, past Python, nowhere."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # standard error is closed: nothing to hide
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(nowhere)
+
+
+with _quiet():
+    import pybullet
+
+__all__ = ["pybullet"]

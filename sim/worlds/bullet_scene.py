@@ -13,8 +13,7 @@ import numpy as np
 from protocol.arrays import Floats, Ints
 from protocol.units import GRAVITY_MPS2
 from sim.state import STEP_S, FleetState
-from sim.terrain.soil import C_RR
-from sim.terrain.terrain import Terrain
+from sim.terrain.terrain import C_RR, Terrain
 from sim.worlds.bullet_client import Frames
 
 # Points that are followed, and the frame that each is fixed to: hubs and `base_link`.

@@ -18,8 +18,7 @@ from sim.machines import chassis
 from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
 from sim.state import STEP_S, FleetState
-from sim.terrain.soil import C_RR, SLIP_STIFFNESS, TRACTION
-from sim.terrain.terrain import Terrain
+from sim.terrain.terrain import C_RR, SLIP_STIFFNESS, TRACTION, Terrain
 from sim.worlds import fast_kernels as k
 
 _CONSTANTS = k.Constants(STEP_S, GRAVITY_MPS2, chassis.STANDSTILL_MPS, chassis.TRACTION_USE)

@@ -22,8 +22,7 @@ from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.options.groups import add_network
-from sitegrid.options.outputs import OutputFile
-from sitegrid.options.values import not_negative
+from sitegrid.options.values import OutputFile, not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
 from sitegrid.security.join import join, reply_check, signer
 
@@ -163,9 +162,8 @@ def _check_files(arguments: Namespace, role: str) -> None:
 
 def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Driver:
     """What readings come from; a log has the corrections that came in when it was recorded."""
-    from agents.drivers.corrections import WithCorrections
     from agents.drivers.replay import Replay
-    from agents.drivers.zenoh import ZenohDriver
+    from agents.drivers.zenoh import WithCorrections, ZenohDriver
 
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)

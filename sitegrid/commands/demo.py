@@ -5,8 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import positive
+from sitegrid.options.values import FOLDER, positive
 from sitegrid.process.lifetime import stop_flag
 from sitegrid.process.progress import Display
 

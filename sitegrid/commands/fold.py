@@ -6,9 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from sitegrid.options.outputs import FOLDER
-from sitegrid.options.times import STAMP_HELP, parse_stamp
-from sitegrid.options.values import count, positive
+from sitegrid.options.values import FOLDER, STAMP_HELP, count, parse_stamp, positive
 
 HELP = "build a new store from archives, with other parameters"
 EXTRA = "server"

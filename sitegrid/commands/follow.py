@@ -16,8 +16,8 @@ from protocol.site.site_file import load_site
 from protocol.wire.keys import check_name
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
-from sitegrid.process.kernels import compilation_reported
 from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
+from sitegrid.process.progress import compilation_reported
 from sitegrid.security.join import join
 
 HELP = "follow a site's journal and answer queries of its map, so that the server need not"

@@ -12,8 +12,7 @@ from typing import Any
 from protocol.errors import ConfigError
 from protocol.wire.keys import check_name
 from sitegrid.options.groups import add_action
-from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import days
+from sitegrid.options.values import FOLDER, days
 from sitegrid.process.lifetime import say, tell
 from sitegrid.security import register as registers
 from sitegrid.security.register import REGISTER_FILE, ROLES, ROUTER, Register, RegisterEntry

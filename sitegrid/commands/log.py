@@ -7,10 +7,9 @@ from functools import partial
 from pathlib import Path
 
 from sitegrid.options.groups import add_action
-from sitegrid.options.outputs import PICTURE
-from sitegrid.options.values import count_or_names, names, setting, withhold
+from sitegrid.options.values import PICTURE, count_or_names, names, setting, withhold
 from sitegrid.process.lifetime import note, plain, say, tell
-from sitegrid.process.tables import lines, table
+from sitegrid.process.streams import lines, table
 
 HELP = "check a recording of a machine, and replay it"
 EXTRA = "agent"

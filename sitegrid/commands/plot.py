@@ -6,8 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from sitegrid.options.groups import add_network, add_site
-from sitegrid.options.outputs import PICTURE
-from sitegrid.options.values import named_text
+from sitegrid.options.values import PICTURE, named_text
 
 HELP = "draw the map"
 EXTRA = "server"

@@ -29,10 +29,8 @@ from protocol.queries.routing import RouteAnswer
 from sitegrid.client import Client, connect
 from sitegrid.explanations import calibrated, why
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
-from sitegrid.options.outputs import OutputFile
-from sitegrid.options.times import HELP as TIME_HELP
-from sitegrid.options.times import SiteTime, parse_time, utc_text
-from sitegrid.options.values import named_text, positive
+from sitegrid.options.values import HELP as TIME_HELP
+from sitegrid.options.values import OutputFile, SiteTime, named_text, parse_time, positive, utc_text
 from sitegrid.process import streams
 from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
 from sitegrid.process.progress import EVERY_S

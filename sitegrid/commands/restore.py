@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 from pathlib import Path
 
-from sitegrid.options.outputs import FOLDER
+from sitegrid.options.values import FOLDER
 from sitegrid.process.lifetime import raise_interrupts, say, tell
 
 HELP = "make a store of a backup"

@@ -17,10 +17,9 @@ from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
-from sitegrid.options.outputs import FOLDER
-from sitegrid.options.values import address
-from sitegrid.process.kernels import compilation_reported
+from sitegrid.options.values import FOLDER, address
 from sitegrid.process.lifetime import end_in_time, return_large_blocks, say, stop_flag, tell
+from sitegrid.process.progress import compilation_reported
 from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
 

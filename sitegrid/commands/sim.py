@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from protocol.errors import ConfigError
 from sitegrid.options.groups import add_network
-from sitegrid.options.outputs import FOLDER, PICTURE
+from sitegrid.options.values import FOLDER, PICTURE
 from sitegrid.process.lifetime import END_S, note, say, stop_flag
 from sitegrid.process.progress import Display
 from sitegrid.security.join import join

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from agents.delivery.spool_file import SCHEMA as SPOOL_SCHEMA
-from agents.delivery.spool_file import run_ends_in
-from agents.delivery.spool_mark import runs_cut_short
-from protocol.disk.traces import Traces, look_beside
+from agents.delivery.spool_file import run_ends_in, runs_cut_short
+from protocol.disk.high_water_mark import Traces, look_beside
 from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
@@ -167,7 +166,7 @@ def read_store(folder: Path, now_s: float, url: str = "") -> StoreState:
     """
     # imported here: needs the `server` extra, which a machine's host does not have
     from mapserver.evidence import snapshot
-    from mapserver.ingest.losses import lacking
+    from mapserver.ingest.map_info import lacking
     from mapserver.journal import shortfall as short
     from mapserver.journal.location import JOURNAL_FILE, JournalLocation
     from mapserver.past.checkpoints import Checkpoints

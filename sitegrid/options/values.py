@@ -1,11 +1,30 @@
-"""Types of options: numbers and addresses; a wrong value is refused in one line."""
+"""Types of options: numbers, addresses, times as people write them, names of files to write.
+
+A wrong value is refused in one line, and a file that cannot be made before the work, not after it: that is tried, with
+one that has no name, since permissions do not tell (root, read-only mounts).
+"""
 
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from argparse import ArgumentTypeError
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
+
+from protocol.errors import ConfigError
+from protocol.machine.readings import MAX_STAMP_NS
+
+STAMP_HELP = "ISO 8601 (UTC unless it names a zone) or a stamp in ns"
+HELP = f"{STAMP_HELP}, or a duration before the newest sample of the site: -2h, -30m, -90s"
+_UNIT_S = {"d": 86_400, "h": 3600, "m": 60, "s": 1}
+_AGO = re.compile(r"-(\d+(?:\.\d+)?)([dhms])")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def count(text: str) -> int:
@@ -101,3 +120,102 @@ def setting(text: str) -> tuple[str, Any]:
 def _require(is_so: bool, problem: str) -> None:  # noqa: FBT001 - a condition
     if not is_so:
         raise ArgumentTypeError(problem)
+
+
+@dataclass(frozen=True)
+class SiteTime:
+    """ns: a stamp; from_now: counted from the site's now instead, and not above 0."""
+
+    ns: int
+    from_now: bool = False
+
+    def stamp(self, option: str, site_now_ns: Callable[[], int]) -> int:
+        """As a stamp. site_now_ns: asked only where it is needed; ConfigError names the option."""
+        if not self.from_now:
+            return self.ns
+        now_ns = site_now_ns()
+        if not now_ns:
+            raise ConfigError(option, "the site has no samples yet, so no now to count from; give a time")
+        if now_ns + self.ns < 1:
+            raise ConfigError(option, f"so long before the site's now, {utc_text(now_ns)}, is before 1970")
+        return now_ns + self.ns
+
+
+def parse_time(text: str) -> SiteTime:
+    """Parse ISO 8601, a stamp, or a time before the site's now; as a type of an argparse option."""
+    if ago := _AGO.fullmatch(text):
+        return SiteTime(-round(float(ago[1]) * _UNIT_S[ago[2]] * 1e9), from_now=True)
+    return SiteTime(parse_stamp(text))
+
+
+def parse_stamp(text: str) -> int:
+    """Parse ISO 8601, UTC where no zone is named, or a stamp in ns; as a type of an argparse option."""
+    ns = int(text) if text.isascii() and text.isdigit() and len(text) < 30 else _iso_ns(text)
+    if not 1 <= ns <= MAX_STAMP_NS:
+        raise ArgumentTypeError(f"{text} is not between the years 1970 and 2100")
+    return ns
+
+
+def utc_text(stamp_ns: int) -> str:
+    """A stamp as people read it, to the second; `never` for 0."""
+    if not stamp_ns:
+        return "never"
+    return (_EPOCH + timedelta(seconds=stamp_ns // 10**9)).strftime("%Y-%m-%d %H:%M:%SZ")
+
+
+def _iso_ns(text: str) -> int:
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise ArgumentTypeError(f"{text!r} is no time: {STAMP_HELP}") from None
+    zoned = time if time.tzinfo else time.replace(tzinfo=UTC)
+    return (zoned - _EPOCH) // timedelta(microseconds=1) * 1000  # exact, where floating point would not be
+
+
+@dataclass(frozen=True)
+class OutputFile:
+    """A file to write. suffixes: of its formats, none for any name. makes_folder: its folder need not be there."""
+
+    suffixes: tuple[str, ...] = ()
+    makes_folder: bool = False
+
+    def __call__(self, text: str) -> Path:
+        """Parse the option; ConfigError where nothing could be written."""
+        path = Path(text)
+        if self.suffixes and path.suffix.lower() not in self.suffixes:
+            fitting = path.with_suffix(self.suffixes[0]) if path.name else Path(f"NAME{self.suffixes[0]}")
+            raise ConfigError(path, f"a file with {' or '.join(self.suffixes)} is written: name it {fitting}")
+        if path.is_dir():
+            raise ConfigError(path, "is a folder; name a file")
+        if not self.makes_folder and not path.parent.is_dir():
+            raise ConfigError(path, f"cannot be written: there is no folder {path.parent}")
+        _require_writable(path.parent, path)
+        return path
+
+
+@dataclass(frozen=True)
+class OutputFolder:
+    """A folder to write into, made where it is missing."""
+
+    def __call__(self, text: str) -> Path:
+        """Parse the option; ConfigError where nothing could be written."""
+        path = Path(text)
+        _require_writable(path, path)
+        return path
+
+
+PICTURE = OutputFile((".png", ".jpg", ".jpeg"))
+FOLDER = OutputFolder()
+
+
+def _require_writable(folder: Path, path: Path) -> None:
+    """Refuse a path where the folder, or the next one above it that is there, takes no file."""
+    there = folder.absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise ConfigError(path, f"cannot be written: {there} is no folder")
+    try:
+        TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise ConfigError(path, f"cannot be written: {there}: {error.strerror}; choose another place") from None

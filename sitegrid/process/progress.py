@@ -1,16 +1,21 @@
-"""Progress of a long run: a bar on a terminal, which moves without news too; elsewhere a plain line now and then."""
+"""Progress of a long run: a bar on a terminal, which moves without news too; elsewhere a plain line now and then.
+
+Numba's compilation of kernels is said when it happens: at the first start in a new folder, or of another version.
+"""
 
 from __future__ import annotations
 
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from sitegrid.process.lifetime import note
+from sitegrid.process.lifetime import note, say
 
 EVERY_S = 5.0  # between two plain lines
+COMPILING = "first start: compiling kernels, about a minute"
 
 
 class Display:
@@ -63,3 +68,23 @@ class Display:
                 self._bar.stop()
         if self._kept and kind is KeyboardInterrupt:
             note(f"interrupted; what is done is kept in {self._kept}, and the same command goes on with it")
+
+
+@contextmanager
+def compilation_reported() -> Iterator[None]:
+    """Print `{"compiling": n}`, the number of kernels so far, for the first and then every EVERY_S."""
+    from numba.core.event import Event, Listener, install_listener
+
+    class Counter(Listener):
+        count, next_s = 0, 0.0
+
+        def on_start(self, _: Event) -> None:
+            self.count += 1
+            if time.monotonic() >= self.next_s:
+                self.next_s = time.monotonic() + EVERY_S
+                say({"compiling": self.count, **({"note": COMPILING} if self.count == 1 else {})})
+
+        def on_end(self, _: Event) -> None: ...
+
+    with install_listener("numba:compile", Counter()):
+        yield

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from mapserver.ingest.decisions import Decisions
-from mapserver.journal.refold import THREADS
+from mapserver.journal.history import THREADS
 from mapserver.journal.rows import Selection
 from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS

@@ -1,28 +1,35 @@
 """Parts of archives, as one task reads each: a Parquet file, or a stretch of a journal that is not archived yet.
 
-They are values that other processes understand, and other hosts where their place is one that these reach, too.
+They are values that other processes understand, and other hosts where their place is one that these reach, too. Which
+samples a part holds are intervals of numbers by spool, so that those of years fit into one process.
 """
 
 from __future__ import annotations
 
 import socket
 import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
 
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.places import Place
-from mapserver.journal.rows import JournalRows
+from mapserver.journal.rows import JournalRows, Selection, SpoolKey
+from protocol.arrays import Bools, Ints
 from protocol.errors import StoreError
 from protocol.machine.samples import COLUMNS
 from protocol.site.site_config import SiteConfig
 
 SLICE_ROWS = 20_000  # of a journal: up to two million samples, as in a file
 HEADS = ("stamp_ns", "x_m", "y_m")  # of samples: all that is needed to choose among them
+Interval = tuple[int, int]  # first and last number
+Taken = Mapping[SpoolKey, tuple[Interval, ...]]  # disjoint, in order
 
 
 @dataclass(frozen=True)
@@ -99,3 +106,106 @@ class JournalPart:
 
 
 Part = FilePart | JournalPart
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What one part holds of what is wanted.
+
+    rows, samples: that are kept, first_ns: when the first row was received. intervals: of the kept samples. reached:
+    the last number of each spool, kept or not. newest_ns: stamp of each spool's newest kept sample. excluded: how many
+    are not kept, by reason.
+    """
+
+    part: Part
+    origin: Origin
+    first_ns: int = 0
+    rows: int = 0
+    samples: int = 0
+    intervals: Mapping[SpoolKey, tuple[Interval, ...]] = field(default_factory=dict)
+    reached: Mapping[SpoolKey, int] = field(default_factory=dict)
+    newest_ns: Mapping[SpoolKey, int] = field(default_factory=dict)
+    excluded: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Look:
+    """A task: look at a part. selection: machines and stamps; taken: numbers that another part has as well."""
+
+    part: Part
+    selection: Selection
+    taken: Taken = field(default_factory=dict)
+
+
+def look(task: Look) -> Contents:
+    """Read through a part; StoreError where it is damaged."""
+    origin = task.part.origin()
+    first_ns, rows_kept, samples = 0, 0, 0
+    excluded: Counter[str] = Counter(machine=0, time=0, twice=0)
+    reached: Counter[SpoolKey] = Counter()
+    newest_ns: Counter[SpoolKey] = Counter()
+    runs: defaultdict[SpoolKey, list[Interval]] = defaultdict(list)
+    for rows in task.part.read(HEADS):
+        first_ns = first_ns or int(rows.received_ns[0])
+        kept, reasons = chosen(rows, task.selection, task.taken)
+        excluded.update(reasons)
+        rows_kept += int(rows.pieces(kept).sum())
+        samples += int(kept.sum())
+        for spool, seqs, of_spool in by_spool(rows):
+            reached[spool] = max(reached[spool], int(seqs.max()))
+            if (wanted := kept[of_spool]).any():
+                newest_ns[spool] = max(newest_ns[spool], int(rows.samples["stamp_ns"][of_spool][wanted].max()))
+                runs[spool] += _intervals(seqs[wanted])
+    intervals = {spool: _joined(task.part, spool, some) for spool, some in runs.items()}
+    return Contents(task.part, origin, first_ns, rows_kept, samples, intervals, reached, newest_ns, excluded)
+
+
+def chosen(rows: JournalRows, selection: Selection, taken: Taken) -> tuple[Bools, Counter[str]]:
+    """Which samples (n,) of rows are kept, and how many are not, by reason: their machine, their time, or twice."""
+    of_others = np.array([machine not in selection.without for machine in rows.machines], np.bool_)
+    wanted = np.repeat(of_others[rows.machine], rows.lengths)
+    in_time = selection.includes(rows.samples)
+    new: Bools = np.ones(len(wanted), np.bool_)
+    if taken:
+        for spool, seqs, of_spool in by_spool(rows):
+            for first, last in taken.get(spool, ()):
+                new[of_spool[(seqs >= first) & (seqs <= last)]] = False
+    reasons = Counter(
+        machine=int((~wanted).sum()), time=int((wanted & ~in_time).sum()), twice=int((wanted & in_time & ~new).sum())
+    )
+    return wanted & in_time & new, reasons
+
+
+def by_spool(rows: JournalRows) -> Iterator[tuple[SpoolKey, Ints, Ints]]:
+    """Each spool of rows, the numbers of its samples, and where they are in the table."""
+    starts = np.cumsum(rows.lengths) - rows.lengths
+    seqs = np.arange(len(rows.samples)) + np.repeat(rows.first_seqs - starts, rows.lengths)
+    pairs = np.rec.fromarrays([rows.machine, rows.spool_ids])
+    unique, number = np.unique(pairs, return_inverse=True)
+    of_sample = np.repeat(number, rows.lengths)
+    order = np.argsort(of_sample, kind="stable")
+    ends = np.cumsum(np.bincount(number, rows.lengths, len(unique)).astype(np.int64))
+    for (machine, spool_id), end, begin in zip(unique.tolist(), ends, [0, *ends[:-1]], strict=True):
+        at = order[begin:end]
+        yield (rows.machines[machine], spool_id), seqs[at], at
+
+
+def _intervals(seqs: Ints) -> list[Interval]:
+    """Numbers as intervals; one that is there twice begins a new one."""
+    seqs = np.sort(seqs)
+    edges = np.flatnonzero(np.diff(seqs) != 1)
+    firsts, lasts = np.append(0, edges + 1), np.append(edges, len(seqs) - 1)
+    return list(zip(seqs[firsts].tolist(), seqs[lasts].tolist(), strict=True))
+
+
+def _joined(part: Part, spool: SpoolKey, intervals: list[Interval]) -> tuple[Interval, ...]:
+    """Intervals in order, those that touch as one; StoreError where two overlap."""
+    out: list[Interval] = []
+    for first, last in sorted(intervals):
+        if out and first <= out[-1][1]:
+            raise StoreError(part, f"holds sample {first} of {spool[0]}, spool {spool[1]:016x}, twice; leave it out")
+        if out and first == out[-1][1] + 1:
+            out[-1] = out[-1][0], last
+        else:
+            out.append((first, last))
+    return tuple(out)

@@ -17,9 +17,8 @@ from mapserver.journal.rows import Selection, SpoolKey, Watermark
 from protocol.arrays import Table
 from protocol.errors import ConfigError, StoreError
 from protocol.machine.samples import RAW_SAMPLE
-from sitegrid.refold.contents import Contents, Interval, Look, by_spool, look
 from sitegrid.refold.engine import Engine
-from sitegrid.refold.parts import Part
+from sitegrid.refold.parts import Contents, Interval, Look, Part, by_spool, look
 
 
 @dataclass(frozen=True)

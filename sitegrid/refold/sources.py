@@ -13,7 +13,7 @@ from pathlib import Path
 from mapserver.config import ServerConfig
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import calibrations
-from mapserver.ingest.losses import lacking
+from mapserver.ingest.map_info import lacking
 from mapserver.ingest.store import ACCEPTED
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive_file import ArchiveFile
@@ -25,8 +25,7 @@ from protocol.errors import ConfigError, StoreError
 from protocol.files import load_toml
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
-from sitegrid.refold.contents import Contents
-from sitegrid.refold.parts import SLICE_ROWS, FilePart, JournalPart, Part
+from sitegrid.refold.parts import SLICE_ROWS, Contents, FilePart, JournalPart, Part
 
 SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
 

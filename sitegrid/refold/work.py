@@ -30,7 +30,7 @@ from mapserver.evidence.pages import CompactPages
 from mapserver.fleet.correction import Corrections
 from mapserver.journal.archive import READABLE, ArchiveWriter
 from mapserver.journal.archive_file import seal
-from mapserver.journal.refold import PIECE, fold_samples
+from mapserver.journal.history import PIECE, fold_samples
 from mapserver.journal.rows import JournalRows, Selection, SpoolKey
 from mapserver.past.checkpoint_file import Checkpoint, CheckpointWriter, DamagedError, Header
 from protocol.arrays import Ints, Table
@@ -38,8 +38,7 @@ from protocol.errors import StoreError
 from protocol.files import PRIVATE, whole_file
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 from protocol.site.site_config import SiteConfig
-from sitegrid.refold.contents import Interval, chosen
-from sitegrid.refold.parts import Part
+from sitegrid.refold.parts import Interval, Part, chosen
 
 TILES = 64  # at most, and at least 4, as no tile lies across an axis: that many processes can merge
 LEAST_TILE = 8  # blocks: 128 cells

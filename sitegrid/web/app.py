@@ -29,10 +29,10 @@ from protocol.site.geometry import Bounds
 from sitegrid.web import live, mercator, values
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
-from sitegrid.web.problems import Problem, bad, problem_response
 from sitegrid.web.resource import tag_of
 from sitegrid.web.resources import RESOURCES, follows_now
 from sitegrid.web.site import SiteFeed
+from sitegrid.web.values import Problem, bad, problem_response
 
 PAGE = Path(__file__).parent / "page"
 FRESH_S = 1.0  # how old the version may be that a tile, or a copy that the asker has, is compared with

@@ -14,7 +14,7 @@ from starlette.datastructures import Headers
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sitegrid.web.problems import Problem, problem_response
+from sitegrid.web.values import Problem, problem_response
 
 COOKIE = "sitegrid"
 RATE_HZ, BURST = 100.0, 500.0  # requests of one address: a GIS asks for some hundred tiles when its view moves

@@ -12,7 +12,6 @@ from protocol.queries.answers import MapVersion
 from protocol.queries.parameters import text_of
 from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, WhyQuery
 from sitegrid.web import features, roads, values
-from sitegrid.web.problems import bad
 from sitegrid.web.resource import (
     AS_OF,
     BOUNDS,
@@ -29,7 +28,7 @@ from sitegrid.web.resource import (
     version_of,
 )
 from sitegrid.web.site import SiteFeed, frame
-from sitegrid.web.values import Parameters
+from sitegrid.web.values import Parameters, bad
 
 MAX_CELLS_JSON = 250_000  # of a region as text: 2 MB a layer
 MAX_CELLS_NPZ = 4_000_000

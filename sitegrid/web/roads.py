@@ -12,8 +12,7 @@ from typing import Any
 from starlette.responses import Response
 
 from protocol.queries.answers import MapVersion
-from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
-from protocol.queries.roads import Segments, Worklist
+from protocol.queries.roads import Segments, SegmentsQuery, Worklist, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
 from sitegrid.web import features

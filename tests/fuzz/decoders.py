@@ -39,7 +39,7 @@ from protocol.queries import requests
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
-from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import NamedMachine
 from protocol.site.geometry import Bounds

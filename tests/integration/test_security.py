@@ -37,7 +37,7 @@ from sitegrid.security.join import reply_check
 from sitegrid.security.signing import Signer
 from tests.patience import PATIENCE_S, until
 
-certificates = pytest.importorskip("sitegrid.security.certificates", reason="cryptography is not installed")
+certificates = pytest.importorskip("sitegrid.security.key_folder", reason="cryptography is not installed")
 pytestmark = pytest.mark.processes
 
 SITE = "paper"

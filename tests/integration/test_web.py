@@ -25,7 +25,7 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_pose
 from protocol.wire.messages import Pose
 from sitegrid.process.children import Children
-from sitegrid.security.certificates import issue, make_authority
+from sitegrid.security.key_folder import issue, make_authority
 from sitegrid.web import values
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, Frame, WebSite

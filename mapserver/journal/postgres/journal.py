@@ -24,11 +24,9 @@ from mapserver.journal.postgres.connection import SCHEMA, Connection, connect, s
 from mapserver.journal.postgres.mark import CHECKSUM, EPOCH, STORE, known_store, store_in, traces_of, trusted_by
 from mapserver.journal.postgres.reader import PostgresQueries
 from mapserver.journal.postgres.session import HANGS_S, WriterSession
-from mapserver.journal.postgres.statements import insert, literal
-from mapserver.journal.postgres.tables import CHANNEL, creation
-from mapserver.journal.progress import Progress
+from mapserver.journal.postgres.tables import CHANNEL, creation, insert, literal
 from mapserver.journal.records import checksum_of
-from mapserver.journal.rows import SpoolKey, Watermark
+from mapserver.journal.rows import Progress, SpoolKey, Watermark
 from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
 from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, watermark_line
 from protocol.disk.high_water_mark import HighWaterMark

@@ -8,8 +8,7 @@ from pathlib import Path
 from mapserver.journal.journal import JournalQueries
 from mapserver.journal.postgres import MARK_FILE
 from mapserver.journal.shortfall import ROW
-from protocol.disk.high_water_mark import read_mark
-from protocol.disk.traces import Traces
+from protocol.disk.high_water_mark import Traces, read_mark
 from protocol.disk.write_ahead_log import LogScan
 from protocol.errors import StoreError
 

@@ -1,11 +1,15 @@
-"""The tables of a journal in PostgreSQL, and how they are made."""
+"""The tables of a journal in PostgreSQL, how they are made, and statements with their values in them.
+
+A transaction is one message (see session.py).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
+from psycopg.sql import quote
+
 from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
-from mapserver.journal.postgres.statements import insert
 from mapserver.journal.writing import new_meta
 
 MAKING = 0x517E62D2  # an advisory lock for as long as tables are made
@@ -61,3 +65,16 @@ BEGIN
         {meta};
     END IF;
 END $making$"""  # noqa: S608 # constants, and literals
+
+
+def insert(table: str, lines: Iterable[tuple[object, ...]], more: str = "") -> str:
+    """One statement for all lines; empty without any."""
+    values = ",".join(f"({','.join(map(literal, line))})" for line in lines)
+    return f"INSERT INTO {table} VALUES {values} {more}" if values else ""  # noqa: S608 # literals, a constant table
+
+
+def literal(value: object) -> str:
+    """A value of plain type as PostgreSQL reads it, where strings conform to the standard."""
+    if isinstance(value, bytes):
+        return f"'\\x{value.hex()}'"
+    return quote(value) if isinstance(value, str) else repr(value)  # numbers

@@ -5,7 +5,7 @@ import pytest
 
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
-from agents.smoothed_track import KEPT_NS, SmoothedTrack
+from agents.pipeline import KEPT_NS, SmoothedTrack
 
 S = 10**9
 

@@ -14,7 +14,7 @@ from numba.core.dispatcher import Dispatcher
 from mapserver.config import ServerConfig
 from mapserver.server import warm_up
 from protocol.queries.requests import encode_query
-from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from tests.unit.mapserver.data import incoming, open_writer, send
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel, load_model
 from sim.state import STEP_S, FleetState
-from sim.terrain.soil import CONCRETE
-from sim.terrain.terrain import Terrain
+from sim.terrain.terrain import CONCRETE, Terrain
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.fast import FastWorld
 from sim.worlds.world import World

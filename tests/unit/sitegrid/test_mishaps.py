@@ -22,8 +22,7 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim import publisher
 from sitegrid import client
 from sitegrid.cli import main
-from sitegrid.options.outputs import OutputFile, OutputFolder
-from sitegrid.options.values import address
+from sitegrid.options.values import OutputFile, OutputFolder, address
 from sitegrid.process.lifetime import tell
 from tests.command_lines import COMMANDS, Command
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from agents.delivery.spool import Spool, SpoolConfig
-from agents.delivery.spool_mark import RunEnd, runs_cut_short
+from agents.delivery.spool_file import RunEnd, runs_cut_short
 from protocol.disk.high_water_mark import mark_path
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash

@@ -7,7 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-from agents.drivers.corrections import QUEUE_CORRECTIONS, WithCorrections
+from agents.drivers.zenoh import QUEUE_CORRECTIONS, WithCorrections
 from protocol.machine.readings import Correction, Encoder, Reading
 from protocol.wire import keys
 from protocol.wire.correction_codec import encode_correction

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mapserver.evidence import grid as grid_module
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import LIVE_ROWS, Grid
-from mapserver.journal.refold import lent
+from mapserver.journal.history import lent
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from tests.reference.grid import by_definition, of_grid, plain

@@ -9,12 +9,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.fleet.applied_part import FAULT_SIGMAS, moved
 from mapserver.fleet.calibration import SCALE_FLOOR, ZERO_FLOOR, Calibration, calibrate
 from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, corrected
 from mapserver.fleet.hysteresis import differs
 from mapserver.fleet.ledger import EPOCH_NS
-from mapserver.fleet.machine_state import MachineState, state_of
+from mapserver.fleet.observability import FAULT_SIGMAS, MachineState, moved, state_of
 from mapserver.fleet.passages import Epochs, passages
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
 from protocol.arrays import Floats, Table

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, Corrections
+from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, Corrections, at, paint
 from mapserver.fleet.decisions import (
     EVERY_NS,
     PERSON,
@@ -20,7 +20,6 @@ from mapserver.fleet.decisions import (
 from mapserver.fleet.hysteresis import FROZEN_NS
 from mapserver.fleet.ledger import EPOCH_NS, Stated
 from mapserver.fleet.observability import CommonScale
-from mapserver.fleet.spans import at, paint
 
 SURE = ((2.5e-7, 0.0, 0.0), (0.0, 2.5e-5, 0.0), (0.0, 0.0, 2.5e-7))  # 0.5e-3, 0.5 %, 0.5e-3
 NOW_NS = 1000 * EPOCH_NS

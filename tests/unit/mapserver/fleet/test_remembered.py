@@ -12,7 +12,7 @@ from mapserver.fleet.calibration import SCALE_FLOOR, Calibration, calibrate
 from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction, corrected
 from mapserver.fleet.decisions import EVERY_NS, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.fleet.ledger import EPOCH_NS, Ledger, newest, stated
-from mapserver.fleet.machine_state import REMEMBERED_STD, remembered_of
+from mapserver.fleet.observability import REMEMBERED_STD, remembered_of
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from protocol.arrays import Floats, Table
 from tests.unit.mapserver.fleet.drives import (

@@ -1,8 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapserver.journal.progress import Progress
-from mapserver.journal.rows import MachineTotals, Watermark
+from mapserver.journal.rows import MachineTotals, Progress, Watermark
 
 MARKS = st.builds(Watermark, st.integers(0, 50), st.integers(0, 50), st.integers(0, 9))
 

@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from mapserver.evidence.grid import Grid
-from mapserver.journal import refold
-from mapserver.journal.history import History
+from mapserver.journal import history as refold
+from mapserver.journal.history import AHEAD, History, ahead, fold_history
 from mapserver.journal.location import JOURNAL_FILE
-from mapserver.journal.refold import AHEAD, ahead, fold_history
 from mapserver.journal.rows import Selection
 from mapserver.journal.sqlite.reader import SqliteReader
 from tests.journals import history_beside

@@ -3,7 +3,7 @@ from contextlib import closing
 
 import pytest
 
-from mapserver.query.answer_pool import MIN_RETRY_S, AnswerPool
+from mapserver.query.queryable import MIN_RETRY_S, AnswerPool
 from protocol.errors import QueryError, Refusal
 from tests.unit.mapserver.data import WAIT_S, wait_for
 

@@ -13,7 +13,7 @@ from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from protocol.arrays import Table
 from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, When, WhyQuery, encode_query
-from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import incoming, open_writer, random_samples, send

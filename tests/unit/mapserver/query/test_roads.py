@@ -27,8 +27,7 @@ from protocol.queries.requests import (
     encode_query,
     parse_query,
 )
-from protocol.queries.road_requests import MAX_LIMIT, SegmentsQuery, WorklistQuery
-from protocol.queries.roads import decode_segments, decode_worklist
+from protocol.queries.roads import MAX_LIMIT, SegmentsQuery, WorklistQuery, decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import decode_answer
 from protocol.site.geometry import Bounds

@@ -7,7 +7,7 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.roads.ledger import Ledgers, resistance
 from mapserver.roads.loss import losses
 from mapserver.roads.tally import HOUR_NS, PER_C, PER_M, Tally
-from mapserver.roads.trend import theil_sen, trends
+from mapserver.roads.worklist import theil_sen, trends
 from protocol.units import GRAVITY_MPS2
 from tests.unit.mapserver.roads.drives import START_NS, along, passes, roads
 

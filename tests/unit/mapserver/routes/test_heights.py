@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapserver.routes.heights import COARSE, Rises, heights, slopes
+from mapserver.routes.prices import COARSE, Rises, heights, slopes
 
 SIZE = 15 * COARSE
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mapserver.routes.line import CURVE_M, limits, steps
+from mapserver.routes.ground import CURVE_M, limits, steps
 
 CORNER = np.array([[0.0, 0.0], [50.0, 0.0], [50.0, 30.0]])
 

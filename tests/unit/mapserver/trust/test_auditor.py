@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from mapserver.evidence.fold_config import FoldConfig
-from mapserver.fleet.machine_state import MachineState
+from mapserver.fleet.observability import MachineState
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.journal.rows import JournalRows
 from mapserver.trust import coarse_map

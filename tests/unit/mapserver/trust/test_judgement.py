@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapserver.fleet.applied_part import FAULT_SIGMAS
-from mapserver.fleet.machine_state import MachineState
+from mapserver.fleet.observability import FAULT_SIGMAS, MachineState
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.trust.comparison import ZERO_ERROR, Difference, Gain
 from mapserver.trust.judgement import (

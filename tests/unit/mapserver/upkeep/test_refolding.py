@@ -19,7 +19,7 @@ from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
-from mapserver.past import anew
+from mapserver.past import past
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import DISTRUST_AFTER, KIND, PERSON, TrustDecision
 from mapserver.trust.judgement import Reason
@@ -55,8 +55,8 @@ class HeldFold:
         self.rows: list[tuple[int, int]] = []
         self.came_to_an_end: list[bool] = []
         self.may_go_on = Event()
-        self._fold = anew.fold_history
-        monkeypatch.setattr(anew, "fold_history", self)
+        self._fold = past.fold_history
+        monkeypatch.setattr(past, "fold_history", self)
 
     def __call__(self, grid: Grid, history: Any, after: int, until: int, selection: Any, stopped: Any) -> bool:
         self.without.append(set(selection.without))
@@ -128,7 +128,7 @@ def test_a_few_rows_are_left_to_the_writer(writer, fold):
 
 
 def test_where_batches_never_end_the_writer_has_them_wait(writer, monkeypatch):
-    monkeypatch.setattr(anew, "FEW_ROWS", -1)
+    monkeypatch.setattr(past, "FEW_ROWS", -1)
     with closing(Refolding(writer, past_of(writer))) as refolds:
         refolds.wait(refolds.decide(decision("b")), WAIT_S)
     assert same(writer.run(grid_copy), map_without("b", 5))
@@ -178,8 +178,8 @@ def test_decisions_that_come_faster_than_folds_do_not_keep_the_map_from_followin
         folds.append(refolding_fold(*arguments))
         return folds[-1]
 
-    refolding_fold = anew.fold_history
-    monkeypatch.setattr(anew, "fold_history", fold)
+    refolding_fold = past.fold_history
+    monkeypatch.setattr(past, "fold_history", fold)
     with closing(Refolding(writer, past_of(writer))) as refolds:
         refolds.wait(refolds.decide(decision("b")), WAIT_S)
         wait_for(lambda: len(folds) >= 6)

@@ -1,6 +1,6 @@
 """The site's now: it follows the machines, and a wrong clock for no longer than it is wrong."""
 
-from mapserver.upkeep.site_clock import RECENT, SiteClock
+from mapserver.upkeep.calibrating import RECENT, SiteClock
 
 H, M, S = 3600, 60, 1
 

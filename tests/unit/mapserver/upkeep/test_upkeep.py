@@ -14,7 +14,7 @@ from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig, Trust
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
 from mapserver.fleet.decisions import CalibrationDecision
-from mapserver.fleet.machine_state import MachineState
+from mapserver.fleet.observability import MachineState
 from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER

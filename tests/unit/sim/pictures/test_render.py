@@ -3,7 +3,7 @@ import pytest
 
 from sim.pictures import render as render_module
 from sim.pictures.render import SKY_RGB, Camera, closeup, overview, render
-from sim.terrain.soil import GRAVEL
+from sim.terrain.terrain import GRAVEL
 from sim.worlds.fast import FastWorld
 from tests.unit.sim.planes import LOADER, placed, plane
 

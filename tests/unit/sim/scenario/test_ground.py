@@ -6,8 +6,7 @@ import pytest
 
 from sim.scenario.file import load_scenario
 from sim.scenario.ground import GroundConfig, RampConfig, ZoneConfig, build_terrain, with_zone
-from sim.terrain.soil import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT
-from sim.terrain.terrain import Terrain
+from sim.terrain.terrain import CONCRETE, DRY_DIRT, GRAVEL, SAND, SOILS, WET_DIRT, Terrain
 from sim.truth import truth_map
 
 PAPER = load_scenario("paper_site").ground

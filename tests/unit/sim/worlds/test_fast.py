@@ -10,8 +10,7 @@ from protocol.machine.machine_config import Mount
 from protocol.units import GRAVITY_MPS2
 from sim.machines.model import MachineModel
 from sim.state import STEP_S, FleetState, stack
-from sim.terrain.soil import C_RR
-from sim.terrain.terrain import Terrain
+from sim.terrain.terrain import C_RR, Terrain
 from sim.worlds.fast import FastWorld
 from tests.unit.sim.planes import BOTH, GRADE_15, LOADER, TRUCK, cruise, idle, placed, plane
 

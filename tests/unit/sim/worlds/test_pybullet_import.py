@@ -9,12 +9,12 @@ def test_pybullet_is_imported_without_a_word() -> None:
 
 
 def test_errors_are_still_shown_afterwards() -> None:
-    code = "import sim.worlds.pybullet_import, sys; print('broken', file=sys.stderr)"
+    code = "import sim.worlds.bullet_client, sys; print('broken', file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert done.stderr == b"broken\n"
 
 
 def test_a_process_without_standard_error_can_simulate() -> None:
-    code = "import os; os.close(2); from sim.worlds.pybullet_import import pybullet as p; print(p.getAPIVersion() > 0)"
+    code = "import os; os.close(2); from sim.worlds.bullet_client import pybullet as p; print(p.getAPIVersion() > 0)"
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, check=True)
     assert done.stdout == b"True\n"

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim.terrain.soil import C_RR, SLIP_STIFFNESS, SOILS, TRACTION
-from sim.worlds.tyre import TyreForces, Tyres, TyreState, WheelMotion, at_rest, radial_load, turn_wheels
+from sim.terrain.terrain import C_RR, SLIP_STIFFNESS, SOILS, TRACTION
+from sim.worlds.bullet import TyreForces, Tyres, TyreState, WheelMotion, at_rest, radial_load, turn_wheels
 
 STEP_S = 0.01
 RADIUS_M, LOAD_N = 0.75, 43e3

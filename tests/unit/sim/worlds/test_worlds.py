@@ -12,7 +12,7 @@ from protocol.units import GRAVITY_MPS2
 from sim.machines.chassis import TRACTION_USE, Bodies
 from sim.machines.model import MachineModel
 from sim.state import STEP_S, FleetState, stack
-from sim.terrain.soil import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
+from sim.terrain.terrain import CONCRETE, SAND, SLIP_STIFFNESS, SOILS, TRACTION, WET_DIRT
 from sim.worlds.bullet import BulletWorld
 from sim.worlds.fast import FastWorld
 from tests.unit.sim.planes import (

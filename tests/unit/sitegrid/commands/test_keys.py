@@ -117,7 +117,7 @@ def lifetime(issued: x509.Certificate) -> timedelta:
 
 
 def test_no_certificate_outlives_its_authority():
-    from sitegrid.security.certificates import expires_at, issue, make_authority
+    from sitegrid.security.key_folder import expires_at, issue, make_authority
 
     authority = make_authority(SITE, NOW, NOW + timedelta(days=10))
     assert expires_at(issue(authority, "loader-1", NOW, NOW + timedelta(days=99))) == NOW + timedelta(days=10)

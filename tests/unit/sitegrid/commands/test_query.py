@@ -29,8 +29,7 @@ from protocol.queries.requests import (
     When,
     parse_query,
 )
-from protocol.queries.road_requests import SegmentsQuery, WorklistQuery
-from protocol.queries.roads import Segments, Worklist, encode_segments, encode_worklist
+from protocol.queries.roads import Segments, SegmentsQuery, Worklist, WorklistQuery, encode_segments, encode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES, NamedMachine
 from protocol.site.geometry import Bounds

@@ -40,11 +40,10 @@ from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
 from sitegrid.doctor import Finding, Level, disk, network
-from sitegrid.doctor.base import check_base
 from sitegrid.doctor.disk import SpoolState, StoreState
+from sitegrid.doctor.examine import check_base, check_positions
 from sitegrid.doctor.keys import Certificate, check_certificate, read_certificate
 from sitegrid.doctor.network import RouterLink
-from sitegrid.doctor.positions import check_positions
 from tests.unit.records import map_info
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)

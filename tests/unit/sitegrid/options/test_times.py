@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
-from sitegrid.options.times import SiteTime, parse_stamp, parse_time, utc_text
+from sitegrid.options.values import SiteTime, parse_stamp, parse_time, utc_text
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
 S = 10**9

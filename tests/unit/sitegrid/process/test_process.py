@@ -13,7 +13,7 @@ import pytest
 
 from sitegrid.door import build_parser
 from sitegrid.process.children import Children, ProcessError
-from sitegrid.process.kernels import COMPILING
+from sitegrid.process.progress import COMPILING
 
 STUBBORN = """
 import sys, time
@@ -169,7 +169,7 @@ def test_a_child_is_waited_for_as_long_as_it_says_that_it_goes_on(tmp_path, monk
 def test_compiled_kernels_are_named_and_those_of_the_cache_are_not(tmp_path, monkeypatch):
     code = """
 import numba
-from sitegrid.process.kernels import compilation_reported
+from sitegrid.process.progress import compilation_reported
 @numba.njit(cache=True)
 def twice(x):
     return 2 * x

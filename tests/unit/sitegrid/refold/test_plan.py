@@ -9,8 +9,8 @@ import pytest
 
 from mapserver.journal.rows import ALL, JournalRow, JournalRows, Selection
 from protocol.errors import SitegridError, StoreError
-from sitegrid.refold.contents import by_spool
 from sitegrid.refold.engine import Here
+from sitegrid.refold.parts import by_spool
 from sitegrid.refold.plan import Plan, plan
 from sitegrid.refold.work import FoldTask, PartWork, fold_parts
 from tests.unit.sitegrid.refold.archives import T0, S, fold_in, samples, write

@@ -14,7 +14,7 @@ from mapserver.evidence.grid_state import GridState
 from mapserver.journal.rows import ALL, JournalRow, Selection
 from protocol.errors import SitegridError, StoreError
 from sitegrid.refold import work
-from sitegrid.refold.contents import Look, look
+from sitegrid.refold.parts import Look, look
 from sitegrid.refold.work import Fold, FoldTask, PartWork, fold_parts, merge_tile, merged_state, tiles
 from tests.unit.mapserver.data import same_state
 from tests.unit.sitegrid.refold.archives import SITE, fold_in, samples, write

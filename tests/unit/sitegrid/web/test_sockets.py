@@ -16,8 +16,8 @@ from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
 from sitegrid.process.children import wait_until
-from sitegrid.web import sockets
-from sitegrid.web.sockets import Listening, PatientProtocol, origin_of
+from sitegrid.web import process
+from sitegrid.web.process import Listening, PatientProtocol, origin_of
 
 WHOLE = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 BODY = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 999\r\n\r\n"
@@ -29,7 +29,7 @@ PATIENCE_S = 0.4
 @pytest.fixture(autouse=True)
 def _short_times_and_few_places(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"REQUEST_S": PATIENCE_S, "OF_ADDRESS": 3, "SPARE": 2}.items():
-        monkeypatch.setattr(sockets, name, value)
+        monkeypatch.setattr(process, name, value)
 
 
 async def app(scope: Scope, receive: Receive, send: Send) -> None:
@@ -97,7 +97,7 @@ def test_a_request_that_does_not_come_in_whole_ends_its_connection(begun: bytes)
 
 
 def test_an_address_has_so_many_sockets_whatever_they_are(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sockets, "REQUEST_S", 60.0)
+    monkeypatch.setattr(process, "REQUEST_S", 60.0)
     with serving() as listening, contextlib.ExitStack() as stack:
         first, live, third, fourth, fifth, *more = (
             stack.enter_context(opened(listening, "127.0.0.2")) for _ in range(9)
