@@ -58,6 +58,7 @@ def test_plot_draws_the_map_and_how_it_differs_from_the_truth(web: WebSite, tmp_
     assert all(cv2.imread(drawn[name]) is not None for name in ("picture", "difference"))
 
 
+@pytest.mark.nightly
 def test_demo_prints_one_object_with_its_proof(tmp_path: Path, husky_data: Path):
     words = ("--seconds", 40, "--speed", 8, "--machines", 3, "--seed", 7, "--out", tmp_path, "--data", husky_data)
     manifest = Path("lab/logs/rl_test1_husky/log.toml").absolute()
