@@ -9,7 +9,7 @@ import pytest
 
 from agents.base_station import PINNED, BaseStation, LastingError
 from protocol.machine.machine_config import Mount, SensorConfig
-from protocol.machine.readings import Gps, Odometry
+from protocol.machine.readings import Correction, Gps, Odometry
 from protocol.site.site_config import Projection, SiteConfig
 
 T0 = 1_750_000_000_000_000_000
@@ -140,3 +140,9 @@ def test_pause_or_a_clock_that_jumps_keeps_what_the_base_has_learnt(at: int) -> 
     assert after
     assert after[0].offset_m2 < 2 * before.offset_m2 + 1e-3 * abs(at)
     assert all(np.isfinite([c.offset_e_m, c.offset_n_m, c.offset_m2]).all() for c in after)
+
+
+def test_corrections_keep_the_limits_of_the_wire() -> None:
+    for correction in station().step([fix(e, i) for i, e in enumerate(100 * drifting(200, 1), 1)]):
+        for name, (low, high) in Correction.limits.items():
+            assert low <= getattr(correction, name) <= high

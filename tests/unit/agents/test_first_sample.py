@@ -93,4 +93,4 @@ def test_nothing_is_said_of_a_machine_that_has_all_nor_before_the_time():
     assert said(DRIVEN) == []
     early = [r for r in STANDING if r.stamp_ns < STANDING[0].stamp_ns + WAIT_NS]
     assert said(early) == []
-    assert said([*early[:80], *(replace(r, stamp_ns=r.stamp_ns + WAIT_NS) for r in early[80:])]) == [], "a clock is set"
+    assert said([*early[:75], *(replace(r, stamp_ns=r.stamp_ns + WAIT_NS) for r in early[75:])]) == [], "a clock is set"

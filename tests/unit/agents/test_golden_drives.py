@@ -58,12 +58,13 @@ def config(engine: str = "ekf", *, lag_s: float = 5.0, estimation: Any = None, *
     return PipelineConfig(LocalisationConfig(engine, lag_s=lag_s, **options), estimation or EstimationConfig())
 
 
-def loader(**options: Any) -> Case:
+def loader(seconds: float = 42.0, **options: Any) -> Case:
     """All that a simulated loader may have, with outliers, a pause of 2 s, and one fix that comes late."""
     site, vehicle, readings, _ = simulated(3, 42.0, gps=(1, 2), imu=(1, 3), attitude=(3,), payload=True)
     troubled = [r for r in moved(readings, 60.0, from_s=34, to_s=36) if not after(r, 38) or after(r, 40)]
     late = next(i for i, r in enumerate(troubled) if isinstance(r, Gps) and after(r, 33))
     troubled.insert(late + 60, troubled.pop(late))
+    troubled = [r for r in troubled if not after(r, seconds)]
     return site, vehicle, troubled, config(start=(29.143, 18.503, -0.339), **options)
 
 
@@ -88,7 +89,7 @@ def modes(profile: str) -> Case:
     readings = noisy(with_ahrs(drive(TOUR, vehicle, ground=SLOPE), 1.0), 3)
     off = moved(readings, 500.0, "gps-2")
     arriving = sorted(off, key=lambda r: r.stamp_ns + (400_000_000 if r.sensor in ("gps-2", "ahrs") else 0))
-    return SITE, vehicle, arriving, config("ukf", profile=profile, start=START)
+    return SITE, vehicle, arriving, config("ukf" if profile == "default" else "ekf", profile=profile, start=START)
 
 
 def body() -> Case:
@@ -166,7 +167,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "loader, rls and mass, no lag": lambda: loader(lag_s=0.0, estimation=EstimationConfig("rls", "estimated")),
     "loader, paper ekf": lambda: loader(profile="paper"),
     "loader, paper ukf, known mass": lambda: loader(
-        engine="ukf", profile="paper", estimation=EstimationConfig(mass="known")
+        10.0, engine="ukf", profile="paper", estimation=EstimationConfig(mass="known")
     ),
     "receivers": receivers,
     "modes": lambda: modes("default"),

@@ -12,7 +12,7 @@ from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity, Reading
 from tests.paths import ROOT
-from tests.unit.agents.drives import S_BEND, SITE, Drive, changed_sensor, drive, fix, machine, thinned
+from tests.unit.agents.drives import S_BEND, SITE, Drive, changed_sensor, drive, fix, machine
 
 HUSKY = ROOT.parent / "shared" / "data" / "rl_test1_husky"
 CONFIG, SETTLE_S = HoldoutConfig(period_s=5.0, off_s=1.0), 10.0
@@ -26,15 +26,14 @@ def vehicle() -> MachineConfig:
 
 @pytest.fixture(scope="module")
 def made(vehicle: MachineConfig) -> Drive:
-    whole = drive(S_BEND, vehicle)
-    return replace(whole, readings=thinned(whole.readings))
+    return drive(S_BEND, vehicle)
 
 
 def run(
     vehicle: MachineConfig, readings: list[Reading], config: HoldoutConfig = CONFIG, settle_s: float = SETTLE_S
 ) -> tuple[Pipeline, Any]:
     pipeline, holdout = Pipeline(SITE, vehicle, CHEAP), Holdout(SITE, vehicle, config, settle_s)
-    for i in range(0, len(readings), 20):
+    for i in range(0, len(readings), 50):
         pipeline.step(holdout.split(readings[i : i + 50]))
         holdout.compare(pipeline)
     return pipeline, holdout.report()

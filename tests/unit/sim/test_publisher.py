@@ -126,6 +126,13 @@ class FakeStop(threading.Event):
         return False
 
 
+def test_run_takes_as_long_as_its_speed_says() -> None:
+    stop = FakeStop()
+    config = replace(CONFIG, speed=4.0)
+    report, _ = published(config, stop=stop, clock=lambda: stop.now, wait_s=1e6)
+    assert report.wall_s == pytest.approx(0.125)
+
+
 @pytest.mark.parametrize(("speed", "wall_s"), [(1.0, 12.0), (4.0, 3.0), (0.0, 0.0)])
 def test_pace_holds_to_the_speed(speed: float, wall_s: float) -> None:
     stop = FakeStop()

@@ -196,6 +196,14 @@ def test_batch_is_halved_on_a_time_out_and_doubled_on_success() -> None:
     assert d.uplink.counters["timeouts"] == 2
 
 
+def test_batch_is_never_less_than_one_sample() -> None:
+    d = met(500, first_batch=4)
+    for _ in range(20):
+        d.payload()
+        d.reply(None)
+    assert len(d.batch().rows) == 1
+
+
 @pytest.mark.parametrize(("asked_s", "least_s"), [(0.3, 0.3), (4.0, 4.0), (3000.0, 5.0)])
 def test_a_machine_comes_again_when_the_server_has_room_and_not_all_at_once(asked_s: float, least_s: float) -> None:
     """As often as it is asked to, and never much later than by itself."""

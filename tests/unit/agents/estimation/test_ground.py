@@ -15,7 +15,7 @@ from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Reading, Torque
 from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, drive, machine, noisy
-from tests.unit.agents.ground import EstimatorRun
+from tests.unit.agents.ground import STEADY, EstimatorRun
 
 SLOPE_RAD = math.radians(15)
 STAND, START = Leg(2), Leg(4, 0.5)
@@ -242,6 +242,16 @@ def test_change_of_slope_blurs_slope_and_resistance() -> None:
     for e in estimates:
         assert np.isnan([e.c_rr, e.c_rr_var, e.slope_x, e.slope_y, e.slope_var]).all()
         assert e.mass_kg == VEHICLE.mass_kg
+
+
+@pytest.mark.parametrize(("speed_mps", "axles"), [(2.0, (0.4, 3.3, 2.1)), (-2.0, (0.6, 3.3, 1.2))])
+def test_step_states_which_axle_leads(speed_mps: float, axles: tuple[float, float, float]) -> None:
+    """Its share of the load, how far the other one is behind, and the load centre."""
+    estimator = GroundEstimator(machine(wheelbase_m=3.3, load_centre_m=1.2), EstimationConfig())
+    step = estimator._balance_step(replace(STEADY, speed_mps=speed_mps, on_front=0.4), 0.1, 0.04, 1.0)
+    assert (step.lead_share, step.wheelbase_m, step.lead_m) == pytest.approx(axles)
+    bare = GroundEstimator(machine(), EstimationConfig())._balance_step(STEADY, 0.1, 0.04, 1.0)
+    assert (bare.lead_share, bare.wheelbase_m) == (1.0, 0.0)
 
 
 # --- calibration -----------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@ import dataclasses
 import gzip
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from protocol.errors import ConfigError, LogFolderError, Refusal
 from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import KINDS, Articulation, Encoder, Gps, Imu
+from protocol.machine.readings import KINDS, Articulation, Encoder, Gps, Imu, Torque
 from protocol.site.site_config import KnownGround, SiteConfig
 
 T0 = 1_750_000_000_000_000_000
@@ -197,6 +198,14 @@ def test_known_ground_of_the_site_reads_back_exactly(tmp_path):
     site = dataclasses.replace(SITE, known_ground=areas)
     write_log(tmp_path, "pad", site, MACHINE, [])
     assert open_log(tmp_path).site == site
+
+
+def test_numbers_of_numpy_read_back(tmp_path):
+    machine = MachineConfig("m-1", sensors=(SensorConfig("drive", "torque", Mount(tuple(np.zeros(3)))),))
+    write_log(tmp_path, "numpy", SITE, machine, [Torque("drive", np.int64(T0), np.float64(0.1))])
+    log = open_log(tmp_path)
+    assert list(log.readings()) == [Torque("drive", T0, 0.1)]
+    assert log.machine.sensors[0].mount == Mount()
 
 
 def test_reading_of_an_unknown_sensor_is_not_written(tmp_path):

@@ -54,6 +54,10 @@ def test_a_missing_piece_is_seen():
         joined([piece(0)])
 
 
+def test_a_piece_travels_with_its_place():
+    assert decode_region(encode_region(piece(1))).piece == piece(1).piece
+
+
 @pytest.mark.parametrize("changes", [{"column": 3}, {"row": -1}, {"number": 2}, {"columns": 10**9}, {"rows": 1}])
 def test_a_piece_outside_of_its_region_is_refused(changes):
     with pytest.raises(MessageError, match="piece"):
