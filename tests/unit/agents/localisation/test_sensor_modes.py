@@ -41,7 +41,7 @@ EACH_PAIR = pytest.mark.parametrize(  # of choices once
     ("mode", "profile", "engine"),
     [
         ("differential", "default", "ekf"),
-        ("differential", "paper", "ukf"),
+        pytest.param("differential", "paper", "ukf", marks=pytest.mark.nightly),  # filterpy's is slow
         ("relative", "default", "ukf"),
         ("relative", "paper", "ekf"),
     ],
