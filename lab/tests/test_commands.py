@@ -42,12 +42,14 @@ def parsers(parser: ArgumentParser) -> dict[str, ArgumentParser]:
 def wrong_words() -> list[tuple[str, ...]]:
     """Each option of each command with a value that it does not have."""
 
-    def of(name: str, option: Action) -> tuple[str, ...] | None:
+    def wrong_word(name: str, option: Action) -> tuple[str, ...] | None:
         wrong = "nonsense" if option.choices and option.option_strings else WRONG.get(option.type)
         return (name, option.option_strings[-1], wrong) if wrong else None
 
     all_of = parsers(build_parser(commands, "python -m lab"))
-    return [words for name, parser in all_of.items() for option in parser._actions if (words := of(name, option))]
+    return [
+        words for name, parser in all_of.items() for option in parser._actions if (words := wrong_word(name, option))
+    ]
 
 
 @pytest.mark.parametrize("name", NAMES)
