@@ -250,11 +250,16 @@ class Localiser:
         return None
 
     def _take_back(self, shown: Alignment, distance_m: float) -> list[Belief]:
-        """Start again with what came since the filter refused fixes, and with what they show."""
+        """Start again with what came since the filter refused fixes, and with what they show.
+
+        Steps of before the heading that is taken back have no place: else each one would filter more than the one before.
+        """
         self._counters["heading_taken_back"] += 1
         self._tracker = Tracker(self._tracker_config)
         self._poses.clear()
         self._smoothed.clear()
+        while self._steps[0].stamp_ns < self._since[0] and len(self._steps) > 1:
+            self._steps.popleft()
         self._forget(self._refused[0].stamp_ns)
         self._refused.clear()
         return self._start(shown, distance_m)

@@ -97,6 +97,7 @@ def test_ctrl_c_ends_everything_that_the_demo_started(tmp_path: Path):
     assert not [pid for pid in started if is_alive(pid)]
 
 
+@pytest.mark.nightly
 def test_on_a_terminal_the_page_of_the_demo_stays_until_ctrl_c(tmp_path: Path):
     terminal, its_end = pty.openpty()
     words = ["demo", "--web", "--machines", "1", "--world", "fast", "--seconds", "20", "--out", str(tmp_path)]

@@ -82,6 +82,7 @@ def repeated(ask: Callable[[], object]) -> Iterator[list[object]]:
         thread.join()
 
 
+@pytest.mark.nightly
 def test_batches_and_queries_are_answered_during_a_refold_and_the_map_is_that_of_a_fold_from_the_start(site: SiteRun):
     server, config = serve(site), load_site(site.site_file)
     with session_of(site.endpoint) as session, site.connect() as client, site.connect() as other:

@@ -73,7 +73,9 @@ def killed(client: Client, victim: Child, start: Callable[[], Child], machine: s
 
     def merged() -> int:
         info = client.info()
-        return info.machines[machine].samples if machine else info.samples_merged
+        if not machine:
+            return info.samples_merged
+        return info.machines[machine].samples if machine in info.machines else 0  # it may be the last to have samples
 
     before = merged()
     kill(victim)

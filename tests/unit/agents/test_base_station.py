@@ -78,6 +78,7 @@ def test_five_corrections_a_second_of_a_fast_receiver() -> None:
 
 @pytest.mark.parametrize("wrong_m", [0.0, 1.0, 5.0])
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_lasting_error_of_a_wrong_survey_is_found_within_what_it_states(wrong_m: float) -> None:
     off = []
     for seed in range(4):

@@ -127,6 +127,7 @@ def test_bad_holdout_option_is_refused_by_name(name: str, value: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not HUSKY.is_dir(), reason=f"no recording in {HUSKY}")
+@pytest.mark.nightly
 def test_real_log_gives_samples_without_resistance_and_a_small_error_where_gps_was_withheld() -> None:
     log = open_log(ROOT / "lab" / "logs" / "rl_test1_husky", HUSKY)
     pipeline, holdout = (

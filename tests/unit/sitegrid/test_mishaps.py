@@ -77,7 +77,7 @@ def endpoint() -> Iterator[str]:
 
 def test_the_sweep_meets_commands_and_options():
     names = {command.words[0] for command in COMMANDS}
-    assert {"agent", "demo", "doctor", "eval", "fold", "keys", "plot", "query", "router", "server", "sim"} <= names
+    assert {"agent", "demo", "doctor", "fold", "keys", "log", "plot", "query", "router", "server", "sim"} <= names
     assert len(with_option(_is_output)) > 15
     assert len(with_option(_is_input)) > 15
 

@@ -329,6 +329,7 @@ def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["kalman", pytest.param("rls", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
 def test_a_machine_that_drives_round_and_round_finds_its_zero_and_applies_it_as_it_drives(estimator: str) -> None:
     """At 2 m/s round a circle of 20 m; it never stands again. Where the calibration changes the ground does not."""
     readings = off(drive([STAND, START, Leg(150, turn_radps=0.1)], VEHICLE).readings, 0.06)

@@ -145,6 +145,7 @@ def shuffled_stamps(readings: Sequence[Reading], rng: np.random.Generator) -> li
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("engine", "rate_hz"), [("ekf", 20), ("ukf", 5)])
+@pytest.mark.nightly
 def test_no_order_of_sensor_tables_and_of_readings_of_a_stamp_changes_a_bit(engine: str, rate_hz: float) -> None:
     vehicle = cart(*MANY)
     readings = readings_of(vehicle, drive(TOUR, vehicle), rate_hz, seed=4)[: 25 * rate_hz * len(MANY)]

@@ -101,6 +101,7 @@ def judged(vehicle: MachineConfig, share: float, runs: int, seconds: int, engine
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("share", "engine"), [(0.0, "ekf"), (0.5, "ukf"), (0.95, "ekf")])
+@pytest.mark.nightly
 def test_a_filter_with_the_true_share_is_consistent(share: float, engine: str) -> None:
     runs = 60
     nees = judged(sharing(3, share), share, runs, 30, engine)
@@ -109,6 +110,7 @@ def test_a_filter_with_the_true_share_is_consistent(share: float, engine: str) -
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_receivers_that_share_nearly_all_deceive_a_filter_that_takes_them_apart_and_no_other() -> None:
     deceived, estimating = (judged(sharing(3, share), 0.95, 60, 45) for share in (0.0, None))
     assert (deceived < 5.99).mean() < 0.8 < (estimating < 5.99).mean()

@@ -55,6 +55,7 @@ def off_m(located: RunLocaliser, made: Drive) -> float:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_reference_holds_the_heading_of_a_machine_without_gps() -> None:
     """A gyro that nobody calibrated, from a start that is known: without a reference it turns away."""
     vehicle = of_ahrs()

@@ -104,6 +104,7 @@ def test_a_value_that_counts_from_an_anchor_does_not_show_where_the_anchor_was()
 
 
 @EACH_PAIR
+@pytest.mark.nightly
 def test_a_machine_with_such_a_receiver_alone_never_aligns_but_runs_from_a_start(
     mode: str, profile: str, engine: str
 ) -> None:

@@ -89,6 +89,7 @@ def test_work_cycles_load_reverse_dump_and_wait_on_their_routes(quarry: Driven) 
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_loaders_at_work_get_round_over_all_soils_in_each_others_company(loading: Driven) -> None:
     speed, payload = loading.states.speed_mps, loading.payload_kg
     assert ((np.diff((payload > 2000).astype(int), axis=0) == 1).sum(axis=0) >= 2).all()  # two cycles, each of them

@@ -129,6 +129,7 @@ def site() -> Driven:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_machines_go_where_their_drivers_wander() -> None:
     driven, config = site(), load_scenario("paper_site_driven").driving
     off_aim = driven.left_m - driven.aim_m

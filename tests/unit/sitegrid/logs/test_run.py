@@ -219,6 +219,7 @@ def test_every_row_of_a_real_log_is_read(folder: str):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_mower_against_its_truth():
     (row,) = run(LOGS / "plaza2_mower", None, data=beside("plaza2_mower"), gps=1)["rows"]
     assert row["truth_net_m"] < 3.0  # one fix of the first receiver alone is off by 3.3 m
