@@ -252,7 +252,7 @@ class Localiser:
     def _take_back(self, shown: Alignment, distance_m: float) -> list[Belief]:
         """Start again with what came since the filter refused fixes, and with what they show.
 
-        Steps of before the heading that is taken back have no place: else each one would filter more than the one before.
+        Steps from before the refuted heading are dropped: else each new start would filter more than the one before.
         """
         self._counters["heading_taken_back"] += 1
         self._tracker = Tracker(self._tracker_config)
