@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from lab.campaign.figures import Goal
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from sitegrid.proof.figures import Row
@@ -44,7 +43,8 @@ def _judgement(value: float | None, goal: str | None) -> Row:
     if goal is None:
         return {"goal": None, "met": None}
     relation, limit = goal.split()
-    return {"goal": goal, "met": Goal({}, "", "<=" if relation == "<=" else ">=", float(limit)).is_met(value)}
+    met = value is not None and (value <= float(limit) if relation == "<=" else value >= float(limit))
+    return {"goal": goal, "met": met}
 
 
 def in_turn(variants: Mapping[str, Callable[[], Figures]], runs: int) -> dict[str, dict[str, float]]:
