@@ -74,8 +74,9 @@ def missing(kinds: Collection[str], health: Mapping[str, Any]) -> list[str]:
         causes.append("GPS fixes outside the site")
     elif health["repeating"]:
         causes.append(f"{', '.join(health['repeating'])} repeats one fix")
-    if not causes and health["aligned"] and not 1 / UNIT < 1 + health["wheel_scale"] < UNIT:
-        return [f"the wheels turn {1 + health['wheel_scale']:.1f} times as far as the fixes go: look at their unit"]
     if not causes and health["aligned"]:
+        turned = 1 + health["wheel_scale"]
+        if not 1 / UNIT < turned < UNIT:
+            return [f"the wheels turn {turned:.1f} times as far as the fixes go: look at their unit"]
         return [f"the heading is not proven until fixes agree with it for {PROVEN_S:g} s and {DISTANCE_M:g} m"]
     return causes or [f"the heading is unknown until the machine has driven {DISTANCE_M:g} m with GPS fixes"]

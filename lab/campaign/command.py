@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
+from importlib import import_module
 from typing import Any
 
 from lab.campaign.experiment import Runner
 from lab.campaign.provenance import made_by
+from lab.campaign.summary import chosen
 from lab.campaign.workers import cores
 from protocol.errors import ConfigError
 from sitegrid.options.values import FOLDER, count, positive, seed
@@ -75,6 +78,19 @@ def perform(
         note(f"recordings and results are in {arguments.out}")
     show(arguments, report, readable)
     return 0
+
+
+def seeded(module: str, title: str) -> Callable[[Namespace], int]:
+    """The `run` of a command whose experiment takes seeds, seconds and perhaps cases; it is in `module`."""
+
+    def run(arguments: Namespace) -> int:
+        experiment = import_module(module)  # here, so that `--help` is quick
+        options: dict[str, Any] = {"seeds": seeds_of(arguments), "seconds": arguments.seconds}
+        if hasattr(arguments, "cases"):
+            options["cases"] = chosen(experiment.CASES, arguments.cases)
+        return perform(arguments, title, partial(experiment.run, **options))
+
+    return run
 
 
 def show(arguments: Namespace, report: Report, readable: Callable[[Report], Report] = lambda report: report) -> None:

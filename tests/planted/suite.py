@@ -39,15 +39,16 @@ class Suite:
         return self.folder / "times.xml"
 
     def copy(self, number: int) -> Path:
-        """A copy of the checkout's files, where it is not there yet."""
+        """A copy of the checkout's files, where it is not there yet; later ones with its compiled kernels."""
         copy = self.folder / f"tree-{number}"
-        if not copy.exists():
-            listed = subprocess.run(
-                ["git", "ls-files", "-z"], cwd=self.root, capture_output=True, check=True, text=True
-            )
-            for name in filter(None, listed.stdout.split("\0")):
-                (copy / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(self.root / name, copy / name)
+        if copy.exists():
+            return copy
+        if number:
+            return Path(shutil.copytree(self.copy(0), copy))
+        listed = subprocess.run(["git", "ls-files", "-z"], cwd=self.root, capture_output=True, check=True, text=True)
+        for name in filter(None, listed.stdout.split("\0")):
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(self.root / name, copy / name)
         return copy
 
     def measure(self, processes: int) -> None:
@@ -113,7 +114,7 @@ def trial(tree: Path, fault: Fault, tests: Sequence[str]) -> str:
     original, stat = place.path.read_bytes(), place.path.stat()
     try:
         place.path.write_bytes(original[: place.start] + place.text + original[place.end :])
-        done = _pytest(tree, ["--exitfirst", "--quiet", *tests], {})
+        done = _pytest(tree, ["--exitfirst", "--quiet", *tests], {}, LIMIT_S)
     except subprocess.TimeoutExpired:
         return "it hangs"
     finally:
@@ -130,10 +131,12 @@ def _ids(contexts: dict[int, list[str]], lines: Sequence[int] | dict[int, list[s
     return {context.partition("|")[0] for line in lines for context in contexts.get(line, []) if context}
 
 
-def _pytest(tree: Path, words: Sequence[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+def _pytest(
+    tree: Path, words: Sequence[str], environment: dict[str, str], limit_s: float | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run pytest in a checkout, without writing byte code: a fault must not outlive its trial."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:randomly", *words]
     extra = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1", **environment}
     return subprocess.run(
-        command, cwd=tree, env=os.environ | extra, capture_output=True, text=True, check=False, timeout=LIMIT_S * 4
+        command, cwd=tree, env=os.environ | extra, capture_output=True, text=True, check=False, timeout=limit_s
     )
