@@ -60,6 +60,7 @@ def test_frame_does_not_depend_on_the_type_of_a_number(number):
         {"name": "a/b"},
         {"origin_lat_deg": 91.0},
         {"origin_lon_deg": 181.0},
+        {"origin_lon_deg": -181.0},
         {"origin_lat_deg": math.nan},
         {"cell_m": 0.0},
         {"cell_m": math.nan},
