@@ -1,6 +1,7 @@
 """`python -m tests.planted`: plants faults in the product, one after the other, and shows which the tests catch.
 
     python -m tests.planted run [FOLDER] --out OUT [--common FOLDER]    plant them in a checkout; goes on where it was
+    python -m tests.planted run [FOLDER] --out OUT --survivors OTHER    those alone that survived in another run
     python -m tests.planted compare BEFORE AFTER                        two of these, side by side
 
 60 faults are written by hand (`faults.toml`), 200 drawn by --seed over functions that FOLDER and --common both have.
@@ -24,16 +25,16 @@ from tests.paths import ROOT
 from tests.planted.faults import Fault, drawn, written
 from tests.planted.suite import Suite, trial
 
+RESULTS = "results.jsonl"
 NO_PLACE, SURVIVED = "no place", "survived"
 MOST_S = 300.0  # of tests, as long as they took in the run with coverage, that one fault is given to
 
 
 def run(suite: Suite, faults: Sequence[Fault], processes: int, most_s: float) -> dict[str, dict[str, str]]:
-    """What became of each fault; kept line by line in `results.jsonl`."""
+    """What became of each fault; kept line by line in RESULTS."""
     suite.folder.mkdir(parents=True, exist_ok=True)
     suite.measure(processes)
-    kept = suite.folder / "results.jsonl"
-    results = {row["name"]: row for row in map(json.loads, kept.read_text().splitlines())} if kept.exists() else {}
+    kept, results = suite.folder / RESULTS, results_of(suite.folder)
     waiting = [fault for fault in faults if fault.name not in results]
     trees = SimpleQueue[Path]()
     for number in range(processes):
@@ -72,12 +73,15 @@ def judged(suite: Suite, fault: Fault, tree: Path, most_s: float) -> dict[str, s
     return {**row, "tier": SURVIVED}
 
 
+def results_of(folder: Path) -> dict[str, dict[str, str]]:
+    """What became of each fault in a run so far, by its name."""
+    kept = folder / RESULTS
+    return {row["name"]: row for row in map(json.loads, kept.read_text().splitlines())} if kept.exists() else {}
+
+
 def compare(before: Path, after: Path) -> tuple[str, int]:
     """Both columns as a table, and how many faults the first catches and the second does not."""
-    columns = [
-        {row["name"]: row for row in map(json.loads, (folder / "results.jsonl").read_text().splitlines())}
-        for folder in (before, after)
-    ]
+    columns = [results_of(folder) for folder in (before, after)]
     both = [
         name
         for name, row in columns[0].items()
@@ -103,6 +107,8 @@ def main(words: Sequence[str] | None = None) -> int:
     planting = what.add_parser("run", help="plant faults in a checkout")
     planting.add_argument("folder", type=Path, nargs="?", default=ROOT)
     planting.add_argument("--common", type=Path, help="a checkout that must have the functions, too")
+    planting.add_argument("--survivors", type=Path, help="only faults that survive in this run of another checkout")
+    planting.add_argument("--tests", nargs="+", default=["tests"], help="files and folders of the suite (%(default)s)")
     planting.add_argument("--out", type=Path, default=Path("planted-output"))
     planting.add_argument("--seed", type=int, default=1000)
     planting.add_argument("--drawn", type=int, default=200, help="how many are drawn (%(default)s)")
@@ -118,7 +124,10 @@ def main(words: Sequence[str] | None = None) -> int:
         return int(lost > 0)
     root, common = options.folder.resolve(), (options.common or options.folder).resolve()
     faults = [*written(), *drawn(root, common, options.drawn, options.seed)]
-    results = run(Suite(root, options.out.resolve()), faults, options.processes, options.seconds)
+    if options.survivors:
+        left = {name for name, row in results_of(options.survivors).items() if row["tier"] == SURVIVED}
+        faults = [fault for fault in faults if fault.name in left]
+    results = run(Suite(root, options.out.resolve(), tuple(options.tests)), faults, options.processes, options.seconds)
     tiers = Counter(results[fault.name]["tier"] for fault in faults)
     print(", ".join(f"{tier} {n}" for tier, n in tiers.most_common()))
     return int(tiers[SURVIVED] > 0)

@@ -23,10 +23,14 @@ NIGHTLY = "nightly"
 
 @dataclass(frozen=True)
 class Suite:
-    """The tests of a checkout. folder: of their times and coverage, and of the copies in which faults are planted."""
+    """The tests of a checkout. folder: of their times and coverage, and of the copies in which faults are planted.
+
+    tests: files and folders of the suite.
+    """
 
     root: Path
     folder: Path
+    tests: tuple[str, ...] = ("tests",)
 
     @property
     def coverage_file(self) -> Path:
@@ -58,8 +62,11 @@ class Suite:
         words = [f"--cov={package}" for package in PACKAGES]
         part = self.times_file.with_suffix(".part")
         words += ["--cov-context=test", "--cov-report=", f"--junitxml={part}", f"--numprocesses={processes}"]
+        words += ["--dist=worksteal", "-o", "junit_family=xunit1", *self.tests]
         environment = {"COVERAGE_FILE": str(self.coverage_file)}
-        done = _pytest(self.copy(0), [*words, "--dist=worksteal", "-o", "junit_family=xunit1", "tests"], environment)
+        done = _pytest(
+            self.copy(0), [*words, "--dist=worksteal", "-o", "junit_family=xunit1", *self.tests], environment
+        )
         print(done.stdout.rpartition("\n\n")[2], flush=True)
         part.rename(self.times_file)
 
@@ -78,7 +85,7 @@ class Suite:
     @cached_property
     def nightly(self) -> set[str]:
         """Ids of the tests that `make nightly` alone runs."""
-        shown = _pytest(self.copy(0), ["--collect-only", "--quiet", "-m", NIGHTLY, "tests"], {}).stdout
+        shown = _pytest(self.copy(0), ["--collect-only", "--quiet", "-m", NIGHTLY, *self.tests], {}).stdout
         return {line for line in shown.splitlines() if "::" in line}
 
     @cached_property
