@@ -23,7 +23,7 @@ from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, open_states, reset_states
 from agents.localisation.filters.motion import GpsError, map_from_base
 from agents.localisation.filters.state import ATTITUDE, VELOCITY, Layout
-from agents.localisation.fix import Fix
+from agents.localisation.fix import GPS_GATE_SIGMA, Fix
 from agents.localisation.site_share import WAIT_S, SiteShareEstimator
 from protocol.arrays import Floats
 from protocol.machine.machine_config import SensorConfig
@@ -33,7 +33,6 @@ MAX_AGE_S = float(WAIT_S)  # older ones are refused: nobody judges what they hav
 SILENT_S = 30.0  # without a correction for so long none is used: a slow GPS error has mostly become another one
 MAX_AHEAD_S = 10.0  # so far ahead of the machine's own readings they wait for these; beyond that a clock is wrong
 REPEATS = 5  # the same error so often in a row is no measurement any more
-GATE_SIGMA = 4.0  # as of fixes
 MEAN_NS, DUE_NS = 1_000_000_000, 900_000_000  # corrections of so long are one measurement, once these are together,
 REFUSALS = 3  # and so many refused ones in a row are a base that has jumped
 LEAST_SHARE = 0.05  # a smaller one is none
@@ -133,7 +132,7 @@ class Corrections:
         variance_m2 = white_m2 + newest.slow_m2 * (1 - fade**2) * alike
         off_m = np.mean([(c.east_m, c.north_m) for c in recent], axis=0)
         change = self._change(newest)
-        z, R, gate = off_m - self._offset_m, np.eye(2) * variance_m2, self._base.gate(GATE_SIGMA)
+        z, R, gate = off_m - self._offset_m, np.eye(2) * variance_m2, self._base.gate(GPS_GATE_SIGMA)
         return measurements.correction(belief.stamp_ns, self._base.name, z, R, fade, self._layout, gate, change)
 
     def confirm(self, result: Conditioned) -> None:

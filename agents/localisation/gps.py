@@ -27,7 +27,7 @@ from agents.localisation.filters.belief import (
 from agents.localisation.filters.late_measurements import RELOCK
 from agents.localisation.filters.motion import GpsError, gps_covariance
 from agents.localisation.filters.state import YAW, Layout
-from agents.localisation.fix import MIN_FIX_STD_M, Fix
+from agents.localisation.fix import GPS_GATE_SIGMA, MIN_FIX_STD_M, Fix
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from agents.localisation.shared_errors import MOST_SHARED, SharedFix, ShareEstimator
 from protocol.arrays import Floats
@@ -35,7 +35,6 @@ from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, Se
 from protocol.machine.readings import Gps
 from protocol.site.site_config import Projection
 
-GATE_SIGMA = 4.0  # fixes further off are refused: outliers of GPS are common
 AGREED_NS = 3_000_000_000  # so old a fix may be to say whether its receiver agrees with the filter
 FADED = 15  # correlation times after which a jump is forgotten
 RESTATED = 4.0  # a receiver that states a variance so many times as large or small has another error from then on
@@ -196,7 +195,7 @@ class Receivers(ModalSensors[Fix]):
                 # nobody tells whether receiver or filter went wrong: the motion will show
                 opens = (measurements.PLACE, error)
         R = np.diag(self._white(fix))
-        gate = sensor.gate(GATE_SIGMA)
+        gate = sensor.gate(GPS_GATE_SIGMA)
         return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
 
     def _is_restated(self, name: str) -> bool:
@@ -217,7 +216,7 @@ class Receivers(ModalSensors[Fix]):
         if not off_m:
             return True
         first_m, last_m = (math.hypot(*np.mean(part, axis=0)) for part in (off_m[:half], off_m[-half:]))
-        return last_m - first_m < GATE_SIGMA * math.sqrt(2 * white_m2 / half)
+        return last_m - first_m < GPS_GATE_SIGMA * math.sqrt(2 * white_m2 / half)
 
     def _votes(self, fix: Fix) -> list[bool]:
         """Of each other receiver that is heard: whether it agrees with the filter."""
@@ -246,7 +245,9 @@ class Receivers(ModalSensors[Fix]):
         R, dt_s = np.diag(mean.variances), (now.stamp_ns - before.stamp_ns) * 1e-9
         if self._slow:
             R += np.eye(2) * (2 * self._differential_m2(fix) * -math.expm1(-dt_s / sensor.drift_time_s) / dt_s**2)
-        return measurements.velocity(mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, sensor.gate(GATE_SIGMA))
+        return measurements.velocity(
+            mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, sensor.gate(GPS_GATE_SIGMA)
+        )
 
     def _differential_m2(self, fix: Fix) -> float:
         """Variance of the slow error, so much larger that receivers which share it are together no better than one."""

@@ -8,11 +8,11 @@ import numpy as np
 
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Measurement
+from agents.localisation.fix import GPS_GATE_SIGMA
 from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import GpsVelocity
 
 MIN_STD_MPS = 0.05  # receivers smooth their velocity, and state less than its error; if configured it may be better
-GATE_SIGMA = 4.0  # as of fixes: reflections make outliers
 
 
 def gps_velocity(reading: GpsVelocity, sensor: SensorConfig) -> Measurement:
@@ -22,5 +22,5 @@ def gps_velocity(reading: GpsVelocity, sensor: SensorConfig) -> Measurement:
     else:
         variances = np.maximum([reading.var_e_m2ps2, reading.var_n_m2ps2], MIN_STD_MPS**2)
     z, lever_m = np.array([reading.velocity_e_mps, reading.velocity_n_mps]), np.array(sensor.mount.xyz_m)
-    gate = sensor.gate(GATE_SIGMA)
+    gate = sensor.gate(GPS_GATE_SIGMA)
     return measurements.velocity(reading.stamp_ns, sensor.name, z, np.diag(variances), lever_m, gate)

@@ -64,9 +64,7 @@ class Suite:
         words += ["--cov-context=test", "--cov-report=", f"--junitxml={part}", f"--numprocesses={processes}"]
         words += ["--dist=worksteal", "-o", "junit_family=xunit1", *self.tests]
         environment = {"COVERAGE_FILE": str(self.coverage_file)}
-        done = _pytest(
-            self.copy(0), [*words, "--dist=worksteal", "-o", "junit_family=xunit1", *self.tests], environment
-        )
+        done = _pytest(self.copy(0), words, environment)
         print(done.stdout.rpartition("\n\n")[2], flush=True)
         part.rename(self.times_file)
 

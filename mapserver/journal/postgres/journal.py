@@ -28,7 +28,7 @@ from mapserver.journal.postgres.tables import CHANNEL, creation, insert, literal
 from mapserver.journal.records import checksum_of
 from mapserver.journal.rows import Progress, SpoolKey, Watermark
 from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
-from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, watermark_line
+from mapserver.journal.table_writer import Line, PlainEvent, TableWriter, event_lines, watermark_line
 from protocol.disk.high_water_mark import HighWaterMark
 from protocol.errors import StoreError
 from protocol.files import make_private

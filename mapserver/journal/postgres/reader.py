@@ -15,8 +15,8 @@ from mapserver.journal.journal import ROWS_AT_ONCE, JournalState
 from mapserver.journal.postgres import connection
 from mapserver.journal.postgres.connection import REPLICAS, Connection, connect, readable, replica_of, shown
 from mapserver.journal.postgres.tables import CHANNEL, SCHEMA
-from mapserver.journal.queries import BYTES_AT_ONCE, TableQueries, size_of
 from mapserver.journal.rows import Selection
+from mapserver.journal.table_queries import BYTES_AT_ONCE, TableQueries, size_of
 from protocol.errors import StoreError
 
 _READ_ALL = "SELECT row, record FROM journal WHERE row > %(after)s AND row <= %(until)s ORDER BY row LIMIT %(most)s"

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from psycopg.sql import quote
 
 from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
-from mapserver.journal.writing import new_meta
+from mapserver.journal.table_writer import new_meta
 
 MAKING = 0x517E62D2  # an advisory lock for as long as tables are made
 SCHEMA = 2

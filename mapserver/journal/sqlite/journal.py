@@ -18,7 +18,15 @@ from mapserver.journal.journal import ROWS_AT_ONCE, UnwrittenError
 from mapserver.journal.rows import JournalRow, Progress, SpoolKey, Watermark
 from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
 from mapserver.journal.sqlite.reader import SCHEMA, TABLES, SqliteQueries
-from mapserver.journal.writing import Line, PlainEvent, TableWriter, event_lines, meta_line, new_meta, watermark_line
+from mapserver.journal.table_writer import (
+    Line,
+    PlainEvent,
+    TableWriter,
+    event_lines,
+    meta_line,
+    new_meta,
+    watermark_line,
+)
 from protocol.disk.high_water_mark import HighWaterMark, Traces, look_beside, mark_path
 from protocol.errors import StoreError
 from protocol.files import make_private

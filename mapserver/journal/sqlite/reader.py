@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from mapserver.journal.journal import ROWS_AT_ONCE, JournalState
-from mapserver.journal.queries import BYTES_AT_ONCE, TableQueries, size_of
 from mapserver.journal.rows import Selection
+from mapserver.journal.table_queries import BYTES_AT_ONCE, TableQueries, size_of
 from protocol.errors import StoreError
 from protocol.files import make_private
 

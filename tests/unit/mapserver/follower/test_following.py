@@ -22,7 +22,7 @@ from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import LAST
 from mapserver.journal.sqlite.reader import SqliteReader
-from mapserver.journal.writing import meta_line
+from mapserver.journal.table_writer import meta_line
 from mapserver.past.making import make
 from mapserver.past.past import Past
 from mapserver.trust.decisions import PERSON, TrustDecision

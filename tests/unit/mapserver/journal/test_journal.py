@@ -12,7 +12,7 @@ from mapserver.journal.journal import UnwrittenError
 from mapserver.journal.rows import Admission, Selection, Watermark
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteQueries, SqliteReader
-from mapserver.journal.writing import meta_line
+from mapserver.journal.table_writer import meta_line
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, put, random_samples, samples
@@ -307,7 +307,7 @@ def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
     ],
 )
 def test_what_stands_beside_the_rows_is_checked_on_opening(placed, monkeypatch, change, problem):
-    monkeypatch.setattr("mapserver.journal.queries._EXTENTS_AT_ONCE", 3)  # read in two pieces
+    monkeypatch.setattr("mapserver.journal.table_queries._EXTENTS_AT_ONCE", 3)  # read in two pieces
     for i in range(2):
         placed.append_event("t", i, {"machine": "a"})
     placed.check()

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from mapserver.journal.queries import TableQueries
 from mapserver.journal.records import extent_of, record
 from mapserver.journal.rows import (
     Admission,
@@ -23,6 +22,7 @@ from mapserver.journal.rows import (
 )
 from mapserver.journal.shortfall import KIND as SHORTFALL
 from mapserver.journal.shortfall import Shortfall
+from mapserver.journal.table_queries import TableQueries
 from protocol.errors import StoreError
 
 PlainEvent = tuple[str, int, Mapping[str, Any]]  # kind, stamp_ns, body
