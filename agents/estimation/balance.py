@@ -5,6 +5,9 @@ payload, m_0 the one without, and lambda the rotating mass factor, which is stat
 
     F / (m g) - (f - g squat) / g - (lambda - 1) (m_0 / m) a / g  =  direction c_rr cos(slope)
 
+F is what the torque sensor states, less what it does not see: friction between it and the wheels, brakes whose force is
+read, and the drag of the air, rho c_d A v^2 / 2.
+
 The accelerometer measures gravity's share of the slope as well, so the grade cancels.
 
 Squat is the pitch that payload and longitudinal force add to that of the ground. Axle loads of a rigid body in balance,
@@ -20,12 +23,23 @@ from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import SlopeFilter
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
-from protocol.machine.readings import Articulation, Imu, Payload, Reading, Torque, WheelReading
+from protocol.machine.readings import (
+    Articulation,
+    Brake,
+    BrakeForce,
+    Imu,
+    Payload,
+    Reading,
+    Torque,
+    WheelReading,
+)
 from protocol.units import GRAVITY_MPS2
 
 STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
 MAX_PAUSE_S = 1.0  # of the IMU, or of the wheels' readings, before their last values no longer count
 SLOW_MPS = 2.0  # a slower machine pitches by its own forces rather than by the ground
+MOVES_MPS = 0.2  # a slower machine is held by friction and brakes, nobody knows which way
+AIR_KGPM3 = 1.2  # density of the air near the ground
 NO_SUMS = (0.0,) * 8
 
 
@@ -34,11 +48,12 @@ class Balance:
     """One step of the force balance.
 
     speed_mps, accel_mps2, distance_m: of the wheels; distance_m counts up in reverse too. unbalanced: the left side of
-    the equation, share: F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad] with
+    the equation, share: what the torque sensor states of F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad] with
     their variance, as the body has them, without squat; sine_x: of the one ahead, by the accelerometer alone.
     pitch_radps: rate of the pitch, nose up positive. norm_mps2: of the specific force. on_front: share of the load on
     the front axle, 0 if not known. body_mps2: acceleration ahead by the accelerometer. torque_s, wheels_s: age of their
-    newest reading. mass_kg: with payload.
+    newest reading. mass_kg: with payload. brake: how much of a brake is applied whose force nobody reads, 0 to 1; NaN
+    of a machine without any reading of its brakes.
     """
 
     stamp_ns: int
@@ -59,6 +74,7 @@ class Balance:
     torque_s: float
     wheels_s: float
     mass_kg: float
+    brake: float
 
     @property
     def direction(self) -> float:
@@ -107,6 +123,8 @@ class Balancer:
         # Ahead and left at the IMU, by the wheels; None where they said nothing in this step.
         self._speed_mps: tuple[float, float] | None = None
         self._torque_nm, self._torque_sums = 0.0, (0, 0.0)
+        self._brakes: dict[str, Brake] = {}
+        self._brake_forces: dict[str, BrakeForce] = {}
 
     @property
     def mass_kg(self) -> float:
@@ -119,6 +137,10 @@ class Balancer:
             self._torque_ns, self._torque_nm = reading.stamp_ns, reading.torque_nm
             count, total = self._torque_sums
             self._torque_sums = count + 1, total + reading.torque_nm
+        elif isinstance(reading, Brake):
+            self._brakes[reading.sensor] = reading
+        elif isinstance(reading, BrakeForce):
+            self._brake_forces[reading.sensor] = reading
         elif isinstance(reading, WheelReading):
             self._wheels_ns = reading.stamp_ns
         elif isinstance(reading, Articulation):
@@ -172,7 +194,8 @@ class Balancer:
         bend = self._climb_of_bend(on_front, squat)
         rotating = (machine.rotating_mass_factor - 1) * machine.mass_kg / self.mass_kg
         curve = self._climb_of_curve(on_front, rate, speed)
-        unbalanced = share - force / g + squat - bend - curve - rotating * accel / g
+        unseen = self._unseen_n(speed) / (self.mass_kg * g)
+        unbalanced = share - unseen - force / g + squat - bend - curve - rotating * accel / g
         return Balance(
             stamp_ns=self._imu_ns,
             dt_s=dt_s,
@@ -192,7 +215,16 @@ class Balancer:
             torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
             wheels_s=self._wheels_s() if dead_reckoning.wheels.is_known else math.inf,
             mass_kg=self.mass_kg,
+            brake=max([brake.applied for brake in self._brakes.values()] or [0.0 if self._brake_forces else math.nan]),
         )
+
+    def _unseen_n(self, speed_mps: float) -> float:
+        """Force against the motion that the torque sensor does not see, as far as it is known; signed ahead."""
+        if abs(speed_mps) < MOVES_MPS:
+            return 0.0
+        drag_n = AIR_KGPM3 * self._machine.drag_area_m2 * speed_mps**2 / 2
+        brakes_n = sum(brake.force_n for brake in self._brake_forces.values())
+        return math.copysign(drag_n + self._machine.drive_friction_n + brakes_n, speed_mps)
 
     def _climb_of_bend(self, on_front: float, squat: float) -> float:
         """Sine of the slope of the front frame of a bent machine, less that of the rear one, by the front's load [-].

@@ -3,6 +3,10 @@
 A machine that stands, brakes, digs or spins its wheels shows nothing of the ground's resistance; on a change of slope
 its axles stand on two slopes; and sensors fail: they fall silent, freeze (stuck, or at the end of their range), or come
 in the wrong unit.
+
+Brakes that neither the torque sensor nor a reading shows make the ground seem rough: a machine that rolls downhill at
+constant speed without torque brakes, or resists by just the grade. Only the first is likely, unless its torque has
+braked before: then it sees the brakes.
 """
 
 import math
@@ -25,6 +29,13 @@ MAX_BRAKE_MPS2 = 1.5  # the wheels slow down faster than by any resistance but t
 # Of drive force over weight, in the direction of travel: who pulls more does not brake, but sand or a ramp slows it
 # down. Above noise and zero of the torque of one that coasts, and no more than gravel resists.
 PULLS_SHARE = 0.02
+APPLIED = 0.01  # of a brake: less is its play
+# Drive force over weight: below, the machine rolls without torque; and above, downwards, the torque brakes it, which
+# no engine's own drag does.
+ROLLS_SHARE, BRAKES_SHARE = 0.015, -0.06
+STEEP = 0.03  # a descent that makes machines brake; on a gentler one hardly any does
+ROLLS_FREELY = 1 / 3  # of a descent: a machine that is resisted by less speeds up, so it does not brake
+SLOWS_MPS2 = 0.5  # on the level, without torque: firm ground does not slow a machine down so much
 MAX_C_RR = 0.45  # no ground that a machine drives on resists more: the bucket digs
 MIN_C_RR = -0.08  # the ground pushes: the torque that does it is missing, and no accelerometer's zero is so far off
 MAX_SLIP_MPS2 = 1.0  # the wheels' acceleration is this far from the body's: they spin or lock
@@ -52,6 +63,8 @@ class Plausibility:
         self._frozen = _Frozen()
         self._gain = _Gain()
         self._resisted = 0.0  # resistance, low-passed
+        self._braked = 0.0  # drive force over weight in the direction of travel, low-passed
+        self._torque_brakes = False  # whether the torque was seen to brake
 
     def judge(self, balance: Balance, resistance: float) -> str:
         """Why this balance shows nothing of the resistance; "" if it does. resistance: c_rr by this balance."""
@@ -82,12 +95,15 @@ class Plausibility:
 
     def _unsteady(self, balance: Balance, resistance: float) -> str:
         """Whether forces that the balance does not include act, or acted a moment ago."""
+        may_brake = self._may_brake_unseen(balance, resistance)
         difference = balance.accel_mps2 - balance.body_mps2
         self._mismatch_mps2 += min(balance.dt_s / MEAN_S, 1.0) * (difference - self._mismatch_mps2)
         if abs(self._mismatch_mps2) > MAX_SLIP_MPS2:
             self._hold = "slip", HOLD_S
         elif _brakes(balance):
             self._hold = "braking", HOLD_S
+        elif may_brake:
+            self._hold = "braking_unseen", HOLD_S
         elif resistance > MAX_C_RR:
             self._hold = "digging", HOLD_S
         reason, left_s = self._hold
@@ -95,10 +111,24 @@ class Plausibility:
         return reason if left_s > 0 else ""
 
 
+    def _may_brake_unseen(self, balance: Balance, resistance: float) -> bool:
+        """Whether the machine rolls without torque and speeds up less than it would, and nothing reads its brakes."""
+        pulls = balance.direction * balance.share
+        self._braked += min(balance.dt_s / SMOOTH_S, 1.0) * (pulls - self._braked)
+        self._torque_brakes |= self._braked < BRAKES_SHARE
+        if self._torque_brakes or not math.isnan(balance.brake) or abs(pulls) > ROLLS_SHARE:
+            return False
+        descent = -balance.direction * math.sin(balance.slope_x)
+        held = descent > STEEP and resistance > ROLLS_FREELY * descent
+        return held or -balance.direction * balance.accel_mps2 > SLOWS_MPS2
+
+
 def _brakes(balance: Balance) -> bool:
-    """Whether the machine slows down fast, and not because the ground does it while it pulls."""
+    """Whether a brake is applied, or the machine slows down fast, not because the ground does it while it pulls."""
     slows_mps2 = -balance.direction * balance.accel_mps2
-    return slows_mps2 > MAX_BRAKE_MPS2 and balance.direction * balance.share < PULLS_SHARE
+    return balance.brake > APPLIED or (
+        slows_mps2 > MAX_BRAKE_MPS2 and balance.direction * balance.share < PULLS_SHARE
+    )
 
 
 class _Frozen:

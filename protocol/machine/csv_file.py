@@ -48,11 +48,20 @@ class CsvFile:
 
 @dataclass(frozen=True)
 class Column:
-    """A value of a row: the sum of CSV columns times their weights, plus an offset, in a unit; it may be constant."""
+    """A value of a row: the sum of CSV columns times their weights, plus an offset, in a unit; it may be constant.
+
+    over: a column that the sum is divided by, as power is by speed; "" for none. Where it is 0, so is the quotient.
+    """
 
     weights: Mapping[str, float] = field(default_factory=dict, hash=False)
     unit: str = ""
     offset: float = 0.0
+    over: str = ""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The CSV columns that it needs."""
+        return (*self.weights, self.over) if self.over else tuple(self.weights)
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,7 @@ class _Written:
     value: float | None = None
     unit: str = ""
     offset: float = 0.0
+    over: str = ""
 
 
 def take_file(table: dict[str, Any], where: str) -> CsvFile:
@@ -87,7 +97,7 @@ def _parse_table(value: Any, where: str) -> Column:
     if (
         sum(one is not None for one in given) != 1
         or written.column == ""
-        or (written.value is not None and written.offset)
+        or (written.value is not None and (written.offset or written.over))
     ):
         forms = '{ column = "name", unit = "deg", offset = 1.5 }, { columns = { left = 0.5, right = 0.5 } }'
         raise ConfigError(where, f'write "name", {forms} or {{ value = 0.01 }}')
@@ -96,7 +106,7 @@ def _parse_table(value: Any, where: str) -> Column:
     weights = {written.column: 1.0} if written.column else dict(written.columns or {})
     if not weights or not all(weights.values()):
         raise ConfigError(where, "columns: names with weights other than 0 are expected")
-    return Column(weights, written.unit, written.offset)
+    return Column(weights, written.unit, written.offset, written.over)
 
 
 def number_reader(column: Column, name: str) -> Callable[[Row], float]:
@@ -106,6 +116,13 @@ def number_reader(column: Column, name: str) -> Callable[[Row], float]:
     """
     scale = factor(column.unit, name) if column.unit else 1.0
     offset, weights = column.offset * scale, [(c, w * scale) for c, w in column.weights.items()]
+    if over := column.over:
+
+        def quotient(row: Row) -> float:
+            divisor = float(row[over])
+            return (sum(float(row[c]) * w for c, w in weights) / divisor if divisor else 0.0) + offset
+
+        return quotient
     if len(weights) == 1 and not offset:
         ((only, weight),) = weights
         return lambda row: float(row[only]) * weight
@@ -118,8 +135,8 @@ def stamp_reader(column: Column) -> Callable[[Row], int]:
     Seconds and nanoseconds may stand in two columns, of weights 1.0 and 1e-9.
     """
     unit_ns = stamp_scale(column.unit or "s")
-    if not column.weights or column.offset:
-        raise ValueError("a column is expected, neither a constant nor an offset: times count from `start_ns`")
+    if not column.weights or column.offset or column.over:
+        raise ValueError("a column is expected, neither a constant, an offset nor a quotient: times count from `start_ns`")
     scales = {name: round(weight * unit_ns) for name, weight in column.weights.items()}
     for name, weight in column.weights.items():
         if not scales[name] or not math.isclose(scales[name], weight * unit_ns, rel_tol=1e-9):

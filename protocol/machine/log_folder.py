@@ -80,7 +80,7 @@ class LogFolder:
         path, parse = self.data / source.file.file, self._parser(source)
         with opened_rows(source.file, self.data) as rows:
             for column in (source.stamp, *source.columns.described.values()):
-                require(column.weights, rows, path)
+                require(column.columns, rows, path)
             newest, problem = 0, ""
             for row in rows:
                 try:
@@ -101,7 +101,7 @@ class LogFolder:
         """What makes a reading of a row; raises RowError."""
         sensor, stamp, values = source.sensor, stamp_reader(source.stamp), source.columns.reader(self.site)
         described = (source.stamp, *source.columns.described.values())
-        numbers = [*source.file.at_least, *(name for column in described for name in column.weights)]
+        numbers = [*source.file.at_least, *(name for column in described for name in column.columns)]
 
         def parse(row: Row) -> Reading:
             try:

@@ -32,6 +32,14 @@ QUANTITIES = {
 MODES = ABSOLUTE, DIFFERENTIAL, RELATIVE = ("absolute", "differential", "relative")
 WITH_MODE = ("gps", "attitude")
 MAX_DELAY_S = 0.4  # what is 0.5 s behind the newest reading is refused as late; readings do not arrive in perfect order
+NOT_NEGATIVE = (
+    "wheelbase_m",
+    "axle_stiffness_npm",
+    "cog_height_m",
+    "payload_z_m",
+    "drag_area_m2",
+    "drive_friction_n",
+)
 MOST_KG = 500_000.0  # of a machine, and of what it carries: a sample states the sum
 MAX_EARLY_S = 10.0  # a stamp that is further ahead of its reading is no delay, but another clock
 
@@ -133,7 +141,8 @@ class MachineConfig:
     The rest, 0 where not known: wheelbase_m: from the rear axle to the front one, straight ahead. axle_stiffness_npm:
     vertical, of the two tyres of one axle together. cog_height_m: of the empty machine's centre of mass above the
     ground. payload_x_m, payload_z_m: where the centre of what it carries lies, ahead of `base_link` when it stands
-    straight, and above the ground.
+    straight, and above the ground. drag_area_m2: frontal area times drag coefficient. drive_friction_n: of what the
+    torque sensor drives before the wheels, at the wheels, whatever the speed.
     """
 
     name: str
@@ -147,6 +156,8 @@ class MachineConfig:
     cog_height_m: float = 0.0
     payload_x_m: float = 0.0
     payload_z_m: float = 0.0
+    drag_area_m2: float = 0.0
+    drive_friction_n: float = 0.0
     sensors: tuple[SensorConfig, ...] = ()
 
     def __post_init__(self) -> None:
@@ -159,7 +170,7 @@ class MachineConfig:
             raise ValueError("rotating_mass_factor: below 1")
         if self.machine_share is not None and not 0 <= self.machine_share <= 1:
             raise ValueError(f"machine_share: {self.machine_share} is not between 0 and 1")
-        for name in ("wheelbase_m", "axle_stiffness_npm", "cog_height_m", "payload_z_m"):
+        for name in NOT_NEGATIVE:
             if not 0 <= getattr(self, name) < math.inf:  # also false for NaN
                 raise ValueError(f"{name}: {getattr(self, name)!r} is not a positive number, nor 0 for not known")
         if not self.wheelbase_m and (blind := [s.name for s in self.sensors if s.kind == "steering" and s.use]):
@@ -199,7 +210,9 @@ def sensor_lines(sensor: SensorConfig) -> list[str]:
 
 def machine_toml(machine: MachineConfig) -> str:
     """A machine and its sensors as TOML, as an agent's configuration has them."""
-    lines = ["[machine]", *plain_lines(machine)]
+    unknown = {name for name in ("drag_area_m2", "drive_friction_n") if not getattr(machine, name)}
+    known = [line for line in plain_lines(machine) if line.partition(" ")[0] not in unknown]
+    lines = ["[machine]", *known]
     for sensor in machine.sensors:
         lines += ["", "[[sensor]]", *sensor_lines(sensor)]
     return "\n".join(lines) + "\n"

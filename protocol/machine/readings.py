@@ -137,6 +137,26 @@ class Torque(Reading):
 
 
 @dataclass(frozen=True, slots=True)
+class Brake(Reading):
+    """How much of a brake or retarder is applied, which the torque does not see; of a switch 0 or 1."""
+
+    kind: ClassVar[str] = "brake"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"applied": (0, 1)}
+
+    applied: float
+
+
+@dataclass(frozen=True, slots=True)
+class BrakeForce(Reading):
+    """Force of brakes or a retarder at the wheels, which the torque does not see, whatever the direction of travel."""
+
+    kind: ClassVar[str] = "brake_force"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"force_n": (0, 1e7)}
+
+    force_n: float
+
+
+@dataclass(frozen=True, slots=True)
 class Articulation(Reading):
     """Angle of the front frame against the rear frame, positive to the left."""
 
@@ -196,7 +216,21 @@ class Correction(Reading):
 
 KINDS: dict[str, type[Reading]] = {
     cls.kind: cls
-    for cls in (Gps, GpsVelocity, Imu, Attitude, Odometry, Encoder, Torque, Articulation, Steering, Payload, Correction)
+    for cls in (
+        Gps,
+        GpsVelocity,
+        Imu,
+        Attitude,
+        Odometry,
+        Encoder,
+        Torque,
+        Brake,
+        BrakeForce,
+        Articulation,
+        Steering,
+        Payload,
+        Correction,
+    )
 }
 
 

@@ -19,6 +19,8 @@ from protocol.site.site_config import NAME
 LIBRARY = Path(__file__).parent / "presets.toml"
 BASE_RATE_HZ = 100  # of the world; sensors read at every so many of its steps
 
+BRAKE_READINGS = {"nothing": "", "switch": "brake", "share": "brake", "force": "brake_force"}  # and their kinds
+
 # What values may be, lowest and highest.
 NotNegative = Annotated[float, (0.0, 1e6)]
 Positive = Annotated[float, (0.01, 1e6)]
@@ -120,12 +122,29 @@ class EncoderNoise(SensorErrors):
 
 @dataclass(frozen=True)
 class TorqueNoise(SensorErrors):
-    """Drive torque: white noise, noise correlated over correlation_s, and an error of the scale (of 1) drawn once."""
+    """Drive torque: white noise, noise correlated over correlation_s, and an error of the scale (of 1) drawn once.
+
+    sees_brakes: whether what brakes the machine is in it; else service brakes do it, beside the drive train.
+    """
 
     white_nm: NotNegative
     correlated_nm: NotNegative
     correlation_s: Positive
     scale: Scale
+    sees_brakes: bool
+
+
+@dataclass(frozen=True)
+class BrakeNoise(SensorErrors):
+    """Brakes. reads: `nothing` of them, a `switch`, the `share` of their most, or their `force` with white noise."""
+
+    reads: str
+    white_n: NotNegative
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.reads not in BRAKE_READINGS:
+            raise ValueError(f"reads: {self.reads!r} is none of {', '.join(BRAKE_READINGS)}")
 
 
 @dataclass(frozen=True)
@@ -164,6 +183,7 @@ class Preset:
     torque: TorqueNoise
     articulation: ArticulationNoise
     payload: PayloadNoise
+    brake: BrakeNoise
     body: BodySpread
 
     def __post_init__(self) -> None:
@@ -172,7 +192,7 @@ class Preset:
 
     def rate_hz(self, kind: str) -> int:
         """How often sensors of a kind read."""
-        return int(getattr(self, kind).rate_hz)
+        return int(getattr(self, "brake" if kind == "brake_force" else kind).rate_hz)
 
 
 @cache

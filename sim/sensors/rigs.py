@@ -13,7 +13,7 @@ from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
 from sim.sensors.noise import generator
-from sim.sensors.presets import GpsNoise, Preset
+from sim.sensors.presets import BRAKE_READINGS, GpsNoise, Preset
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ def machine_config(
     sensors += [SensorConfig("articulation", "articulation")]
     sensors += [_receiver(number, model, preset.gps) for number in gps]
     sensors += [SensorConfig("payload", "payload")] if payload else []
+    sensors += [SensorConfig("brake", kind)] if (kind := BRAKE_READINGS[preset.brake.reads]) else []
     payload_x_m, _, payload_z_m = np.round(model.payload_centre_m, 2).tolist()  # no finer than a data sheet
     return MachineConfig(
         name,

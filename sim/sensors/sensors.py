@@ -1,7 +1,7 @@
 """All sensors of all machines: true states in, raw readings out, as columns; reading objects only on demand.
 
 Beside GPS: IMUs, and the attitude and heading references in them, on either frame of articulated machines; wheel
-encoders, drive torque, angle of the joint, weight of what is carried.
+encoders, drive torque, brakes, angle of the joint, weight of what is carried.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from protocol.arrays import Floats, Ints
 from protocol.machine.machine_config import BASE, FRONT
-from protocol.machine.readings import Reading
+from protocol.machine.readings import BrakeForce, Reading
 from protocol.rotations import quaternion_from_rpy
 from protocol.site.site_config import Projection
 from sim.sensors.frames import compose, cross, rotation, seen_turned, turned
@@ -49,6 +49,7 @@ class TorqueGroup(SensorGroup):
         start = self.per_unit(lambda unit: unit.rng.standard_normal(2))
         self._scale = 1 + scale * start[0]
         self._fault = self.per_unit(lambda unit: unit.rig.faults.torque_scale)
+        self._sees_brakes = np.array([noise.sees_brakes for noise in noises])
         slow_nm, time_s = np.array([(noise.correlated_nm, noise.correlation_s) for noise in noises]).T
         self._slow = GaussMarkov(slow_nm[None], time_s, 1 / noises[0].rate_hz, start[1:])
         self._draws = Draws([unit.rng for unit in units], 2)
@@ -57,10 +58,42 @@ class TorqueGroup(SensorGroup):
         """Torque of all wheels together."""
         draws = self._draws.next_rows(len(steps))
         scale = self._scale * np.where(self.faulty(steps), self._fault, 1.0)
-        values: Floats = (
-            scale * self.pick(states.torque_nm, rows) + self._slow.run(draws[:1]) + self._white_nm * draws[1]
-        )
+        torque = self.pick(states.torque_nm, rows)
+        torque = np.where(self._sees_brakes, torque, torque + self._braking_nm(rows, states))
+        values: Floats = scale * torque + self._slow.run(draws[:1]) + self._white_nm * draws[1]
         return values
+
+    def _braking_nm(self, rows: Ints, states: FleetState) -> Floats:
+        """Torque against the motion at all wheels, signed ahead."""
+        return braking_nm(self.pick(states.torque_nm, rows), self.pick(states.speed_mps, rows))
+
+
+def braking_nm(torque_nm: Floats, speed_mps: Floats) -> Floats:
+    """What brakes must add to a torque against the motion, so that the drive has none of it; 0 where it drives."""
+    return np.where(torque_nm * speed_mps < 0, -torque_nm, 0.0)
+
+
+class BrakeGroup(SensorGroup):
+    """Brakes of machines whose drive does not brake: a switch, their share of the most, or their force."""
+
+    def __init__(self, units: Sequence[SensorUnit]) -> None:
+        super().__init__(units)
+        self._radius_m = self.per_unit(lambda unit: unit.rig.machine.wheel_radius_m)
+        self._most_n = self.per_unit(lambda unit: unit.rig.model.max_brake_n)
+        self._is_switch = np.array([unit.rig.preset.brake.reads == "switch" for unit in units])
+        self._white_n = np.array([unit.rig.preset.brake.white_n for unit in units])
+        self._reads_force = units[0].sensor.kind == BrakeForce.kind
+        self._draws = Draws([unit.rng for unit in units], 1)
+
+    def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
+        """The force, or how much of the most is applied; a switch closes at a fiftieth of it."""
+        braking = braking_nm(self.pick(states.torque_nm, rows), self.pick(states.speed_mps, rows))
+        force = np.abs(braking) / self._radius_m
+        noise = self._white_n * self._draws.next_rows(len(steps)) * (force > 0)
+        if self._reads_force:
+            return np.maximum(force + noise, 0.0)
+        share = np.minimum(force / self._most_n, 1.0)
+        return np.where(self._is_switch, share > 0.02, share)
 
 
 class ArticulationGroup(SensorGroup):
@@ -213,6 +246,8 @@ _GROUPS: dict[str, type[SensorGroup]] = {
     "imu": ImuGroup,
     "attitude": AttitudeGroup,
     "torque": TorqueGroup,
+    "brake": BrakeGroup,
+    "brake_force": BrakeGroup,
     "encoder": EncoderGroup,
     "articulation": ArticulationGroup,
     "payload": PayloadGroup,

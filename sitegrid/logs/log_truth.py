@@ -146,10 +146,10 @@ def _rows(
     """Stamp and place of each row that counts, NaN where a row says so; raises LogFolderError with the line."""
     path, newest = log.data / file.file, 0
     stamp, readers = stamp_reader(time), [number_reader(column, name) for name, column in pair.items()]
-    numbers = [*file.at_least, *(name for column in (time, *pair.values()) for name in column.weights)]
+    numbers = [*file.at_least, *(name for column in (time, *pair.values()) for name in column.columns)]
     with opened_rows(file, log.data) as rows:
         for column in (time, *pair.values()):
-            require(column.weights, rows, path)
+            require(column.columns, rows, path)
         for row in rows:
             try:
                 file.check(row)
