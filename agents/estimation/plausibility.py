@@ -4,9 +4,9 @@ A machine that stands, brakes, digs or spins its wheels shows nothing of the gro
 its axles stand on two slopes; and sensors fail: they fall silent, freeze (stuck, or at the end of their range), or come
 in the wrong unit.
 
-Brakes that neither the torque sensor nor a reading shows make the ground seem rough: a machine that rolls downhill at
-constant speed without torque brakes, or resists by just the grade. Only the first is likely, unless its torque has
-braked before: then it sees the brakes.
+Brakes that neither the torque sensor nor a reading shows make the ground seem rough: downhill at constant speed, without
+torque, c_rr would be just the grade. So a machine that rolls without torque shows nothing, unless its brakes are read,
+or its torque has braked before: then that sees them.
 """
 
 import math
@@ -30,12 +30,9 @@ MAX_BRAKE_MPS2 = 1.5  # the wheels slow down faster than by any resistance but t
 # down. Above noise and zero of the torque of one that coasts, and no more than gravel resists.
 PULLS_SHARE = 0.02
 APPLIED = 0.01  # of a brake: less is its play
-# Drive force over weight: below, the machine rolls without torque; and above, downwards, the torque brakes it, which
-# no engine's own drag does.
+# Drive force over weight in the direction of travel: below the first, the machine rolls without torque, but for noise
+# and zero; below the second the torque brakes it, as no engine's own drag does.
 ROLLS_SHARE, BRAKES_SHARE = 0.015, -0.06
-STEEP = 0.03  # a descent that makes machines brake; on a gentler one hardly any does
-ROLLS_FREELY = 1 / 3  # of a descent: a machine that is resisted by less speeds up, so it does not brake
-SLOWS_MPS2 = 0.5  # on the level, without torque: firm ground does not slow a machine down so much
 MAX_C_RR = 0.45  # no ground that a machine drives on resists more: the bucket digs
 MIN_C_RR = -0.08  # the ground pushes: the torque that does it is missing, and no accelerometer's zero is so far off
 MAX_SLIP_MPS2 = 1.0  # the wheels' acceleration is this far from the body's: they spin or lock
@@ -95,7 +92,7 @@ class Plausibility:
 
     def _unsteady(self, balance: Balance, resistance: float) -> str:
         """Whether forces that the balance does not include act, or acted a moment ago."""
-        may_brake = self._may_brake_unseen(balance, resistance)
+        may_brake = self._may_brake_unseen(balance)
         difference = balance.accel_mps2 - balance.body_mps2
         self._mismatch_mps2 += min(balance.dt_s / MEAN_S, 1.0) * (difference - self._mismatch_mps2)
         if abs(self._mismatch_mps2) > MAX_SLIP_MPS2:
@@ -111,16 +108,12 @@ class Plausibility:
         return reason if left_s > 0 else ""
 
 
-    def _may_brake_unseen(self, balance: Balance, resistance: float) -> bool:
-        """Whether the machine rolls without torque and speeds up less than it would, and nothing reads its brakes."""
+    def _may_brake_unseen(self, balance: Balance) -> bool:
+        """Whether the machine rolls without torque, and nothing has shown its brakes."""
         pulls = balance.direction * balance.share
         self._braked += min(balance.dt_s / SMOOTH_S, 1.0) * (pulls - self._braked)
         self._torque_brakes |= self._braked < BRAKES_SHARE
-        if self._torque_brakes or not math.isnan(balance.brake) or abs(pulls) > ROLLS_SHARE:
-            return False
-        descent = -balance.direction * math.sin(balance.slope_x)
-        held = descent > STEEP and resistance > ROLLS_FREELY * descent
-        return held or -balance.direction * balance.accel_mps2 > SLOWS_MPS2
+        return not self._torque_brakes and math.isnan(balance.brake) and pulls < ROLLS_SHARE
 
 
 def _brakes(balance: Balance) -> bool:

@@ -89,10 +89,10 @@ class BrakeGroup(SensorGroup):
         """The force, or how much of the most is applied; a switch closes at a fiftieth of it."""
         braking = braking_nm(self.pick(states.torque_nm, rows), self.pick(states.speed_mps, rows))
         force = np.abs(braking) / self._radius_m
-        noise = self._white_n * self._draws.next_rows(len(steps)) * (force > 0)
+        noise = self._white_n * self._draws.next_rows(len(steps)) * (force > 0)  # also gives the axis of the values
         if self._reads_force:
             return np.maximum(force + noise, 0.0)
-        share = np.minimum(force / self._most_n, 1.0)
+        share = np.minimum(force[None] / self._most_n, 1.0)
         return np.where(self._is_switch, share > 0.02, share)
 
 
