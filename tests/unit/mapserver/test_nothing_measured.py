@@ -1,14 +1,13 @@
 """Samples that say no more than where a machine was: they count as driven, and do no harm anywhere."""
 
 import numpy as np
-import pytest
 
 from mapserver.change.detection import ChangeConfig
 from mapserver.change.validity import valid_pages
 from mapserver.fleet.calibration import calibrate
 from mapserver.fleet.ledger import Ledger
 from mapserver.trust.auditor import Auditor
-from protocol.machine.samples import GRADE, RESISTANCE, check_samples
+from protocol.machine.samples import GRADE, RESISTANCE
 from tests.unit.mapserver.roads.drives import EVERYWHERE, along, grid_of, passes
 
 LINE = along([(10, 10), (110, 10)])
@@ -52,11 +51,3 @@ def test_calibration_learns_nothing_from_them():
     assert [each for each in with_blind.corrections if each.machine == "a"] == list(
         calibrate({"a": true.stays()}).corrections
     )
-
-
-@pytest.mark.parametrize("mass_kg", [0.5, 2e6, -1.0, np.inf])
-def test_an_absurd_mass_is_refused_by_name(mass_kg):
-    rows = passes(LINE, 1)
-    rows["mass_kg"][3] = mass_kg
-    with pytest.raises(Exception, match="mass_kg"):
-        check_samples(rows, 20_000.0)

@@ -119,12 +119,6 @@ def test_a_refused_batch_gets_its_reason(served):
     assert counted == {"refused_gap": 1, "refused_wrong_machine": 1, "refused_not_msgpack": 1}
 
 
-def test_a_wildcard_names_no_machine(served):
-    _, client = served
-    reply = get(client, keys.ingest_all("pit"), payload=encode_batch(batch(samples(1))))
-    assert decode_reply(reply.ok.payload.to_bytes()).reason == Refusal.WRONG_MACHINE
-
-
 @pytest.mark.parametrize(
     ("name", "parameters", "reason"),
     [
@@ -188,9 +182,6 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     assert ack == Ack(5, 1, store=ack.store)
     assert server.answers.info()["samples_merged"] == 5
     server.close()
-
-
-# --- readers that ask for much ----------------------------------------------------------------------------------------
 
 
 def begun(client: zenoh.Session, key: str, parameters: dict[str, str], n: int) -> list[zenoh.Handler]:
@@ -259,9 +250,6 @@ def test_a_large_region_comes_in_pieces_and_is_forgotten_after_a_while(served, m
     monkeypatch.setattr(region_pieces, "IDLE_S", -1.0)
     piece = {"cursor": str(first.piece.cursor), "number": "0"}
     assert refusal(client, "piece", piece).reason == Refusal.EXPIRED
-
-
-# --- changes, commands, the past --------------------------------------------------------------------------------------
 
 
 def test_events_and_queries_below_the_map_do_not_meet(served):

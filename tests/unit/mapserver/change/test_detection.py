@@ -45,29 +45,10 @@ def firsts(pages: list[TimedPage], config: ChangeConfig = CONFIG) -> Ints:
     return np.unique(cuts(pages, config).first)
 
 
-# --- one block -------------------------------------------------------------------------------------------------------
-
-
-def test_ground_that_stays_as_it_is_keeps_all_its_evidence():
-    assert firsts(passes(0.04, 0.04, 0.04)) == [0]
-    assert firsts(passes(*[0.04] * 6, noise=0.05)) == [0]
-
-
-@pytest.mark.parametrize("old", [1, 3, 6])
-def test_ground_that_changed_is_seen_after_one_pass(old):
-    assert firsts(passes(*[0.04] * old, 0.2)) == [old]
-
-
 @pytest.mark.parametrize("column", ["c_rr", "grade_e", "grade_n"])
 def test_every_kind_of_vote_tells_a_change(column):
     old, new = (0.04, 0.2) if column == "c_rr" else (0.1, -0.2)
     assert firsts(passes(old, old, new, new, column=column)) == [2]
-
-
-def test_of_two_changes_the_last_counts():
-    assert firsts(passes(0.04, 0.04, 0.2, 0.2, 0.01, 0.01)) == [4]
-    assert firsts(passes(0.04, 0.04, 0.2, 0.2, 0.04)) == [4]
-    assert firsts(passes(0.04, 0.2, 0.01)) == [2]
 
 
 def test_the_later_of_a_change_of_resistance_and_one_of_grade_counts():
@@ -82,23 +63,6 @@ def test_the_later_of_a_change_of_resistance_and_one_of_grade_counts():
         assert firsts(grid.pages([(0, 0)])[0]) == [4]
 
 
-def test_one_page_or_none_has_no_change():
-    assert cuts([], CONFIG).first.tolist() == [0] * 256
-    assert firsts(passes(0.2)) == [0]
-
-
-def test_cells_change_each_on_their_own():
-    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
-    grid = Grid(1.0, FoldConfig())
-    for hour in range(3):
-        c_rr = np.where((x > 8) & (hour == 2), 0.2, 0.04)
-        rows = samples(256, x_m=x, y_m=y, stamp_ns=NOW_NS + hour * HOUR_NS, cov_xx_m2=0, cov_yy_m2=0, c_rr=c_rr)
-        grid.fold(rows, "a")
-    first = cuts(grid.pages([(0, 0)])[0], CONFIG).first.reshape(16, 16)
-    assert (first[:, 8:] == 2).all()
-    assert (first[:, :8] == 0).all()
-
-
 def bin_of(c_rr: float) -> float:
     """Place of a coefficient on the axis of bins."""
     return float(np.log(c_rr / ev.RESISTANCE_CENTRES[0])) / BIN
@@ -109,12 +73,6 @@ def test_the_kind_of_a_change_is_the_ground_after_it():
     assert np.allclose(cuts(pages, CONFIG).kind, bin_of(0.01), atol=0.6)
     assert np.isnan(cuts(passes(0.04, 0.04), CONFIG).kind).all()
     assert np.isnan(cuts(passes(0.1, -0.2, column="grade_e"), CONFIG).kind).all()
-
-
-def test_the_kind_of_a_cell_is_the_median_of_all_its_votes():
-    assert np.allclose(known(passes(0.04, 0.04, 0.2)).kind, bin_of(0.04), atol=0.6)
-    assert np.isnan(known([]).kind).all()
-    assert np.isnan(known(passes(0.1, column="grade_e")[:0]).kind).all()
 
 
 def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for_a_cut():
@@ -131,16 +89,6 @@ def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for
         for value, index in ((cells.from_ns, first), (cells.until_ns, last)):
             assert np.array_equal(value, np.full(256, begins[index] if index == index else np.nan), equal_nan=True)
     assert np.isnan(known([]).from_ns).all()
-
-
-def test_a_cut_lies_between_the_pages_that_knew_the_ground_before_and_after():
-    pages = passes(0.04, 0.04, 0.2)
-    one_cut, nothing = cuts(pages, CONFIG), cuts(passes(0.04, 0.04), CONFIG)
-    assert (set(one_cut.old_ns), set(one_cut.new_ns)) == ({pages[1].first_ns}, {pages[2].first_ns})
-    assert np.isnan([nothing.old_ns, nothing.new_ns]).all()
-
-
-# --- limits ----------------------------------------------------------------------------------------------------------
 
 
 def test_medians_nearer_than_bins_are_no_change():
@@ -182,8 +130,6 @@ def test_less_evidence_than_weight_on_either_side_is_no_change(old_is_less):
         old, new = (metres, 2.0) if old_is_less else (2.0, metres)
         assert firsts(two_passes({0.04: old}, {0.2: new})) == [change]
 
-
-# --- areas -----------------------------------------------------------------------------------------------------------
 
 # Ground of bin 10 in 80 x 80 cells, of which some are changed to bin 15 from a time on.
 OLD, NEW, NEW_NS = 10.0, 15.0, 300e9
@@ -310,11 +256,6 @@ def test_what_a_cell_shows_depends_on_the_blocks_near_it_alone(seed, size_m):
     inner = slice(reach * BLOCK_CELLS, (reach + 1) * BLOCK_CELLS)
     alone = credible(crop(cut, middle), crop(seen, middle), 1.0, config)[inner, inner]
     assert np.array_equal(alone, whole[4 * BLOCK_CELLS : 5 * BLOCK_CELLS, 4 * BLOCK_CELLS : 5 * BLOCK_CELLS])
-
-
-def test_nothing_changed_and_nothing_known_is_nothing():
-    nothing, unknown = square(0), np.full((80, 80), np.nan)
-    assert not believed(nothing, unknown, unknown).any()
 
 
 def fringed(wide: int, *, is_fresh: bool) -> tuple[Bools, Bools]:

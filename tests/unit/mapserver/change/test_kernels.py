@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums, weights
+from mapserver.change.kernels import differ, likeliest_cuts, medians, sums
 from mapserver.evidence import cells as ev
 
 PARTS = [ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH]
@@ -33,17 +33,6 @@ def test_pages_differ_by_the_mean_or_the_spread_of_their_votes(part):
         assert np.array_equal(differ(votes, ends, part.start, part.stop, least, most), expected)
         assert expected.any()
         assert not expected.all()
-
-
-@pytest.mark.parametrize("part", PARTS)
-def test_histograms_are_those_of_the_cells_asked_for(part):
-    votes, ends, counts = made_up(7)
-    cells = np.array([3, 200, 17])
-    columns = np.full(ev.CELLS, -1)
-    columns[cells] = np.arange(3)
-    out = np.zeros((4, part.stop - part.start, 3))
-    histograms(votes, ends, part.start, part.stop, columns, out)
-    assert np.array_equal(out, counts[:, part][:, :, cells])
 
 
 def entropy(votes: np.ndarray) -> np.ndarray:
@@ -82,13 +71,6 @@ def median(votes: np.ndarray) -> np.ndarray:
     return np.array([np.interp(0.5, column, np.arange(len(column)) - 0.5) for column in until.T])
 
 
-@pytest.mark.parametrize("part", PARTS)
-def test_weights_are_the_sums_of_all_bins_page_by_page(part):
-    votes, ends, counts = made_up(7)
-    assert np.array_equal(weights(votes, ends, part.start, part.stop), counts[:, part].sum(axis=1))
-    assert weights(votes[:0], ends[:0], part.start, part.stop).shape == (0, ev.CELLS)
-
-
 def test_all_pages_together_have_their_sums_and_medians():
     votes, _, counts = made_up(3)
     part = ev.RESISTANCE
@@ -99,10 +81,3 @@ def test_all_pages_together_have_their_sums_and_medians():
     np.testing.assert_allclose(of_all[known], median(together[:, known]), atol=1e-9)
     assert np.isnan(medians(np.zeros((24, 2)))).all()
     assert known.any()
-
-
-def test_a_side_with_too_little_evidence_is_no_side():
-    votes = np.zeros((3, 24, 1))
-    votes[0, 3], votes[2, 20] = 5.0, 0.2
-    best, *_ = likeliest_cuts(votes, np.zeros(1, np.int64), 0.3)
-    assert best.tolist() == [0]

@@ -3,17 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.change import validity
-from mapserver.change.detection import ChangeConfig, cuts
-from mapserver.change.validity import around, clusters, valid_pages
+from mapserver.change.detection import ChangeConfig
+from mapserver.change.validity import valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import evidence
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import ReadConfig
-from protocol.site.geometry import CellWindow
-from tests.unit.mapserver.data import NOW_NS, folded, random_samples, samples
+from tests.unit.mapserver.data import NOW_NS, samples
 
 HOUR_NS = 3600 * 10**9
 CONFIG = ChangeConfig()
@@ -79,11 +77,6 @@ def test_a_repaved_area_is_seen_after_one_pass_and_the_rest_stays(place):
     assert not now.changed_ns[outside].any()
     assert now.weight[inside].max() < 2 * ev.WEIGHT_UNITS_PER_M  # of one pass
     assert now.weight[outside].min() > (PASSES - 2) * ev.WEIGHT_UNITS_PER_M  # of all
-
-
-def test_after_a_pause_a_change_is_dated_where_the_first_new_bucket_begins():
-    now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
-    assert (now.changed_ns[inside] == NOW_NS + (PASSES - 1) * HOUR_NS).all()
 
 
 @pytest.mark.parametrize("keep_buckets", [1, 2, 3])
@@ -168,49 +161,6 @@ def test_bits_and_newest_stamp_are_those_of_the_evidence_that_holds():
     assert np.bitwise_count(now.bitmaps[..., ev.VISITS])[inside].max() <= 5  # the minutes of the last pass
     assert np.bitwise_count(now.bitmaps[..., ev.VISITS])[outside].min() >= PASSES - 1
     assert (now.newest_ns >= NOW_NS + (PASSES - 1) * HOUR_NS).all()
-
-
-def test_no_blocks_and_blocks_without_pages_are_read():
-    assert valid_pages({}, 1.0, CONFIG) == {}
-    nothing = valid_pages({(0, 0): [], (5, -3): []}, 1.0, CONFIG)
-    assert {block: first.any() for block, first in nothing.items()} == {(0, 0): False, (5, -3): False}
-
-
-def test_blocks_far_apart_are_read_in_one_image():
-    grid = repaved(3, 3, 10)
-    pages = {block: grid.pages([block])[0] for block in [(0, 0), (40, -40)]}
-    first = valid_pages(pages, 1.0, CONFIG)
-    assert first[0, 0].any()
-    assert not first[40, -40].any()
-
-
-@pytest.mark.parametrize("reach", [0, 1, 3])
-def test_around_a_block_are_all_blocks_so_far(reach):
-    blocks = around((0, -1), reach)
-    assert len(blocks) == len(set(blocks)) == (2 * reach + 1) ** 2
-    assert {max(abs(x), abs(y + 1)) for x, y in blocks} == set(range(reach + 1))
-
-
-def test_pages_are_cut_once_as_long_as_nothing_is_folded_into_them(monkeypatch):
-    grid = folded(random_samples(200, 3, half_m=20.0))
-    calls = []
-    monkeypatch.setattr(validity, "cuts", lambda pages, config: calls.append(pages) or cuts(pages, config))
-
-    def look() -> int:
-        calls.clear()
-        blocks = grid.blocks_in(CellWindow(-64, -64, 128, 128))
-        valid_pages(dict(zip(blocks, grid.pages(blocks), strict=True)), 1.0, CONFIG)
-        return len(calls)
-
-    assert look() == len(grid.blocks_in(CellWindow(-64, -64, 128, 128))) > 1
-    assert look() == 0
-    grid.fold(samples(1, x_m=8.5, y_m=8.5, cov_xx_m2=0, cov_yy_m2=0), "b")
-    assert look() == 1
-
-
-def test_blocks_near_each_other_are_in_one_cluster():
-    parts = clusters([(0, 0), (40, 0), (2, 2), (4, 4), (40, 3)], 1)
-    assert sorted(map(sorted, parts)) == [[(0, 0), (2, 2), (4, 4)], [(40, 0)], [(40, 3)]]
 
 
 def ages_of(begin_ns: int, cells: slice) -> dict[tuple[int, int], np.ndarray]:

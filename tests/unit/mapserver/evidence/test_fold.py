@@ -8,20 +8,11 @@ from mapserver.evidence.fold_config import TABLE, TABLE_LAST, FoldConfig
 from mapserver.evidence.grid import Grid
 from protocol.errors import MessageError
 from protocol.machine.samples import check_samples
-from protocol.site.ground_classes import ZONES
-from tests.reference.votes import prepare, split_grade, split_resistance
 from tests.unit.mapserver.data import APART, NOW_NS, filled_to, folded, is_by_definition, same, samples, total
 
 UNITS = ev.WEIGHT_UNITS_PER_M
 HOUR_NS = 3600 * 10**9
 
-
-def weight_of(grid: Grid, block: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """Weight of a block's cells (rows, columns)."""
-    return grid.evidence([block]).weight[0].reshape(16, 16)
-
-
-# --- weights ---------------------------------------------------------------------------------------------------------
 
 metres = st.floats(-20_000, 20_000)
 deviation = st.floats(0, 2.1)  # at most 3 m along any direction
@@ -94,19 +85,6 @@ def test_a_stencil_of_many_blocks_is_what_the_definition_says(monkeypatch):
     assert same(folded(rows, cell_m=0.2), grid)
 
 
-def test_weight_falls_off_with_the_covariance():
-    rows = samples(cov_xx_m2=1.0, cov_yy_m2=0.04, distance_m=100.0)
-    weight = weight_of(folded(rows)).astype(float)
-    middle = weight[8, 8]
-    assert weight[8, 9] / middle == pytest.approx(np.exp(-0.5 / 1.09), rel=0.01)  # one metre off, variance 1 + 0.3**2
-    assert weight[9, 8] / middle == pytest.approx(np.exp(-0.5 / 0.13), rel=0.02)
-    assert weight[8, 7] == weight[8, 9]
-    assert weight[7, 8] == weight[9, 8]
-
-
-# --- order and batching ----------------------------------------------------------------------------------------------
-
-
 def test_only_full_counts_saturate():
     rows = samples(50, distance_m=100.0, cov_xx_m2=0.5, cov_yy_m2=0.5)
     near_full = filled_to(folded(rows).state(), ev.COUNT_MAX - 5_000_000)
@@ -132,9 +110,6 @@ def test_no_count_wraps_before_it_is_packed(batch):
     assert counts[ev.GRADE_EAST][20] == counts[ev.GRADE_EAST].sum() == ev.COUNT_MAX
 
 
-# --- what votes for what ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("c_rr", "bin_"), [(-0.5, 0), (0.0, 0), (0.004, 0), (0.4, 23), (5.0, 23)])
 def test_resistance_beyond_the_bins_votes_for_the_end(c_rr, bin_):
     counts = total(folded(samples(c_rr=c_rr, cov_xx_m2=0, cov_yy_m2=0, distance_m=4.0)))[ev.RESISTANCE]
@@ -147,19 +122,6 @@ def test_grade_votes_lie_on_their_centres(grade, bin_):
     counts = total(folded(samples(grade_e=grade, grade_n=-grade)))
     assert counts[ev.GRADE_EAST].argmax() == bin_
     assert counts[ev.GRADE_NORTH].argmax() == 32 - bin_
-
-
-def test_a_vote_is_split_linearly_between_two_bins():
-    lower, share = split_grade(np.array([0.25 / 32]))
-    assert (lower[0], share[0]) == (16, 64)
-    lower, share = split_resistance(np.sqrt(ev.RESISTANCE_CENTRES[3:4] * ev.RESISTANCE_CENTRES[4:5]))
-    assert (lower[0], share[0]) == (3, 128)
-    assert [int(part[0]) for part in split_grade(np.array([np.nan]))] == [-1, 0]
-
-
-def test_neighbouring_zones_are_at_least_two_bins_apart():
-    lower, share = split_resistance(np.array([zone.c_rr for zone in ZONES]))
-    assert np.diff(lower + share / ev.SHARE_ONE).min() > 1.9
 
 
 @pytest.mark.parametrize(
@@ -175,9 +137,6 @@ def test_a_sample_too_uncertain_is_the_newest_too():
     assert grid.evidence([(0, 0)]).newest_ns.max() == NOW_NS
 
 
-# --- options ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cap", [3.0, 1.0])
 def test_a_sample_too_uncertain_is_counted_not_folded(cap):
     rows = samples(4, cov_xx_m2=[cap**2, cap**2 * 1.01, 0.0, 0.0], cov_yy_m2=[0.0, 0.0, cap**2 * 1.01, 0.0])
@@ -185,13 +144,6 @@ def test_a_sample_too_uncertain_is_counted_not_folded(cap):
     assert (grid.folded, grid.skipped) == (2, 2)
     oblique = samples(cov_xx_m2=0.9 * cap**2, cov_yy_m2=0.9 * cap**2, cov_xy_m2=0.5 * cap**2)
     assert folded(oblique, std_cap_m=cap).skipped == 1  # sure east and north, but not along the diagonal
-
-
-def test_the_floor_spreads_a_sample_that_claims_to_be_exact():
-    rows = samples(cov_xx_m2=0.0, cov_yy_m2=0.0, distance_m=100.0)
-    cells = [folded(rows, cell_m=cell_m).known_cells() for cell_m in (1.0, 0.5, 0.25)]
-    assert cells[0] == 1
-    assert cells == sorted(set(cells)), cells
 
 
 def test_bucket_length_decides_the_buckets():
@@ -213,19 +165,6 @@ def test_bad_option_is_refused_by_name(name, values):
     for value in values:
         with pytest.raises(ValueError, match=name):
             FoldConfig(**{name: value})
-
-
-def test_every_admitted_covariance_is_invertible():
-    std = np.linspace(0.0, 3.0, 40)
-    xx, yy = (axis.ravel() for axis in np.meshgrid(std**2, std**2))
-    diagonal = np.linspace(1.0, 449.9, 50)  # along it, twice as much
-    xx, yy = np.append(xx, diagonal), np.append(yy, diagonal)
-    xy = np.sqrt(xx * yy) * (1 + 4e-7)  # what rounding lets pass
-    rows = samples(len(xx), cov_xx_m2=xx, cov_yy_m2=yy, cov_xy_m2=xy)
-    check_samples(rows[1600:], 20_000.0)
-    a, b, c = prepare(rows, "a", 1.0, FoldConfig(std_cap_m=30.0)).inverse.T
-    assert (a > 0).all()
-    assert (a * c > b * b / 4).all()
 
 
 def test_covariances_that_only_rounding_lets_pass_vote_as_the_definition_says():

@@ -3,7 +3,7 @@ import pytest
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
-from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks
+from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridCounts
 from protocol.site.geometry import CellWindow
 from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
@@ -19,18 +19,6 @@ def test_an_empty_grid_knows_nothing():
     assert grid.evidence([(0, 0)]).counts.sum() == 0
     grid.fold(samples(0), "a")
     assert len(grid.state().pages) == 0
-
-
-def test_blocks_exist_only_where_somebody_drove():
-    grid = folded(samples(3, x_m=[8.0, 1000.0, -900.0], y_m=[8.0, 8.0, -5000.0]))
-    assert grid.blocks_in(EVERYTHING) == [(-57, -313), (0, 0), (62, 0)]
-
-
-def test_a_sample_at_a_corner_touches_four_blocks():
-    grid = folded(samples(x_m=0.0, y_m=0.0, cov_xx_m2=0.25, cov_yy_m2=0.25))
-    assert grid.blocks_in(EVERYTHING) == [(-1, -1), (-1, 0), (0, -1), (0, 0)]
-    weights = grid.evidence(grid.blocks_in(EVERYTHING)).weight.sum(axis=1)
-    assert weights.max() - weights.min() < 0.01 * weights.sum()
 
 
 @pytest.mark.parametrize(
@@ -147,26 +135,12 @@ def test_the_ends_of_the_site_and_of_time_have_blocks_of_their_own(cell_m, stamp
     assert {(at.tier, at.index) for at in grid.state().pages} == {(0, stamp_ns // (60 * 10**9))}
 
 
-def test_rows_are_folded_once_however_many_wait(monkeypatch):
-    monkeypatch.setattr("mapserver.evidence.grid.PIECE", 64)
-    rows = random_samples(200, 4)
-    grid = folded(rows, waiting_rows=3)
-    assert (grid.folded, grid.skipped) == (200, 0)
-    assert same(grid, folded(rows))
-
-
 @pytest.mark.parametrize(("limit", "most"), [("MOST_PAGES", 3), ("MOST_VOTES", 1)])
 def test_pages_are_packed_a_few_at_a_time_where_space_is_short(limit, most, monkeypatch):
     rows = random_samples(200, 4)
     whole = folded(rows)
     monkeypatch.setattr(f"mapserver.evidence.fold.{limit}", most)
     assert same(folded(rows), whole)
-
-
-def test_rows_that_are_all_too_uncertain_leave_no_page():
-    grid = folded(samples(5000, cov_xx_m2=100.0))
-    assert (grid.folded, grid.skipped) == (0, 5000)
-    assert grid.state().pages == []
 
 
 def test_pages_of_a_block_come_in_the_order_of_time():
@@ -178,27 +152,6 @@ def test_pages_of_a_block_come_in_the_order_of_time():
     assert newest == sorted(newest)
     assert not len(nothing)
     assert all(timed.first_ns <= stamp < timed.end_ns for timed, stamp in zip(pages, newest, strict=True))
-
-
-def test_a_cell_and_bucket_that_machines_drive_take_few_bytes():
-    """A page takes about 45, and this fails when that grows."""
-    draw, n = np.random.default_rng(0), 4000
-    turn = np.cumsum(draw.normal(0, 0.02, n))
-    rows = samples(
-        n,
-        x_m=np.cumsum(0.5 * np.cos(turn)),
-        y_m=np.cumsum(0.5 * np.sin(turn)),
-        heading_rad=(turn + np.pi) % (2 * np.pi) - np.pi,
-        distance_m=0.5,
-        stamp_ns=NOW_NS + np.arange(n) * 250_000_000,
-        cov_xx_m2=1.2**2,
-        cov_yy_m2=1.2**2,
-        c_rr=0.04 * np.exp(draw.normal(0, 0.15, n)),
-        grade_e=draw.normal(0.03, 0.02, n),
-        grade_n=draw.normal(-0.02, 0.02, n),
-    )
-    blocks = [pages for _, _, pages in folded(rows, keep_buckets=1000).state().blocks]
-    assert sum(pages.nbytes for pages in blocks) / sum(len(pages.marks) for pages in blocks) <= 55
 
 
 def test_blocks_are_touched_once_until_they_are_folded_into_again():
@@ -216,10 +169,3 @@ def test_blocks_are_touched_once_until_they_are_folded_into_again():
 def test_a_sample_that_adds_nothing_touches_nothing():
     grid = folded(samples(2, x_m=[8.0, 40.0], distance_m=[0.0, 1.0], cov_xx_m2=[0.0, 100.0]))
     assert grid.take_touched(9) == []
-
-
-def test_chunks_hold_every_block_once():
-    blocks = [(i, -i) for i in range(2 * READ_BLOCKS + 3)]
-    pieces = list(chunks(blocks))
-    assert [len(piece) for piece in pieces] == [READ_BLOCKS, READ_BLOCKS, 3]
-    assert [block for piece in pieces for block in piece] == blocks

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.pages import CELL, EMPTY, NARROW, WIDE, CompactPages, PackedPages, Page, pick
+from mapserver.evidence.pages import CELL, CompactPages, PackedPages, Page, pick
 
 PLACES = ev.COUNTS * ev.CELLS
 counts = st.one_of(st.integers(1, 2**17), st.integers(ev.COUNT_MAX - 3, ev.COUNT_MAX))
@@ -57,33 +57,6 @@ def test_compact_pages_come_back_to_the_bit(drawn_pages):
     assert kept.is_sound
 
 
-def test_every_place_of_a_full_block_is_kept():
-    full = packed([(dict.fromkeys(range(PLACES), int(ev.COUNT_MAX)), {i: (2**64 - 1 - i, 5 + i) for i in range(256)})])
-    after = compact(full).expanded()
-    assert np.array_equal(after.votes, full.votes)
-    assert after.cells.tobytes() == full.cells.tobytes()
-
-
-@pytest.mark.parametrize(("count", "high"), [(2**16 - 1, 0), (2**16, 2), (ev.COUNT_MAX, 2)])
-def test_counts_that_fit_take_two_bytes(count, high):
-    kept = compact(packed([({3: int(count), 7: 1}, {3: (1, 1)})]))
-    assert len(kept.high) == high
-    assert kept.expanded().votes.tolist() == [int(count) << 16 | 3, 1 << 16 | 7]
-
-
-def test_nothing_is_compact_too():
-    assert EMPTY.is_sound
-    assert EMPTY.nbytes == 0
-    assert list(EMPTY.expanded().items()) == []
-
-
-@pytest.mark.parametrize(("count", "dtype"), [(2**16 - 1, NARROW), (2**16, WIDE), (ev.COUNT_MAX, WIDE)])
-def test_a_page_shows_its_votes_as_records(count, dtype):
-    one = page({3: int(count), 7: 1})
-    assert one.votes.dtype == dtype
-    assert one.votes["count"].tolist() == [count, 1]
-
-
 @given(drawn, st.sets(st.integers(0, 255)))
 def test_a_part_of_the_cells_and_the_rest_are_the_page(drawn_page, chosen):
     one, inside = page(*drawn_page), np.zeros(ev.CELLS, np.bool_)
@@ -94,10 +67,3 @@ def test_a_part_of_the_cells_and_the_rest_are_the_page(drawn_page, chosen):
     together = unpacked(part)
     rest.add_to(*together)
     assert all(map(np.array_equal, together, unpacked(one)))
-
-
-def test_sums_add_many_full_pages_without_wrapping():
-    counts, bitmaps, newest_ns = unpacked(page({2: int(ev.COUNT_MAX)}))
-    for _ in range(3):
-        page({2: int(ev.COUNT_MAX)}).add_to(counts, bitmaps, newest_ns)
-    assert counts[2] == 4 * int(ev.COUNT_MAX)

@@ -15,7 +15,6 @@ from mapserver.evidence.grid import LIVE_ROWS, Grid
 from mapserver.journal.history import lent
 from protocol.arrays import Table
 from protocol.machine.samples import empty
-from tests.reference.grid import by_definition, of_grid, plain
 from tests.unit.mapserver.data import same
 
 CONFIG = FoldConfig()
@@ -48,32 +47,12 @@ def grid_of(parts: Batches, waiting_rows: int = LIVE_ROWS, cell_m: float = 1.0) 
     return grid
 
 
-@pytest.mark.parametrize(("seed", "days", "cell_m"), [(1, 0.01, 1.0), (2, 3.0, 2.0), (3, 30.0, 1.0), (4, 400.0, 4.0)])
-def test_every_page_is_as_the_definition_says(seed: int, days: float, cell_m: float) -> None:
-    parts = batches(seed, n=80, days=days)
-    grid = grid_of(parts, cell_m=cell_m)
-    assert plain(of_grid(grid)) == plain(by_definition(parts, cell_m, CONFIG))
-    assert grid.folded + grid.skipped == 80
-    assert grid.skipped > 0
-
-
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0]), st.sampled_from([1, 7, 100, 8192]))
 def test_how_many_samples_wait_and_in_which_order_they_come_does_not_matter(seed: int, days: float, rows: int) -> None:
     parts = batches(seed, days=days)
     shuffled = [parts[i] for i in np.random.default_rng(seed).permutation(len(parts))]
     assert same(grid_of(parts), grid_of(shuffled, rows))
-
-
-@settings(max_examples=40)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0, 400.0]))
-def test_reading_meanwhile_does_not_matter(seed: int, days: float) -> None:
-    parts = batches(seed, days=days)
-    read = Grid(1.0, CONFIG)
-    for machine, rows in parts:
-        read.fold(rows, machine)
-        read.state()
-    assert same(read, grid_of(parts))
 
 
 @settings(max_examples=12)
@@ -96,14 +75,6 @@ def test_how_many_threads_fold_does_not_matter(seed: int, days: float, count: in
     for machine, part in more:
         grid.fold(part, machine)
     assert same(grid, grid_of(parts + more)), "it is an ordinary grid again"
-
-
-def test_an_error_in_a_thread_reaches_the_caller() -> None:
-    def fails(_: int) -> None:
-        raise MemoryError
-
-    with lent(2) as workers, pytest.raises(MemoryError):
-        workers.each(fails)
 
 
 @settings(max_examples=40)

@@ -1,5 +1,3 @@
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -110,21 +108,6 @@ def test_blocks_of_wide_counts_are_settled_beside_others():
     for line in lines:
         line.add(page(START))
     assert [next(line.items())[2].votes["count"].tolist() for line in lines] == [[2], [2**16 + 1], [3]]
-
-
-# --- spans -----------------------------------------------------------------------------------------------------------
-
-
-@settings(max_examples=60)
-@given(st.lists(bucket, min_size=1, max_size=40), keep, keep, keep)
-def test_pages_lie_in_their_spans_and_in_the_order_of_time(buckets, a, b, c):
-    timed = timeline(buckets, keep_buckets=a, keep_hours=b, keep_days=c).timed()
-    for one in timed:
-        stamps = one.page.cells["newest_ns"]
-        assert one.first_ns <= stamps.min()
-        assert stamps.max() < one.end_ns
-    for one, other in pairwise(timed):
-        assert one.page.cells["newest_ns"].max() < other.page.cells["newest_ns"].min()
 
 
 @pytest.mark.parametrize("offset", [0, PER_HOUR - 1])

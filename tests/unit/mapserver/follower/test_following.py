@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import sqlite3
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -21,15 +20,12 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import LAST
-from mapserver.journal.sqlite.reader import SqliteReader
-from mapserver.journal.table_writer import meta_line
 from mapserver.past.making import make
 from mapserver.past.past import Past
 from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import GroundChange, MapVersion
-from tests import postgres_server as server
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
@@ -238,65 +234,6 @@ def test_a_journal_that_went_another_course_is_noticed_and_folded_again(tmp_path
         assert caplog.text.count("rows are gone") == 1
 
 
-def test_an_epoch_that_is_lower_than_before_is_noticed(tmp_path, caplog):
-    with closing(open_writer(tmp_path)) as writer:
-        deliver(writer, 1)
-    open_writer(tmp_path).close()
-    with following(tmp_path) as one:
-        wait_for(lambda: version(one) is not None)
-        with closing(sqlite3.connect(tmp_path / "journal.db", isolation_level=None)) as db:
-            db.execute("REPLACE INTO meta VALUES (?, ?, ?)", meta_line("epoch", "1"))
-        wait_for(lambda: "rows are gone" in caplog.text)
-        wait_for(lambda: version(one) is not None)
-        assert caplog.text.count("rows are gone") == 1
-
-
-def test_a_slow_follower_holds_nobody_up_says_how_far_behind_it_is_and_has_the_same_map_in_the_end(
-    tmp_path, monkeypatch
-):
-    may_read = threading.Event()
-    may_read.set()
-    read = module.read_history
-
-    def slowly(*words):
-        for rows in read(*words):
-            assert may_read.wait(WAIT_S)
-            yield rows
-
-    monkeypatch.setattr(module, "read_history", slowly)
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-        may_read.clear()
-        for seed in range(2, 10):
-            deliver(writer, seed, machine="b")  # each is acknowledged
-        wait_for(lambda: one.behind()[0] > 0)
-        before_s = one.behind()[1]
-        wait_for(lambda: one.behind()[1] > before_s + 0.2)
-        assert version(one).row == 1, "and it answers with the map that it has"
-        may_read.set()
-        catches_up(one, writer)
-        wait_for(lambda: one.behind()[0] == 0 and one.behind()[1] < 1.5)
-
-
-def test_it_begins_with_the_snapshot_of_the_server(tmp_path, monkeypatch):
-    with closing(open_writer(tmp_path)) as writer:
-        for seed in range(4):
-            deliver(writer, seed)
-        writer.run(lambda store: store.save_snapshot())
-        deliver(writer, 5)
-        folded, fold_history = list[int](), module.fold_history
-
-        def noted(grid, history, after, *more) -> bool:
-            folded.append(after)
-            return fold_history(grid, history, after, *more)
-
-        monkeypatch.setattr(module, "fold_history", noted)
-        with following(tmp_path) as one:
-            catches_up(one, writer)
-        assert folded == [4]
-
-
 @pytest.mark.parametrize(
     ("site", "problem"), [(replace(SITE, name="quarry"), "quarry"), (replace(SITE, origin_lat_deg=49.0), "frame")]
 )
@@ -344,35 +281,6 @@ def test_a_journal_damaged_beneath_a_follower_takes_no_map_away_and_gives_none_t
             catches_up(one, writer)
 
 
-def test_a_row_that_is_gone_from_a_database_is_named_and_gives_no_map(tmp_path, database, caplog):
-    location = JournalLocation(tmp_path / "store", database.url)
-    with closing(Writer(Store(location, SITE, CONFIG, now_ns))) as writer:
-        for seed in (1, 2, 3):
-            deliver(writer, seed)
-        (row,) = database.sql("SELECT record FROM sitegrid.journal WHERE row = 2")
-        database.sql("DELETE FROM sitegrid.journal WHERE row = 2")
-        one = Following(JournalLocation(tmp_path / "elsewhere", database.url), SITE, CONFIG)
-        one.start()
-        with closing(one):
-            wait_for(lambda: "what follows number 1 is damaged" in caplog.text)
-            assert version(one) is None
-            database.sql(f"INSERT INTO sitegrid.journal VALUES (2, '\\x{bytes(row[0]).hex()}')")
-            catches_up(one, writer)
-
-
-def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):
-    def lost(self, known, timeout_s):  # the notification; the time-out is not
-        wait_for(lambda: True)
-        return self.state()
-
-    monkeypatch.setattr(SqliteReader, "follow", lost)
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-        deliver(writer, 2)
-        catches_up(one, writer)
-
-
 def test_changes_of_the_ground_come_with_the_events(tmp_path):
     change = GroundChange(1, 1, 2, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, 0.5)
     with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
@@ -401,28 +309,6 @@ def test_a_fold_beside_that_fails_is_done_again(tmp_path, monkeypatch):
         assert folds == [1, 1]
 
 
-def test_a_damaged_row_behind_a_sound_one_takes_no_map_away(tmp_path, caplog):
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-
-        def damage(store) -> None:
-            db = store.journal._db
-            record = bytearray(db.execute("SELECT record FROM journal WHERE row = 3").fetchone()[0])
-            record[60] ^= 1
-            db.execute("UPDATE journal SET record = ? WHERE row = 3", (bytes(record),))
-
-        with one._lock:  # it sees both rows at once
-            for seed in (2, 3):
-                deliver(writer, seed)
-            writer.run(damage)
-        wait_for(lambda: "journal row 3" in caplog.text)
-        wait_for(lambda: one.behind()[1] > 2.5)  # it has opened the journal again
-        assert version(one).row == 2
-        assert one.behind()[0] == 1
-        assert "rows are gone" not in caplog.text
-
-
 def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_path, database):
     location = JournalLocation(tmp_path / "store", database.url)
     with closing(Store(location, SITE, CONFIG, now_ns)) as store:
@@ -445,35 +331,3 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
             assert one.run(lambda replica: same(replica.grid, other.grid))
             with location.reader() as reader:
                 assert same(one.past.grid_as_of(reader, LAST), other.grid)
-
-
-@pytest.mark.nightly
-def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_it_is(tmp_path, caplog):
-    with server.cluster() as primary, server.replica(primary, "b") as replica:
-        database = primary.new_database()
-        with closing(Store(JournalLocation(tmp_path / "store", database.url), SITE, CONFIG, now_ns)) as store:
-
-            def deliver(seed: int) -> None:
-                store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
-
-            deliver(1)
-            url = replica.url(database.name)
-            wait_for(lambda: replica.shows_all_of(primary))
-            of_one = Following(JournalLocation(tmp_path / "one", url), SITE, CONFIG)
-            ports = f"127.0.0.1:{primary.port},127.0.0.1:{replica.port}"
-            pool = f"postgresql://postgres@{ports}/{database.name}?load_balance_hosts=random"
-            of_any = Following(JournalLocation(tmp_path / "any", pool), SITE, CONFIG)
-            with closing(of_one), closing(of_any):
-                for each in (of_one, of_any):
-                    each.start()
-                    wait_for(lambda each=each: version(each) == store.version and each.behind()[1] < 1)
-                replica.sql("SELECT pg_wal_replay_pause()")
-                wait_for(lambda: replica.sql("SELECT pg_get_wal_replay_pause_state()") == [("paused",)])
-                deliver(2)
-                wait_for(lambda: version(of_any) == store.version)
-                wait_for(lambda: of_one.behind()[1] > 4)
-                assert version(of_one).row == 1
-                assert version(of_any) == store.version
-                replica.sql("SELECT pg_wal_replay_resume()")
-                wait_for(lambda: version(of_one) == store.version and of_one.behind()[1] < 2.5)
-        assert "rows are gone" not in caplog.text

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mapserver.ingest.batches import decode_batches
 from protocol.errors import MessageError
-from protocol.machine.samples import COLUMNS, GRADE, LIMITS, RESISTANCE, SAMPLE_DTYPE
+from protocol.machine.samples import COLUMNS, LIMITS, SAMPLE_DTYPE
 from protocol.wire.codec import decode_batch, encode_batch
 from tests.unit.mapserver.data import batch, random_samples, samples
 
@@ -45,20 +45,6 @@ def edges(name: str) -> list[float]:
     low, high = LIMITS.get(name, (-EXTENT_M, EXTENT_M))
     near = [*beside(low, kind), *beside(high, kind)]
     return near if kind is np.int64 else [*near, 0.0, -0.0, 1e-45, np.nan, np.inf, -np.inf]
-
-
-@st.composite
-def tables(draw, most: int = 4):
-    """Plausible samples, of which some values are others."""
-    rows = random_samples(draw(st.integers(0, most)), draw(st.integers(0, 99)))
-    for _ in range(draw(st.integers(0, 2)) if len(rows) else 0):
-        names = draw(st.sampled_from([(name,) for name in COLUMNS] + [RESISTANCE, GRADE, GRADE[:2], GRADE[1:]]))
-        row = draw(st.integers(0, len(rows) - 1))
-        value = draw(st.sampled_from(edges(names[0])) | st.just(None))
-        for name in names:
-            if value is not None:
-                rows[name][row] = value
-    return rows
 
 
 @given(
@@ -109,9 +95,3 @@ def test_refused_ones_leave_the_others_as_they_are():
         are_equal([*good[:2], *bad[:i], *good[2:], *bad[i:], good[0]])
     are_equal([])
     are_equal(bad)
-
-
-@pytest.mark.slow
-@given(st.lists(tables(most=12), min_size=1, max_size=6))
-def test_groups_of_any_batches_are_decoded_as_each_by_itself(group):
-    are_equal([encode_batch(batch(rows, 1)) for rows in group])

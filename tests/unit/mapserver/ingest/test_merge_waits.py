@@ -1,4 +1,3 @@
-import threading
 from concurrent.futures import Future
 from contextlib import closing
 
@@ -38,14 +37,6 @@ def test_a_wait_that_is_over_calls_back_with_an_error_and_leaves_the_others(wait
     assert not other.done()
 
 
-def test_any_number_of_waits_holds_one_thread(waits):
-    before = threading.active_count()
-    called = [added(waits, 6) for _ in range(200)]
-    assert threading.active_count() == before
-    waits.advance(6)
-    assert [one.result(WAIT_S) for one in called] == [None] * 200
-
-
 def test_waits_are_bounded_and_room_comes_back(waits, monkeypatch):
     monkeypatch.setattr(merge_waits, "MOST_WAITING", 2)
     first = [added(waits, 6), added(waits, 6)]
@@ -57,10 +48,3 @@ def test_waits_are_bounded_and_room_comes_back(waits, monkeypatch):
     waits.advance(6)
     assert [one.result(WAIT_S) for one in first] == [None, None]
     assert not added(waits, 7).done()
-
-
-def test_who_waits_at_the_end_is_forgotten():
-    waits = MergeWaits(0)
-    called = added(waits, 1)
-    waits.close()
-    assert not called.done()

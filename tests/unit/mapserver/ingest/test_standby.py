@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,7 +15,6 @@ from mapserver.journal.journal import JournalQueries
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.postgres import reader as postgres_reader
 from mapserver.trust.decisions import PERSON, TrustDecision
-from protocol.errors import StoreError
 from tests.postgres_server import Database
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, fold_of, incoming, now_ns, random_samples, same, wait_for
 
@@ -51,36 +49,6 @@ def is_fold(standby: Standby, journal: JournalQueries, without: frozenset[str] =
     return same(standby._grid, fold_of(journal.read(until=standby.row), without))
 
 
-def fails_after(reads: int, standby: Standby) -> None:
-    """Have its reader fail at a read, once."""
-    reader = standby._opened()
-    real, left = reader._piece, [reads]
-
-    def piece(*words: Any) -> Any:
-        left[0] -= 1
-        if left[0] == -1:
-            raise StoreError("the database", "the connection was cut")
-        return real(*words)
-
-    reader._piece = piece
-
-
-@pytest.mark.parametrize("warm_rows", [0, 2])
-def test_rows_before_a_read_that_fails_are_folded_once(location, standby, warm_rows):
-    with closing(opened(location)) as store:
-        send(store, 1, warm_rows)
-        if warm_rows:
-            standby.follow(5.0)
-        send(store, warm_rows + 1, 8)
-        fails_after(3, standby)
-        standby.follow(5.0)
-        assert standby.row == warm_rows + 3
-        assert is_fold(standby, store.journal)
-        standby.follow(5.0)
-        assert standby.row == 8
-        assert is_fold(standby, store.journal)
-
-
 @pytest.mark.parametrize("warm_rows", [0, 2])
 def test_before_a_damaged_row_it_waits_and_folds_nothing_twice(location, standby, warm_rows, database):
     with closing(opened(location)) as store:
@@ -99,21 +67,6 @@ def test_before_a_damaged_row_it_waits_and_folds_nothing_twice(location, standby
         standby.follow(0.1)
         assert (standby.row, standby._problem) == (6, "")
         assert is_fold(standby, store.journal)
-
-
-def test_after_a_failed_read_it_tries_again_ever_more_seldom(location, standby, database, monkeypatch):
-    monkeypatch.setattr(module, "_MOST_PAUSE_S", 3600.0)
-    standby._pause_s = 1800.0
-    with closing(opened(location)) as store:
-        send(store, 1, 1)
-        fails_after(0, standby)
-        standby.follow(0.01)
-        assert standby._pause_s == 3600.0
-        standby.follow(0.01)
-        assert standby.row == 0, "it did not look"
-        standby._again_s = 0.0
-        standby.follow(0.01)
-        assert (standby.row, standby._pause_s) == (1, module._PAUSE_S)
 
 
 def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
@@ -176,15 +129,3 @@ def test_a_decision_of_another_course_is_not_kept(location, standby, database):
         store.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
         assert events == 1, "what is missing is an event"
     wait_for(lambda: standby.follow(0.1) or standby._facts.excluded == {"c"})
-
-
-def test_a_snapshot_is_where_it_begins(location, standby, tmp_path, database):
-    with closing(opened(JournalLocation(tmp_path / "two", database.url))) as store:
-        send(store, 1, 4)
-        store.save_snapshot()
-        send(store, 5, 6)
-        fails_after(1, standby)
-        standby.follow(5.0)
-        assert standby.row == 5, "the snapshot's four, and one"
-        standby.follow(5.0)
-        assert is_fold(standby, store.journal)

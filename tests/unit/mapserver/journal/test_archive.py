@@ -1,10 +1,6 @@
 import os
-import signal
 import sqlite3
 import stat
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
@@ -13,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mapserver.journal import archive as ar
 from mapserver.journal import archive_file
@@ -28,7 +22,6 @@ from protocol import files
 from protocol.errors import ConfigError, StoreError
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
-from tests.paths import ROOT
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, put, random_samples, samples
 
 pq = pytest.importorskip("pyarrow.parquet")
@@ -90,9 +83,6 @@ def day(tmp_path) -> Iterator[Machines]:
         yield machines
 
 
-# --- writing ---------------------------------------------------------------------------------------------------------
-
-
 def test_each_hour_of_reception_is_a_file(day):
     before = plain(day.reader.read())
     assert day.archive() == [
@@ -109,19 +99,6 @@ def test_each_hour_of_reception_is_a_file(day):
 def test_an_hour_is_archived_once_it_ended_before_the_given_time(day, hours, archived):
     day.archive(NOW_NS + int(hours * HOUR_NS))
     assert day.journal.archived_row == archived
-
-
-def test_files_are_contiguous_where_the_clock_steps_back(tmp_path):
-    with opened(tmp_path) as machines:
-        for hour in (5, 5, 4, 5):
-            machines.send(2, NOW_NS + hour * HOUR_NS)
-        before = machines.both()
-        assert [name[11:] for name in machines.archive()] == [
-            "05_000001-000002.parquet",
-            "04_000003-000003.parquet",
-            "05_000004-000004.parquet",
-        ]
-        assert machines.both() == before
 
 
 def test_a_full_hour_is_cut_and_row_groups_never_cut_a_batch(tmp_path, monkeypatch):
@@ -194,8 +171,6 @@ def test_a_full_disk_leaves_the_journal_as_it_was(day, monkeypatch):
     assert (list(day.folder.iterdir()), day.journal.archived_row, day.both()) == ([], 0, before)
 
 
-# --- reading ---------------------------------------------------------------------------------------------------------
-
 PLACE = Bounds(-20.0, -20.0, 10.0, 15.0)
 FILTERS = [
     Selection(from_ns=NOW_NS + 900 * 10**9),
@@ -213,61 +188,6 @@ def test_filters_choose_the_same_rows_in_journal_and_archive(day, selection):
     before = day.both(selection)
     day.archive(NOW_NS + 2 * HOUR_NS)
     assert day.both(selection) == before
-
-
-def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
-    monkeypatch.setattr(ar, "GROUP_SAMPLES", 1)
-    with opened(tmp_path) as machines:
-        for i in range(4):
-            rows = samples(3, x_m=10.0 * i, stamp_ns=NOW_NS + i)
-            put(machines.journal, batch(rows, 1 + 3 * i), NOW_NS + i // 2 * HOUR_NS)
-        machines.archive()
-        decoded: list[int] = []
-        real = archive_file._rows
-        monkeypatch.setattr(archive_file, "_rows", lambda table, *rest: decoded.append(1) or real(table, *rest))
-        checked: list[Path] = []
-        whole = archive_file._checked
-        monkeypatch.setattr(archive_file, "_checked", lambda path: checked.append(path) or whole(path))
-        for selection, groups, files in (
-            (ALL, 4, 2),
-            (Selection(bounds=Bounds(9, 0, 11, 20)), 1, 1),
-            (Selection(to_ns=NOW_NS + 2), 3, 2),
-            (Selection(from_ns=NOW_NS + 4), 0, 0),
-            (Selection(without=frozenset({"a"})), 0, 0),
-        ):
-            decoded.clear(), checked.clear()
-            list(archived(machines.folder, 0, 4, selection))
-            assert (len(decoded), len(checked)) == (groups, files), selection
-
-
-@pytest.mark.slow
-@settings(max_examples=8, deadline=None)
-@given(data=st.data())
-def test_rows_come_back_whatever_the_cuts(data):
-    """Whatever batches come in, whenever hours are archived and with whatever sizes of files and row groups."""
-    sized = pytest.MonkeyPatch.context()
-    with tempfile.TemporaryDirectory() as folder, opened(Path(folder)) as machines, sized as patch:
-        patch.setattr(ar, "FILE_SAMPLES", data.draw(st.integers(1, 30)))
-        patch.setattr(ar, "GROUP_SAMPLES", data.draw(st.integers(1, 30)))
-        now_ns, before = NOW_NS, []
-        for i, step in enumerate(data.draw(st.lists(st.integers(0, 6), min_size=1, max_size=8))):
-            now_ns += step * HOUR_NS // 4
-            machines.send(data.draw(st.integers(1, 9)), now_ns, data.draw(st.sampled_from("abc")), seed=i)
-            before += plain(machines.reader.read(machines.journal.last_row - 1))
-            if data.draw(st.booleans()):
-                machines.archive(now_ns - data.draw(st.integers(0, 4)) * HOUR_NS // 2)
-                assert machines.both() == before
-        after, until = sorted(data.draw(st.tuples(*[st.integers(0, machines.journal.archived_row)] * 2)))
-        assert plain(archived(machines.folder, after, until)) == before[after:until]
-        for selection in FILTERS:
-            chosen = machines.both(selection)
-            assert [row for row in before if row in chosen] == chosen
-            machines.archive()
-            assert machines.both(selection) == chosen
-        assert machines.both() == before
-
-
-# --- damage ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -306,32 +226,24 @@ def test_damaged_statistics_do_not_hide_rows(file, day):
         list(archived(day.folder, 0, 7, Selection(from_ns=FUTURE)))
 
 
-def test_a_parquet_file_of_somebody_else_is_refused(tmp_path):
+def test_what_is_no_file_of_this_archive_is_refused(day, tmp_path, monkeypatch):
     import pyarrow as pa
 
-    path = tmp_path / "2026-01-01T00_000001-000003.parquet"
-    pq.write_table(pa.table({"x": [1]}), path)
-    with pytest.raises(StoreError, match="no file of a map server's archive"):
-        ArchiveFile(path)
-
-
-def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    with pytest.raises(StoreError, match=r"nothing\.parquet: cannot be read: No such file"):
-        ArchiveFile(tmp_path / "nothing.parquet")
-
-
-def test_a_file_of_another_schema_is_refused(day, monkeypatch):
-    monkeypatch.setattr(ar, "asdict", lambda header: asdict(header) | {"schema": 1})
-    path = ar.write_file(day.folder, "0" * 16, SITE, ((row, row.received_ns) for row in day.reader.read()))
-    with pytest.raises(StoreError, match="has schema 1, this version knows 4"):
-        ArchiveFile(path)
-
-
-def test_a_renamed_file_is_found(file):
-    path, _ = file
-    other = path.rename(path.with_name("2026-01-01T00_000001-000004.parquet"))
-    with pytest.raises(StoreError, match=r"000004\.parquet: holds the rows 1 to 3"):
-        ArchiveFile(other)
+    foreign = tmp_path / "2026-01-01T00_000001-000003.parquet"
+    pq.write_table(pa.table({"x": [1]}), foreign)
+    with monkeypatch.context() as patch:
+        patch.setattr(ar, "asdict", lambda header: asdict(header) | {"schema": 1})
+        older = ar.write_file(day.folder, "0" * 16, SITE, ((row, row.received_ns) for row in day.reader.read()))
+    older = older.rename(tmp_path / older.name)
+    renamed = (day.folder / day.archive()[0]).rename(tmp_path / "2026-01-01T00_000001-000004.parquet")
+    for path, problem in (
+        (foreign, "no file of a map server's archive"),
+        (older, "has schema 1, this version knows 4"),
+        (renamed, r"000004\.parquet: holds the rows 1 to 3"),
+        (tmp_path / "nothing.parquet", r"nothing\.parquet: cannot be read: No such file"),
+    ):
+        with pytest.raises(StoreError, match=problem):
+            ArchiveFile(path)
 
 
 def test_a_missing_file_is_an_error(day):
@@ -352,9 +264,6 @@ def test_two_files_with_the_same_row_are_an_error(day):
     ar.write_file(day.folder, "0" * 16, SITE, iter(twice))
     with pytest.raises(StoreError, match="row 3 is also in another file"):
         list(archived(day.folder, 0, 7))
-
-
-# --- crashes ---------------------------------------------------------------------------------------------------------
 
 
 class Crash(BaseException):
@@ -422,45 +331,6 @@ def test_nothing_is_forgotten_before_file_and_name_are_on_disk(day, monkeypatch)
     assert done == ["sync", "replace", "sync folder", "rename", "sync folder", "forget"]
 
 
-KILLED = """
-import os, signal, sys
-from importlib import import_module
-from itertools import chain
-from pathlib import Path
-from mapserver.journal.archive import archive
-from mapserver.journal.sqlite.journal import SqliteJournal
-from mapserver.journal.sqlite.reader import SqliteReader
-from protocol.site.site_config import SiteConfig
-
-site = SiteConfig("pit", 48.0, 11.0)
-folder, step, calls = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
-journal = SqliteJournal(folder / "journal.db", site.name, site.frame)
-
-def killing(real):
-    def call(*arguments):
-        global calls
-        if calls == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        calls -= 1
-        return real(*arguments)
-    return call
-
-forget = lambda until: journal.forget(until, 1)
-if step == "forget":
-    forget = killing(forget)
-elif step == "delete":
-    journal._db.set_trace_callback(killing(lambda text: None))
-elif step in ("rename", "replace"):
-    setattr(Path, step, killing(getattr(Path, step)))
-else:
-    module, _, name = step.rpartition(".")
-    module = import_module(f"mapserver.journal.{module}")
-    setattr(module, name, killing(getattr(module, name)))
-for _ in archive(folder / "archive", SqliteReader(folder / "journal.db"), site, 2**62, forget):
-    pass
-"""
-
-
 YEAR_NS = 365 * 24 * HOUR_NS
 
 
@@ -485,32 +355,6 @@ def test_rows_that_came_in_next_year_wait_for_one_that_did_not(tmp_path):
         assert machines.archive(**later) == []
         machines.send(3, NOW_NS + 29 * HOUR_NS - 1)
         assert machines.archive(**later) == ["2026-01-02T04_000002-000003.parquet"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("step", "calls"),
-    [
-        ("archive.seal", 1),
-        ("rename", 0),
-        ("forget", 2),
-        ("delete", 13),
-    ],
-)
-def test_a_killed_process_loses_and_doubles_nothing(tmp_path, step, calls):
-    with opened(tmp_path) as machines:
-        for i in range(6):
-            machines.send(5, NOW_NS + i // 3 * HOUR_NS, "ab"[i % 2])
-        before = machines.both()
-    ended = subprocess.run(
-        [sys.executable, "-c", KILLED, str(tmp_path), step, str(calls)], cwd=ROOT, check=False, timeout=60
-    )
-    assert ended.returncode == -signal.SIGKILL
-    with opened(tmp_path) as machines:
-        assert machines.both() == before
-        machines.archive()
-        assert machines.both() == before
-        assert (machines.journal.archived_row, len(list(machines.folder.iterdir()))) == (6, 2)
 
 
 def test_a_file_that_is_not_the_journal_s_is_never_a_reason_to_forget(day):

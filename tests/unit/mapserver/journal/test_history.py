@@ -1,18 +1,34 @@
+import threading
 from collections.abc import Iterator
-from threading import Thread
+from contextlib import closing
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mapserver.evidence.grid import Grid
+from mapserver.journal import history as module
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
-from mapserver.journal.history import History, history_rows
+from mapserver.journal.history import AHEAD, History, ahead, fold_history, history_rows
+from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.rows import Admission, JournalRow, Selection
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
-from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
 from tests.journals import history_beside
-from tests.unit.mapserver.data import NOW_NS, SITE, WAIT_S, batch, put, random_samples, samples
+from tests.unit.mapserver.data import (
+    CONFIG,
+    NOW_NS,
+    SITE,
+    batch,
+    incoming,
+    open_store,
+    put,
+    random_samples,
+    same,
+    samples,
+)
 
 pytest.importorskip("pyarrow.parquet")
 PARTS = {name: np.split(random_samples(200, seed, half_m=25.0), 10) for seed, name in enumerate("ab")}
@@ -65,41 +81,69 @@ def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
     reader.close(), other.close(), journal.close()
 
 
-@pytest.mark.slow
-def test_rows_come_once_while_another_thread_archives_and_the_owner_writes(tmp_path):
-    journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
-    for i in range(120):
-        put(journal, batch(samples(1), i + 1), NOW_NS + i // 10 * HOUR_NS)
-    owner_calls: list[int] = []
-
-    def age() -> None:
-        mine = SqliteReader(journal.path)
-        list(archive(tmp_path / FOLDER, mine, SITE, NOW_NS + 8 * HOUR_NS, forget))
-        mine.close()
-
-    def forget(until: int) -> int:
-        owner_calls.append(until)
-        return journal.forget(until, most=3)
-
-    thread = Thread(target=age)
-    thread.start()
-    while thread.is_alive():
-        reader = SqliteReader(journal.path)
-        assert numbers(history_rows(history_beside(reader))) == list(range(1, 121))
-        reader.close()
-    thread.join(WAIT_S)
-    assert journal.archived_row == 80
-    journal.close()
+@pytest.fixture
+def history(tmp_path: Path) -> Iterator[History]:
+    """Three machines, 20 rows of 25 samples each."""
+    with closing(open_store(tmp_path)) as store:
+        for number in range(20):
+            store.commit([incoming(rows_of(name, number), 1 + 25 * number, name) for name in "abc"])
+    with SqliteReader(tmp_path / JOURNAL_FILE) as reader:
+        yield history_beside(reader)
 
 
-def test_a_missing_file_is_no_silent_gap(tmp_path):
-    journal = SqliteJournal(tmp_path / "journal.db", SITE.name, SITE.frame)
-    for i in range(3):
-        put(journal, batch(samples(1), i + 1), NOW_NS + i * HOUR_NS)
-    history = history_beside(journal)
-    with SqliteReader(journal.path) as reader:
-        list(archive(tmp_path / FOLDER, reader, SITE, NOW_NS + 2 * HOUR_NS, journal.forget))
-    history.archive.paths()[1].unlink()
-    with pytest.raises(StoreError, match="the file with row 2 is missing"):
-        list(history_rows(history))
-    journal.close()
+def rows_of(machine: str, number: int):
+    return random_samples(25, seed=100 * "abc".index(machine) + number)
+
+
+def expected(machines: str) -> Grid:
+    grid = Grid(SITE.cell_m, CONFIG.fold)
+    for name in machines:
+        for number in range(20):
+            grid.fold(rows_of(name, number), name)
+    return grid
+
+
+@pytest.mark.parametrize("piece", [7, 16_384])
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_a_history_folded_by_any_threads_is_the_fold_of_its_rows(history, monkeypatch, threads, piece):
+    monkeypatch.setattr(module, "PIECE", piece)
+    grid = Grid(SITE.cell_m, CONFIG.fold)
+    without_b = Selection(without=frozenset("b"))
+    assert fold_history(grid, history, until=30, selection=without_b, threads=threads)
+    assert fold_history(grid, history, after=30, selection=without_b, threads=threads)
+    assert same(grid, expected("ac"))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_fold_that_is_stopped_ends_at_once_and_says_so(history, monkeypatch, threads):
+    monkeypatch.setattr(module, "PIECE", 10)
+    asked = count()
+    grid = Grid(SITE.cell_m, CONFIG.fold)
+    assert not fold_history(grid, history, stopped=lambda: next(asked) == 3, threads=threads)
+    assert next(asked) == 4
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith(("fold", "read"))]
+
+
+def test_what_is_made_ahead_comes_in_order_and_no_more_is_made_than_that():
+    made = []
+
+    def numbers() -> Iterator[int]:
+        for number in count(1):
+            made.append(number)
+            yield number
+
+    with closing(ahead(numbers())) as coming:
+        assert [next(coming) for _ in range(50)] == list(range(1, 51))
+    assert len(made) <= 50 + AHEAD
+    assert list(ahead(iter(range(1, 40)))) == list(range(1, 40))
+
+
+def test_an_error_of_what_is_made_ahead_comes_in_its_place():
+    def numbers() -> Iterator[int]:
+        yield from (1, 2)
+        raise OSError("the disk")
+
+    coming = ahead(numbers())
+    assert (next(coming), next(coming)) == (1, 2)
+    with pytest.raises(OSError, match="the disk"):
+        next(coming)

@@ -46,13 +46,6 @@ def test_what_is_written_is_read(tmp_path, state, count):
     assert same(read(path), Grid.from_state(1.0, FoldConfig(), GridState(state.blocks, 0, 0, 0, 0)))
 
 
-def test_one_without_evidence_is_one(tmp_path):
-    path = written(tmp_path / "none", GridState((), 0, 0, 0, 0))
-    with Checkpoint(path) as checkpoint:
-        assert checkpoint.header == HEADER
-        assert list(checkpoint.blocks(checkpoint.numbers_in(None))) == []
-
-
 @pytest.mark.parametrize("window", [(-16, -16, 32, 32), (0, 0, 1, 1), (-1, 15, 2, 2), (500, 500, 9, 9)])
 def test_the_blocks_of_a_window_are_read_alone(tmp_path, state, window):
     column, row, columns, rows = window
@@ -72,16 +65,6 @@ def test_the_blocks_of_a_window_are_read_alone(tmp_path, state, window):
     path.write_bytes(data)
     assert path.stat().st_size == size
     assert [(x, y) for x, y, _ in read(path, CellWindow(*window)).state().blocks] == got
-
-
-def test_blocks_are_copied_as_they_are(tmp_path, state):
-    path = written(tmp_path / "one", state)
-    with Checkpoint(path) as source, (tmp_path / "copy").open("wb") as file:
-        writer = CheckpointWriter(file)
-        for numbers in np.array_split(np.arange(len(source.index)), 3):
-            writer.copy(source, numbers)
-        writer.finish(source.header)
-    assert (tmp_path / "copy").read_bytes() == path.read_bytes()
 
 
 def test_no_flipped_bit_is_believed(tmp_path, state):
@@ -114,9 +97,4 @@ def test_a_file_that_was_cut_is_damaged(tmp_path, state, keep):
 def test_a_foreign_file_is_damaged(tmp_path, data):
     (tmp_path / "one").write_bytes(data)
     with pytest.raises(DamagedError, match=r"one: its (end|header) is damaged; it is made again"):
-        Checkpoint(tmp_path / "one")
-
-
-def test_a_file_that_is_gone_is_no_damage(tmp_path):
-    with pytest.raises(FileNotFoundError):
         Checkpoint(tmp_path / "one")

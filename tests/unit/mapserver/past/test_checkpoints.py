@@ -6,7 +6,7 @@ from contextlib import closing
 import pytest
 
 from mapserver.journal.facts import NO_FACTS, Facts
-from mapserver.past.checkpoints import Checkpoints, remove_beyond
+from mapserver.past.checkpoints import remove_beyond
 from mapserver.past.plan import HOUR_NS
 from tests.unit.mapserver.data import NOW_NS, random_samples
 from tests.unit.mapserver.past.past_store import PastStore
@@ -30,17 +30,6 @@ def nearest(store: PastStore, hour: float, without=(), last_row: int = 3) -> int
         return None
     checkpoint.close()
     return (checkpoint.header.closed_ns - NOW_NS) // HOUR_NS
-
-
-def test_the_nearest_is_the_newest_before_a_time(store):
-    assert [nearest(store, hour) for hour in (0.9, 1, 1.9, 2, 3, 90)] == [None, 1, 1, 2, 3, 3]
-
-
-def test_names_are_for_people(store):
-    assert sorted(path.name for path in store.past.checkpoints.folder.iterdir()) == [
-        f"2026-01-01T0{hour}.checkpoint" for hour in (1, 2, 3)
-    ]
-    assert all(path.stat().st_mode & 0o077 == 0 for path in store.past.checkpoints.folder.iterdir())
 
 
 def test_one_of_other_facts_is_not_used(store):
@@ -79,14 +68,6 @@ def test_a_file_under_another_name_is_not_what_its_name_says(store):
     assert store.past.checkpoints.passed_over == 1
 
 
-def test_a_replaced_file_is_another_one(store):
-    entries = store.past.checkpoints.entries(store.past.depends_on(store.reader, NO_FACTS), 3)
-    assert [entry.header.row for entry in entries] == [1, 2, 3]
-    store.make(NOW_NS + HOUR_NS)
-    entries = store.past.checkpoints.entries(store.past.depends_on(store.reader, NO_FACTS), 3)
-    assert [entry.header.row for entry in entries] == [3, 2, 3]
-
-
 def test_damage_seen_in_a_file_that_was_replaced_meanwhile_does_not_count(store):
     facts = store.past.depends_on(store.reader, NO_FACTS)
     with store.past.checkpoints.nearest(NOW_NS + HOUR_NS, facts, 3) as checkpoint:
@@ -103,8 +84,3 @@ def test_a_look_says_what_there_is(store):
     size = sum(path.stat().st_size for path in checkpoints.folder.iterdir())
     checkpoints.look(store.past.depends_on(store.reader, NO_FACTS), 2)
     assert checkpoints.state == {"count": 2, "bytes": size, "newest_ns": NOW_NS + 2 * HOUR_NS, "passed_over": 0}
-
-
-def test_a_store_without_any_has_none(tmp_path):
-    assert Checkpoints(tmp_path).entries(lambda _: {}, 9) == []
-    remove_beyond(tmp_path, 0)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mapserver.journal.facts import NO_FACTS
 from mapserver.past import making
 from mapserver.past.checkpoint_file import Checkpoint, DamagedError
-from mapserver.past.making import make, remove_unfinished
+from mapserver.past.making import make
 from mapserver.past.plan import HOUR_NS
 from tests.unit.mapserver.data import NOW_NS, random_samples, same
 from tests.unit.mapserver.past.past_store import PastStore, S
@@ -36,17 +36,6 @@ def some_samples(seed: int, n: int = 40, first_h: float = 0.0, hours: float = HO
     stamps[4::9] = stamps[4::9] // HOUR_NS * HOUR_NS - 1
     rows["stamp_ns"] = np.maximum(stamps, NOW_NS)
     return rows
-
-
-def test_a_checkpoint_is_the_fold_of_what_was_stamped_before_it(store):
-    store.add(some_samples(1))
-    store.add(some_samples(2), "b")
-    closed_ns = NOW_NS + 2 * HOUR_NS
-    store.make(closed_ns)
-    with Checkpoint(store.past.checkpoints.path(closed_ns)) as checkpoint:
-        assert same(store.past.grid(checkpoint), store.folded(closed_ns - 1))
-        assert (checkpoint.header.closed_ns, checkpoint.header.row) == (closed_ns, 2)
-    assert not same(store.folded(closed_ns - 1), store.folded(closed_ns))
 
 
 ACTIONS = st.one_of(
@@ -89,24 +78,6 @@ def test_late_samples_are_folded_in_when_they_are_read_and_when_it_is_made_again
     assert same(store.as_of(closed_ns), store.folded(closed_ns))
 
 
-def test_a_checkpoint_begins_with_the_one_before_it_and_reads_only_what_that_one_lacks(store, monkeypatch):
-    for hour in range(3):
-        store.add(some_samples(hour, 30, hour, 0.99))
-    store.make(NOW_NS + 2 * HOUR_NS)
-    read = []
-    samples = type(store.past).samples
-
-    def noted(self, reader, selection, after=0, until=2**63 - 1):
-        for rows, names in samples(self, reader, selection, after, until):
-            read.append(len(rows))
-            yield rows, names
-
-    monkeypatch.setattr(type(store.past), "samples", noted)
-    store.make(NOW_NS + 3 * HOUR_NS)
-    rows = np.concatenate([rows for _, rows in store.sent])["stamp_ns"]
-    assert sum(read) == np.count_nonzero((rows >= NOW_NS + 2 * HOUR_NS) & (rows < NOW_NS + 3 * HOUR_NS))
-
-
 @pytest.mark.parametrize("spill", [50, 10**6])
 def test_memory_is_bounded_by_parts_that_go_to_disk(store, monkeypatch, spill):
     monkeypatch.setattr(making, "SPILL_SAMPLES", spill)
@@ -131,16 +102,6 @@ def test_one_that_is_given_up_leaves_what_was_there(store, steps, monkeypatch):
         next(running)
     running.close()
     assert {path.name: path.read_bytes() for path in store.past.checkpoints.folder.iterdir()} == before
-
-
-def test_what_a_killed_process_left_is_removed(store):
-    store.add(some_samples(1))
-    store.make(NOW_NS + HOUR_NS)
-    folder = store.past.checkpoints.folder
-    for name in (".2026-01-01T02.checkpoint.0123.part", "spill", ".spill.99.part"):
-        (folder / name).write_bytes(b"half")
-    remove_unfinished(store.past.checkpoints)
-    assert [path.name for path in folder.iterdir()] == ["2026-01-01T01.checkpoint"]
 
 
 def test_damage_in_what_it_begins_with_is_found_and_the_next_attempt_does_without(store):

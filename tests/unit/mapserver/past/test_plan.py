@@ -48,33 +48,6 @@ def test_what_cannot_be_used_is_made_again_oldest_first():
     assert due(at(1, 12), [at(1, 11)], [at(1, 12)], stamps) is None, "not over yet"
 
 
-@given(st.integers(1, 400), st.sets(st.integers(0, 100), min_size=1))
-def test_every_sample_of_a_replayed_log_is_before_a_checkpoint_in_the_end(now_h, hours):
-    """However far the site's now has gone on, the last one closes the last hour or day that is over."""
-    now, stamps = at(0, now_h) + GRACE_NS, [at(0, hour + 0.5) for hour in hours if hour < now_h]
-    made = []
-    while (closed := due(now, made, [], next_stamp(*stamps))) is not None:
-        assert closed not in made
-        made.append(closed)
-    assert made == sorted(made)
-    for stamp in stamps:
-        later = [closed for closed in made if closed > stamp]
-        assert later
-        assert later[0] - stamp <= (HOUR_NS if stamp > now - DAY_NS else DAY_NS)
-        assert later[0] <= now - GRACE_NS
-
-
-def test_of_old_hours_the_last_one_of_each_day_stays():
-    closed = [at(0, 10), at(0, 18), at(1, 12), at(2), at(2, 1), at(2, 9), at(2, 10)]
-    assert surplus(at(3, 9.5), closed) == [
-        at(0, 10),
-        at(1, 12),
-        at(2, 1),
-        at(2, 9),
-    ]  # that of midnight is of the day before
-    assert surplus(at(0, 20), closed[:2]) == []
-
-
 def test_one_in_the_future_was_closed_by_a_wrong_clock():
     assert surplus(at(0, 12), [at(0, 11), at(5)]) == [at(5)]
 

@@ -1,13 +1,11 @@
 """Simulated fleets on five zones: bad machines are found, with the reason; nobody else is."""
 
-import tracemalloc
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from mapserver.evidence.fold_config import FoldConfig
 from mapserver.fleet.observability import MachineState
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.journal.rows import JournalRows
@@ -17,7 +15,7 @@ from mapserver.trust.judgement import Reason
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from protocol.site.ground_classes import ZONES
-from tests.unit.mapserver.data import NOW_NS, samples
+from tests.unit.mapserver.data import NOW_NS
 
 WIDTH_M, HEIGHT_M, STEP_M, STEP_S = 150, 100, 0.6, 0.2
 C_RR = np.array([zone.c_rr for zone in ZONES])
@@ -156,21 +154,6 @@ def test_a_machine_at_fault_is_no_measure_for_the_others() -> None:
     assert by_right == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_machine_whose_clock_is_off_measures_the_ground_like_any_other() -> None:
-    late = fleet(0, GOOD, GOOD, {"gain": 1.1, "clock_s": -400.0})
-    verdicts = audit(late)
-    assert accused(verdicts) == {"c": (Reason.CLOCK,)}
-    assert verdicts["a"].evidence["gain"] < 0.99
-
-
-def test_gain_and_displacement_of_corrected_samples_are_told_apart() -> None:
-    """The gain is corrected, and the offset stays: it is no business of calibration."""
-    auditor = Auditor(1.0)
-    send(auditor, "abcd", fleet(1, GOOD, GOOD, GOOD, {"off_m": (0.0, 3.5)}, km=10.8))
-    verdicts = auditor.verdicts({"d": state(0.002, 0.55)})
-    assert accused(verdicts) == {"d": (Reason.OFFSET, Reason.BEYOND_DATA_SHEET)}
-
-
 HONEST = {
     "alike": [GOOD] * 4,
     "one far better": [{"std_m": 0.05}] + [{"std_m": 2.5}] * 3,
@@ -203,35 +186,6 @@ def test_a_machine_that_left_before_the_rain_is_not_accused(after_s: float) -> N
     assert bool(accused(auditor.verdicts())) == (after_s == 0)
 
 
-def test_of_two_machines_both_are_reported_as_disagreeing() -> None:
-    verdicts = audit(fleet(0, GOOD, {"gain": 1.6}))
-    assert verdicts["a"].evidence["disagrees_with"] == ("b",)
-    assert verdicts["b"].evidence["disagrees_with"] == ("a",)
-
-
-def test_a_machine_on_new_ground_is_undecided() -> None:
-    rows = drive(3)
-    rows["x_m"] += 1000
-    evidence = audit([*fleet(0, GOOD, GOOD, GOOD), rows])["d"].evidence
-    assert evidence["cells"] == 0
-    assert "gain" not in evidence
-
-
-def test_a_parked_machine_says_nothing_about_the_ground() -> None:
-    rows = drive(3, gain=1.6)
-    rows["distance_m"] = 0
-    assert audit([*fleet(0, GOOD, GOOD, GOOD), rows])["d"].evidence["cells"] == 0
-
-
-def test_samples_unsure_of_their_place_do_not_count() -> None:
-    rows = drive(3, gain=1.6)
-    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 4.0
-    auditor = Auditor(1.0, FoldConfig(std_cap_m=1.9))
-    for name, part in zip("abcd", [*fleet(0, GOOD, GOOD, GOOD), rows], strict=True):
-        auditor.add(name, part)
-    assert auditor.verdicts()["d"].evidence["cells"] == 0
-
-
 def test_a_repaired_machine_is_cleared_once_its_bad_periods_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(coarse_map, "PERIOD_S", 900.0)
     monkeypatch.setattr(coarse_map, "PERIODS", 2)
@@ -241,20 +195,6 @@ def test_a_repaired_machine_is_cleared_once_its_bad_periods_are_forgotten(monkey
     assert accused(audit([*others, mended])) == {}
     early = [rows[:half] for rows in (*others, mended)]
     assert accused(audit(early)) == {"d": (Reason.GAIN,)}
-
-
-def test_ten_machines_on_a_large_site_take_little_memory() -> None:
-    """1 km2, 10 % of it driven by each of ten machines: 25 000 cells of 2 m."""
-    x_m, y_m = np.meshgrid(np.arange(0.5, 1000, 2), np.arange(0.5, 100, 2))
-    rows = samples(x_m.size, x_m=x_m.ravel(), y_m=y_m.ravel(), stamp_ns=NOW_NS)
-    tracemalloc.start()
-    auditor = Auditor(1.0)
-    for machine in "abcdefghij":
-        auditor.add(machine, rows)
-        auditor.add(machine, rows)
-    used = tracemalloc.get_traced_memory()[0]
-    tracemalloc.stop()
-    assert used < 30e6
 
 
 def test_many_rows_at_once_are_judged_as_one_by_one() -> None:
@@ -270,9 +210,3 @@ def test_many_rows_at_once_are_judged_as_one_by_one() -> None:
         machine = np.array([i for i, _ in part])
         at_once.add_all(JournalRows(samples_of, lengths, tuple("abcd"), machine, np.arange(n), none, none, none))
     assert at_once.verdicts() == one_by_one.verdicts()
-
-
-def test_an_auditor_without_samples_has_no_verdicts() -> None:
-    auditor = Auditor(1.0)
-    auditor.add("a", samples(0))
-    assert auditor.verdicts() == {}

@@ -58,13 +58,6 @@ def test_a_machine_of_which_nothing_shows_that_it_agrees_again_stays_out(agrees)
     assert judged(decisions, GOOD, TRUST_AFTER - 1) == [], "four in a row"
 
 
-def test_a_machine_that_was_excluded_in_words_comes_back_once_it_agrees_in_anything():
-    decisions = TrustDecisions([])
-    decisions.add(TrustDecision("c", False, AUDIT, "left to the audit", 1))
-    assert judged(decisions, Verdict("c", (), {}, False), 20) == []
-    assert judged(decisions, Verdict("c", (), {}, False, frozenset({Reason.STUCK})), TRUST_AFTER)
-
-
 @pytest.mark.parametrize("trusted", [True, False])
 def test_what_a_person_decided_stands_against_the_audit(trusted):
     decisions = TrustDecisions([])
@@ -90,12 +83,6 @@ def test_a_machine_beyond_its_data_sheet_is_let_in_by_a_person_alone(reasons):
     decisions.add(TrustDecision("c", True, PERSON, "its samples are corrected", 30))
     assert decisions.distrusted == frozenset()
     assert judged(decisions, Verdict("c", reasons, {}, True), 20) == []
-
-
-def test_a_machine_that_was_handed_back_is_judged_whatever_the_words_were():
-    decisions = TrustDecisions([])
-    decisions.add(TrustDecision("c", True, AUDIT, "beyond_data_sheet", 1))
-    assert judged(decisions, BAD, DISTRUST_AFTER)
 
 
 def test_decisions_come_back_from_events_the_newest_of_each_machine():

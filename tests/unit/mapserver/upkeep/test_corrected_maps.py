@@ -16,7 +16,7 @@ from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.correction import ANY_SHARE, LEVEL_SHARE, Correction, Corrections
+from mapserver.fleet.correction import LEVEL_SHARE, Correction, Corrections
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
@@ -25,12 +25,10 @@ from mapserver.journal.rows import Selection
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past.cell_history import cell_history
 from mapserver.past.making import make
-from mapserver.past.past import Past
 from mapserver.past.plan import HOUR_NS
 from mapserver.trust.decisions import TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.arrays import Table
-from protocol.errors import StoreError
 from tests.reference.correction import in_numpy
 from tests.reference.grid import by_definition, of_grid, plain
 from tests.unit.mapserver.data import (
@@ -136,19 +134,6 @@ def test_any_batching_any_order_and_any_time_of_the_decision_give_one_map(writer
         assert store.fact == 2
 
 
-def test_the_journal_stays_byte_for_byte_what_was_sent(writer):
-    fleet = Fleet(7)
-    fleet.send(writer, 10)
-    with closing(Refolding(writer, past_of(writer))) as refolds:
-        refolds.wait(refolds.decide(decision("a")), WAIT_S)
-        fleet.send(writer, 3)
-        with SqliteReader(writer.location.folder / JOURNAL_FILE) as reader:
-            assert all(
-                row.rows.tobytes() == fleet.rows[row.machine][row.first_seq - 1 :][: len(row.rows)].tobytes()
-                for row in reader.read()
-            )
-
-
 def test_a_correction_of_a_machine_that_is_left_out_folds_nothing_and_counts_when_it_comes_back(writer):
     fleet = Fleet(8)
     fleet.send(writer, 12)
@@ -187,31 +172,6 @@ def test_maps_of_the_past_have_the_facts_of_now_and_a_checkpoint_that_lacks_them
         )
 
 
-def test_a_fold_begins_with_the_newest_checkpoint_that_stays_true(writer, monkeypatch):
-    fleet, past, read = Fleet(10), past_of(writer), list[Selection]()
-    for name in MACHINES:
-        fleet.rows[name]["stamp_ns"] += np.arange(900) // 300 * HOUR_NS
-    fleet.send(writer, 30)
-    recent = (Correction("a", NOW_NS + 2 * HOUR_NS, END_NS, 0.02, 0.05, 0.0, (), ANY_SHARE),)
-
-    def lacking(self: Past, reader: object, base: object, selection: Selection, until: int = 0) -> object:
-        read.append(base)
-        return original(self, reader, base, selection, until)
-
-    original = Past.lacking
-    with closing(Refolding(writer, past)) as refolds, SqliteReader(writer.location.folder / JOURNAL_FILE) as reader:
-        for hour in (1, 2, 3):
-            assert list(make(past, reader, NOW_NS + hour * HOUR_NS, Facts()))
-        monkeypatch.setattr(Past, "lacking", lacking)
-        refolds.wait(refolds.decide(decision("a", recent)), WAIT_S)
-        assert [base.closed_ns for base in read] == [NOW_NS + 2 * HOUR_NS]
-        assert same(writer.run(grid_copy), fleet.folded(recent))
-        past.checkpoints.path(NOW_NS + 2 * HOUR_NS).write_bytes(b"damaged")
-        refolds.wait(refolds.decide(decision("a", (replace(recent[0], zero=0.01),))), WAIT_S)
-        assert [base.closed_ns for base in read[1:]] == [NOW_NS + HOUR_NS]
-        assert same(writer.run(grid_copy), fleet.folded((replace(recent[0], zero=0.01),)))
-
-
 def test_the_history_of_a_cell_is_that_of_corrected_samples(writer):
     rows = samples(200, stamp_ns=NOW_NS + np.arange(200) * 10 * S, c_rr=0.04, speed_mps=1.0, grade_e=0.0, grade_n=0.0)
     send(writer, [incoming(rows)])
@@ -222,9 +182,6 @@ def test_the_history_of_a_cell_is_that_of_corrected_samples(writer):
         assert len(there.first_ns) == len(before.first_ns) >= 4
         differs = (there.evidence.counts != before.evidence.counts).any(axis=(1, 2))
         assert differs.tolist() == [first >= NOW_NS + 900 * S for first in there.first_ns.tolist()]
-
-
-# --- starts ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_snapshot_that_lacks_a_fact_is_folded_again(tmp_path):
@@ -244,18 +201,6 @@ def test_a_snapshot_that_lacks_a_fact_is_folded_again(tmp_path):
     with closing(open_store(tmp_path)) as store:
         assert store.snapshot_row == store.merged, "the new one has it"
         assert same(store.grid, fleet.folded(decision("a").corrections))
-
-
-def test_a_fact_of_another_version_is_refused_not_ignored(tmp_path):
-    with closing(open_store(tmp_path)) as store:
-        store.commit([incoming(samples(3))])
-        store.decide(decision("a"))
-        store.journal.append_event("calibration", NOW_NS, decision("a").body() | {"version": 2})
-    with pytest.raises(StoreError, match=r"journal\.db: event 2 has a correction of version 2, this program knows 1"):
-        open_store(tmp_path)
-
-
-# --- changes of the ground -------------------------------------------------------------------------------------------
 
 
 def looked(log: ChangeLog, grid: Grid) -> list[object]:

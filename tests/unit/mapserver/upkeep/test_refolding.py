@@ -33,7 +33,6 @@ from tests.unit.mapserver.data import (
     grid_copy,
     held,
     incoming,
-    open_store,
     open_writer,
     past_of,
     random_samples,
@@ -116,17 +115,6 @@ def test_batches_are_acknowledged_during_a_fold_and_are_in_the_map_afterwards(wr
         assert same(writer.run(grid_copy), map_without("b", 12))
 
 
-def test_a_few_rows_are_left_to_the_writer(writer, fold):
-    with closing(Refolding(writer, past_of(writer))) as refolds:
-        number = refolds.decide(decision("b"))
-        fold.wait(1)
-        deliver(writer, range(5, 7))
-        fold.may_go_on.set()
-        refolds.wait(number, WAIT_S)
-        assert fold.rows == [(0, 20)]
-        assert same(writer.run(grid_copy), map_without("b", 7))
-
-
 def test_where_batches_never_end_the_writer_has_them_wait(writer, monkeypatch):
     monkeypatch.setattr(past, "FEW_ROWS", -1)
     with closing(Refolding(writer, past_of(writer))) as refolds:
@@ -170,35 +158,6 @@ def test_the_solver_decides_nothing_new_until_the_map_follows_unless_it_is_asked
         assert (number, newest and newest.zero) == (3, 0.004)
 
 
-def test_decisions_that_come_faster_than_folds_do_not_keep_the_map_from_following(writer, monkeypatch):
-    folds: list[bool] = []
-
-    def fold(*arguments: Any) -> bool:
-        refolds.calibrate(solved(0.001 * (len(folds) + 1)), NOW_NS, asked=True)  # during each fold
-        folds.append(refolding_fold(*arguments))
-        return folds[-1]
-
-    refolding_fold = past.fold_history
-    monkeypatch.setattr(past, "fold_history", fold)
-    with closing(Refolding(writer, past_of(writer))) as refolds:
-        refolds.wait(refolds.decide(decision("b")), WAIT_S)
-        wait_for(lambda: len(folds) >= 6)
-        assert folds[:6] == [False, True] * 3
-        assert refolds.facts().excluded == {"b"}
-
-
-def test_a_decision_that_leaves_the_same_machines_out_lets_the_fold_go_on(writer, fold):
-    with closing(Refolding(writer, past_of(writer))) as refolds:
-        refolds.decide(decision("b"))
-        fold.wait(1)
-        refolds.decide(decision("c"))
-        refolds.decide(decision("c", trusted=True))
-        number = refolds.decide(decision("b", reason="a better reason"))
-        fold.may_go_on.set()
-        refolds.wait(number, WAIT_S)
-        assert (fold.without, fold.came_to_an_end) == ([{"b"}], [True])
-
-
 def test_a_decision_that_is_taken_back_during_its_fold_leaves_the_map(writer, fold):
     before = writer.run(lambda store: store.grid)
     with closing(Refolding(writer, past_of(writer))) as refolds:
@@ -209,33 +168,6 @@ def test_a_decision_that_is_taken_back_during_its_fold_leaves_the_map(writer, fo
         refolds.wait(number, WAIT_S)
         assert fold.came_to_an_end == [False]
         assert writer.run(lambda store: store.grid) is before
-
-
-def test_the_end_during_a_fold_gives_it_up_and_the_next_start_has_the_map(writer, fold, tmp_path):
-    refolds = Refolding(writer, past_of(writer))
-    number = refolds.decide(decision("b"))
-    problems: list[str] = []
-
-    def wait() -> None:
-        with pytest.raises(QueryError) as refused:
-            refolds.wait(number, WAIT_S)
-        problems.append(str(refused.value))
-
-    waits, ends = Thread(target=wait), Thread(target=refolds.close)
-    waits.start()
-    fold.wait(1)
-    ends.start()
-    waits.join(WAIT_S)
-    fold.may_go_on.set()
-    ends.join(WAIT_S)
-    assert not ends.is_alive()
-    assert fold.came_to_an_end == [False]
-    assert problems
-    assert "the decision is kept, but the server is stopping" in problems[0]
-    writer.close()
-    with closing(open_store(tmp_path)) as store:
-        assert store.facts.excluded == {"b"}
-        assert same(store.grid, map_without("b", 5))
 
 
 def room(store: Store, *, full: bool) -> None:
@@ -258,20 +190,6 @@ def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer,
         assert [event.body["machine"] for event in reader.events(KIND)] == ["b"]
         deliver(writer, range(5, 6))
     assert same(writer.run(grid_copy), map_without("b", 6))
-
-
-def test_the_audit_decides_again_what_a_full_disk_did_not_take(writer):
-    bad = {"b": Verdict("b", (Reason.GAIN,), {"why": "evidence that needs new pages" * 1000}, True)}
-    with closing(Refolding(writer, past_of(writer))) as refolds:
-        writer.run(lambda store: room(store, full=True))
-        for _ in range(DISTRUST_AFTER - 1):
-            refolds.judge(bad, NOW_NS)
-        with pytest.raises(QueryError, match="cannot be written"):
-            refolds.judge(bad, NOW_NS)
-        assert (refolds.decision("b"), refolds.facts().excluded) == (None, frozenset())
-        writer.run(lambda store: room(store, full=False))
-        refolds.judge(bad, NOW_NS)
-        wait_for(lambda: refolds.facts().excluded == {"b"})
 
 
 def test_a_person_is_not_overruled_by_an_audit_that_judged_at_the_same_time(writer):

@@ -19,13 +19,12 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.location import JOURNAL_FILE
-from mapserver.journal.sqlite import reader as journal_reader
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.judgement import Reason
 from mapserver.upkeep import refolding, upkeep
 from mapserver.upkeep.jobs import Archiving, Audit
 from mapserver.upkeep.upkeep import Upkeep
-from protocol.errors import QueryError, StoreError
+from protocol.errors import QueryError
 from protocol.queries.answers import GroundChange
 from protocol.site.ground_classes import ZONES
 from tests.unit.mapserver.data import (
@@ -147,20 +146,6 @@ def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
         assert same(site.grid, fold_of(sent, site.config))
 
 
-@pytest.mark.parametrize("snapshot", [True, False])
-def test_a_decision_outlives_the_server(opened, tmp_path, snapshot):
-    sent = fleet({}, size=16)
-    with opened() as site:
-        deliver(site, sent)
-        site.upkeep.trust("b", False, "why", 20.0)
-    if not snapshot:
-        for path in (tmp_path / "store").glob("snapshot-*"):
-            path.unlink()
-    with opened() as site:
-        assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert (site.machine("b")["trusted"], site.machine("b")["reason"]) == (False, "why")
-
-
 def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
     with opened(judge_s=JUDGE_S, calibrates=False) as site:  # its evidence is of what it sent
@@ -229,9 +214,6 @@ def test_a_change_is_published_listed_and_kept(opened):
         assert site.upkeep.changes(after=change.id) == []
 
 
-# --- archiving -------------------------------------------------------------------------------------------------------
-
-
 def archiving(writer: Writer, reader: SqliteReader, after_h: float, hours_later: float = 3.0) -> Archiving:
     writer = copy(writer)
     writer.now_ns = lambda: NOW_NS + round(hours_later * HOUR_NS)
@@ -276,15 +258,6 @@ def test_decisions_are_written_beside_the_archive_with_a_new_file_or_once_in_an_
     assert decide(0.004) == [0.001, 0.002, 0.003, 0.004]
 
 
-def test_where_nothing_was_old_enough_it_looks_again_only_later(store):
-    writer, reader = store
-    job = archiving(writer, reader, 1.0)
-    job.run()
-    send(writer, [incoming(samples(5))])
-    job.run()
-    assert reader.archived_row == 0, "it looked a moment ago"
-
-
 def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, caplog):
     with opened() as site, SqliteReader(tmp_path / "store" / JOURNAL_FILE) as reader:
         send(site.writer, [incoming(samples(5))])
@@ -300,9 +273,6 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
         assert site.grid.state().folded == 10
 
 
-# --- the audit -------------------------------------------------------------------------------------------------------
-
-
 def audit_of(
     writer: Writer,
     reader: SqliteReader,
@@ -312,22 +282,6 @@ def audit_of(
 ) -> Audit:
     writer.config = ServerConfig(trust=TrustConfig(judge_s))
     return Audit(writer, reader, report, known, threading.Event())
-
-
-def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(store, monkeypatch):
-    writer, reader = store
-    send(writer, [incoming(samples(5))])
-    reports: list[Any] = []
-
-    def damaged(*_: Any, **__: Any) -> Any:
-        raise StoreError("journal.db", "is damaged")
-
-    audit = audit_of(writer, reader, lambda *report: reports.append(report))
-    audit.run()
-    monkeypatch.setattr(reader, "read_many", damaged)
-    with pytest.raises(StoreError):
-        audit.run()
-    assert [(list(verdicts), stamp_ns) for verdicts, stamp_ns in reports] == [(["a"], NOW_NS + 4 * 10**9)] * 2
 
 
 def test_corrected_samples_are_judged_also_those_that_came_before_the_correction(store):
@@ -361,15 +315,3 @@ def test_machines_are_judged_so_often(store, judge_s, times):
     for _ in range(3):
         audit.run()
     assert len(reports) == times
-
-
-def test_an_audit_that_is_to_end_ends_after_what_it_read(store, monkeypatch):
-    monkeypatch.setattr(journal_reader, "BYTES_AT_ONCE", 1)
-    monkeypatch.setattr(journal_reader, "ROWS_AT_ONCE", 1)
-    writer, reader = store
-    send(writer, [incoming(samples(5), machine=name) for name in "abc"])
-    audit = audit_of(writer, reader, lambda *_: None)
-    audit._ending.set()
-    for followed in ("a", "ab", "abc", "abc"):
-        audit.run()
-        assert sorted(audit.verdicts) == list(followed)
