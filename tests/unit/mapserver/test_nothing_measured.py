@@ -14,7 +14,6 @@ LINE = along([(10, 10), (110, 10)])
 
 
 def nothing_measured(rows):
-    """The same drives, of which nothing is known but the place."""
     rows = rows.copy()
     for name in (*RESISTANCE, *GRADE):
         rows[name] = np.nan

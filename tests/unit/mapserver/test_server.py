@@ -8,7 +8,7 @@ import zenoh
 
 from mapserver import server as server_module
 from mapserver.journal.location import JournalLocation
-from mapserver.query import queryable, region_pieces
+from mapserver.query import queryable
 from mapserver.query.answering import SMALL_BYTES
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
@@ -16,13 +16,11 @@ from protocol.queries import answer_codec as codec
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
-from protocol.queries.pieces import joined
 from protocol.queries.requests import (
     AliveQuery,
     Freshness,
     HistoryQuery,
     InfoQuery,
-    PieceQuery,
     PointQuery,
     RegionQuery,
     encode_query,
@@ -60,7 +58,6 @@ def served(sessions, tmp_path):
 
 
 def get(client: zenoh.Session, key: str, parameters: dict[str, str] | None = None, payload: bytes | None = None):
-    """The one reply to a query."""
     selector = f"{key}?{selector_of(parameters)}" if parameters else key
     (reply,) = client.get(selector, payload=payload, timeout=WAIT_S)
     return reply
@@ -120,17 +117,19 @@ def test_a_refused_batch_gets_its_reason(served):
 
 
 @pytest.mark.parametrize(
-    ("name", "parameters", "reason"),
+    ("key", "parameters", "reason"),
     [
-        ("region", {"bounds": "0,0,1,1", "colour": "red"}, Refusal.UNKNOWN_PARAMETER),
-        ("elevation", {}, Refusal.UNKNOWN_QUERY),
-        ("info", {"after": "9", "wait": "0.01"}, Refusal.AFTER_TIMEOUT),
+        (keys.map_query("pit", "region"), {"bounds": "0,0,1,1", "colour": "red"}, Refusal.UNKNOWN_PARAMETER),
+        (keys.map_query("pit", "elevation"), {}, Refusal.UNKNOWN_QUERY),
+        (keys.map_query("pit", "info"), {"after": "9", "wait": "0.01"}, Refusal.AFTER_TIMEOUT),
+        (keys.admin("pit", "trust"), {"machine": "c", "trusted": "yes"}, Refusal.UNKNOWN_MACHINE),
+        (keys.admin("pit", "trust"), {"machine": "c"}, Refusal.MISSING_FIELD),
+        (keys.admin("pit", "shutdown"), {}, Refusal.UNKNOWN_QUERY),
     ],
 )
-def test_a_refused_query_gets_its_reason_and_is_counted(served, name, parameters, reason):
+def test_a_refused_query_or_command_gets_its_reason_and_is_counted(served, key, parameters, reason):
     _, client = served
-    error = refusal(client, name, parameters)
-    assert error.reason == reason
+    assert codec.decode_error(get(client, key, parameters).err.payload.to_bytes()).reason == reason
     assert counters(client) == {f"refused_query_{reason}": 1}
 
 
@@ -185,7 +184,6 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
 
 
 def begun(client: zenoh.Session, key: str, parameters: dict[str, str], n: int) -> list[zenoh.Handler]:
-    """Queries whose answers nobody waits for yet."""
     return [client.get(f"{key}?{selector_of(parameters)}", timeout=WAIT_S) for _ in range(n)]
 
 
@@ -236,37 +234,6 @@ def test_a_query_that_would_fill_memory_while_it_waits_is_refused(served, asked)
     assert codec.decode_error(reply.err.payload.to_bytes()).reason == Refusal.TOO_LARGE
 
 
-def test_a_large_region_comes_in_pieces_and_is_forgotten_after_a_while(served, monkeypatch):
-    _, client = served
-    deliver(client, batch(samples(5, c_rr=0.25)))
-    first = codec.decode_region(ask(client, RegionQuery(Bounds(0, 0, 600, 400), ("resistance",))))
-    count = first.piece.count
-    parts = [codec.decode_region(ask(client, PieceQuery(first.piece.cursor, n))) for n in range(count)]
-    region = joined(parts)
-    assert count > 1
-    assert region["resistance"].shape == (400, 600)
-    assert region["resistance"][8, 8] == pytest.approx(0.25, rel=1e-3)
-    assert np.isfinite(region["resistance"]).sum() == 1
-    monkeypatch.setattr(region_pieces, "IDLE_S", -1.0)
-    piece = {"cursor": str(first.piece.cursor), "number": "0"}
-    assert refusal(client, "piece", piece).reason == Refusal.EXPIRED
-
-
-def test_events_and_queries_below_the_map_do_not_meet(served):
-    server, client = served
-    received, here = [], threading.Event()
-    subscriber = client.declare_subscriber(
-        keys.changed("pit"), lambda s: (received.append(s.payload.to_bytes()), here.set())
-    )
-    error = codec.decode_error(get(client, keys.changed("pit")).err.payload.to_bytes())
-    assert error.reason == Refusal.UNKNOWN_QUERY
-    ask(client, InfoQuery())  # the subscription has reached the server with this answer
-    server._publish({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})
-    assert here.wait(WAIT_S)
-    assert received == [codec.encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
-    subscriber.undeclare()
-
-
 def test_no_batch_is_taken_while_another_server_may_be_the_writer(served):
     server, client = served
     server._claim.held = False
@@ -293,20 +260,6 @@ def test_a_command_reaches_the_upkeep_with_its_reason(served):
     assert machine.name == "a"
     assert not machine.trusted
     assert answer.version == MapVersion(row.store, 1, 1)
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "reason"),
-    [
-        ("trust", {"machine": "c", "trusted": "yes"}, Refusal.UNKNOWN_MACHINE),
-        ("trust", {"machine": "c"}, Refusal.MISSING_FIELD),
-        ("shutdown", {}, Refusal.UNKNOWN_QUERY),
-    ],
-)
-def test_a_refused_command_gets_its_reason_and_is_counted(served, name, parameters, reason):
-    _, client = served
-    assert codec.decode_error(get(client, keys.admin("pit", name), parameters).err.payload.to_bytes()).reason == reason
-    assert counters(client) == {f"refused_query_{reason}": 1}
 
 
 @pytest.mark.parametrize("slow", ["past", "command"])

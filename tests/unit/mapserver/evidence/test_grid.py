@@ -36,11 +36,6 @@ def test_window_finds_the_blocks_that_it_touches(window, expected):
     assert grid.blocks_in(window) == expected
 
 
-def test_bounds_are_those_of_the_blocks():
-    grid = folded(samples(2, x_m=[8.0, -24.0], y_m=[8.0, 40.0]))
-    assert grid.bounds() == (-32, 0, 16, 48)
-
-
 def test_counts_are_kept_while_folding_and_fold_nothing(monkeypatch):
     """Through folds, merges and snapshots; what waits is counted at once, its cells and bounds once it is folded."""
     grid, parts = Grid(1.0, FoldConfig(), 200), [random_samples(90, seed, std_m=4.0) for seed in range(5)]
@@ -62,13 +57,6 @@ def test_counts_are_kept_while_folding_and_fold_nothing(monkeypatch):
         cells = sum(timeline.known_cells for timeline in timelines.values())
         sure = sum(int(is_foldable(part, grid.config).sum()) for part in rows)
         assert each.counts() == GridCounts(sure, 90 * len(rows) - sure, cells, bounds)
-
-
-def test_known_cells_are_counted_once_over_all_buckets():
-    once = folded(samples(1))
-    again = folded(samples(2, stamp_ns=[NOW_NS, NOW_NS + 3600 * 10**9]))
-    assert len(again.state().pages) == 2
-    assert once.known_cells() == again.known_cells() > 0
 
 
 def test_evidence_is_summed_over_buckets():
@@ -98,16 +86,6 @@ def test_summing_buckets_does_not_wrap():
     grid = folded(samples(4, stamp_ns=NOW_NS + np.arange(4) * 3600 * 10**9))
     grid = Grid.from_state(1.0, FoldConfig(), filled_to(grid.state(), ev.COUNT_MAX))
     assert grid.evidence([(0, 0)]).counts.max() == 4 * int(ev.COUNT_MAX)
-
-
-def test_a_grid_from_its_state_folds_on_as_if_nothing_happened():
-    rows = random_samples(400, 1)
-    whole = folded(rows)
-    first = folded(rows[:200])
-    again = Grid.from_state(1.0, FoldConfig(), first.state())
-    assert same(first, again)
-    again.fold(rows[200:], "a")
-    assert same(again, whole)
 
 
 def test_state_is_a_copy():

@@ -13,7 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.change import change_log
+from mapserver.follower import follower as edge
 from mapserver.follower import following as module
+from mapserver.follower.follower import Follower
 from mapserver.follower.following import Following
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
@@ -26,6 +28,7 @@ from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import GroundChange, MapVersion
+from tests import postgres_server as server
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
@@ -37,6 +40,7 @@ from tests.unit.mapserver.data import (
     past_of,
     random_samples,
     refused,
+    routed,
     same,
     send,
     wait_for,
@@ -80,7 +84,6 @@ def version(one: Following) -> MapVersion | None:
 
 
 def catches_up(one: Following, writer: Writer) -> None:
-    """Wait until both have the same version of the map, then compare all that there is of it."""
     wait_for(lambda: version(one) == writer.run(lambda store: store.version))
     ours, theirs = one.run(lambda replica: replica.grid), writer.run(lambda store: store.grid)
     assert one.run(lambda replica: writer.run(lambda store: same(replica.grid, store.grid)))
@@ -129,7 +132,6 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
 
 
 def archive_all(folder: Path, writer: Writer) -> list[Path]:
-    """Have all rows in the archive; returns its new files."""
     location = JournalLocation(folder)
 
     def forget(until: int) -> int:
@@ -140,8 +142,6 @@ def archive_all(folder: Path, writer: Writer) -> list[Path]:
 
 
 class Served:
-    """A writer and its folds over a folder: rows come in, machines are decided about, it archives and starts again."""
-
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._open()
@@ -331,3 +331,66 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
             assert one.run(lambda replica: same(replica.grid, other.grid))
             with location.reader() as reader:
                 assert same(one.past.grid_as_of(reader, LAST), other.grid)
+
+
+def test_a_follower_that_cannot_keep_up_is_hidden_until_it_has_caught_up(tmp_path, monkeypatch, caplog):
+    may_read, read = threading.Event(), module.read_history
+
+    def slowly(*words):
+        for rows in read(*words):
+            assert may_read.wait(WAIT_S)
+            yield rows
+
+    monkeypatch.setattr(edge, "SHOWN_S", 1.5)  # for ten seconds
+    monkeypatch.setattr(module, "read_history", slowly)
+    may_read.set()
+    with routed() as (_, session), closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(random_samples(20, 1), 1, "a")])
+        with closing(Follower(session, "slow", JournalLocation(tmp_path), SITE, CONFIG, now_ns)) as one:
+
+            def is_shown() -> bool:
+                one.tend()
+                return one.is_shown
+
+            wait_for(is_shown)
+            may_read.clear()
+            send(writer, [incoming(random_samples(20, 2), 21, "a")])
+            wait_for(lambda: not is_shown())
+            assert "clients ask others" in caplog.text
+            assert one.source.origin().behind_rows == 1
+            assert writer.run(lambda store: store.merged) == 2, "nobody waits for it"
+            may_read.set()
+            wait_for(is_shown)
+            assert one.source.origin().behind_rows == 0
+
+
+@pytest.mark.nightly
+def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_it_is(tmp_path, caplog):
+    with server.cluster() as primary, server.replica(primary, "b") as replica:
+        database = primary.new_database()
+        with closing(Store(JournalLocation(tmp_path / "store", database.url), SITE, CONFIG, now_ns)) as store:
+
+            def deliver(seed: int) -> None:
+                store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
+
+            deliver(1)
+            url = replica.url(database.name)
+            wait_for(lambda: replica.shows_all_of(primary))
+            of_one = Following(JournalLocation(tmp_path / "one", url), SITE, CONFIG)
+            ports = f"127.0.0.1:{primary.port},127.0.0.1:{replica.port}"
+            pool = f"postgresql://postgres@{ports}/{database.name}?load_balance_hosts=random"
+            of_any = Following(JournalLocation(tmp_path / "any", pool), SITE, CONFIG)
+            with closing(of_one), closing(of_any):
+                for each in (of_one, of_any):
+                    each.start()
+                    wait_for(lambda each=each: version(each) == store.version and each.behind()[1] < 1)
+                replica.sql("SELECT pg_wal_replay_pause()")
+                wait_for(lambda: replica.sql("SELECT pg_get_wal_replay_pause_state()") == [("paused",)])
+                deliver(2)
+                wait_for(lambda: version(of_any) == store.version)
+                wait_for(lambda: of_one.behind()[1] > 4)
+                assert version(of_one).row == 1
+                assert version(of_any) == store.version
+                replica.sql("SELECT pg_wal_replay_resume()")
+                wait_for(lambda: version(of_one) == store.version and of_one.behind()[1] < 2.5)
+        assert "rows are gone" not in caplog.text

@@ -45,7 +45,6 @@ def send(store: Store, first: int, last: int, machine: str = "a") -> None:
 
 
 def is_fold(standby: Standby, journal: JournalQueries, without: frozenset[str] = frozenset()) -> bool:
-    """Whether the grid is what its rows make."""
     return same(standby._grid, fold_of(journal.read(until=standby.row), without))
 
 

@@ -1,5 +1,4 @@
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,11 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.evidence import snapshot
 from mapserver.fleet.correction import LAST_NS, NO_SHARE, Correction
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.store import Store
-from mapserver.journal.facts import NO_FACTS, Facts
+from mapserver.journal.facts import Facts
 from mapserver.journal.journal import UnwrittenError
 from mapserver.journal.location import JournalLocation
 from mapserver.trust.decisions import TrustDecision
@@ -118,18 +116,6 @@ def test_a_store_that_cannot_be_opened_is_let_go(tmp_path):
     open_store(tmp_path).close()
 
 
-def test_a_grid_adopted_while_a_snapshot_is_written_gets_one_of_its_own(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(3)), incoming(samples(3), machine="b")])
-    write = store.snapshot()
-    store.adopt(folded(samples(3)), store.merged, Facts(frozenset({"b"})))
-    write()
-    store.save_snapshot()
-    row, _ = snapshot.load_newest(tmp_path, store.merged, SITE.cell_m, store.config.fold, store.facts.of_evidence())
-    store.close()
-    assert row == 2
-
-
 @pytest.mark.parametrize("row", [0, 1])
 def test_an_adopted_grid_gets_what_came_since_without_those_excluded(store, row):
     store.commit([incoming(samples(3)), incoming(samples(3), machine="b"), incoming(samples(5), 4)])
@@ -210,35 +196,6 @@ def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, sa
     store.close()
 
 
-@pytest.mark.parametrize("parts", [1, 25])
-def test_a_replay_of_any_part_of_the_journal_after_a_snapshot_gives_the_same_bits(tmp_path, parts):
-    rows = random_samples(100, 13, half_m=20.0)
-    rows["stamp_ns"] += np.arange(100) % 9 * 10**9 * 9_000
-    store = open_store(tmp_path / "store")
-    for i, part in enumerate(np.split(rows, parts * 4)):
-        store.commit([incoming(part, 1 + i * len(part))])
-        if i == parts:
-            store.save_snapshot()
-    shutil.copytree(tmp_path / "store", tmp_path / "copy")  # as a kill leaves it
-    again = open_store(tmp_path / "copy")
-    assert again.snapshot_row == parts + 1 == max(snapshot.rows_on_disk(tmp_path / "copy"))
-    assert same(again.grid, store.grid)
-    assert same(again.grid, folded(rows))
-    store.close(), again.close()
-
-
-def test_samples_at_the_end_of_a_spool_are_declared_lost_without_a_row(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(3))])
-    (answer,) = store.commit([incoming(samples(0), 8, lost_before=4)])
-    assert (answer.watermark, answer.row) == (7, 1)
-    assert store.counters["samples_lost"] == 4
-    store.close()
-    store = open_store(tmp_path)
-    assert store.machines()["a"] == counts(1, 3, 4, NOW_NS + 2 * 10**9)
-    store.close()
-
-
 GONE = "0123456789abcdef"
 
 
@@ -288,16 +245,6 @@ def test_the_site_s_now_is_that_of_trusted_machines_and_is_taken_back(tmp_path):
         assert (store.newest_ns, store.machines()["b"]["newest_ns"]) == (NOW_NS, NOW_NS + DAY)
     with closing(open_store(tmp_path)) as store:
         assert store.newest_ns == NOW_NS
-
-
-def test_a_machine_from_the_future_bears_out_no_other_once_it_is_distrusted(tmp_path):
-    with closing(open_store(tmp_path)) as store:
-        store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
-        later = incoming(samples(1, stamp_ns=NOW_NS + 2 * DAY), machine="c")
-        store.adopt(folded(samples(0)), 1, Facts(frozenset({"b"})))
-        assert store.commit([later])[0].reason == Refusal.FAR_FUTURE
-        store.adopt(folded(samples(1, stamp_ns=NOW_NS + DAY)), 1, NO_FACTS)
-        assert isinstance(store.commit([later])[0], Ack)
 
 
 def test_a_server_whose_clock_went_back_says_so_until_it_is_right_again(tmp_path):

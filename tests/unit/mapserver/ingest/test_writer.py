@@ -1,6 +1,9 @@
 import math
 import threading
 import time
+from collections import Counter
+from concurrent.futures import Future
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
@@ -12,9 +15,10 @@ from hypothesis import strategies as st
 
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
-from mapserver.ingest import backlog, snapshot_times
+from mapserver.ingest import backlog, merge_waits, snapshot_times
 from mapserver.ingest import writer as writer_module
-from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, MOST_RETRY_S
+from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, GROUP_BYTES, MOST_RETRY_S, Backlog, Pace
+from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE, SnapshotTimes
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
@@ -203,8 +207,6 @@ def test_snapshots_never_take_more_than_their_share_of_the_time(snapshots, every
 
 
 class Clock:
-    """Seconds that pass when a test says so."""
-
     def __init__(self) -> None:
         self.now_s = 1000.0
 
@@ -213,7 +215,6 @@ class Clock:
 
 
 def turn(writer: Writer) -> None:
-    """Have the owner look what is due, to the end."""
     for _ in range(2):
         writer.run(lambda _: None)
 
@@ -229,16 +230,6 @@ def test_a_snapshot_is_made_once_a_restart_would_take_long(start, tmp_path):
         send(writer, [incoming(samples(1), row)])
         turn(writer)
         wait_for(lambda row=row: snapshot.rows_on_disk(tmp_path) == expected[row // 3 * 3] and is_written(writer))
-
-
-def test_what_a_start_has_folded_counts_for_the_next_snapshot(start, tmp_path):
-    writer = start(clock=Clock())
-    send(writer, [incoming(samples(2)), incoming(samples(2), machine="b")])
-    writer.close()
-    next(tmp_path.glob("snapshot-*")).unlink()
-    again = start(restart_samples=4, clock=Clock())
-    turn(again)
-    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [2])
 
 
 def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start, tmp_path, monkeypatch):
@@ -403,3 +394,84 @@ def test_a_refused_batch_is_counted_by_its_reason(start, reason, payload):
     info = writer.info()
     assert info["counters"][f"refused_{reason}"] == 1
     assert info["journalled"] == 0
+
+
+def filled(batches: str, size: int = 10, limit: int = 10**9) -> Backlog[str]:
+    backlog, sent = Backlog(limit), Counter()
+    for machine in batches:
+        sent[machine] += 1
+        backlog.add(machine, size, f"{machine}{sent[machine]}")
+    return backlog
+
+
+def test_who_has_had_a_turn_comes_after_those_who_wait():
+    backlog = filled("a" * 2 * GROUP_BATCHES + "b")
+    first = backlog.take()
+    assert (len(first), first[:3]) == (GROUP_BATCHES, ["a1", "b1", "a2"])
+    backlog.add("c", 10, "c1")
+    assert backlog.take()[:2] == [f"a{GROUP_BATCHES}", "c1"]
+
+
+def test_a_group_is_bounded_in_bytes_and_never_empty():
+    backlog = filled("abc", GROUP_BYTES // 2)
+    assert backlog.take() == ["a1", "b1"]
+    assert filled("ab", 2 * GROUP_BYTES).take() == ["a1"]
+
+
+def test_the_newest_of_the_machine_with_most_bytes_gives_way():
+    backlog = filled("aaab", limit=40)
+    assert backlog.add("c", 10, "c1") == ["a3"]
+    assert backlog.add("c", 10, "c2") == ["c2"]  # as much as anybody has
+    assert backlog.add("d", 10, "d1") == ["a2"]
+    assert backlog.add("e", 10, "e1") == ["e1"]  # all have one
+    assert backlog.take() == ["a1", "b1", "c1", "d1"]
+
+
+def test_a_batch_larger_than_all_room_is_not_taken_and_takes_nobodys_place():
+    backlog = filled("ab", limit=40)
+    assert backlog.add("c", 41, "c1") == ["c1"]
+    assert backlog.take() == ["a1", "b1"]
+
+
+def test_the_time_until_there_is_room_follows_the_pace():
+    pace = Pace()
+    for _ in range(100):
+        pace.worked(2_000_000, 0.5)
+    assert 0.9 < pace.retry_after_s(4_000_000) < 1.1
+    pace.worked(1, 0.0)  # a clock that stood still
+    assert pace.retry_after_s(10**12) == MOST_RETRY_S
+
+
+@pytest.fixture
+def waits():
+    with closing(MergeWaits(5)) as made:
+        yield made
+
+
+def added(waits: MergeWaits, row: int, wait_s: float = WAIT_S) -> Future:
+    called: Future[QueryError | None] = Future()
+    waits.add(row, wait_s, called.set_result)
+    return called
+
+
+def test_rows_call_back_as_they_are_merged_in_any_order(waits):
+    later, sooner = added(waits, 9), added(waits, 7)
+    waits.advance(6)
+    waits.advance(7)
+    assert sooner.result(WAIT_S) is None
+    assert not later.done()
+    waits.advance(12)
+    assert later.result(WAIT_S) is None
+
+
+def test_waits_are_bounded_and_room_comes_back(waits, monkeypatch):
+    monkeypatch.setattr(merge_waits, "MOST_WAITING", 2)
+    first = [added(waits, 6), added(waits, 6)]
+    with pytest.raises(QueryError, match="too many queries wait") as caught:
+        added(waits, 6)
+    assert caught.value.reason == Refusal.OVERLOADED
+    assert caught.value.retry_after_s > 0
+    assert added(waits, 5).done(), "which waits for nothing"
+    waits.advance(6)
+    assert [one.result(WAIT_S) for one in first] == [None, None]
+    assert not added(waits, 7).done()

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from mapserver.ingest.store import Store
@@ -180,14 +179,6 @@ def test_rows_are_selected_by_time_and_place(journal, reader):
     assert reader.rows_before(0, 5, NOW_NS + 200) == 2
 
 
-def test_many_rows_come_in_order_whatever_their_size(journal, reader):
-    for first in range(0, 450, 150):
-        write(journal, *(admission(40, 1 + 40 * k, spool_id=9) for k in range(first, first + 150)))
-    pieces = list(reader.read_many())
-    assert np.concatenate([rows.numbers for rows in pieces]).tolist() == list(range(1, 451))
-    assert len(pieces) > 1
-
-
 def test_archived_rows_are_forgotten_in_pieces(journal, reader):
     write(journal, *(admission(1, k) for k in range(1, 8)))
     assert journal.forget(3, most=2) == 2
@@ -246,11 +237,17 @@ def test_a_journal_of_another_site_or_frame_is_refused(place):
         ("UPDATE meta SET value = 'x' WHERE key = 'store'", "the store of the journal"),
         ("UPDATE meta SET value = 'hill' WHERE key = 'site'", "the site of the journal"),
         ("DELETE FROM events WHERE id = 2", "what follows number 1"),
+        ("DELETE FROM events WHERE id = 1", "what follows number 0"),
+        ("UPDATE events SET kind = 'u' WHERE id = 2", "event 2"),
+        ("DELETE FROM extent WHERE row = 3", "what follows number 2"),
+        ("UPDATE extent SET row = 9 WHERE row = 3", "the extent of journal row 9"),
+        ("DELETE FROM meta WHERE key = 'frame'", "the frame of the journal"),
     ],
 )
-def test_damage_is_found_on_opening(place, change, problem):
+def test_damage_is_found_on_opening(place, monkeypatch, change, problem):
+    monkeypatch.setattr("mapserver.journal.queries._EXTENTS_AT_ONCE", 2)  # read in two pieces
     with closing(place.open()) as journal:
-        write(journal, admission(), admission(1, 4))
+        write(journal, admission(), admission(1, 4), admission(1, 5))
         for stamp_ns in (5, 6):
             journal.append_event("t", stamp_ns, {})
     place.sql(change)
@@ -280,24 +277,12 @@ def test_losses_beyond_what_the_wire_has_can_be_asked_for(place):
         assert store.machines()["a"]["samples"] == 6
 
 
-def test_a_damaged_row_is_found_when_it_is_read(place, journal, reader):
-    write(journal, admission(), admission(1, 4), admission(1, 5))
-    place.sql("UPDATE journal SET record = (SELECT record FROM journal WHERE row = 1) WHERE row = 2")
-    rows = reader.read()
-    assert next(rows).row == 1
-    with pytest.raises(StoreError, match="journal row 2 is damaged"):
-        next(rows)
-
-
 def test_another_schema_is_refused(place):
     place.open().close()
     place.sql("UPDATE meta SET value = '99' WHERE key = 'schema'")
     for opened in (place.open, place.location.reader):
         with pytest.raises(StoreError, match=r"schema '99', this version knows \d+; open it with the version that"):
             opened()
-
-
-# --- faults ----------------------------------------------------------------------------------------------------------
 
 
 class Faults:

@@ -166,8 +166,6 @@ def test_the_operators_page_names_every_metric_with_its_labels(tmp_path: Path):
 
 
 class One(Collector):
-    """A collector with one metric, or with a bug."""
-
     def __init__(self, *, fails: bool = False) -> None:
         self.fails = fails
 

@@ -67,7 +67,6 @@ def drive(
 
 
 def audit(fleet: list[Table], batch: int = 250) -> dict[str, Verdict]:
-    """Machines a, b, c... send in turn."""
     auditor = Auditor(1.0)
     send(auditor, "abcdefgh", fleet, batch)
     return auditor.verdicts()

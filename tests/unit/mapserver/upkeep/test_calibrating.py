@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet import calibration
-from mapserver.fleet.calibration import Calibration, calibrate
+from mapserver.fleet.calibration import Calibration
 from mapserver.fleet.correction import corrected
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
-from mapserver.upkeep import calibrating as calibrating_module
 from mapserver.upkeep.calibrating import EVERY_NS, Calibrating
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.arrays import Table
@@ -38,7 +36,6 @@ S = 10**9
 
 
 def deliver(writer: Writer, first: float = 0.0, last: float = 1.0, batch: int = 150) -> None:
-    """A share of each machine's samples, in batches that take turns."""
     spans = {name: range(int(first * len(rows)), int(last * len(rows)), batch) for name, rows in DRIVES.items()}
     for i in range(max(map(len, spans.values()))):
         for name, starts in spans.items():
@@ -55,7 +52,6 @@ def writer(tmp_path: Path) -> Iterator[Writer]:
 
 
 def calibrating(writer: Writer, *doubtful: str) -> tuple[Calibrating, list[int]]:
-    """A job without a thread, and when it had something decided."""
     decided: list[int] = []
 
     def decide(_: Calibration, now_ns: int) -> None:
@@ -127,7 +123,6 @@ def test_it_solves_in_site_time(tmp_path):
 
 
 def folded(upkeep: Upkeep, writer: Writer) -> Grid:
-    """The fold of all samples with the corrections that count."""
     each = writer.run(lambda store: store.facts.corrections).each
     grid = Grid(SITE.cell_m, writer.config.fold)
     for name, rows in DRIVES.items():
@@ -197,44 +192,6 @@ def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, 
             assert same(writer.run(grid_copy), folded(site, writer))
 
 
-def test_what_a_person_takes_off_is_no_measured_fault(writer, monkeypatch):
-    deliver(writer)
-    with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
-        monkeypatch.setattr(site._calibrating, "states", dict)  # nothing is solved yet
-        site.correct(CalibrateCommand("a", zero=0.03, scale=0.4, reason="known to read too much", wait_s=WAIT_S))
-        corrections, known = site._known()
-        assert corrections.newest("a") is not None
-        assert known == {}
-        site.calibrate(WAIT_S)
-        assert {*site._known()[1]} == {"b", "c"}, "of what the solver decided, the deviation is known"
-
-
-def test_a_large_fleet_is_solved_in_groups_that_take_turns(writer, monkeypatch):
-    monkeypatch.setattr(calibration, "MOST_MACHINES", 2)
-    monkeypatch.setattr(calibration, "MOST_EPOCHS", 4)
-    together: list[set[str]] = []
-
-    def note(stays: Mapping[str, Table], *more: Any) -> Calibration:
-        together.append({*stays})
-        return calibrate(stays, *more)
-
-    monkeypatch.setattr(calibrating_module, "calibrate", note)
-    deliver(writer, last=0.1)
-    job, _ = calibrating(writer)
-    together.clear()
-    with closing(job):
-        for share in (0.1, 0.4, 0.7):
-            job._due_s = 0.0
-            job.run()
-            deliver(writer, share, share + 0.3)
-        job._due_s = 0.0
-        job.run()
-        assert together == [{"a", "c"}, {"b"}, {"a", "c"}]
-        assert {*job.states()} == set(DRIVES)
-        assert {*job.solve()[0].machines} == set(DRIVES)
-        assert {ledger.epochs for ledger in job._ledgers.values()} == {2}
-
-
 def test_it_says_from_when_on_there_may_be_samples_of_a_machine(writer):
     deliver(writer, last=0.5)
     job, _ = calibrating(writer)
@@ -249,7 +206,6 @@ def test_it_says_from_when_on_there_may_be_samples_of_a_machine(writer):
 
 
 def follows(job: Calibrating, writer: Writer, rows: Table, name: str = "a", first_seq: int = 1) -> None:
-    """Samples come in, some 15 s at a time, and the job has its turn after each."""
     for first in range(0, len(rows), 120):
         send(writer, [incoming(rows[first : first + 120], first_seq + first, name)])
         job._due_s = 0.0

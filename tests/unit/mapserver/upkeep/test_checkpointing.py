@@ -33,8 +33,6 @@ TURNS = 500
 
 
 class Site:
-    """A writer, the job alone, and what was sent, also to a writer before it."""
-
     def __init__(self, folder: Path, sent: list[tuple[str, Table]], checkpoints_gb: float = 5.0) -> None:
         self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0, checkpoints_gb=checkpoints_gb))
         self.writer = Writer(Store(JournalLocation(folder), SITE, self.config, lambda: NOW_NS + 200 * HOUR_NS))
@@ -45,7 +43,6 @@ class Site:
         self.sent = sent
 
     def drive(self, hours: list[float], n: int = 30, machine: str = "a") -> None:
-        """Send samples of half an hour from each of these hours on."""
         for hour in hours:
             rows = random_samples(n, len(self.sent), half_m=20.0)
             rows["stamp_ns"] += round(hour * HOUR_NS)
@@ -54,12 +51,10 @@ class Site:
             self.sent.append((machine, rows))
 
     def exclude(self, *machines: str) -> None:
-        """Have the map without some machines, as after a decision."""
         grid = self.folded(2**62, frozenset(machines))
         self.writer.run(lambda store: store.adopt(grid, store.merged, Facts(frozenset(machines))))
 
     def run(self) -> None:
-        """Turns until nothing is left to do."""
         idle = 0
         for _ in range(TURNS):
             self.job.run()
@@ -156,18 +151,6 @@ def test_after_a_decision_about_a_machine_they_are_made_again_and_until_then_not
         site.run()
         assert site.hours == [9, 10]
         assert all(site.is_true(hour) for hour in (8.9, 9.5, 10.4))
-
-
-def test_a_turn_is_short_and_the_next_one_goes_on(opened, monkeypatch):
-    monkeypatch.setattr(checkpointing, "PIECE_S", 0.0)
-    with opened() as site:
-        site.drive([8, 8.1, 9])
-        turns = 0
-        while not site.hours:
-            site.job.run()
-            turns += 1
-        assert turns > 2
-        assert site.hours == [9]
 
 
 def test_room_is_kept_to(opened, tmp_path):

@@ -4,27 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
+import numpy as np
 import pytest
 
+from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import LAST_NS, Correction
-from mapserver.fleet.decisions import EVERY_NS
+from mapserver.fleet.correction import LAST_NS, LEVEL_SHARE, Correction
+from mapserver.fleet.decisions import EVERY_NS, SOLVER, CalibrationDecision
 from mapserver.fleet.observability import CommonScale
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
+from mapserver.journal.facts import Facts
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past import past
+from mapserver.past.making import make
+from mapserver.past.plan import HOUR_NS
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import DISTRUST_AFTER, KIND, PERSON, TrustDecision
 from mapserver.trust.judgement import Reason
 from mapserver.upkeep.refolding import Refolding
+from protocol.arrays import Table
 from protocol.errors import QueryError, Refusal
+from tests.reference.correction import in_numpy
+from tests.reference.grid import by_definition, of_grid, plain
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
@@ -33,6 +43,7 @@ from tests.unit.mapserver.data import (
     grid_copy,
     held,
     incoming,
+    open_store,
     open_writer,
     past_of,
     random_samples,
@@ -217,3 +228,145 @@ def test_a_decision_that_the_writer_has_no_time_for_is_not_said_to_be_refused(wr
                 refolds.decide(decision("b"))
         assert refused.value.reason == Refusal.AFTER_TIMEOUT
         wait_for(lambda: refolds.decision("b") == decision("b"))
+
+
+DRIVERS = "abc"
+END_NS = 2**62
+S = 10**9
+MADE = (
+    Correction("a", 0, NOW_NS + 700 * S, 0.02, 0.05, -0.01, ()),
+    Correction("a", NOW_NS + 700 * S, END_NS, -0.03, 0.0, 0.0, (), LEVEL_SHARE),
+    Correction("b", NOW_NS + 300 * S, NOW_NS + 1200 * S, 0.01, -0.2, 0.02, ()),
+)
+
+
+def correction_of(machine: str, corrections: tuple[Correction, ...] = MADE, by: str = SOLVER) -> CalibrationDecision:
+    return CalibrationDecision(machine, by, "", NOW_NS, tuple(one for one in corrections if one.machine == machine))
+
+
+def by_reference(rows: Table, machine: str, corrections: tuple[Correction, ...]) -> Table:
+    out = rows.copy()
+    for one in corrections:
+        hit = (rows["stamp_ns"] >= one.from_ns) & (rows["stamp_ns"] < one.to_ns) & (one.machine == machine)
+        out[hit] = in_numpy(rows[hit], one)
+    return out
+
+
+class Fleet:
+    def __init__(self, seed: int, n: int = 900) -> None:
+        self.draw = np.random.default_rng(seed)
+        self.rows = {name: random_samples(n, seed=100 * seed + i, half_m=25.0) for i, name in enumerate(DRIVERS)}
+        for rows in self.rows.values():
+            rows["speed_mps"] = self.draw.choice([-1.0, 1.0], n)
+        self.left = {name: self._cut(n) for name in DRIVERS}
+
+    def _cut(self, n: int) -> list[slice]:
+        ends = np.unique(np.r_[0, self.draw.integers(1, n, 12), n]).tolist()
+        return [slice(*ends) for ends in pairwise(ends)]
+
+    def send(self, empty_writer: Writer, batches: int) -> None:
+        for _ in range(batches):
+            name = self.draw.choice([each for each in DRIVERS if self.left[each]])
+            part = self.left[name].pop(0)
+            send(empty_writer, [incoming(self.rows[name][part], part.start + 1, name)])
+
+    def sent(self, name: str) -> Table:
+        return self.rows[name][: self.left[name][0].start if self.left[name] else None]
+
+    def folded(self, corrections: tuple[Correction, ...], to_ns: int = END_NS, without: str = "") -> Grid:
+        grid = Grid(SITE.cell_m, CONFIG.fold)
+        for name in sorted(set(DRIVERS) - set(without)):
+            rows = by_reference(self.sent(name), name, corrections)
+            grid.fold(rows[rows["stamp_ns"] <= to_ns], name)
+        return grid
+
+
+@pytest.fixture
+def empty_writer(tmp_path: Path) -> Iterator[Writer]:
+    with closing(open_writer(tmp_path)) as opened:
+        yield opened
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_any_batching_any_order_and_any_time_of_the_decision_give_one_map(empty_writer, tmp_path, seed):
+    fleet = Fleet(seed)
+    with closing(Refolding(empty_writer, past_of(empty_writer))) as refolds:
+        fleet.send(empty_writer, int(fleet.draw.integers(1, 20)))
+        refolds.wait(refolds.decide(correction_of("a")), WAIT_S)
+        assert same(empty_writer.run(grid_copy), fleet.folded(correction_of("a").corrections))
+        fleet.send(empty_writer, 6)
+        number = refolds.decide(correction_of("b"))
+        fleet.send(empty_writer, 6)
+        refolds.wait(number, WAIT_S)
+        live = empty_writer.run(grid_copy)
+        assert same(live, fleet.folded(MADE))
+        assert empty_writer.run(lambda store: store.version.fact) == 2
+        reference = [(name, by_reference(fleet.sent(name), name, MADE)) for name in DRIVERS]
+        assert plain(of_grid(live)) == plain(by_definition(reference, SITE.cell_m, CONFIG.fold))
+    empty_writer.close()
+    for path in tmp_path.glob("snapshot-*"):
+        path.unlink()
+    with closing(open_store(tmp_path)) as store:
+        assert same(store.grid, live)
+        assert store.fact == 2
+
+
+def test_a_correction_of_a_machine_that_is_left_out_folds_nothing_and_counts_when_it_comes_back(empty_writer):
+    fleet = Fleet(8)
+    fleet.send(empty_writer, 12)
+    with closing(Refolding(empty_writer, past_of(empty_writer))) as refolds:
+        refolds.wait(refolds.decide(TrustDecision("b", False, PERSON, "why", NOW_NS)), WAIT_S)
+        grid = empty_writer.run(lambda store: store.grid)
+        refolds.wait(refolds.decide(correction_of("b")), WAIT_S)
+        assert empty_writer.run(lambda store: store.grid) is grid
+        assert empty_writer.run(lambda store: store.fact) == 2
+        refolds.wait(refolds.decide(TrustDecision("b", True, PERSON, "mended", NOW_NS)), WAIT_S)
+        assert same(empty_writer.run(grid_copy), fleet.folded(correction_of("b").corrections))
+
+
+def test_maps_of_the_past_have_the_facts_of_now_and_a_checkpoint_that_lacks_them_is_not_used(empty_writer):
+    fleet, past = Fleet(9), past_of(empty_writer)
+    for name in DRIVERS:
+        fleet.rows[name]["stamp_ns"] += np.arange(900) // 300 * HOUR_NS
+    fleet.send(empty_writer, 30)
+    later = tuple(replace(one, from_ns=one.from_ns and one.from_ns + HOUR_NS) for one in MADE[1:])
+    later = tuple(replace(one, to_ns=max(one.to_ns, one.from_ns + HOUR_NS)) for one in later)
+    with (
+        closing(Refolding(empty_writer, past)) as refolds,
+        SqliteReader(empty_writer.location.folder / JOURNAL_FILE) as reader,
+    ):
+        for hour in (1, 2, 3):
+            assert list(make(past, reader, NOW_NS + hour * HOUR_NS, empty_writer.run(lambda store: store.facts)))
+        for name in "ab":
+            refolds.wait(refolds.decide(correction_of(name, later)), WAIT_S)
+        facts = empty_writer.run(lambda store: store.facts)
+        entries = past.checkpoints.entries(past.depends_on(reader, facts), reader.last_row)
+        assert [entry.usable for entry in entries] == [True, False, False], "an hour that they do not touch stays"
+        for hours in (0.4, 1.0, 1.3, 2.2, 5.0):
+            to_ns = NOW_NS + round(hours * HOUR_NS)
+            assert same(past.grid_as_of(reader, to_ns, facts=facts), fleet.folded(later, to_ns))
+        assert same(empty_writer.run(grid_copy), fleet.folded(later))
+        assert list(make(past, reader, NOW_NS + 2 * HOUR_NS, facts))
+        assert same(
+            past.grid_as_of(reader, NOW_NS + 2 * HOUR_NS, facts=facts), fleet.folded(later, NOW_NS + 2 * HOUR_NS)
+        )
+
+
+def test_a_snapshot_that_lacks_a_fact_is_folded_again(tmp_path):
+    fleet = Fleet(11)
+    with closing(open_writer(tmp_path)) as empty_writer:
+        fleet.send(empty_writer, 15)
+    files = tmp_path.glob("snapshot-*")  # a slow machine may have made one before
+    old = max(files, key=lambda path: int(path.stem.removeprefix("snapshot-")))
+    assert snapshot.load(old, SITE.cell_m, CONFIG.fold, Facts().of_evidence())
+    with closing(open_store(tmp_path)) as store:
+        store.decide(correction_of("a"))
+        assert store.fact == 0, "killed before the map was folded again"
+    with closing(open_store(tmp_path)) as store:
+        assert same(store.grid, fleet.folded(correction_of("a").corrections))
+        assert (store.snapshot_row, store.fact) == (0, 1)
+        store.save_snapshot()
+    with closing(open_store(tmp_path)) as store:
+        assert store.snapshot_row == store.merged, "the new one has it"
+        assert same(store.grid, fleet.folded(correction_of("a").corrections))
