@@ -245,7 +245,7 @@ def test_a_journal_of_another_site_or_frame_is_refused(place):
     ],
 )
 def test_damage_is_found_on_opening(place, monkeypatch, change, problem):
-    monkeypatch.setattr("mapserver.journal.queries._EXTENTS_AT_ONCE", 2)  # read in two pieces
+    monkeypatch.setattr("mapserver.journal.table_queries._EXTENTS_AT_ONCE", 2)  # read in two pieces
     with closing(place.open()) as journal:
         write(journal, admission(), admission(1, 4), admission(1, 5))
         for stamp_ns in (5, 6):

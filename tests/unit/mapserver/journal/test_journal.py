@@ -22,7 +22,7 @@ from mapserver.journal.shortfall import KIND, Shortfall, SpoolShortfall, missing
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteQueries, SqliteReader
 from mapserver.journal.stamp_index import StampIndex
-from mapserver.journal.writing import meta_line
+from mapserver.journal.table_writer import meta_line
 from protocol.disk.high_water_mark import mark_path
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
