@@ -2,13 +2,11 @@
 
 import numpy as np
 
-from mapserver.change.detection import ChangeConfig
-from mapserver.change.validity import valid_pages
 from mapserver.fleet.calibration import calibrate
 from mapserver.fleet.ledger import Ledger
 from mapserver.trust.auditor import Auditor
 from protocol.machine.samples import GRADE, RESISTANCE
-from tests.unit.mapserver.roads.drives import EVERYWHERE, along, grid_of, passes
+from tests.unit.mapserver.roads.drives import along, passes
 
 LINE = along([(10, 10), (110, 10)])
 
@@ -18,14 +16,6 @@ def nothing_measured(rows):
     for name in (*RESISTANCE, *GRADE):
         rows[name] = np.nan
     return rows
-
-
-def test_they_change_no_ground():
-    true, blind = passes(LINE, 30), nothing_measured(passes(LINE, 30, seed=1, after_s=3600.0))
-    grid = grid_of(true, blind)
-    blocks = grid.blocks_in(EVERYWHERE)
-    first = valid_pages(dict(zip(blocks, grid.pages(blocks), strict=True)), 1.0, ChangeConfig())
-    assert not any(index.any() for index in first.values())
 
 
 def test_a_machine_that_sends_nothing_else_is_not_judged_and_accuses_nobody():

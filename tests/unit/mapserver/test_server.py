@@ -1,5 +1,6 @@
 import threading
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -29,18 +30,7 @@ from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    WAIT_S,
-    batch,
-    held,
-    now_ns,
-    routed,
-    samples,
-    wait_for,
-)
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, WAIT_S, batch, held, now_ns, routed, samples, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -144,29 +134,20 @@ def test_a_bug_in_a_query_is_answered(served, monkeypatch):
 @pytest.mark.parametrize(("query_threads", "together"), [(1, False), (2, True)])
 def test_so_many_queries_are_answered_at_once(sessions, tmp_path, monkeypatch, query_threads, together):
     router, client = sessions
-    server = Server(
-        router, router, JournalLocation(tmp_path), SITE, replace(CONFIG, query_threads=query_threads), now_ns
-    )
-    both = threading.Barrier(2)
-    met = []
+    config = replace(CONFIG, query_threads=query_threads)
+    both, met = threading.Barrier(2), []
 
-    def meet(_) -> dict[str, object]:
-        try:
+    def meet() -> dict[str, object]:
+        with suppress(threading.BrokenBarrierError):
             both.wait(WAIT_S if together else 0.2)
-        except threading.BrokenBarrierError:
-            met.append(False)
-        else:
             met.append(True)
         return {}
 
-    monkeypatch.setattr(server.answers, "info", lambda: meet(None))
-    askers = [threading.Thread(target=ask, args=(client, InfoQuery())) for _ in range(2)]
-    for asker in askers:
-        asker.start()
-    for asker in askers:
-        asker.join()
-    server.close()
-    assert met == [together] * 2
+    with closing(Server(router, router, JournalLocation(tmp_path), SITE, config, now_ns)) as server:
+        monkeypatch.setattr(server.answers, "info", meet)
+        with ThreadPoolExecutor() as threads:
+            list(threads.map(ask, [client] * 2, [InfoQuery()] * 2))
+    assert len(met) == 2 * together
 
 
 def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):

@@ -11,16 +11,6 @@ from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples,
 EVERYTHING = CellWindow(-(2**20), -(2**20), 2**21, 2**21)
 
 
-def test_an_empty_grid_knows_nothing():
-    grid = Grid(1.0, FoldConfig())
-    assert grid.bounds() is None
-    assert grid.known_cells() == 0
-    assert grid.blocks_in(EVERYTHING) == []
-    assert grid.evidence([(0, 0)]).counts.sum() == 0
-    grid.fold(samples(0), "a")
-    assert len(grid.state().pages) == 0
-
-
 @pytest.mark.parametrize(
     ("window", "expected"),
     [

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sqlite3
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -22,6 +23,7 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import LAST
+from mapserver.journal.table_writer import meta_line
 from mapserver.past.making import make
 from mapserver.past.past import Past
 from mapserver.trust.decisions import PERSON, TrustDecision
@@ -231,6 +233,19 @@ def test_a_journal_that_went_another_course_is_noticed_and_folded_again(tmp_path
             assert one.run(lambda replica: replica.facts.excluded) == excluded == set(theirs.decides)
             deliver(writer, 7)
             catches_up(one, writer)
+        assert caplog.text.count("rows are gone") == 1
+
+
+def test_an_epoch_that_is_lower_than_before_is_noticed(tmp_path, caplog):
+    with closing(open_writer(tmp_path)) as writer:
+        deliver(writer, 1)
+    open_writer(tmp_path).close()
+    with following(tmp_path) as one:
+        wait_for(lambda: version(one) is not None)
+        with closing(sqlite3.connect(tmp_path / "journal.db", isolation_level=None)) as db:
+            db.execute("REPLACE INTO meta VALUES (?, ?, ?)", meta_line("epoch", "1"))
+        wait_for(lambda: "rows are gone" in caplog.text)
+        wait_for(lambda: version(one) is not None)
         assert caplog.text.count("rows are gone") == 1
 
 

@@ -217,20 +217,6 @@ def test_a_run_that_is_bound_to_another_store_is_refused_until_a_person_accepts_
         assert store.commit([incoming(samples(1), 6, store=store.identity.id)])[0].replaces == ""
 
 
-def test_the_version_of_the_map_names_the_last_decision_that_counts_in_it(tmp_path):
-    with closing(open_store(tmp_path)) as store:
-        store.commit([incoming(samples(2)), incoming(samples(2), machine="b")])
-        assert (store.version.row, store.version.fact) == (2, 0)
-        store.decide(TrustDecision("a", trusted=True, by="person", reason="", stamp_ns=1))
-        assert store.fact == 1  # it changes nothing in the map, so it counts at once
-        store.decide(TrustDecision("b", trusted=False, by="person", reason="moved", stamp_ns=1))
-        assert store.fact == 1
-        store.adopt(folded(samples(2)), 2, Facts(frozenset({"b"})))
-        assert store.fact == 2
-    with closing(open_store(tmp_path)) as store:
-        assert (store.version.row, store.version.fact) == (2, 2)
-
-
 DAY = 86_400 * 10**9
 
 

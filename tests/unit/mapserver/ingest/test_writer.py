@@ -10,8 +10,6 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
@@ -19,7 +17,7 @@ from mapserver.ingest import backlog, merge_waits, snapshot_times
 from mapserver.ingest import writer as writer_module
 from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, GROUP_BYTES, MOST_RETRY_S, Backlog, Pace
 from mapserver.ingest.merge_waits import MergeWaits
-from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE, SnapshotTimes
+from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
 from mapserver.journal.sqlite.journal import SqliteJournal
@@ -192,18 +190,6 @@ def test_nobody_looks_while_the_owner_commits(start, monkeypatch):
         asker.join(WAIT_S)
     assert both
     assert all(folded == 2 * merged for merged, folded in both)
-
-
-@given(st.lists(st.tuples(st.floats(0.001, 100), st.integers(0, 2 * RESTART_SAMPLES)), min_size=1), st.floats(0.1, 600))
-def test_snapshots_never_take_more_than_their_share_of_the_time(snapshots, every_s):
-    times, now_s, spent_s, first_s = SnapshotTimes(every_s, 0.0), 0.0, 0.0, 0.0
-    for took_s, behind in snapshots:
-        now_s = max(now_s, times.due_s(behind))
-        first_s = first_s if spent_s else now_s
-        assert spent_s <= SHARE * (now_s - first_s) * (1 + 1e-9)
-        times.began(now_s)
-        now_s, spent_s = now_s + took_s, spent_s + took_s
-        times.ended(now_s)
 
 
 class Clock:

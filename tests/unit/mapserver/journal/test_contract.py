@@ -134,13 +134,6 @@ def test_nothing_of_an_open_transaction_is_read_or_stays(place, journal, reader)
     assert journal.machines()["a"].samples == 4
 
 
-def test_an_empty_transaction_is_no_row(journal, reader):
-    before = reader.state()
-    journal.begin()
-    journal.commit()
-    assert reader.state() == before
-
-
 def test_lost_samples_are_summed_and_move_the_watermark_alone(journal, reader):
     write(journal, admission(), admission(2, 6, lost=2), admission(1, 9, lost=1))
     journal.begin()

@@ -191,14 +191,6 @@ def test_spans_machines_and_times_of_a_history_can_be_chosen(two_drives):
     assert nowhere.evidence.counts.shape == (0, 1, ev.COUNTS)
 
 
-@pytest.mark.parametrize("span_ns", [1, S, 10**18])
-def test_spans_may_be_of_any_length(tmp_path, span_ns):
-    with closing(PastStore(tmp_path)) as two_drives:
-        two_drives.add(samples(3, stamp_ns=[NOW_NS, NOW_NS + 1, NOW_NS + S]))
-        past = cell_history(two_drives.past, two_drives.reader, (8, 8), span_ns)
-    assert past.first_ns.tolist() == sorted({stamp // span_ns * span_ns for stamp in (NOW_NS, NOW_NS + 1, NOW_NS + S)})
-
-
 def test_cells_are_those_of_the_grid(tmp_path):
     with closing(PastStore(tmp_path, 0.5)) as two_drives:
         two_drives.add(samples(1, x_m=-0.25, y_m=20.75))

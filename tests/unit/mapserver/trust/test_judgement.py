@@ -12,7 +12,7 @@ from mapserver.fleet.observability import FAULT_SIGMAS, MachineState
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.journal.rows import Event
 from mapserver.trust.auditor import Verdict
-from mapserver.trust.coarse_map import LEVEL_FLOOR, CoarseMap, Surface, map_cell_m, pooled
+from mapserver.trust.coarse_map import LEVEL_FLOOR, CoarseMap, Surface, pooled
 from mapserver.trust.comparison import ZERO_ERROR, Difference, Gain
 from mapserver.trust.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER, TrustDecision, TrustDecisions
 from mapserver.trust.judgement import (
@@ -84,8 +84,6 @@ def test_between_maps_that_have_nothing_in_common_gain_and_offset_mean_nothing(c
     assert {judgement.state for judgement in judge(None, sigmas=0.0).values()} == {UNKNOWN}
 
 
-# --- sensors ---------------------------------------------------------------------------------------------------------
-
 STATE = MachineState(0.0, 0.001, 0.0, 0.01, 0.0, 0.001, ("heights",), ("edges",), (0.0, 0.0))
 ZERO_LIMIT, SCALE_LIMIT = FAULT_SIGMAS
 
@@ -122,9 +120,6 @@ def test_faults_are_named_as_long_as_half_of_the_machines_are_right(
     assert faulty([known[each] for each in at_fault]) == expected
 
 
-# --- votes -----------------------------------------------------------------------------------------------------------
-
-
 def states(n: int, *against: tuple[int, int], unknown: tuple[tuple[int, int], ...] = ()) -> Ints:
     matrix = np.full((n, n), AGREE)
     np.fill_diagonal(matrix, UNKNOWN)
@@ -150,9 +145,6 @@ def states(n: int, *against: tuple[int, int], unknown: tuple[tuple[int, int], ..
 )
 def test_the_larger_side_that_agrees_in_itself_outvotes(matrix: Ints, expected: list[tuple[int, ...]]) -> None:
     assert outvoted(matrix) == expected
-
-
-# --- clocks ----------------------------------------------------------------------------------------------------------
 
 
 def judged(sent: Iterator[tuple[str, float]]) -> int:
@@ -215,11 +207,6 @@ def test_a_pooled_map_without_one_of_its_parts_is_the_map_of_the_rest() -> None:
     assert np.array_equal(rest.codes, other.codes)
     assert np.array_equal(rest.sums, other.sums)
     assert len(pooled([]).codes) == 0
-
-
-@pytest.mark.parametrize(("cell_m", "expected"), [(1.0, 2.0), (0.5, 2.0), (0.7, 2.1), (5.0, 5.0)])
-def test_cells_are_whole_cells_of_the_site(cell_m: float, expected: float) -> None:
-    assert map_cell_m(cell_m) == pytest.approx(expected)
 
 
 BAD = Verdict("c", (Reason.GAIN, Reason.OFFSET), {"gain": 1.6}, True)

@@ -19,15 +19,7 @@ from mapserver.past.plan import HOUR_NS
 from mapserver.upkeep import checkpointing
 from mapserver.upkeep.checkpointing import RESERVE_BYTES, Checkpointing
 from protocol.arrays import Table
-from tests.unit.mapserver.data import (
-    NOW_NS,
-    SITE,
-    incoming,
-    past_of,
-    random_samples,
-    same,
-    send,
-)
+from tests.unit.mapserver.data import NOW_NS, SITE, incoming, past_of, random_samples, same, send
 
 TURNS = 500
 

@@ -126,13 +126,6 @@ def test_batches_are_acknowledged_during_a_fold_and_are_in_the_map_afterwards(wr
         assert same(writer.run(grid_copy), map_without("b", 12))
 
 
-def test_where_batches_never_end_the_writer_has_them_wait(writer, monkeypatch):
-    monkeypatch.setattr(past, "FEW_ROWS", -1)
-    with closing(Refolding(writer, past_of(writer))) as refolds:
-        refolds.wait(refolds.decide(decision("b")), WAIT_S)
-    assert same(writer.run(grid_copy), map_without("b", 5))
-
-
 def test_decisions_during_a_fold_are_folded_together_and_the_old_fold_is_given_up(writer, fold):
     with closing(Refolding(writer, past_of(writer))) as refolds:
         first = refolds.decide(decision("b"))

@@ -293,13 +293,3 @@ def test_corrected_samples_are_judged_also_those_that_came_before_the_correction
     audit.run()
     assert not audit.verdicts["c"].contradicts
     assert not any(audit.verdicts[name].contradicts for name in "abd")
-
-
-@pytest.mark.parametrize(("judge_s", "times"), [(1e-9, 3), (60.0, 1)])
-def test_machines_are_judged_so_often(store, judge_s, times):
-    writer, reader = store
-    reports: list[Any] = []
-    audit = audit_of(writer, reader, lambda *report: reports.append(report), judge_s)
-    for _ in range(3):
-        audit.run()
-    assert len(reports) == times
