@@ -8,8 +8,6 @@ from mapserver.evidence.grid_state import GridCounts
 from protocol.site.geometry import CellWindow
 from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
 
-EVERYTHING = CellWindow(-(2**20), -(2**20), 2**21, 2**21)
-
 
 @pytest.mark.parametrize(
     ("window", "expected"),

@@ -288,7 +288,7 @@ MACHINES = ("loader-1", "loader-2")
 BATCHES, SAMPLES = 10, 100  # of each machine, of each batch
 
 
-def sends(journal: SqliteJournal, machine: str, first_seq: int, n: int = SAMPLES, lost: int = 0) -> None:
+def send(journal: SqliteJournal, machine: str, first_seq: int, n: int = SAMPLES, lost: int = 0) -> None:
     put(journal, batch(random_samples(n, first_seq), first_seq, machine=machine), lost=lost)
 
 
@@ -299,7 +299,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with closing(open_journal(work)) as journal:
         for i in range(BATCHES):
             for machine in MACHINES:
-                sends(journal, machine, 1 + i * SAMPLES)
+                send(journal, machine, 1 + i * SAMPLES)
             if i == BATCHES // 2:
                 journal.append_event("trust", NOW_NS, {"machine": "loader-2"})
         shutil.copytree(work, left, dirs_exist_ok=True)
@@ -376,9 +376,9 @@ def test_what_is_gone_is_remembered_until_it_is_sent_again_or_declared_lost(fold
     with closing(open_journal(folder)) as journal:
         assert journal.shortfall is None, "it is named once"
         assert gone_of(journal) == before, "and counted for ever"
-        sends(journal, "loader-1", reached["loader-1"] + 1)  # it still has some
+        send(journal, "loader-1", reached["loader-1"] + 1)  # it still has some
         assert gone_of(journal) == {**before, "loader-1": before["loader-1"] - SAMPLES}
-        sends(journal, "loader-1", 1001, lost=1000 - reached["loader-1"] - SAMPLES)  # and declares the others
+        send(journal, "loader-1", 1001, lost=1000 - reached["loader-1"] - SAMPLES)  # and declares the others
         assert gone_of(journal) == {"loader-2": before["loader-2"]}
         assert journal.watermark("loader-1", 7).lost == before["loader-1"] - SAMPLES
 
@@ -403,10 +403,10 @@ def test_a_log_with_damage_is_kept_for_a_person(folder):
 
 def test_a_journal_from_a_backup_beside_a_newer_mark_is_named(folder, tmp_path):
     with closing(open_journal(folder)) as journal:
-        sends(journal, "loader-1", 1001)
+        send(journal, "loader-1", 1001)
     shutil.copy(folder / "journal.db", tmp_path / "backup.db")
     with closing(open_journal(folder)) as journal:
-        sends(journal, "loader-1", 1101, n=40)
+        send(journal, "loader-1", 1101, n=40)
     shutil.copy(tmp_path / "backup.db", folder / "journal.db")
     with closing(open_journal(folder)) as journal:
         assert journal.shortfall == Shortfall(21, 22, 1, 1, (SpoolShortfall("loader-1", 7, 1100, 1140),))

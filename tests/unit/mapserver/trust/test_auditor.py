@@ -89,13 +89,10 @@ def fleet(seed: int, *machines: dict[str, Any], **all_of_them: Any) -> list[Tabl
 GOOD: dict[str, Any] = {}
 BAD = {
     "gain": ([{"gain": 1.6}], [Reason.GAIN]),
-    "small gain": ([{"gain": 1.25}], [Reason.GAIN]),
     "weak": ([{"gain": 0.7}], [Reason.GAIN]),
     "stuck": ([{"stuck": 0.04}], [Reason.STUCK]),
     "fast clock": ([{"clock_s": 3600.0}], [Reason.CLOCK]),
-    "slow clock": ([{"clock_s": -3600.0}], [Reason.CLOCK]),
     "displaced": ([{"off_m": (3.5, 0.0), "km": 10.8}], [Reason.OFFSET]),
-    "two of five": ([{"gain": 1.6}, {"stuck": 0.04}], [Reason.GAIN, Reason.STUCK]),
     "two alike of five": ([{"gain": 1.6}, {"gain": 1.6}], [Reason.GAIN, Reason.GAIN]),
     "mirrored site": ([{"site": SITE[::-1, ::-1]}], [Reason.DISAGREES]),
 }
@@ -156,14 +153,10 @@ def test_a_machine_at_fault_is_no_measure_for_the_others() -> None:
 HONEST = {
     "alike": [GOOD] * 4,
     "one far better": [{"std_m": 0.05}] + [{"std_m": 2.5}] * 3,
-    "one poorer": [GOOD] * 3 + [{"std_m": 2.5}],
     "scales of 5 %": [{"gain": 0.95}, GOOD, GOOD, {"gain": 1.05}],
-    "zero errors": [{"zero": -0.003}, GOOD, {"zero": 0.003}, {"zero": 0.003}],
     "zero errors on concrete": [{"zero": z, "site": 0 * SITE} for z in (0.0, 0.0, 0.003)],
-    "one class": [{"site": DIRT}] * 3,
     "stuck where nothing varies": [{"site": DIRT}] * 3 + [{"site": DIRT, "stuck": 0.04}],
     "repaved for all": [{"later": (600.0, WETTER)}] * 3,
-    "two only": [GOOD, {"gain": 1.6}],
     "two against two": [GOOD, GOOD, {"gain": 1.6}, {"gain": 1.6}],
     "most are wrong": [GOOD, GOOD, {"gain": 1.6}, {"gain": 0.6}, {"gain": 2.5}],
     "alone": [GOOD],
