@@ -41,7 +41,7 @@ from tests.unit.mapserver.data import (
     samples,
 )
 
-pytest.importorskip("pyarrow.parquet")
+pq = pytest.importorskip("pyarrow.parquet")
 PARTS = {name: np.split(random_samples(200, seed, half_m=25.0), 10) for seed, name in enumerate("ab")}
 
 
@@ -139,7 +139,6 @@ def test_an_error_of_what_is_made_ahead_comes_in_its_place():
         next(coming)
 
 
-pq = pytest.importorskip("pyarrow.parquet")
 FUTURE = NOW_NS + 1000 * HOUR_NS
 
 

@@ -1,4 +1,4 @@
-"""Which checkpoints of a store can be used."""
+"""Checkpoints: which there should be, how they are made and kept in a file, and which can be used."""
 
 import shutil
 import tempfile

@@ -1,4 +1,4 @@
-"""Maps of the past, and what is read for them."""
+"""Maps of the past and histories of cells, and what is read for them."""
 
 from contextlib import closing
 
@@ -142,7 +142,6 @@ def test_a_damaged_checkpoint_is_passed_over_counted_and_never_used(tmp_path, at
         assert same(store.as_of(NOW_NS + 3 * HOUR_NS), store.folded(NOW_NS + 3 * HOUR_NS))
 
 
-pytest.importorskip("pyarrow.parquet")
 CELL, PLACE, BLOCK = (-3, 7), 16 * 7 + 13, (-1, 0)
 SPAN_NS = 300 * S
 

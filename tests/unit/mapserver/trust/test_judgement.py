@@ -1,4 +1,4 @@
-"""Judgements: each limit from both sides, votes, clocks."""
+"""Judgements: each limit from both sides, votes, clocks; decisions that come of them."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, replace

@@ -1,4 +1,4 @@
-"""Maps folded again beside the writer: decisions, batches and the end meanwhile; decisions on a full disk."""
+"""Maps folded again beside the writer, for decisions of trust and for corrections: all are one fold, bit for bit."""
 
 from __future__ import annotations
 
