@@ -51,12 +51,6 @@ def test_a_second_server_is_refused_in_one_line_and_the_first_goes_on(network: N
         assert (first.held, first.ended, second.held) == (True, "", False)
 
 
-def test_a_server_of_another_site_is_no_rival(network: Network):
-    with network.writer(FIRST), closing(WriterClaim(network.session(), "hill", SECOND)) as other:
-        other.acquire()
-        assert other.held
-
-
 def test_a_server_that_takes_over_waits_until_the_other_one_has_ended(network: Network):
     with ExitStack() as opened, ThreadPoolExecutor() as threads:
         with network.writer(FIRST) as first:

@@ -140,13 +140,6 @@ def test_a_change_stays_found_where_the_rest_of_its_block_is_driven_on(days):
     assert np.allclose(resistance(read(grid))[area(1, 1, 8)], NEW, rtol=0.05)
 
 
-def test_late_samples_of_the_time_before_the_change_do_not_count_either():
-    grid = repaved(-5, 4, 10)
-    late = lane(0, -32, -32, 64, 64, c_rr=OLD)
-    grid.fold(late, "b")
-    assert np.allclose(resistance(read(grid))[area(-5, 4, 10, -1)], NEW, rtol=0.05)
-
-
 def test_bits_and_newest_stamp_are_those_of_the_evidence_that_holds():
     now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
     outside = ~area(-5, 4, 10, 1)

@@ -130,8 +130,3 @@ def test_blocks_are_touched_once_until_they_are_folded_into_again():
     grid.touch_all()
     assert len(grid.take_touched(1)) == len(grid.take_touched(1)) == 1
     assert grid.take_touched(1) == []
-
-
-def test_a_sample_that_adds_nothing_touches_nothing():
-    grid = folded(samples(2, x_m=[8.0, 40.0], distance_m=[0.0, 1.0], cov_xx_m2=[0.0, 100.0]))
-    assert grid.take_touched(9) == []
