@@ -166,7 +166,7 @@ def grid_of(parts: Batches, waiting_rows: int = LIVE_ROWS, cell_m: float = 1.0) 
     return grid
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0]), st.sampled_from([1, 7, 100, 8192]))
 def test_how_many_samples_wait_and_in_which_order_they_come_does_not_matter(seed: int, days: float, rows: int) -> None:
     parts = batches(seed, days=days)
@@ -196,7 +196,7 @@ def test_how_many_threads_fold_does_not_matter(seed: int, days: float, count: in
     assert same(grid, grid_of(parts + more)), "it is an ordinary grid again"
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0, 400.0]), st.integers(1, 4))
 def test_a_merge_of_folds_is_the_fold_of_all(seed: int, days: float, more: int) -> None:
     parts = batches(seed, days=days)

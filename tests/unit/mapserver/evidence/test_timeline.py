@@ -64,7 +64,7 @@ bucket = st.one_of(st.integers(0, 12 * PER_DAY), st.integers(0, 30)).map(lambda 
 keep = st.integers(1, 4)
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(bucket, st.sets(st.integers(0, 3), min_size=1).map(tuple)), min_size=1, max_size=30),
     st.tuples(keep, keep, keep),
@@ -183,8 +183,7 @@ def unpacked(one: Page) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return counts, bitmaps, newest_ns
 
 
-@pytest.mark.slow
-@settings(max_examples=100)
+@settings(max_examples=30)
 @given(st.lists(drawn, max_size=5))
 def test_compact_pages_come_back_to_the_bit(drawn_pages):
     before = packed(drawn_pages)

@@ -269,7 +269,7 @@ def test_an_honest_drive_is_taken_whole_with_gaps_and_jumps(cell_m: float, std_m
 
 
 @pytest.mark.parametrize("distance_m", [0.5, 100.0])
-@pytest.mark.parametrize("stay", [0, 1, 2, 10, 100])  # samples at a place, to and fro by 2 m; 0: on a line, 85 m apart
+@pytest.mark.parametrize("stay", [0, 1, 10, 100])  # samples at a place, to and fro by 2 m; 0: on a line, 85 m apart
 @pytest.mark.parametrize("std_m", [2.9, 50.0])  # of every other sample; a large one has no vote
 def test_whoever_scatters_opens_what_its_metres_pay_for(stay: int, distance_m: float, std_m: float):
     draw, n = np.random.default_rng(2), 2000

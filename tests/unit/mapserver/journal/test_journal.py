@@ -430,5 +430,5 @@ def test_a_watermark_behind_its_rows_ends_the_start(folder):
         assert journal.shortfall is None
         journal._mark.write({"loader-2 " + f"{7:016x}": 1001})
     assert mark.exists()
-    with pytest.raises(StoreError, match="what its sends-ahead log left is damaged; restore the file from a backup"):
+    with pytest.raises(StoreError, match="what its write-ahead log left is damaged; restore the file from a backup"):
         open_journal(folder)

@@ -48,8 +48,8 @@ def test_the_stamp_itself_belongs_to_the_past(tmp_path):
         assert [store.as_of(t).folded for t in (99, 100, 299, 300)] == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("closed_h", [None, 1, 2])
-@pytest.mark.parametrize("cell_m", [0.25, 1.0, 3.0])
+@pytest.mark.parametrize("closed_h", [None, 2])
+@pytest.mark.parametrize("cell_m", [0.25, 3.0])
 def test_a_window_holds_the_same_evidence_as_the_whole(tmp_path, cell_m, closed_h):
     with closing(PastStore(tmp_path, cell_m, FoldConfig(std_cap_m=2.0))) as store:
         for seed, name in enumerate("ab"):

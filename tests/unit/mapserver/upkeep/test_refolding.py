@@ -281,9 +281,8 @@ def empty_writer(tmp_path: Path) -> Iterator[Writer]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_any_batching_any_order_and_any_time_of_the_decision_give_one_map(empty_writer, tmp_path, seed):
-    fleet = Fleet(seed)
+def test_any_batching_any_order_and_any_time_of_the_decision_give_one_map(empty_writer, tmp_path):
+    fleet = Fleet(1)
     with closing(Refolding(empty_writer, past_of(empty_writer))) as refolds:
         fleet.send(empty_writer, int(fleet.draw.integers(1, 20)))
         refolds.wait(refolds.decide(correction_of("a")), WAIT_S)
