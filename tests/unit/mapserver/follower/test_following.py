@@ -18,7 +18,6 @@ from mapserver.follower import follower as edge
 from mapserver.follower import following as module
 from mapserver.follower.follower import Follower
 from mapserver.follower.following import Following
-from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.location import JournalLocation
@@ -45,6 +44,7 @@ from tests.unit.mapserver.data import (
     routed,
     same,
     send,
+    store_at,
     wait_for,
 )
 
@@ -62,7 +62,7 @@ def following(folder: Path, site=SITE, config=CONFIG) -> Iterator[Following]:
 @pytest.mark.parametrize("folder", ["store", "elsewhere"])
 def test_a_follower_of_a_journal_in_postgresql_is_told_of_rows(tmp_path, database, folder):
     location = JournalLocation(tmp_path / "store", database.url)
-    with closing(Writer(Store(location, SITE, CONFIG, now_ns))) as writer:
+    with closing(Writer(store_at(location))) as writer:
         deliver(writer, 1)
         writer.run(lambda store: store.save_snapshot())
         deliver(writer, 2)
@@ -326,7 +326,7 @@ def test_a_fold_beside_that_fails_is_done_again(tmp_path, monkeypatch):
 
 def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_path, database):
     location = JournalLocation(tmp_path / "store", database.url)
-    with closing(Store(location, SITE, CONFIG, now_ns)) as store:
+    with closing(store_at(location)) as store:
         for seed in (1, 2, 3):
             store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
         with location.reader() as reader:
@@ -336,7 +336,7 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
     database.sql(
         "UPDATE sitegrid.head SET last_row = 1; DELETE FROM sitegrid.watermark WHERE spool_id <> '\\x0000000000000001'"
     )
-    with closing(Store(JournalLocation(tmp_path / "other", database.url), SITE, CONFIG, now_ns)) as other:
+    with closing(store_at(JournalLocation(tmp_path / "other", database.url))) as other:
         for seed in (4, 5, 6):  # another host's server goes on
             other.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
         one = Following(location, SITE, CONFIG)
@@ -383,7 +383,7 @@ def test_a_follower_that_cannot_keep_up_is_hidden_until_it_has_caught_up(tmp_pat
 def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_it_is(tmp_path, caplog):
     with server.cluster() as primary, server.replica(primary, "b") as replica:
         database = primary.new_database()
-        with closing(Store(JournalLocation(tmp_path / "store", database.url), SITE, CONFIG, now_ns)) as store:
+        with closing(store_at(JournalLocation(tmp_path / "store", database.url))) as store:
 
             def deliver(seed: int) -> None:
                 store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])

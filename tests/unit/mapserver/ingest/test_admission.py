@@ -13,24 +13,11 @@ from mapserver.evidence.fold_config import FoldConfig
 from mapserver.ingest.admission import GapError, SeenTime, admit, judge
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.block_credit import BlockCredit
-from mapserver.journal.journal import UnwrittenError
 from protocol.arrays import Table
 from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import COLUMNS, LIMITS, SAMPLE_DTYPE
 from protocol.wire.codec import decode_batch, encode_batch
-from protocol.wire.messages import Ack
-from tests.unit.mapserver.data import (
-    NOW_NS,
-    SITE,
-    batch,
-    folded,
-    incoming,
-    now_ns,
-    open_store,
-    random_samples,
-    refused,
-    samples,
-)
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, folded, now_ns, random_samples, refused, samples
 
 
 def numbered(first: int, n: int, **more):
@@ -301,24 +288,3 @@ def test_what_is_refused_earns_nothing_however_often_it_comes_but_driving_on_doe
     assert {taken(credit, liar) for _ in range(20)} == {first}
     rows = samples(4000, x_m=5000 + 0.5 * np.arange(4000), y_m=0.0, distance_m=0.5)  # new ground, two blocks at a time
     assert 3500 < taken(credit, rows) < 4000
-
-
-def test_what_is_refused_or_not_committed_is_neither_journalled_nor_paid_for(tmp_path, monkeypatch):
-    store, rows = open_store(tmp_path), scattered(np.random.default_rng(6), 400)
-    rows["stamp_ns"] = NOW_NS
-
-    def fails() -> None:
-        raise UnwrittenError("journal", "the disk is full")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(store.journal, "commit", fails)
-        lost = [store.commit([incoming(rows[first : first + 40])])[0] for first in range(50, 400, 40)]
-    assert {answer.reason for answer in lost} == {Refusal.STORE}
-    (refused,) = store.commit([incoming(rows)])
-    assert refused.reason == Refusal.SCATTERED
-    assert store.commit([incoming(rows)]) == [refused]
-    assert isinstance(store.commit([incoming(rows[:50])])[0], Ack)
-    (overlapping,) = store.commit([incoming(rows[:300])])
-    assert 50 <= int(overlapping.problem.removeprefix("x_m[").split("]")[0]) < 300, "rows count as they were sent"
-    assert (store.journal.samples, store.counters["refused_scattered"]) == (50, 3)
-    store.close()

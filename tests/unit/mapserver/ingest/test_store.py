@@ -41,6 +41,7 @@ from tests.unit.mapserver.data import (
     random_samples,
     same,
     samples,
+    store_at,
     wait_for,
 )
 
@@ -105,6 +106,26 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
     assert [(a.watermark, a.trimmed) for a in again] == [(5, 0), (4, 0)]
     assert store.grid.folded == 9
     assert store.info()["machines"]["b"] == counts(1, 4, 0, NOW_NS + 3 * 10**9)
+
+
+def test_what_is_refused_or_not_committed_is_neither_journalled_nor_paid_for(store, monkeypatch):
+    x_m, y_m = np.random.default_rng(6).uniform(-2e4, 2e4, (2, 400))
+    rows = samples(400, x_m=x_m, y_m=y_m, cov_xx_m2=8.9, cov_yy_m2=8.9, stamp_ns=NOW_NS)
+
+    def fails() -> None:
+        raise UnwrittenError("journal", "the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store.journal, "commit", fails)
+        lost = [store.commit([incoming(rows[first : first + 40])])[0] for first in range(50, 400, 40)]
+    assert {answer.reason for answer in lost} == {Refusal.STORE}
+    (refused,) = store.commit([incoming(rows)])
+    assert refused.reason == Refusal.SCATTERED
+    assert store.commit([incoming(rows)]) == [refused]
+    assert isinstance(store.commit([incoming(rows[:50])])[0], Ack)
+    (overlapping,) = store.commit([incoming(rows[:300])])
+    assert 50 <= int(overlapping.problem.removeprefix("x_m[").split("]")[0]) < 300, "rows count as they were sent"
+    assert (store.journal.samples, store.counters["refused_scattered"]) == (50, 3)
 
 
 def test_info_tells_the_state_in_plain_values(store):
@@ -409,10 +430,6 @@ def standby(tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch)
         yield made
 
 
-def opened_at(location: JournalLocation) -> Store:
-    return Store(location, SITE, CONFIG, now_ns)
-
-
 def send(store: Store, first: int, last: int, machine: str = "a") -> None:
     for seq in range(first, last + 1):
         store.commit([incoming(random_samples(1, seq), seq, machine)])
@@ -424,7 +441,7 @@ def is_fold(standby: Standby, journal: JournalQueries, without: frozenset[str] =
 
 @pytest.mark.parametrize("warm_rows", [0, 2])
 def test_before_a_damaged_row_it_waits_and_folds_nothing_twice(location, standby, warm_rows, database):
-    with closing(opened_at(location)) as store:
+    with closing(store_at(location)) as store:
         send(store, 1, warm_rows)
         if warm_rows:
             standby.follow(5.0)
@@ -443,7 +460,7 @@ def test_before_a_damaged_row_it_waits_and_folds_nothing_twice(location, standby
 
 
 def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
-    with closing(opened_at(location)) as store:
+    with closing(store_at(location)) as store:
         send(store, 1, 2)
         standby.follow(5.0)
         row, grid = standby.grid_for(store.journal, store.facts)
@@ -469,13 +486,13 @@ def restore(database: Database, row: int) -> None:
 
 @pytest.mark.parametrize("rows_since", [0, 2, 4, 6])
 def test_a_database_that_is_restored_within_an_epoch_is_folded_again(location, standby, database, rows_since):
-    with closing(opened_at(location)) as store:
+    with closing(store_at(location)) as store:
         send(store, 1, 4)
         standby.follow(5.0)
         assert standby.has_checked(store.journal)
     restore(database, 1)
     epoch = database.sql("SELECT epoch FROM sitegrid.head")[0][0]
-    with closing(opened_at(location)) as store:
+    with closing(store_at(location)) as store:
         send(store, 1, rows_since, machine="b")
         database.sql(f"UPDATE sitegrid.head SET epoch = {epoch}")
         assert not standby.has_checked(store.journal)
@@ -489,7 +506,7 @@ def test_a_database_that_is_restored_within_an_epoch_is_folded_again(location, s
 
 def test_a_decision_of_another_course_is_not_kept(location, standby, database):
     """A restored database may have another decision under the number of one that is gone."""
-    with closing(opened_at(location)) as store:
+    with closing(store_at(location)) as store:
         send(store, 1, 4)
         send(store, 1, 4, machine="b")
         store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
@@ -497,7 +514,7 @@ def test_a_decision_of_another_course_is_not_kept(location, standby, database):
         assert standby._facts.excluded == {"b"}
     restore(database, 2)
     database.sql("DELETE FROM sitegrid.events; UPDATE sitegrid.head SET last_event = 0")
-    with closing(opened_at(location)) as store:
+    with closing(store_at(location)) as store:
         events = store.journal.state().event
         store.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
         assert events == 1, "what is missing is an event"

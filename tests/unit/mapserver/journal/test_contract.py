@@ -23,18 +23,7 @@ from protocol.site.geometry import Bounds
 from protocol.wire.codec import pack, unpack
 from protocol.wire.messages import Ack, Refused
 from tests.postgres_server import Database
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    batch,
-    fold_of,
-    incoming,
-    now_ns,
-    random_samples,
-    same,
-    samples,
-)
+from tests.unit.mapserver.data import NOW_NS, SITE, batch, fold_of, incoming, random_samples, same, samples, store_at
 
 
 @dataclass
@@ -48,7 +37,7 @@ class Place:
         return self.location.open(site, frame)
 
     def store(self) -> Store:
-        return Store(self.location, SITE, CONFIG, now_ns)
+        return store_at(self.location)
 
 
 @pytest.fixture(params=["sqlite", "postgres"])

@@ -28,18 +28,7 @@ from protocol.errors import ConfigError, StoreError
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
 from tests.journals import history_beside
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    batch,
-    incoming,
-    open_store,
-    put,
-    random_samples,
-    same,
-    samples,
-)
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, put, random_samples, same, samples
 
 pq = pytest.importorskip("pyarrow.parquet")
 PARTS = {name: np.split(random_samples(200, seed, half_m=25.0), 10) for seed, name in enumerate("ab")}
@@ -88,9 +77,10 @@ def test_rows_that_move_while_they_are_read_come_once(tmp_path, where):
 
 @pytest.fixture
 def history(tmp_path: Path) -> Iterator[History]:
-    with closing(open_store(tmp_path)) as store:
+    with closing(SqliteJournal(tmp_path / JOURNAL_FILE, SITE.name, SITE.frame)) as journal:
         for number in range(20):
-            store.commit([incoming(rows_of(name, number), 1 + 25 * number, name) for name in "abc"])
+            for name in "abc":
+                put(journal, batch(rows_of(name, number), 1 + 25 * number, name))
     with SqliteReader(tmp_path / JOURNAL_FILE) as reader:
         yield history_beside(reader)
 

@@ -34,18 +34,7 @@ from protocol.wire.messages import Ack, Refused
 from tests import postgres_server as server
 from tests.postgres_server import Cluster, Database
 from tests.tcp_proxy import Proxy, Weather
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    fold_of,
-    incoming,
-    now_ns,
-    past_of,
-    random_samples,
-    same,
-    wait_for,
-)
+from tests.unit.mapserver.data import CONFIG, SITE, fold_of, incoming, now_ns, past_of, random_samples, same, wait_for
 
 
 def place(folder: Path, database: Database) -> JournalLocation:
@@ -248,12 +237,12 @@ def test_a_decision_whose_answer_is_lost_is_not_called_refused(tmp_path, databas
     with closing(writer), closing(Refolding(writer, past_of(writer))) as refolding:
         LostAnswer(writer._store.journal._session, "INSERT INTO events")
         with pytest.raises(QueryError, match=r"not known whether the decision is kept.*ask for") as caught:
-            refolding.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+            refolding.decide(TrustDecision("b", False, PERSON, "it lies", 1))
         assert caught.value.reason == Refusal.AFTER_TIMEOUT
         with pytest.raises(
             QueryError, match="is not written: a decision was committed whose answer was lost"
         ) as caught:
-            refolding.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
+            refolding.decide(TrustDecision("c", False, PERSON, "it lies", 1))
         assert caught.value.reason == Refusal.NOT_WRITER
     with closing(open_store(tmp_path, database)) as store:
         assert store.facts.excluded == {"b"}

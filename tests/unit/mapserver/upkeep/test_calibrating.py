@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig
 from mapserver.evidence.grid import Grid
 from mapserver.fleet import calibration
-from mapserver.fleet.calibration import Calibration
+from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import corrected
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
+from mapserver.upkeep import calibrating as calibrating_module
 from mapserver.upkeep.calibrating import EVERY_NS, Calibrating
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.arrays import Table
@@ -190,6 +193,49 @@ def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, 
             assert site.calibration().solved_ns > 0
             assert sum(bool(each.spans) for each in site.calibration().machines) == machines
             assert same(writer.run(grid_copy), folded(site, writer))
+
+
+def test_rows_that_cannot_be_read_do_not_keep_the_others_from_counting(writer, tmp_path):
+    deliver(writer)
+    whole = solved(writer)
+    damaged = writer.run(lambda store: store.journal.last_row) // 3
+    with closing(sqlite3.connect(tmp_path / JOURNAL_FILE)) as db, db:
+        (record,) = db.execute("SELECT record FROM journal WHERE row = ?", (damaged,)).fetchone()
+        flipped = record[:-1] + bytes([record[-1] ^ 1])
+        db.execute("UPDATE journal SET record = ? WHERE row = ?", (flipped, damaged))
+    job, _ = calibrating(writer)
+    with closing(job):
+        without = job.solve()[0]
+    assert {*without.machines} == set(DRIVES)
+    assert without != whole
+    for name, state in whole.machines.items():
+        assert without.machines[name].zero == pytest.approx(state.zero, abs=2 * state.zero_std)
+
+
+def test_a_large_fleet_is_solved_in_groups_that_take_turns(writer, monkeypatch):
+    monkeypatch.setattr(calibration, "MOST_MACHINES", 2)
+    monkeypatch.setattr(calibration, "MOST_EPOCHS", 4)
+    together: list[set[str]] = []
+
+    def note(stays: Mapping[str, Table], *more: Any) -> Calibration:
+        together.append({*stays})
+        return calibrate(stays, *more)
+
+    monkeypatch.setattr(calibrating_module, "calibrate", note)
+    deliver(writer, last=0.1)
+    job, _ = calibrating(writer)
+    together.clear()
+    with closing(job):
+        for share in (0.1, 0.4, 0.7):
+            job._due_s = 0.0
+            job.run()
+            deliver(writer, share, share + 0.3)
+        job._due_s = 0.0
+        job.run()
+        assert together == [{"a", "c"}, {"b"}, {"a", "c"}]
+        assert {*job.states()} == set(DRIVES)
+        assert {*job.solve()[0].machines} == set(DRIVES)
+        assert {ledger.epochs for ledger in job._ledgers.values()} == {2}
 
 
 def test_it_says_from_when_on_there_may_be_samples_of_a_machine(writer):
