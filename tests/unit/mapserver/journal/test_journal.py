@@ -236,11 +236,6 @@ def test_totals_begin_with_what_is_on_disk():
 S = 10**9
 
 
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch):
-    monkeypatch.setattr(stamp_index, "CHUNK", 4)
-
-
 def append(journal: SqliteJournal, first_s: int, last_s: int) -> None:
     stamps = NOW_NS + np.array([first_s, last_s]) * S
     put(journal, batch(samples(2, stamp_ns=stamps), 1 + 2 * journal.last_row))
@@ -260,7 +255,8 @@ ROWS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 6)), min_size=1, ma
 )
 def test_no_selected_row_is_passed_over(rows, cut, archived, begin, length):
     selection = Selection(NOW_NS + begin * S, NOW_NS + (begin + length) * S)
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stamp_index, "CHUNK", 4)
         journal = SqliteJournal(Path(folder) / "journal.db", SITE.name, SITE.frame)
         with closing(journal), SqliteReader(journal.path) as reader:
             index = StampIndex()

@@ -193,16 +193,16 @@ ACTIONS = st.one_of(
 @given(actions=st.lists(ACTIONS, min_size=3, max_size=14), ask=st.integers(-1, HOURS * 3600), fine=st.booleans())
 def test_whatever_came_late_was_excluded_or_archived_the_past_is_a_fold_from_the_start(actions, ask, fine):
     to_ns = NOW_NS + ask * S - fine
-    with tempfile.TemporaryDirectory() as folder, closing(PastStore(Path(folder))) as empty_store:
+    with tempfile.TemporaryDirectory() as folder, closing(PastStore(Path(folder))) as store:
         for what, number, more in actions:
             if what == "add":
-                empty_store.add(some_samples(number, 20), more)
+                store.add(some_samples(number, 20), more)
             elif what == "make":
-                empty_store.make(NOW_NS + number * HOUR_NS, more)
+                store.make(NOW_NS + number * HOUR_NS, more)
             else:
-                empty_store.archive(number)
+                store.archive(number)
         for without in ((), ("a",), ("b",)):
-            assert same(empty_store.as_of(to_ns, without), empty_store.folded(to_ns, without))
+            assert same(store.as_of(to_ns, without), store.folded(to_ns, without))
 
 
 @pytest.mark.parametrize("spill", [50, 10**6])

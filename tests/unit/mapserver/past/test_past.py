@@ -191,9 +191,9 @@ def test_spans_machines_and_times_of_a_history_can_be_chosen(two_drives):
 
 
 def test_cells_are_those_of_the_grid(tmp_path):
-    with closing(PastStore(tmp_path, 0.5)) as two_drives:
-        two_drives.add(samples(1, x_m=-0.25, y_m=20.75))
-        past = cell_history(two_drives.past, two_drives.reader, (-1, 41), SPAN_NS)
+    with closing(PastStore(tmp_path, 0.5)) as store:
+        store.add(samples(1, x_m=-0.25, y_m=20.75))
+        past = cell_history(store.past, store.reader, (-1, 41), SPAN_NS)
     grid = folded(samples(1, x_m=-0.25, y_m=20.75), cell_m=0.5)
     assert past.evidence.weight[0, 0] == grid.evidence([(-1, 2)]).weight[0, 9 * 16 + 15] > 0
 
@@ -202,11 +202,11 @@ def test_cells_are_those_of_the_grid(tmp_path):
 def test_no_sample_is_passed_over_that_votes_for_the_cell(tmp_path, std_m):
     """Samples around the cell, a tenth of a metre apart, each a span of its own."""
     offsets = np.arange(-12.0, 12.0, 0.1)
-    with closing(PastStore(tmp_path)) as two_drives:
+    with closing(PastStore(tmp_path)) as store:
         stamps = NOW_NS + np.arange(len(offsets)) * S
         rows = samples(len(offsets), x_m=8.5 + offsets, stamp_ns=stamps, cov_xx_m2=std_m**2, cov_yy_m2=std_m**2)
-        two_drives.add(rows)
-        past = cell_history(two_drives.past, two_drives.reader, (8, 8), S)
+        store.add(rows)
+        past = cell_history(store.past, store.reader, (8, 8), S)
     votes = [stamp for row, stamp in zip(rows, stamps, strict=True) if _votes(row)]
     assert past.first_ns.tolist() == votes
 
