@@ -1,13 +1,14 @@
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 
 import pytest
 import zenoh
 
 from mapserver.claim import BETWEEN_S, WriterClaim
 from protocol.errors import LinkError
+from protocol.wire import keys
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from tests.tcp_proxy import FAIR, Proxy, Weather
 from tests.unit.mapserver.data import WAIT_S, wait_for
@@ -105,6 +106,16 @@ def test_of_two_that_write_since_neither_answered_in_time_the_earlier_one_goes_o
         second._watch.start()
         wait_for(lambda: second.ended)
         assert (first.held, first.ended, second.held) == (True, "", False)
+
+
+def test_whatever_is_asked_is_answered(network: Network):
+    with network.writer(FIRST) as claim:
+        for payload in (b"", b"\xc1", b"\x80"):
+            (reply,) = network.session().get(keys.writer("pit"), payload=payload, timeout=WAIT_S)
+            assert reply.ok is not None
+        with suppress(LinkError):
+            network.claim(SECOND).acquire()
+        assert (claim.held, claim.ended) == (True, "")
 
 
 def shared(network: Network, epoch: int, known: int) -> WriterClaim:

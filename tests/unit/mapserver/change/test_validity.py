@@ -111,13 +111,6 @@ def test_the_least_size_is_obeyed(size_m, seen):
     assert now.changed_ns.any() == seen
 
 
-def test_detection_off_leaves_everything():
-    now = read(repaved(-5, 4, 10), replace(CONFIG, detect=False))
-    assert not now.changed_ns.any()
-    everything = repaved(-5, 4, 10).evidence([(x, y) for x in range(-2, 2) for y in range(-2, 2)])
-    assert now.counts.sum() == everything.counts.sum()
-
-
 def test_of_two_changes_the_last_counts_and_dates():
     grid = Grid(1.0, FoldConfig())
     for hour, c_rr in enumerate([OLD, OLD, NEW, NEW, 0.01]):

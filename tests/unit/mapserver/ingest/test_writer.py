@@ -154,13 +154,6 @@ def test_closing_finishes_what_is_waiting(start, tmp_path):
     assert again.info()["snapshot"] == again.info()["merged"] == 7
 
 
-def test_a_thread_gets_the_error_that_its_work_raised(start):
-    writer = start()
-    with pytest.raises(ZeroDivisionError):
-        writer.run(lambda _: 1 // 0)
-    assert not writer.failed
-
-
 def test_a_look_is_taken_by_whoever_asks_while_the_owner_waits(start):
     writer = start()
     send(writer, [incoming(samples(3))])

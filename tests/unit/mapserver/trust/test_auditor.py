@@ -178,6 +178,13 @@ def test_a_machine_that_left_before_the_rain_is_not_accused(after_s: float) -> N
     assert bool(accused(auditor.verdicts())) == (after_s == 0)
 
 
+@pytest.mark.parametrize(("name", "value"), [("x_m", 5000.0), ("distance_m", 0.0), ("cov_xx_m2", 100.0)])
+def test_samples_from_elsewhere_of_no_way_or_unsure_of_their_place_do_not_count(name: str, value: float) -> None:
+    rows = drive(3, gain=1.6)
+    rows[name] = value
+    assert audit([*fleet(0, GOOD, GOOD, GOOD), rows])["d"].evidence["cells"] == 0
+
+
 def test_a_repaired_machine_is_cleared_once_its_bad_periods_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(coarse_map, "PERIOD_S", 900.0)
     monkeypatch.setattr(coarse_map, "PERIODS", 2)
