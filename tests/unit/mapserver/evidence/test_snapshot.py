@@ -170,9 +170,3 @@ def test_only_the_newest_two_are_kept_and_nothing_else_is_left(tmp_path):
         save(tmp_path, row)
     assert snapshot.rows_on_disk(tmp_path) == [100, 10]
     assert names(tmp_path) == ["snapshot-10.npz", "snapshot-100.npz"]
-
-
-def test_other_files_are_no_snapshots(tmp_path):
-    for name in ("snapshot-x.npz", "snapshot-1.npz.old", "my-snapshot-3.npz"):
-        (tmp_path / name).touch()
-    assert snapshot.rows_on_disk(tmp_path) == []

@@ -108,15 +108,6 @@ def test_rows_are_read_that_a_checkpoint_lacks_and_no_others(tmp_path, read_rows
         assert sorted(read_rows) == [1, 3]
 
 
-def test_rows_are_read_that_touch_the_window_and_no_others(tmp_path, read_rows):
-    with closing(PastStore(tmp_path)) as store:
-        two_hours(store)
-        for x, rows in ((0, []), (100, [2]), (200, [3]), (400, [])):
-            read_rows.clear()
-            store.as_of(NOW_NS + HOUR_NS + 5 * S, window=CellWindow(x, 8, 1, 1))
-            assert read_rows == rows
-
-
 def flip(path, at: int) -> None:
     data = bytearray(path.read_bytes())
     data[at] ^= 0x10

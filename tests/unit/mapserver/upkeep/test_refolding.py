@@ -162,6 +162,23 @@ def test_the_solver_decides_nothing_new_until_the_map_follows_unless_it_is_asked
         assert (number, newest and newest.zero) == (3, 0.004)
 
 
+def test_decisions_that_come_faster_than_folds_do_not_keep_the_map_from_following(writer, monkeypatch):
+    folds: list[bool] = []
+
+    def fold(*arguments: Any) -> bool:
+        refolds.calibrate(solved(0.001 * (len(folds) + 1)), NOW_NS, asked=True)  # during each fold
+        folds.append(refolding_fold(*arguments))
+        return folds[-1]
+
+    refolding_fold = past.fold_history
+    monkeypatch.setattr(past, "fold_history", fold)
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        refolds.wait(refolds.decide(decision("b")), WAIT_S)
+        wait_for(lambda: len(folds) >= 6)
+        assert folds[:6] == [False, True] * 3
+        assert refolds.facts().excluded == {"b"}
+
+
 def test_a_decision_that_is_taken_back_during_its_fold_leaves_the_map(writer, fold):
     before = writer.run(lambda store: store.grid)
     with closing(Refolding(writer, past_of(writer))) as refolds:
