@@ -150,7 +150,6 @@ def two_blocks(tmp_path_factory):
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_cannot_be_is_passed_over(tmp_path, two_blocks, change):
-    """Something was changed in a way that no checksum sees."""
     arrays = {name: array.copy() for name, array in two_blocks.items()}
     np.savez(tmp_path / "snapshot-1.npz", **arrays)
     assert snapshot.load(tmp_path / "snapshot-1.npz", 1.0, FOLD)

@@ -166,7 +166,6 @@ def edges(name: str) -> list[float]:
     st.integers(-40, 40),
 )
 def test_a_covariance_passes_exactly_where_it_passes_by_itself(xx, yy, sign, steps):
-    """Around the border of what is positive semidefinite, step by step of single precision."""
     xy = np.float32(sign * np.sqrt(np.float64(xx) * np.float64(yy)))
     for _ in range(abs(steps)):
         xy = np.nextafter(xy, np.float32(np.copysign(np.inf, steps)))
@@ -175,7 +174,6 @@ def test_a_covariance_passes_exactly_where_it_passes_by_itself(xx, yy, sign, ste
 
 @pytest.mark.parametrize("name", COLUMNS)
 def test_each_limit_is_that_of_the_protocol(name):
-    """Not by a hair more or less, whatever the column, alone and beside a good batch."""
     good = encode_batch(batch(samples(2), 1))
     verdicts = set()
     for value in edges(name):
@@ -188,7 +186,6 @@ def test_each_limit_is_that_of_the_protocol(name):
 
 
 def test_refused_ones_leave_the_others_as_they_are():
-    """Malformed in any way, implausible, empty, and long: whatever stands before and behind."""
     good = [encode_batch(batch(random_samples(n, n), 1 + n, f"m-{n}")) for n in (1, 7, 0, 300)]
     table = msgpack.unpackb(good[1])
     cols = table["cols"]

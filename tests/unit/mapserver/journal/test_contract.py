@@ -304,7 +304,6 @@ FAULTS += [("postgres", number, mode) for number in range(1, 5) for mode in ("fu
 
 @pytest.mark.parametrize(("place", "number", "mode"), FAULTS, indirect=["place"])
 def test_after_a_fault_at_any_statement_nothing_is_lost_or_double(place, number, mode):
-    """Two machines send until all is acknowledged."""
     faults = Faults(number, mode)
     sent = {machine: random_samples(20, seed) for seed, machine in enumerate("ab")}
     with closing(place.store()) as store:
