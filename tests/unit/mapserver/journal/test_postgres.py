@@ -186,7 +186,7 @@ def test_a_commit_whose_answer_never_comes_ends_once_another_server_has_taken_ov
                 committing.join(20.0)
                 assert len(answers) == 1
                 assert not isinstance(answers[0], Ack)
-                assert "taken over the journal, with epoch 2 after 1" in store.journal.fenced
+                wait_for(lambda: "taken over the journal, with epoch 2 after 1" in store.journal.fenced)
                 assert send(second, 6).trimmed == 5, "it was committed, and nobody was told so"
 
 
