@@ -130,3 +130,24 @@ def test_blocks_are_touched_once_until_they_are_folded_into_again():
     grid.touch_all()
     assert len(grid.take_touched(1)) == len(grid.take_touched(1)) == 1
     assert grid.take_touched(1) == []
+
+
+def test_a_cell_and_bucket_that_machines_drive_take_few_bytes():
+    """A page takes about 45, and this fails when that grows."""
+    draw, n = np.random.default_rng(0), 4000
+    turn = np.cumsum(draw.normal(0, 0.02, n))
+    rows = samples(
+        n,
+        x_m=np.cumsum(0.5 * np.cos(turn)),
+        y_m=np.cumsum(0.5 * np.sin(turn)),
+        heading_rad=(turn + np.pi) % (2 * np.pi) - np.pi,
+        distance_m=0.5,
+        stamp_ns=NOW_NS + np.arange(n) * 250_000_000,
+        cov_xx_m2=1.2**2,
+        cov_yy_m2=1.2**2,
+        c_rr=0.04 * np.exp(draw.normal(0, 0.15, n)),
+        grade_e=draw.normal(0.03, 0.02, n),
+        grade_n=draw.normal(-0.02, 0.02, n),
+    )
+    blocks = [pages for _, _, pages in folded(rows, keep_buckets=1000).state().blocks]
+    assert sum(pages.nbytes for pages in blocks) / sum(len(pages.marks) for pages in blocks) <= 55

@@ -478,3 +478,28 @@ def test_a_file_that_is_not_the_journal_s_is_never_a_reason_to_forget(day):
     assert day.journal.archived_row == 0
     path.rename(path.with_suffix(".away"))
     assert len(day.archive()) == 3
+
+
+def test_files_and_row_groups_outside_are_not_decoded(tmp_path, monkeypatch):
+    monkeypatch.setattr(ar, "GROUP_SAMPLES", 1)
+    with opened(tmp_path) as machines:
+        for i in range(4):
+            rows = samples(3, x_m=10.0 * i, stamp_ns=NOW_NS + i)
+            put(machines.journal, batch(rows, 1 + 3 * i), NOW_NS + i // 2 * HOUR_NS)
+        machines.archive()
+        decoded: list[int] = []
+        real = archive_file._rows
+        monkeypatch.setattr(archive_file, "_rows", lambda table, *rest: decoded.append(1) or real(table, *rest))
+        checked: list[Path] = []
+        whole = archive_file._checked
+        monkeypatch.setattr(archive_file, "_checked", lambda path: checked.append(path) or whole(path))
+        for selection, groups, files in (
+            (ALL, 4, 2),
+            (Selection(bounds=Bounds(9, 0, 11, 20)), 1, 1),
+            (Selection(to_ns=NOW_NS + 2), 3, 2),
+            (Selection(from_ns=NOW_NS + 4), 0, 0),
+            (Selection(without=frozenset({"a"})), 0, 0),
+        ):
+            decoded.clear(), checked.clear()
+            list(archived(machines.folder, 0, 4, selection))
+            assert (len(decoded), len(checked)) == (groups, files), selection

@@ -1,5 +1,6 @@
 """Simulated fleets on five zones: bad machines are found, with the reason; nobody else is."""
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from mapserver.trust.judgement import Reason
 from protocol.arrays import Table
 from protocol.machine.samples import empty
 from protocol.site.ground_classes import ZONES
-from tests.unit.mapserver.data import NOW_NS
+from tests.unit.mapserver.data import NOW_NS, samples
 
 WIDTH_M, HEIGHT_M, STEP_M, STEP_S = 150, 100, 0.6, 0.2
 C_RR = np.array([zone.c_rr for zone in ZONES])
@@ -209,3 +210,17 @@ def test_many_rows_at_once_are_judged_as_one_by_one() -> None:
         machine = np.array([i for i, _ in part])
         at_once.add_all(JournalRows(samples_of, lengths, tuple("abcd"), machine, np.arange(n), none, none, none))
     assert at_once.verdicts() == one_by_one.verdicts()
+
+
+def test_ten_machines_on_a_large_site_take_little_memory() -> None:
+    """1 km2, 10 % of it driven by each of ten machines: 25 000 cells of 2 m."""
+    x_m, y_m = np.meshgrid(np.arange(0.5, 1000, 2), np.arange(0.5, 100, 2))
+    rows = samples(x_m.size, x_m=x_m.ravel(), y_m=y_m.ravel(), stamp_ns=NOW_NS)
+    tracemalloc.start()
+    auditor = Auditor(1.0)
+    for machine in "abcdefghij":
+        auditor.add(machine, rows)
+        auditor.add(machine, rows)
+    used = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert used < 30e6

@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapserver.change.change_log import ChangeLog
+from mapserver.change.detection import reach_blocks
+from mapserver.change.validity import around
 from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.fleet.calibration import Calibration
@@ -49,6 +52,7 @@ from tests.unit.mapserver.data import (
     random_samples,
     refused,
     same,
+    samples,
     send,
     wait_for,
 )
@@ -379,3 +383,45 @@ def test_a_snapshot_that_lacks_a_fact_is_folded_again(tmp_path):
     with closing(open_store(tmp_path)) as store:
         assert store.snapshot_row == store.merged, "the new one has it"
         assert same(store.grid, fleet.folded(correction_of("a").corrections))
+
+
+def looked(log: ChangeLog, grid: Grid) -> list[object]:
+    """What a search for changes finds in all that was folded since the last look."""
+    blocks = grid.take_touched(10_000)
+    wide = sorted({near for block in blocks for near in around(block, reach_blocks(SITE.cell_m, CONFIG.change))})
+    pages = {block: pages for block, pages in zip(wide, grid.pages(wide), strict=True) if pages}
+    return list(log.look(blocks, pages))
+
+
+def passes(c_rr: float, hours: range, zero: float) -> Table:
+    """Many passes over a field of 24 by 24 cells, by a machine whose zero is off."""
+    x, y = (v.ravel() + 0.5 for v in np.meshgrid(np.arange(24), np.arange(24)))
+    parts = []
+    for hour in hours:
+        draw = np.random.default_rng(hour)
+        measured = c_rr + zero + draw.normal(0, 0.002, len(x))
+        stamps = NOW_NS + hour * HOUR_NS + np.arange(len(x)) * S
+        values = {"x_m": x, "y_m": y, "stamp_ns": stamps, "c_rr": measured, "grade_e": -zero, "grade_n": 0.0}
+        parts.append(samples(len(x), speed_mps=1.0, heading_rad=0.0, **values))
+    return np.concatenate(parts)
+
+
+@pytest.mark.slow
+def test_a_correction_is_never_taken_for_a_change_of_the_ground_and_hides_none(writer):
+    zero = 0.12  # so large that samples with and without it are of different classes
+    log = ChangeLog(SITE.cell_m, CONFIG.change, CONFIG.read)
+    gravel, paved = passes(0.2, range(4), zero), passes(0.02, range(5, 9), zero)
+    send(writer, [incoming(gravel)])
+    assert writer.run(lambda store: looked(log, store.grid)) == []
+    with closing(Refolding(writer, past_of(writer))) as refolds:
+        fact = CalibrationDecision("a", SOLVER, "", NOW_NS, (Correction("a", 0, END_NS, zero, 0.0, 0.0, ()),))
+        refolds.wait(refolds.decide(fact), WAIT_S)
+        assert writer.run(lambda store: looked(log, store.grid)) == [], "all was folded again, and nothing changed"
+        send(writer, [incoming(paved[: len(paved) // 2], 1 + len(gravel))])
+        refolds.wait(refolds.decide(replace(fact, corrections=(replace(fact.corrections[0], zero=0.119),))), WAIT_S)
+        send(writer, [incoming(paved[len(paved) // 2 :], 1 + len(gravel) + len(paved) // 2)])
+        found_changes = writer.run(lambda store: looked(log, store.grid))
+    assert found_changes
+    assert found_changes[-1].resistance_before == pytest.approx(0.2, rel=0.15)
+    assert found_changes[-1].resistance_after == pytest.approx(0.02, rel=0.3)
+    assert found_changes[-1].cells > 400
