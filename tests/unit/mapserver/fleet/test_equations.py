@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from mapserver.fleet.equations import AT_ONCE, Equations, eliminate, equations, sparse, stacked
+from mapserver.fleet.equations import AT_ONCE, Equations, eliminate, equations, sparse
 from protocol.arrays import Floats
 
 N, UNKNOWNS = 300, 20
@@ -40,39 +40,8 @@ def test_elimination_is_the_solution_of_the_whole_system(blocks: int, parameters
     assert information.ground(x) == pytest.approx(expected[parameters:], abs=1e-6)
 
 
-def test_sources_without_common_ground_add_up() -> None:
-    one, other = system(1, 1), system(2, 0)
-    parts = [eliminate(eq, eq.weights(np.zeros(7), None)) for eq in (one, other)]
-    x = np.linalg.solve(sum(p.matrix for p in parts), sum(p.vector for p in parts))
-    none = sp.csr_matrix((N, UNKNOWNS))
-    both = stacked(
-        equations(one.A, sp.hstack([one.B, none]).tocsr(), one.b, one.std, 0),
-        equations(other.A, sp.hstack([none, other.B]).tocsr(), other.b, other.std, 0),
-    )
-    assert x == pytest.approx(whole(both, 1 / both.std**2)[:7], abs=1e-6)
-
-
-def test_ground_that_nothing_ties_down_is_zero_and_says_nothing() -> None:
-    eq = system(3, 1)
-    wider = equations(eq.A, sp.hstack([eq.B, sp.csr_matrix((N, 5))]).tocsr(), eq.b, eq.std, 1)
-    information, same = (eliminate(each, 1 / each.std**2) for each in (wider, eq))
-    assert information.matrix == pytest.approx(same.matrix)
-    assert information.ground(np.ones(7))[-5:] == pytest.approx(0.0)
-
-
 def test_far_equations_count_little_and_heavy_ones_hardly() -> None:
     b = np.array([0.5, 3.0, 30.0, 3.0, 30.0])
     eq = equations(sp.csr_matrix((5, 1)), None, b, np.ones(5))
     eq.heavy[3:] = True
     assert eq.weights(np.zeros(1), np.zeros(0)) == pytest.approx([1.0, 0.5, 0.05, 0.1, 1 / 901])
-
-
-def test_equations_on_known_ground_leave_other_ground_away() -> None:
-    eq = system(4, 1)
-    y = np.arange(UNKNOWNS, dtype=np.float64)
-    y[3] = np.nan
-    on = eq.on(y)
-    elsewhere = eq.B[:, 3].toarray()[:, 0] != 0
-    assert len(on.b) == N - elsewhere.sum()
-    assert on.b == pytest.approx((eq.b - eq.B @ np.nan_to_num(y))[~elsewhere])
-    assert on.B.shape[1] == 0

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import SCALE_FLOOR, Calibration, calibrate
-from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction, corrected
+from mapserver.fleet.calibration import Calibration, calibrate
+from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
 from mapserver.fleet.decisions import EVERY_NS, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.fleet.ledger import EPOCH_NS, Ledger, newest, stated
 from mapserver.fleet.observability import REMEMBERED_STD, remembered_of
@@ -22,7 +22,6 @@ from tests.unit.mapserver.fleet.drives import (
     RAMP,
     RAMP_AGAIN,
     START_NS,
-    TOP_M,
     Errors,
     Site,
     drive,
@@ -99,48 +98,6 @@ def test_a_scale_that_was_shown_counts_where_slopes_contradict_each_other(site: 
     result = calibrate(ledgers(rows), remembered=remembered_of(KNOWN))
     assert {one.most_share for one in result.corrections} == {ANY_SHARE}
     assert scales(result) == pytest.approx(scales_of(ERRORS), abs=0.015)
-
-
-def test_a_scale_that_is_remembered_does_not_wear_out() -> None:
-    """A decision every ten minutes, since the zero wanders; the scale is shown in the first one."""
-    decisions, ledger, kept = CalibrationDecisions(), Ledger(), []
-    ledger.epochs = 1
-    for turn in range(10):
-        error = Errors(0.002 * (turn % 2), 0.12)
-        ledger.add(drive(LOW if turn else BOTH, error, seconds=200.0, seed=turn, start_s=600.0 * turn))
-        for minute in range(2):
-            solved = calibrate({"a": ledger.stays()}, remembered=remembered_of(decisions.shown()))
-            for decision in decisions.judge(solved, START_NS + (600 * turn + 300 + 60 * minute) * S):
-                decisions.add(CalibrationDecision.from_body(decision.body()))
-                kept.append(decision)
-    assert [each.remembered for each in kept] == [False] + [True] * (len(kept) - 1)
-    assert len(kept) > 5
-    newest = decisions.corrections.newest("a")
-    assert newest.most_share == ANY_SHARE
-    assert newest.scale == kept[0].corrections[-1].scale
-    assert newest.covariance[1][1] == pytest.approx(REMEMBERED_STD**2 + SCALE_FLOOR**2, rel=0.01)
-    assert remembered_of(CalibrationDecisions(kept).shown()) == remembered_of(decisions.shown()), "after a start, too"
-
-
-def test_a_scale_that_is_found_late_leaves_no_step_in_the_map() -> None:
-    """Paved ramps show nothing, until the machine drives one both ways; what it drove before is right then, too."""
-    ledger, decisions, driven = Ledger(), CalibrationDecisions(), []
-    ledger.epochs = 2
-    for turn in range(6):
-        route = BOTH if turn == 4 else RAMP
-        driven.append(drive(route, Errors(0.006, 0.1), site=paved, seconds=300.0, seed=turn, start_s=600.0 * turn))
-        ledger.add(driven[-1])
-        for minute in range(2):
-            solved = calibrate({"a": ledger.stays()}, remembered=remembered_of(decisions.shown()))
-            for decision in decisions.judge(solved, START_NS + (600 * turn + 300 + 60 * minute) * S):
-                decisions.add(decision)
-        assert decisions.corrections.newest("a").most_share == (ANY_SHARE if turn >= 4 else LEVEL_SHARE)
-    on_ramps = []
-    for rows in (driven[0], driven[-1]):
-        right = corrected(rows, decisions.corrections.spans_of("a"))
-        uphill = (np.abs(right["x_m"] - (FOOT_M + TOP_M) / 2) < 6.0) & (right["y_m"] < 20.0)
-        on_ramps.append(np.nanmean(right["c_rr"][uphill]))
-    assert on_ramps == pytest.approx([0.02, 0.02], abs=0.004)
 
 
 def test_a_quarter_of_an_hour_in_which_nothing_is_shown_erases_nothing() -> None:
@@ -239,12 +196,3 @@ def test_of_two_machines_that_contradict_each_other_none_is_corrected(errors: Er
         assert (state.zero, state.scale) == pytest.approx((0.0, 0.0), abs=0.001)
         assert (state.zero_by, state.scale_by) == ((), ())
         assert max(state.beyond[0] / 5.0, state.beyond[1] / 6.7) < 1, "and nobody is accused"
-
-
-def test_of_two_sound_machines_the_difference_is_shared() -> None:
-    rows = {
-        name: drive(OPEN, Errors(zero), seconds=200.0, closed=False, seed=i)
-        for i, (name, zero) in enumerate({"one": 0.004, "other": -0.004}.items())
-    }
-    machines = calibrate(ledgers(rows)).machines
-    assert machines["one"].zero - machines["other"].zero == pytest.approx(0.008, abs=0.001)
