@@ -36,25 +36,6 @@ def same(a, b) -> None:
         np.testing.assert_array_equal(layer, b[name], err_msg=name)
 
 
-def test_only_what_lies_near_to_new_samples_is_derived_again(tmp_path):
-    names, wide = ("resistance", "grade_east_filled"), CellWindow(-320, -16, 640, 32)
-    kept = fresh()
-    with closing(open_writer(tmp_path)) as writer:
-        line = samples(600, x_m=np.arange(-300, 300) + 0.5, y_m=0.5, distance_m=4.0)
-        send(writer, [incoming(line)])
-        read(kept, writer, wide, names)
-        first = kept.derived
-        read(kept, writer, wide, names)
-        assert kept.derived == first, "nothing came in"
-        assert first >= 600 // BLOCK_CELLS
-        more = samples(5, x_m=np.arange(5) + 0.5, y_m=0.5, distance_m=4.0)
-        more["stamp_ns"] += 10**12
-        send(writer, [incoming(more, first_seq=601)])
-        read(kept, writer, wide, names)
-        assert 0 < kept.derived - first <= 2 * 9 * 3
-        same(read(kept, writer, wide, names), read(fresh(), writer, wide, names))
-
-
 def test_ages_grow_though_nothing_is_derived_again(tmp_path):
     names, here, there = ("age_s",), CellWindow(0, 0, 16, 16), 400.0
     kept = fresh()

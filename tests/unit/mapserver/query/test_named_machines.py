@@ -50,11 +50,6 @@ def test_a_named_machine_weighs_what_it_said_last_and_drives_as_fast_as_it_did(a
     assert asked(answers, NamedMachine("truck-1")).machine == drive.machine
 
 
-def test_what_is_given_holds(answers):
-    given = asked(answers, NamedMachine("truck-1", (("mass_kg", 30e3), ("speed_mps", 3.0)))).machine
-    assert (given.mass_kg, given.speed_mps) == (30e3, 3.0)
-
-
 def test_as_of_a_time_it_weighs_what_it_said_until_then(answers):
     then = asked(answers, NamedMachine("truck-1"), NOW_NS + 7200 * S + 60 * S)
     assert then.machine.mass_kg == 22_000.0

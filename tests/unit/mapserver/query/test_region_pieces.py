@@ -45,7 +45,7 @@ def same(a: Region, b: Region) -> bool:
 @pytest.mark.slow
 def test_pieces_make_up_the_region(served, monkeypatch):
     _, answers = served
-    for bounds in ((-100, -100, 100, 100), (-93.5, 7, 61, 51.2), (-100, 3, 100, 4), (2, -80, 3, 90)):
+    for bounds in ((-93.5, 7, 61, 51.2), (-100, 3, 100, 4), (2, -80, 3, 90)):
         when = When(minus_ns=NOW_NS + 900 * 10**9) if bounds[0] == -93.5 else When()
         query = RegionQuery(Bounds(*bounds), NAMES, when=when)
         whole = answers.region(query)
@@ -54,9 +54,7 @@ def test_pieces_make_up_the_region(served, monkeypatch):
             patched.setattr(region_pieces, "PIECE_BYTES", 16 * len(NAMES) * BLOCK_CELLS)
             parts = read(answers, query)
         assert len(parts) > 1
-        counted = []
-        assert same(joined(parts, lambda *n, counted=counted: counted.append(n)), whole)
-        assert counted == [(n + 1, len(parts)) for n in range(len(parts))]
+        assert same(joined(parts), whole)
 
 
 def test_pieces_are_of_one_version_while_samples_come_in(served, monkeypatch):
@@ -73,10 +71,10 @@ def test_pieces_are_of_one_version_while_samples_come_in(served, monkeypatch):
     assert same(repeated, others[0])
 
 
-@pytest.mark.parametrize("layers", [1, 3, 13])
+@pytest.mark.parametrize("layers", [1, 13])
 def test_pieces_cover_every_cell_once_and_stay_small(layers):
     rng = np.random.default_rng(5)
-    for limits in [(1000, 1000), (40, 3000), (3000, 40), (100_000, 2), (2, 100_000), (20, 20)] * 4:
+    for limits in [(1000, 1000), (40, 3000), (3000, 40), (100_000, 2), (2, 100_000), (20, 20)]:
         sizes = rng.integers(1, limits)
         window = CellWindow(*(int(v) for v in (*rng.integers(-5000, 5000, 2), *sizes)))
         grid = PieceGrid.of_layers(window, layers)
@@ -91,11 +89,6 @@ def test_pieces_cover_every_cell_once_and_stay_small(layers):
             assert all(end == begin and end % BLOCK_CELLS == 0 for (_, end), (begin, _) in pairwise(spans))
 
 
-def test_three_layers_of_256_x_256_cells_are_one_piece():
-    assert PieceGrid.of_layers(CellWindow(5, -7, 256, 256), 3).count == 1
-    assert PieceGrid.of_layers(CellWindow(5, -7, 256, 257), 3).count > 1
-
-
 # --- how long a region is kept ----------------------------------------------------------------------------------------
 
 LARGE = Reading(CellWindow(0, 0, 4000, 4000), ("visits",), ())
@@ -108,27 +101,23 @@ def clock(monkeypatch):
     return now_s
 
 
-def test_a_region_that_nobody_reads_on_expires(clock):
+def test_a_region_expires_that_nobody_reads_on_or_that_is_read_for_too_long(clock):
     regions = OpenRegions()
     cursor = regions.open(LARGE)
     for _ in range(4):
         clock[0] += region_pieces.IDLE_S - 1
         assert regions.reading(cursor, 1)[0] is LARGE
+    with refused(Refusal.OUT_OF_RANGE, "from 0"):
+        regions.reading(cursor, 10_000)
     clock[0] += region_pieces.IDLE_S + 1
     with refused(Refusal.EXPIRED, "ask for it again"):
         regions.reading(cursor, 1)
-
-
-def test_a_region_is_not_kept_for_ever(clock):
-    regions = OpenRegions()
-    cursor = regions.open(LARGE)
-    while clock[0] < 100 + region_pieces.OPEN_S - region_pieces.IDLE_S:
+    cursor, opened_s = regions.open(LARGE), clock[0]
+    while clock[0] < opened_s + region_pieces.OPEN_S:
+        assert regions.reading(cursor, 1)[0] is LARGE
         clock[0] += region_pieces.IDLE_S / 2
-        regions.reading(cursor, 1)
-    clock[0] += region_pieces.IDLE_S
-    regions.reading(cursor, 1)
-    clock[0] += region_pieces.IDLE_S / 2
-    with pytest.raises(QueryError):
+    clock[0] += 1
+    with refused(Refusal.EXPIRED):
         regions.reading(cursor, 1)
 
 
@@ -148,10 +137,3 @@ def test_so_many_regions_are_read_at_once_and_one_that_is_read_makes_room(clock)
     assert regions.reading(cursors[0], 0)[0] is LARGE
     clock[0] += region_pieces.IDLE_S + 1
     assert len({regions.open(LARGE) for _ in range(region_pieces.MOST_OPEN)}) == region_pieces.MOST_OPEN
-
-
-def test_a_piece_that_does_not_exist_is_refused():
-    regions = OpenRegions()
-    cursor = regions.open(LARGE)
-    with refused(Refusal.OUT_OF_RANGE, "from 0"):
-        regions.reading(cursor, 10_000)

@@ -1,11 +1,9 @@
 """Drives with known answers: energy is resistance, height and speed; power, curves and brakes bound the speed."""
 
-import math
-
 import numpy as np
 import pytest
 
-from mapserver.routes.drive import CREEP_MPS, LATE_S, Drive, drive, smoothed
+from mapserver.routes.drive import CREEP_MPS, LATE_S, Drive, drive
 from protocol.arrays import Floats
 from protocol.queries.routing import RouteMachine
 from protocol.units import GRAVITY_MPS2
@@ -85,30 +83,6 @@ def test_what_the_power_cannot_do_is_said() -> None:
     done = rolling(0.03, slope, weak)
     assert 400 <= done.stalls <= 402
     assert rolling(0.03, 0.2, weak).stalls == -1
-
-
-def test_smoothing_keeps_what_is_even_and_the_length_of_the_line() -> None:
-    assert smoothed(np.full(40, 0.3), 1.0) == pytest.approx(np.full(40, 0.3))
-    spike = np.zeros(41)
-    spike[20] = 9.0
-    assert smoothed(spike, 1.0)[16:25] == pytest.approx(np.ones(9))
-    assert smoothed(np.array([0.2]), 1.0).tolist() == [0.2]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("mass_kg", 0.0),
-        ("mass_kg", 2e6),
-        ("efficiency", 1.2),
-        ("efficiency", 0.0),
-        ("rotating", 0.5),
-        ("power_w", math.nan),
-    ],
-)
-def test_machines_that_cannot_be_are_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"^{name}: "):
-        RouteMachine(**{name: value})
 
 
 def test_changes_of_the_ground_cost_what_drivers_answer_late() -> None:

@@ -1,9 +1,13 @@
-"""Layers along a line."""
+"""Layers along a line, its steps, and the speeds that its curves allow."""
+
+import math
 
 import numpy as np
 import pytest
 
-from mapserver.routes.ground import Squares
+from mapserver.routes.ground import CURVE_M, Squares, limits, steps
+
+CORNER = np.array([[0.0, 0.0], [50.0, 0.0], [50.0, 30.0]])
 
 
 def test_a_plane_is_read_exactly_between_the_centres_of_cells_and_over_edges_of_squares() -> None:
@@ -24,3 +28,43 @@ def test_unknown_cells_count_nothing_and_alone_are_unknown() -> None:
     field = Squares.stacked(1.0, 4, {(0, 0): {"a": values}})
     assert field.at(np.array([[1.5, 1.5], [1.9, 1.5]]))["a"].tolist() == [0.03, 0.03]
     assert np.isnan(field.at(np.array([[2.4, 1.5], [2.4, 2.4], [-5.0, 1.0], [100.0, 1.0]]))["a"]).all()
+
+
+def test_steps_divide_a_line_evenly() -> None:
+    cut = steps(CORNER, 1.0)
+    assert len(cut.length_m) == 80
+    assert cut.length_m == pytest.approx(np.ones(80))
+    assert cut.position_m[0].tolist() == [0.5, 0.0]
+    assert cut.position_m[-1].tolist() == [50.0, 29.5]
+    assert cut.direction[:50] == pytest.approx(np.tile([1.0, 0.0], (50, 1)))
+    assert cut.direction[50:] == pytest.approx(np.tile([0.0, 1.0], (30, 1)))
+
+
+def test_a_line_that_is_no_whole_number_of_steps_keeps_its_length() -> None:
+    cut = steps(np.array([[0.0, 0.0], [3.0, 4.4]]), 1.0)
+    assert cut.length_m.sum() == pytest.approx(math.hypot(3.0, 4.4))
+    assert len(steps(np.array([[0.0, 0.0], [0.1, 0.0]]), 1.0).length_m) == 1
+
+
+def test_a_circle_is_driven_as_its_radius_allows() -> None:
+    angle = np.linspace(0, math.pi, 200)
+    circle = 20.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    limit = limits(circle, steps(circle, 1.0).end_m, 0.9)
+    assert limit[5:-5] == pytest.approx(np.full(len(limit) - 10, math.sqrt(0.9 * 20.0)), rel=0.03)
+
+
+def test_a_corner_slows_down_around_it_alone() -> None:
+    limit = limits(CORNER, steps(CORNER, 1.0).end_m, 0.9)
+    assert np.isinf(limit[: 50 - math.ceil(CURVE_M / 2)]).all()
+    assert limit[50] == pytest.approx(math.sqrt(0.9 * CURVE_M / (math.pi / 2)))
+    assert np.isinf(limit[50 + math.ceil(CURVE_M / 2) + 1 :]).all()
+
+
+def test_where_it_turns_back_a_machine_stands() -> None:
+    back = np.array([[0.0, 0.0], [20.0, 0.0], [5.0, 1.0]])
+    cut = steps(back, 1.0)
+    limit = limits(back, cut.end_m, 0.9)
+    assert np.flatnonzero(limit == 0.0).tolist() == [20]
+    assert cut.direction[18] == pytest.approx([1.0, 0.0])
+    assert cut.direction[22, 0] < -0.9
+    assert np.hypot(*cut.direction.T) == pytest.approx(np.ones(len(cut.direction)))

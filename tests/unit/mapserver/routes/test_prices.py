@@ -1,13 +1,14 @@
-"""Prices of ground where nobody was."""
+"""Prices of ground where nobody was, and slopes between known ground."""
 
 import numpy as np
 import pytest
 
 from mapserver.routes.ground import Squares
-from mapserver.routes.prices import LOOSE, NEEDS, RESISTANCE, Prices, around, bare
+from mapserver.routes.prices import COARSE, LOOSE, NEEDS, RESISTANCE, Prices, Rises, bare, heights, slopes
 
 EDGE = 32
 HERE = {(0, 0)}
+SIZE = 15 * COARSE
 
 
 def squares(made: dict[tuple[int, int], dict[str, object]], std: float = 0.001) -> Squares:
@@ -51,29 +52,10 @@ def test_what_is_filled_in_costs_more_the_less_sure_it_is() -> None:
     assert 0.03 < price[0] < 0.09
 
 
-def test_a_price_is_the_same_whatever_else_was_read() -> None:
-    draw = np.random.default_rng(5)
-    made = {}
-    for x in range(-2, 4):
-        for y in range(-2, 4):
-            values = np.exp(draw.normal(-3.5, 0.5, (EDGE, EDGE)))
-            made[x, y] = {"resistance": values, "grade": draw.normal(0, 0.1), "driven": draw.random((EDGE, EDGE)) < 0.3}
-    everything, near = squares(made), squares({place: made[place] for place in around(HERE)})
-    few = Prices(near).squares(HERE).layers[RESISTANCE][0]
-    many = Prices(everything).squares({(1, 1), (0, 0), (0, 1)})
-    assert np.array_equal(few, many.layers[RESISTANCE][many.by_place()[0, 0]], equal_nan=True)
-
-
 def test_far_from_everything_ground_is_as_loose_as_sand_unless_somebody_says_what_it_is() -> None:
     far = squares({(3, 0): {"resistance": 0.03}})
     assert (Prices(far).squares(HERE).layers[RESISTANCE] == LOOSE).all()
     assert (Prices(far, 0.04).squares(HERE).layers[RESISTANCE] == 0.04).all()
-
-
-def test_what_was_driven_and_not_measured_is_as_the_nearest_that_was() -> None:
-    one = squares({(0, 0): {"resistance": half(0.04)}})
-    assert Prices(one).squares(HERE).layers[RESISTANCE][0][:, EDGE // 2 :] == pytest.approx(0.04)
-    assert bare(one, HERE) == HERE, "though machines were everywhere"
 
 
 def test_squares_are_bare_where_any_cell_was_never_driven() -> None:
@@ -81,3 +63,13 @@ def test_squares_are_bare_where_any_cell_was_never_driven() -> None:
     driven[3, 4] = False
     some = squares({(0, 0): {"resistance": 0.03}, (1, 0): {"resistance": 0.03, "driven": driven}})
     assert bare(some, {(0, 0), (1, 0), (5, 5)}) == {(1, 0), (5, 5)}
+
+
+def test_a_plane_goes_on_between_what_is_known_of_it() -> None:
+    known = np.ones((SIZE, SIZE), bool)
+    known[30:90, 36:84] = False
+    rises = Rises.of_slopes(np.full((SIZE, SIZE), 0.05), np.full((SIZE, SIZE), -0.02), known)
+    east, north = slopes(heights(rises))
+    inner = slice(36 - COARSE, 84 - COARSE), slice(42 - COARSE, 78 - COARSE)
+    assert east[inner] == pytest.approx(np.full((48, 36), 0.05), abs=0.002)
+    assert north[inner] == pytest.approx(np.full((48, 36), -0.02), abs=0.002)

@@ -7,7 +7,7 @@ import pytest
 
 from mapserver.routes.ground import Squares
 from mapserver.routes.prices import Prices
-from mapserver.routes.route import LAYERS, STEP_M, mean_std, route
+from mapserver.routes.route import LAYERS, STEP_M, route
 from protocol.arrays import Floats
 from protocol.errors import QueryError
 from protocol.queries.routing import RouteMachine
@@ -80,12 +80,6 @@ def test_no_line_is_so_long_that_errors_of_a_map_vanish() -> None:
     _, totals = route(line((1, 1), (219, 219), (1, 219), (219, 1)), fields(0.1, std=1e-6), SLOW, stops=ROLLING)
     half = (totals.energy_high_j - totals.energy_low_j) / 2 / totals.energy_j
     assert half == pytest.approx(1.645 * math.hypot(0.03, 0.02), rel=0.1)
-
-
-def test_errors_along_a_line_average_out_but_not_over_short_stretches() -> None:
-    std, step = np.full(2000, 0.01), np.full(2000, 1.0)
-    assert mean_std(std[:5], step[:5]) == pytest.approx(0.01, rel=0.1)
-    assert mean_std(std, step) == pytest.approx(math.hypot(0.01 * math.sqrt(2 * 25 / 2000), 0.001), rel=0.02)
 
 
 def test_unknown_ground_counts_as_the_dearest_and_is_said() -> None:
