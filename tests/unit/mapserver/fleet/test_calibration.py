@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -10,10 +11,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import Calibration, calibrate
-from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, corrected
+from mapserver.fleet.calibration import (
+    MOST_EPOCHS,
+    MOST_MACHINES,
+    Calibration,
+    calibrate,
+    epochs_of_each,
+    groups,
+    joined,
+)
+from mapserver.fleet.correction import ANY_SHARE, LAST_NS, Correction, corrected
 from mapserver.fleet.hysteresis import differs
-from mapserver.fleet.ledger import EPOCH_NS
+from mapserver.fleet.ledger import EPOCH_NS, EPOCHS, newest
 from mapserver.fleet.observability import FAULT_SIGMAS, MachineState, state_of
 from mapserver.fleet.passages import passages
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
@@ -40,7 +49,6 @@ FLEET = {
     "ramp": (RAMP, Errors(-0.006, 0.04, -0.003)),
     "again": (RAMP_AGAIN, Errors(0.008, 0.03, 0.0)),
 }
-ELSEWHERE = ((20.0, 60.0), (110.0, 60.0), (110.0, 90.0), (20.0, 90.0))  # over the same ramp in lanes of its own
 
 
 def fleet(site: Site = soils, seed: int = 0, errors: Mapping[str, Errors] | None = None) -> dict[str, Table]:
@@ -204,29 +212,6 @@ def test_an_epoch_in_which_the_zero_steps_states_a_large_deviation() -> None:
     assert max(np.sqrt(each.covariance[0][0]) for each in still) < 0.0015
 
 
-def test_ramps_of_other_ground_change_nothing_on_the_slope() -> None:
-    rows = fleet(lambda x, y, h: soils(x, y, h) - 0.02 * on_ramp(x))
-    result = solve(rows)
-    assert not result.common.observed
-    assert result.common.reason == "ground_changes_with_slope"
-    for name in ("ramp", "again"):
-        own = [each for each in result.corrections if each.machine == name]
-        assert {each.most_share for each in own} == {LEVEL_SHARE}
-        right = corrected(rows[name], own)
-        steep = np.hypot(rows[name]["grade_e"], rows[name]["grade_n"]) > 0.2
-        assert right["c_rr"][steep].tobytes() == rows[name]["c_rr"][steep].tobytes()
-        assert result.machines[name].zero == pytest.approx(FLEET[name][1].zero, abs=0.002)
-
-
-def test_lanes_that_disagree_leave_the_scale_at_the_data_sheet() -> None:
-    rows = fleet(lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x) * (y < 32.0))  # gravel up, none down
-    result = solve(rows)
-    assert not result.common.observed
-    for name in ("ramp", "again"):
-        assert result.machines[name].scale_by == ()
-        assert {each.scale for each in result.corrections if each.machine == name} == {0.0}
-
-
 def test_a_ramp_that_is_only_ever_climbed_shows_no_scale() -> None:
     rows = drive(RAMP, Errors(scale=0.1))
     climbed = rows[rows["y_m"] < 25.0]  # the rest is not sampled
@@ -278,23 +263,6 @@ def test_a_machine_at_fault_has_no_say_though_nobody_said_so(scale: float, zero:
     assert max(np.divide(result.machines["bad"].beyond, FAULT_SIGMAS)) > 1
 
 
-def test_a_machine_that_puts_the_slopes_in_doubt_is_the_one_that_is_far_off() -> None:
-    """Not as far as a fault in the common estimate, which has a say of its own; alone against the others it is."""
-    result = solve(with_bad(0.65, route=RAMP_AGAIN, off_m=6.0))
-    assert result.common.observed
-    assert of_others(result) == usual().corrections
-    assert result.machines["bad"].beyond[1] > FAULT_SIGMAS[1]
-
-
-@pytest.mark.parametrize(("scale", "at_fault"), [(0.65, True), (0.2, False)])
-def test_where_the_doubt_stays_only_a_fault_is_left_out(scale: float, at_fault: bool) -> None:
-    rows = with_bad(scale, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
-    result = solve(rows)
-    assert result.common.reason == "ground_changes_with_slope"
-    assert (result.machines["bad"].beyond[1] > FAULT_SIGMAS[1]) == at_fault
-    assert (of_others(result) == of_others(solve(rows, ("bad",)))) == at_fault
-
-
 def test_of_slopes_that_contradict_each_other_nobody_is_at_fault() -> None:
     """One machine measures half of its force where few others pass: the doubt must not fall on one of them."""
     rows = fleet()
@@ -320,12 +288,6 @@ def test_of_a_sensor_that_measures_no_force_slopes_alone_are_corrected(factor: f
     assert differs(own[-1], earlier), "what was taken off before its sensor broke does not hold on"
     assert result.machines["low"].beyond[1] > FAULT_SIGMAS[1]
     check(result.machines["ramp"], FLEET["ramp"][1])
-
-
-def test_a_machine_without_a_say_that_shares_no_ground_shows_its_scale_by_its_own_edges() -> None:
-    state = solve(with_bad(0.6, route=ELSEWHERE, off_m=0.0), ("bad",)).machines["bad"]
-    assert state.scale == pytest.approx(0.6, abs=0.06)
-    assert state.scale_by == ("edges",)
 
 
 def test_a_fault_is_one_also_against_ground_that_may_itself_be_off_by_what_data_sheets_allow() -> None:
@@ -434,3 +396,38 @@ def test_a_correction_says_of_its_machine_what_the_solve_said() -> None:
         )
         assert (state.zero_std, state.scale_std) == pytest.approx((known.zero_std, known.scale_std), rel=1e-3)
         assert (state.beyond[1] > FAULT_SIGMAS[1]) == (name == "again")
+
+
+@pytest.mark.nightly
+def test_a_hundred_machines_take_a_gigabyte_at_most() -> None:
+    """What they know of four hours each is bounded: of all together a solve takes so many epochs."""
+    driven = [drive(route, own, seconds=4 * 3600.0, seed=3, late=False) for route, own in FLEET.values()]
+    tables = [*ledgers(dict(enumerate(driven))).values()]
+    stays = {f"m{i:03d}": tables[i % 3] for i in range(MOST_MACHINES)}
+    tracemalloc.start()
+    result = calibrate(stays)
+    most_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most_bytes < 0.7e9  # beside what the program itself takes
+    assert len(result.corrections) == MOST_EPOCHS
+    assert result.common.observed
+    one = calibrate({name: newest(stays[name], epochs_of_each(3)) for name in ("m000", "m001", "m002")})
+    assert result.machines["m001"].zero == pytest.approx(one.machines["m001"].zero, abs=0.002)
+
+
+def test_more_machines_are_solved_in_groups() -> None:
+    names = [f"m{i:03d}" for i in range(2 * MOST_MACHINES + 1)]
+    assert groups([]) == [()]
+    assert groups(names[:MOST_MACHINES]) == [tuple(names[:MOST_MACHINES])]
+    some = groups(reversed(names))
+    assert (len(some), sorted(name for group in some for name in group)) == (3, names)
+    assert [epochs_of_each(n) for n in (0, 1, 20, 21, 100, 5000)] == [EPOCHS, EPOCHS, EPOCHS, 47, 10, 10]
+
+
+def test_what_groups_say_is_joined_and_the_common_scale_is_the_least_known() -> None:
+    parts = [solve({name: drive(route, Errors(0.004, 0.03))}) for name, route in (("a", LOW), ("b", RAMP))]
+    whole = joined(parts)
+    assert {*whole.machines} == {*whole.stated} == {one.machine for one in whole.corrections} == {"a", "b"}
+    assert whole.machines["b"] == parts[1].machines["b"]
+    assert parts[1].common.observed
+    assert whole.common == parts[0].common

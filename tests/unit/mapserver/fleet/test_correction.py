@@ -15,12 +15,11 @@ from mapserver.fleet.correction import (
     corrected,
     measured,
 )
-from mapserver.fleet.stays import MEASURED, stays
 from protocol.arrays import Floats, Table
-from protocol.machine.samples import APPLIED, LIMITS, SAMPLE_DTYPE
+from protocol.machine.samples import APPLIED, LIMITS
 from tests.reference.correction import in_numpy
 from tests.unit.mapserver.data import random_samples
-from tests.unit.mapserver.fleet.drives import LOW, RAMP, START_NS, Errors, drive
+from tests.unit.mapserver.fleet.drives import RAMP, START_NS, Errors, drive
 
 EVER = (0, 2**62)
 
@@ -65,27 +64,15 @@ def test_errors_are_undone_ahead_and_in_reverse_on_level_ground_and_on_slopes(di
     assert np.abs(wrong["c_rr"] - true["c_rr"]).max() > 0.1
 
 
-def test_rows_that_no_correction_covers_stay_bytes_as_they_were() -> None:
-    rows = drive(LOW, seconds=200.0)[:1000]
-    rows["stamp_ns"] = START_NS + np.arange(1000) * 10**9
-    span = START_NS + 200 * 10**9, START_NS + 300 * 10**9
-    out = corrected(rows, [correction(0.01, span=span)])
-    changed = np.array([a.tobytes() != b.tobytes() for a, b in zip(out, rows, strict=True)])
-    assert changed[200:300].all()
-    assert not changed[:200].any()
-    assert not changed[300:].any()
-    assert corrected(rows, []) is rows
-
-
-def test_each_span_has_its_own_correction_in_any_order() -> None:
+def test_each_span_has_its_own_correction_and_rows_of_none_stay_bytes_as_they_were() -> None:
     rows = random_samples(400, 2)
     rows["stamp_ns"] = START_NS + np.arange(400) * 10**9
-    middle = START_NS + 200 * 10**9
-    both = [correction(-0.004, span=(middle, EVER[1])), correction(0.003, 0.1, span=(0, middle))]
-    out = corrected(rows, both)
-    assert out.tobytes() == corrected(rows, both[::-1]).tobytes()
-    apart = np.concatenate([corrected(rows[:200], both[1:]), corrected(rows[200:], both[:1])])
-    assert out.tobytes() == apart.tobytes()
+    first, middle, end = (START_NS + second * 10**9 for second in (100, 200, 300))
+    both = [correction(-0.004, span=(middle, end)), correction(0.003, 0.1, span=(first, middle))]
+    parts = [rows[:100], in_numpy(rows[100:200], both[1]), in_numpy(rows[200:300], both[0]), rows[300:]]
+    for some in (both, both[::-1]):
+        assert corrected(rows, some).tobytes() == np.concatenate(parts).tobytes()
+    assert corrected(rows, []) is rows
 
 
 # --- machines that calibrate themselves ------------------------------------------------------------------------------
@@ -103,17 +90,11 @@ def calibrated_by_itself(rows: Table, zero: Floats, scale: Floats) -> Table:
     return out
 
 
-def at_standstills(n: int, seed: int) -> tuple[Floats, Floats]:
-    """Zeros and scales (n,) of a calibration that changes at standstills."""
-    draw = np.random.default_rng(seed)
-    stand = np.arange(n) * 12 // n
-    return draw.normal(0, 0.006, 12)[stand], draw.normal(0, 0.1, 12)[stand]
-
-
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_what_a_machine_applied_is_undone_sample_by_sample(direction: float) -> None:
     raw = drive(RAMP, Errors(0.006, 0.08, -0.004), direction=direction, seed=4)
-    sent = calibrated_by_itself(raw, *at_standstills(len(raw), 1))
+    draw, standstill = np.random.default_rng(1), np.arange(len(raw)) * 12 // len(raw)
+    sent = calibrated_by_itself(raw, draw.normal(0, 0.006, 12)[standstill], draw.normal(0, 0.1, 12)[standstill])
     assert np.abs(sent["c_rr"] - raw["c_rr"]).max() > 0.01
     back = measured(sent)
     for name in ("c_rr", "grade_e", "grade_n"):
@@ -121,29 +102,6 @@ def test_what_a_machine_applied_is_undone_sample_by_sample(direction: float) -> 
     assert not back["applied_zero"].any()
     assert not back["applied_scale"].any()
     assert measured(back) is back
-
-
-def test_the_ledger_of_a_machine_that_calibrates_itself_is_that_of_one_that_does_not() -> None:
-    raw = drive(RAMP, Errors(0.006, 0.08, -0.004), seed=5)
-    sent = calibrated_by_itself(raw, *at_standstills(len(raw), 3))
-    unstated = sent.copy()
-    unstated["applied_zero"] = unstated["applied_scale"] = 0.0
-    one, other, blind = (stays(rows, 2.0) for rows in (raw, sent, unstated))
-    assert (one["key"] == other["key"]).all()
-    for name in ("c_rr", "east", "north"):
-        assert np.abs(one[name] - other[name]).max() <= 5 * one["n"].max(), name
-        assert np.abs(one[name] - blind[name]).max() > 100 * one["n"].max(), name
-    for name in set(MEASURED) - {"c_rr", "east", "north"}:
-        assert (one[name] == other[name]).all(), name
-
-
-def test_headings_are_those_of_the_table() -> None:
-    angles: Floats = np.linspace(-7, 7, 20_001)
-    rows = np.zeros(len(angles), SAMPLE_DTYPE)
-    rows["heading_rad"], rows["speed_mps"] = angles, 1.0
-    out = corrected(rows, [correction(1.0)])
-    assert np.abs(out["grade_e"] - np.cos(angles)).max() < np.pi / HEADINGS + 1e-5
-    assert np.abs(out["grade_n"] - np.sin(angles)).max() < np.pi / HEADINGS + 1e-5
 
 
 # --- all machines ----------------------------------------------------------------------------------------------------

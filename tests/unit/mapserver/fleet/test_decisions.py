@@ -134,18 +134,6 @@ def test_in_the_first_minutes_of_machines_it_decides_again_when_twice_the_time_h
     assert np.flatnonzero(counts).tolist() == decided
 
 
-def test_the_limit_holds_after_a_clock_was_ahead():
-    solver = Solver()
-    for _ in range(2):
-        solver.hears(one(0.002))
-    solver.now_ns += 23 * 3600 * 10**9
-    for _ in range(2):
-        solver.hears(one(0.004))
-    solver.now_ns -= 23 * 3600 * 10**9
-    counts = [solver.hears(one(0.006 + 0.002 * (minute // 2))) for minute in range(24)]
-    assert np.flatnonzero(counts).tolist() == [1, 11, 21]
-
-
 def test_while_a_clock_is_ahead_and_after_a_night_what_is_half_learned_is_learned_on():
     solver = Solver()
     solver.watches(2 * EVERY_NS, one(0.002))
@@ -194,13 +182,6 @@ def test_samples_that_come_hours_late_are_corrected():
     assert [solver.hears(one(0.003), one(0.04, machine="late")) for _ in range(3)] == [0] * 3
 
 
-def test_asked_for_it_takes_all_that_is_known_and_then_nothing_is_left_to_decide():
-    solver = Solver()
-    assert solver.hears(one(0.0001), asked=True) == 1
-    assert solver.hears(one(0.0001), asked=True) == 0
-    assert solver.hears(one(0.00011), asked=True) == 1
-
-
 def person(zero: float | None, *, machine: str = "a") -> CalibrationDecision:
     corrections = () if zero is None else (Correction(machine, 0, LAST_NS, zero, 0.0, 0.0, ()),)
     return CalibrationDecision(machine, PERSON, "why", NOW_NS, corrections)
@@ -242,27 +223,22 @@ def test_painted_spans_are_what_painting_each_time_by_itself_gives():
 
 
 @pytest.mark.parametrize(
-    ("begins", "expected"), [({}, 0), ({"a": 900 * EPOCH_NS}, 900), ({"a": 1002 * EPOCH_NS}, 1000)]
+    ("begins", "applied", "expected"),
+    [
+        ({}, {}, 0),
+        ({"a": 900 * EPOCH_NS}, {}, 900),
+        ({"a": 1002 * EPOCH_NS}, {}, 1000),
+        ({}, {1000: Stated(0.001)}, 1000),  # what was before was sent with the machine's own zero of then
+    ],
 )
-def test_the_first_correction_of_a_machine_is_that_of_all_its_samples_before(begins, expected):
+def test_the_first_correction_of_a_machine_is_that_of_all_its_samples_before(begins, applied, expected):
     decisions = CalibrationDecisions()
-    calibration = replace(solved(one(0.003, 1000), one(0.005, 1001)), begins_ns=begins)
-    for decision in decisions.judge(calibration, NOW_NS, asked=True):
-        decisions.add(decision)
-    assert [each.from_ns // EPOCH_NS for each in decisions.corrections.each] == [expected, 1001]
-    later = replace(solved(one(0.003, 1002), one(0.01, 1003)), begins_ns=begins)
-    for decision in decisions.judge(later, NOW_NS, asked=True):
-        decisions.add(decision)
+    for epoch in (1000, 1002):
+        calibration = solved(one(0.003, epoch), one(0.005 * (epoch - 999), epoch + 1))
+        calibration = replace(calibration, begins_ns=begins, stated={"a": applied})
+        for decision in decisions.judge(calibration, NOW_NS, asked=True):
+            decisions.add(decision)
     assert [each.from_ns // EPOCH_NS for each in decisions.corrections.each] == [expected, 1001, 1002, 1003]
-
-
-@pytest.mark.parametrize(("applied", "expected"), [({}, 0), ({1000: Stated(0.001)}, 1000)])
-def test_samples_before_are_not_given_the_zero_of_a_machine_that_stated_its_own(applied, expected):
-    calibration = replace(solved(one(0.003, 1000), one(0.005, 1001)), begins_ns={}, stated={"a": applied})
-    decisions = CalibrationDecisions()
-    for decision in decisions.judge(calibration, NOW_NS, asked=True):
-        decisions.add(decision)
-    assert decisions.corrections.each[0].from_ns == expected * EPOCH_NS
 
 
 def test_before_what_the_machine_knows_itself_nothing_is_corrected():

@@ -165,13 +165,6 @@ def test_a_machine_that_applied_nonsense_is_corrected_though_its_sensor_is_good(
     assert decided({"a": true}).corrections.each == ()
 
 
-def test_a_machine_that_knows_its_zero_is_left_alone() -> None:
-    rows = drive(LOW, Errors(0.012), seconds=900.0, seed=2)
-    known = calibrate(ledgers({"a": rows})).machines["a"].zero
-    assert decided({"a": rows}).corrections.each != ()
-    assert decided({"a": applied(rows, known)}).corrections.each == ()
-
-
 def test_a_machine_that_changes_its_mind_within_an_epoch_is_corrected() -> None:
     rows = drive(LOW, Errors(0.012), seconds=900.0)
     to_and_fro = 0.012 + 0.006 * np.where(np.arange(len(rows)) // 100 % 2, 1.0, -1.0)

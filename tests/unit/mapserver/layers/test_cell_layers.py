@@ -14,9 +14,7 @@ from mapserver.layers.cell_layers import (
     UNEVEN_STD,
     ZERO_STD,
     ReadConfig,
-    derive_area,
     read,
-    required,
     select,
 )
 from protocol.errors import Refusal
@@ -24,7 +22,6 @@ from protocol.site.ground_classes import SLOPE_LIMIT, ZONES
 from tests.unit.mapserver.data import NOW_NS, folded, refused, samples
 
 CELL = 8 * 16 + 8  # of the usual sample in its block
-RESISTANCE_LAYERS = ("resistance", "resistance_std", "resistance_class", "confidence")
 LOG_STEP = np.log(100) / 23  # between resistance bins
 EXACT = {"cov_xx_m2": 0.0, "cov_yy_m2": 0.0}
 
@@ -123,14 +120,6 @@ def test_noise_does_not_bias_the_gradient(start, noise):
     assert value(grid, "grade_east") == pytest.approx(true, abs=0.0012)
 
 
-@pytest.mark.parametrize(("start", "count"), [(0.0, 30), (0.3, 600), (0.8, 30)])
-def test_votes_that_agree_err_in_what_they_have_in_common_however_many_they_are(start, count):
-    c_rr = 0.03 * np.exp(start * LOG_STEP)
-    grid = folded(samples(count, c_rr=c_rr, grade_e=start / 32, grade_n=-start / 32, distance_m=10.0))
-    assert value(grid, "resistance_std") == pytest.approx(deviation(c_rr, 0.0), rel=0.01)
-    assert value(grid, "grade_std") == pytest.approx(grade_deviation(start / 32 * np.sqrt(2), 0.0), rel=0.03)
-
-
 def test_a_zero_of_the_machines_is_a_larger_share_of_firm_ground():
     stds = [value(folded(samples(30, c_rr=c_rr)), "resistance_std") / c_rr for c_rr in (0.008, 0.04, 0.25)]
     assert stds == pytest.approx([0.194, 0.0625, 0.050], abs=0.003)
@@ -182,17 +171,6 @@ def test_age_is_the_time_since_the_newest_sample():
     assert np.isnan(value(grid, "age_s", now_ns=0))
 
 
-def test_time_since_the_last_change_is_known_where_one_was_found():
-    evidence = folded(samples(2, x_m=[8.5, 2.5])).evidence([(0, 0)])
-    changed_ns = np.zeros((1, 256), np.int64)
-    changed_ns[0, CELL] = NOW_NS - 50 * 10**9
-    changed = replace(evidence, changed_ns=changed_ns)
-    layer = read(changed, ["changed_s"], ReadConfig(), NOW_NS)["changed_s"][0]
-    assert layer[CELL] == pytest.approx(50.0)
-    assert np.isnan(np.delete(layer, CELL)).all()
-    assert np.isnan(read(changed, ["changed_s"], ReadConfig(), 0)["changed_s"]).all()
-
-
 @pytest.mark.parametrize(("steepness", "expected"), [(SLOPE_LIMIT - 0.005, 0), (SLOPE_LIMIT + 0.005, 1)])
 @pytest.mark.parametrize("angle", [0.0, 4.0])
 def test_slope_class_is_by_steepness(steepness, expected, angle):
@@ -225,13 +203,17 @@ def test_unknown_is_nan_in_every_layer():
         assert np.isfinite(layer[0, CELL]) == (name != "changed_s"), name
 
 
-def test_what_a_cell_has_no_votes_for_is_nan():
-    no_grade = folded(samples(5, grade_e=np.nan, grade_n=np.nan, grade_var=np.nan))
-    assert all(np.isnan(value(no_grade, n)) for n in ("grade", "grade_std", "grade_east", "grade_north", "slope_class"))
-    assert value(no_grade, "resistance_class") == 2
-    no_resistance = folded(samples(5, c_rr=np.nan, c_rr_var=np.nan))
-    assert all(np.isnan(value(no_resistance, name)) for name in RESISTANCE_LAYERS)
-    assert value(no_resistance, "grade_east") == pytest.approx(0.1, abs=1e-3)
+RESISTANCE_LAYERS = {"resistance", "resistance_std", "resistance_class", "confidence"}
+GRADE_LAYERS = {"grade", "grade_std", "grade_east", "grade_north", "slope_class"}
+
+
+@pytest.mark.parametrize(
+    ("columns", "unknown"),
+    [(("grade_e", "grade_n", "grade_var"), GRADE_LAYERS), (("c_rr", "c_rr_var"), RESISTANCE_LAYERS)],
+)
+def test_what_a_cell_has_no_votes_for_is_nan(columns, unknown):
+    grid = folded(samples(5, **dict.fromkeys(columns, np.nan)))
+    assert {name for name in LAYERS if np.isnan(value(grid, name))} == {*unknown, "changed_s"}
 
 
 def test_where_machines_could_measure_nothing_a_cell_is_driven_and_not_known():
@@ -261,13 +243,3 @@ def test_no_names_mean_all_layers_of_cells_and_an_unknown_one_is_named():
     assert select(["grade", "resistance_filled", "visits"]) == ("grade", "resistance_filled", "visits")
     with refused(Refusal.UNKNOWN_LAYER, r"`colour`.*resistance_class.*resistance_filled"):
         select(["grade", "colour"])
-
-
-def test_layers_come_in_the_order_asked_for_and_cells_unchanged():
-    names = ["resistance_filled_std", "visits", "resistance_filled", "grade_filled"]
-    draw = np.random.default_rng(5)
-    cells = {name: draw.uniform(0.1, 1.0, (7, 9)).astype(np.float32) for name in required(names)}
-    made = derive_area(names, cells, 1.0, ReadConfig())
-    assert list(made) == names
-    assert all(layer.dtype == np.float32 and layer.shape == (7, 9) for layer in made.values())
-    assert np.array_equal(made["visits"], cells["visits"])

@@ -6,7 +6,6 @@ from mapserver.layers.gap_filling import (
     AREA_LAYERS,
     GRADE_PRIOR_STD,
     RESISTANCE_PRIOR_STD,
-    cell_weights,
     fill_by_majority,
     sparse_kernel,
 )
@@ -56,19 +55,6 @@ def random_map(seed, known_share=0.25):
         known=draw.random(patches.shape) < known_share,
         weight=draw.uniform(0.1, 9.0, patches.shape),
     )
-
-
-@pytest.mark.parametrize("reach", [1.0, 7.3])
-def test_the_kernel_is_one_at_its_centre_and_falls_to_zero_at_its_reach(reach):
-    kernel = sparse_kernel(reach, 0.1) / 0.1**2
-    half = len(kernel) // 2
-    ray = kernel[half, half:]
-    assert ray[0] == pytest.approx(1.0)
-    assert (np.diff(ray) < 1e-12).all()
-    assert ray[5 * half // 10] == pytest.approx((2 + np.cos(np.pi)) / 6, abs=0.05)
-    outside = np.hypot(*np.indices(kernel.shape) - half) * 0.1 >= reach
-    assert np.abs(kernel[outside]).max(initial=0.0) < 1e-12
-    assert np.allclose(kernel, kernel.T)
 
 
 def test_known_cells_keep_what_they_have():
@@ -124,14 +110,6 @@ def test_more_and_surer_evidence_has_the_say():
         assert fill(better, "resistance_filled")[12, 10] == pytest.approx(0.25, rel=1e-5)
 
 
-def test_a_hundred_passes_over_a_cell_count_little_more_than_ten():
-    weights = cell_weights(np.zeros(4), np.array([0.5, 1.0, 10.0, 100.0]), np.zeros(4), 1.0)
-    assert weights[1] == pytest.approx(0.5)
-    assert weights[3] < 1.1 * weights[2]
-    assert (np.diff(weights) > 0).all()
-    assert cell_weights(np.array([np.nan]), np.array([np.nan]), np.array([np.nan]), 1.0)[0] == 0.0
-
-
 @pytest.mark.parametrize(
     ("name", "known", "prior"),
     [
@@ -185,14 +163,3 @@ def test_a_tie_goes_to_the_firmer_ground_whatever_the_window(size):
     weights = np.where(np.isfinite(values), 0.7, 0.0)
     filled = fill_by_majority(values, weights, sparse_kernel(5.0, 1.0), np.log(BOUNDARIES).tolist())
     assert filled[:, size // 2] == pytest.approx(np.log(0.02))
-
-
-def test_what_a_cell_layer_does_not_know_is_a_gap_of_its_own():
-    cells = window(known=columns((0, 20)))
-    for name in ("grade_east", "grade_north", "grade_std"):
-        cells[name] = np.where(columns((0, 5)), cells[name], np.float32(np.nan))
-    made = fill(cells, "resistance_filled", "grade_filled", "grade_filled_std")
-    assert np.isfinite(made["resistance_filled"][:, :20]).all()
-    assert np.isfinite(made["grade_filled"][:, :9]).all()
-    assert np.isnan(made["grade_filled"][:, 10:]).all()
-    assert np.isnan(made["grade_filled_std"][:, 10:]).all()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapserver.pictures.worklist import REPAIRED, UNKNOWN, WORST, _notes, draw_worklist
-from protocol.queries.roads import Segments, Worklist, decode_segments, decode_worklist
+from protocol.queries.roads import decode_segments, decode_worklist
 from tests.paths import GOLDEN
 
 ROADS = decode_segments((GOLDEN / "segments.bin").read_bytes())
@@ -28,13 +28,6 @@ def test_stretches_have_the_colours_of_their_cost():
     assert count(draw_worklist(roads, replace(WORK, rows=())), REPAIRED) > 100
 
 
-def test_a_map_without_roads_is_a_picture():
-    version = (WORK.store, 0, 0, 0)
-    picture = draw_worklist(Segments(*version, 0.0, 1.0, ()), Worklist(*version, 0.0, 0.02, 0.0, (), ()))
-    assert picture.ndim == 3
-    assert count(picture, WORST) == 0
-
-
 def test_what_became_worse_is_not_green_and_is_said():
     change = WORK.changes[0]
     worse = replace(change, before=change.after, after=change.before, saved_kwh_ph=-change.saved_kwh_ph)
@@ -44,9 +37,3 @@ def test_what_became_worse_is_not_green_and_is_said():
         f"1 repaired since they were known: {change.saved_kwh_ph:.1f} kWh an hour saved",
         f"1 worse since they were known: {change.saved_kwh_ph:.1f} kWh an hour more lost",
     ]
-
-
-def test_stretches_of_one_rank_are_said_to_be_so():
-    row = WORK.rows[0]
-    assert any("either order" in note for note in _notes(replace(WORK, rows=(row, row))))
-    assert not any("either order" in note for note in _notes(replace(WORK, rows=(row,))))

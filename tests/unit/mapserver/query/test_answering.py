@@ -71,9 +71,9 @@ def test_a_region_is_cut_from_its_blocks(answers, bounds):
 
 
 def test_a_region_that_no_reply_carries_is_refused(answers):
-    bounds = Bounds(0, 0, 4001, 4000)
-    for query in (RegionQuery(bounds), RegionQuery(bounds, resolution_m=4001.0), RegionQuery(bounds, when=When(1))):
-        with refused(Refusal.TOO_LARGE, "4001 x 4000 cells"):
+    bounds = Bounds(0, 0, 5000, 4000)
+    for query in (RegionQuery(bounds), RegionQuery(bounds, resolution_m=1000.0), RegionQuery(bounds, when=When(1))):
+        with refused(Refusal.TOO_LARGE, "5000 x 4000 cells"):
             answers.region(query)
 
 

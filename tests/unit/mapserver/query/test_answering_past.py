@@ -84,12 +84,6 @@ def test_the_map_as_of_a_time_is_that_of_a_server_that_knew_no_more(answers, ser
     assert then.stamp_ns == stamp_ns
 
 
-def test_before_the_first_sample_nothing_was_known(answers):
-    then = answers.region(RegionQuery(BOX, when=When(as_of_ns=NOW_NS - 1)))
-    assert tuple(then.layers) == tuple(LAYERS)
-    assert all(np.isnan(layer).all() for layer in then.layers.values())
-
-
 def repaved():
     """An area of 20 x 20 m, driven at 0.02, and two hours later at 0.25."""
     x, y = (axis.ravel() + 0.5 for axis in np.meshgrid(np.arange(20), np.arange(20)))
@@ -236,25 +230,6 @@ def test_questions_about_the_past_are_recognised():
     assert reads_past(PointQuery(0, 0, when=When(as_of_ns=1)))
     assert reads_past(RegionQuery(BOX, when=When(minus_ns=1)))
     assert not reads_past(PointQuery(0, 0, fresh=Freshness(3)))
-
-
-def test_answers_about_the_past_travel_as_bytes(answers):
-    stamp = str(NOW_NS + 900 * S)
-    region = {"bounds": "-2,-2,2,2", "layers": "visits"}
-    then = codec.decode_region(answered(answers, "region", {**region, "as_of": stamp}))
-    difference = codec.decode_region(answered(answers, "region", {**region, "minus": stamp}))
-    now = codec.decode_region(answered(answers, "region", region))
-    assert np.array_equal(difference["visits"], now["visits"] - then["visits"], equal_nan=True)
-    assert then.stamp_ns == int(stamp)
-    place = {"x": "0.5", "y": "0.5", "layers": "visits"}
-    assert codec.decode_point(answered(answers, "point", {**place, "as_of": stamp})).stamp_ns == int(stamp)
-    one = ROWS["a"][ROWS["a"]["distance_m"].argmax()]
-    there = {"x": str(one["x_m"]), "y": str(one["y_m"]), "layers": "visits"}
-    times = {"from": str(one["stamp_ns"]), "to": str(one["stamp_ns"]), "span": "600"}
-    [span] = codec.decode_history(answered(answers, "history", {**there, **times})).spans
-    assert span.last_ns - span.first_ns == 600 * S - 1
-    with pytest.raises(QueryError, match="row 9 is not merged"):
-        answered(answers, "history", {**place, "after": "9", "wait": "0.01"})
 
 
 # --- machines, changes, commands -------------------------------------------------------------------------------------

@@ -36,22 +36,6 @@ def same(a, b) -> None:
         np.testing.assert_array_equal(layer, b[name], err_msg=name)
 
 
-def test_ages_grow_though_nothing_is_derived_again(tmp_path):
-    names, here, there = ("age_s",), CellWindow(0, 0, 16, 16), 400.0
-    kept = fresh()
-    with closing(open_writer(tmp_path)) as writer:
-        send(writer, [incoming(samples(1, x_m=3.5, y_m=3.5, distance_m=4.0))])
-        before = read(kept, writer, here, names)["age_s"]
-        later = samples(1, x_m=there, y_m=there, distance_m=4.0)
-        later["stamp_ns"] += 60 * 10**9
-        send(writer, [incoming(later, first_seq=2)])
-        derived = kept.derived
-        after = read(kept, writer, here, names)["age_s"]
-        assert kept.derived == derived
-        assert after[3, 3] - before[3, 3] == pytest.approx(60.0)
-        assert np.isnan(after[10, 10])
-
-
 def test_another_grid_begins_anew_and_an_old_look_keeps_nothing(tmp_path):
     kept, names, window = fresh(), ("resistance", "resistance_filled"), CellWindow(0, 0, 40, 40)
     with closing(open_writer(tmp_path)) as writer:

@@ -1,6 +1,7 @@
 """Roads and worklists as they are answered: now and as of any time, by what the map is made of."""
 
 import threading
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -48,9 +49,24 @@ def rows_of(first: float = 0.05, second: float = 0.03):
 @pytest.fixture
 def writer(tmp_path):
     with closing(open_writer(tmp_path)) as opened:
-        for machine, rows in rows_of().items():
-            send(opened, [incoming(rows, machine=machine)])
+        deliver(opened, [rows_of()])
         yield opened
+
+
+def deliver(writer, parts):
+    """Samples by machine, part after part."""
+    sent = Counter()
+    for rows in parts:
+        for name, own in rows.items():
+            send(writer, [incoming(own, 1 + sent[name], machine=name)])
+            sent[name] += len(own)
+
+
+def of_both(count, c_rr, after_s):
+    """Passes of two machines on one road."""
+    return {
+        name: passes(LINE, count, c_rr, seed=7 * count + i, after_s=after_s + 30.0 * i) for i, name in enumerate("ab")
+    }
 
 
 def segments(answers, **parameters):
@@ -118,12 +134,8 @@ def test_hours_and_bounds_choose(writer):
 
 def test_shuffled_and_rebatched_samples_give_the_same_list(tmp_path):
     """Two machines on one road that was repaired, and on one of their own; whoever sends first, in whatever pieces."""
-    draw, parts = np.random.default_rng(37), {"a": [], "b": []}
-    for i, name in enumerate(parts):
-        for count, c_rr, after_s in ((4, 0.06, 0.0), (3, 0.02, 900.0)):
-            parts[name].append(passes(LINE, count, c_rr, seed=10 * count + i, after_s=after_s + 30.0 * i))
-    rows = {name: np.concatenate([*some, rows_of()[name]]) for name, some in parts.items()}
-    lists = []
+    draw, parts, lists = np.random.default_rng(37), (of_both(4, 0.06, 0.0), of_both(3, 0.02, 900.0), rows_of()), []
+    rows = {name: np.concatenate([part[name] for part in parts]) for name in "ab"}
     for shuffled in (False, True):
         with closing(open_writer(tmp_path / str(shuffled))) as opened:
             for name in sorted(rows, reverse=shuffled):
@@ -136,16 +148,6 @@ def test_shuffled_and_rebatched_samples_give_the_same_list(tmp_path):
             lists.append((segments(answers).segments, listed.rows, listed.changes, drive(answers).totals))
     assert lists[0] == lists[1]
     assert lists[0][2], "with changes"
-
-
-def test_the_list_as_of_a_time_is_that_of_then(writer):
-    answers = answers_of(writer)
-    then_ns = int(rows_of()["a"]["stamp_ns"].max())
-    before = worklist(answers, as_of_ns=then_ns)
-    assert {row.segment.id.split("_")[1] for row in before.rows} == {"0"}
-    newest = int(rows_of()["b"]["stamp_ns"].max())
-    now, as_of_now = worklist(answers), worklist(answers, as_of_ns=newest)
-    assert as_of_now.rows == now.rows
 
 
 def test_facts_count_for_samples(writer):
@@ -204,11 +206,9 @@ def test_traffic_of_one_stamp_is_no_division_by_nothing(tmp_path):
 
 
 def test_a_repair_is_told_and_counts(tmp_path):
-    bad = {name: passes(LINE, 4, 0.06, seed=i, after_s=30.0 * i) for i, name in enumerate("ab")}
-    good = {name: passes(LINE, 2, 0.02, seed=i, after_s=600.0 + 30.0 * i) for i, name in enumerate("ab", 7)}
+    bad, good = of_both(4, 0.06, 0.0), of_both(2, 0.02, 600.0)
     with closing(open_writer(tmp_path)) as opened:
-        for machine, rows in bad.items():
-            send(opened, [incoming(rows, machine=machine)])
+        deliver(opened, [bad])
         answers = answers_of(opened)
         before = worklist(answers, target=0.03)
         assert before.rows
@@ -241,14 +241,8 @@ BOX = Bounds(36.0, 8.0, 44.0, 13.0)
 @pytest.fixture
 def repaired(tmp_path):
     """Ground of 0.06 until 600 s, 0.02 since, driven by two machines; and the stamp at which it was still bad."""
-    parts = [(0.06, 4, 0.0), (0.02, 3, 900.0)]
     with closing(open_writer(tmp_path)) as opened:
-        sent = {"a": 1, "b": 1}
-        for c_rr, count, after_s in parts:
-            for i, name in enumerate(sent):
-                rows = passes(LINE, count, c_rr, seed=7 * count + i, after_s=after_s + 30.0 * i)
-                send(opened, [incoming(rows, sent[name], machine=name)])
-                sent[name] += len(rows)
+        deliver(opened, [of_both(4, 0.06, 0.0), of_both(3, 0.02, 900.0)])
         yield opened, START_NS + 800 * 10**9
 
 
@@ -330,18 +324,6 @@ def test_tiles_show_a_repair_with_the_next_row(repaired):
     assert {(tile.x, tile.y): tile.planes for tile in fresh.tiles}[0, 0] == later[0, 0].planes
 
 
-def test_pictures_have_the_ages_of_some_seconds_ago(repaired, monkeypatch):
-    opened, _ = repaired
-    monkeypatch.setattr(road_maps, "CHEAP", DEAR)
-    roads = RoadMaps(source_of(opened))
-    known = roads.lately()
-    assert known.keys() == roads.read().ages.keys() != set()
-    send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine="c")])
-    assert roads.lately() is known, "asked again at once: as it was"
-    monkeypatch.setattr(road_maps, "FRESH_S", 0.0)
-    assert roads.lately() is not known
-
-
 def come(opened, machine="c"):
     """One more pass on the second road: a newer map."""
     send(opened, [incoming(passes(BESIDE, 1, after_s=5000.0), machine=machine)])
@@ -375,27 +357,6 @@ def test_roads_are_those_of_the_last_seconds_and_say_which(repaired, look_s, old
     assert (first.version.row, second.version.row) == (4, 5)
     clock.now_s += 100 * FRESH_S
     assert roads.read() is second, "nothing came in since, however long ago"
-
-
-def test_who_waits_for_a_row_gets_roads_of_it(repaired, monkeypatch):
-    opened, then_ns = repaired
-    monkeypatch.setattr(road_maps, "CHEAP", DEAR)
-    answers = answers_of(opened)
-    asked = encode_query(RouteQuery(((15.0, 10.0), (205.0, 10.0))))
-    first = answered(answers, "route", asked)
-    come(opened)
-    assert answered(answers, "route", {**asked, "after": "4"}) == first
-    assert decode_answer(answered(answers, "route", {**asked, "after": "5"})).merged == 5
-    of_now, then = (worklist(answers, as_of_ns=as_of_ns) for as_of_ns in (None, then_ns))
-    assert (of_now.merged, then.merged) == (5, 5)
-
-
-def test_roads_of_another_fact_are_of_no_use(repaired):
-    opened, _ = repaired
-    roads = RoadMaps(source_of(opened))
-    known = roads.read()
-    opened.run(lambda store: setattr(store, "facts", Facts(frozenset({"b"}), number=1)))
-    assert roads.read().version.fact == 1 != known.version.fact
 
 
 WHOLE = RouteQuery(((15.0, 10.0), (205.0, 10.0)))
@@ -501,21 +462,18 @@ def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
 def test_a_fact_between_two_passes_is_no_repair(tmp_path, facts):
     """The machines' samples are off by 0.02, or b's alone; the fact comes while they drive on."""
     off = {"a": 0.0 if facts.excluded else 0.02, "b": 0.02}
-    sent = {"a": 1, "b": 1}
-
-    def drive(opened, after_s):
-        for i, name in enumerate(sent):
-            rows = passes(LINE, 4, 0.04 + off[name], seed=i, after_s=after_s + 30.0 * i)
-            send(opened, [incoming(rows, sent[name], machine=name)])
-            sent[name] += len(rows)
-
+    parts = [of_both(4, 0.04, 0.0), of_both(4, 0.04, 600.0)]
+    for name in "ab":
+        for part in parts:
+            part[name]["c_rr"] += off[name]
     with closing(open_writer(tmp_path)) as opened:
-        drive(opened, 0.0)
+        deliver(opened, parts[:1])
         answers = answers_of(opened)
         assert worklist(answers).changes == ()
         opened.run(lambda store: setattr(store, "facts", facts))
         assert worklist(answers).changes == ()
-        drive(opened, 600.0)
+        first = {name: 1 + len(rows) for name, rows in parts[0].items()}
+        send(opened, [incoming(rows, first[name], machine=name) for name, rows in parts[1].items()])
         listed = worklist(answers)
         known = {one.id: one.resistance for one in segments(answers).segments}
         plain, since = (resistance(answers, repairs=repairs) for repairs in (False, True))
@@ -527,12 +485,9 @@ def test_a_fact_between_two_passes_is_no_repair(tmp_path, facts):
 
 def test_days_of_a_row_are_its_history(tmp_path):
     day_ns = 24 * HOUR_NS
+    days = [passes(LINE, 2, 0.04 + 0.002 * day, seed=day, after_s=86_400.0 * day) for day in range(4)]
     with closing(open_writer(tmp_path)) as opened:
-        first = 1
-        for day in range(4):
-            rows = passes(LINE, 2, 0.04 + 0.002 * day, seed=day, after_s=86_400.0 * day)
-            send(opened, [incoming(rows, first)])
-            first += len(rows)
+        deliver(opened, [{"a": rows} for rows in days])
         row = worklist(answers_of(opened)).rows[0]
     assert row.day_ns == tuple((START_NS // day_ns + day) * day_ns for day in range(4))
     assert row.day_resistance == pytest.approx([0.04, 0.042, 0.044, 0.046], abs=5e-4)

@@ -80,18 +80,6 @@ def test_a_way_leads_around_sand_and_costs_less_than_straight(tmp_path):
         assert again.totals.energy_j == pytest.approx(way.totals.energy_j)
 
 
-def test_up_and_down_have_ways_of_their_own(tmp_path):
-    """A steep short cut with brakes downhill, and a detour that rises gently: nobody saves by braking."""
-    steep = lambda x, y: np.where(abs(y) < 20, 0.12, 0.02)  # noqa: E731
-    with answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x, steep)) as answers:
-        up, down = (
-            ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
-            for ends in (((-40.0, 0.0), (40.0, 0.0)), ((40.0, 0.0), (-40.0, 0.0)))
-        )
-        assert abs(up.line_m[:, 1]).max() > 15
-        assert abs(down.line_m[:, 1]).max() < 15
-
-
 def test_unknown_ground_is_dear_refused_or_as_told(tmp_path):
     gap = lambda x, y: (abs(x) < 10) & (y < 40)  # noqa: E731
     soils = lambda x, y: np.where(y > 45, 0.08, 0.02)  # noqa: E731

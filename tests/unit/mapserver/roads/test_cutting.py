@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.roads.cutting import LATTICE_M, LEAST_M, SLIVER_M, cut, gathered
+from mapserver.roads.cutting import LATTICE_M, LEAST_M, SLIVER_M, cut
 
 
 def edges(*lines):
@@ -37,11 +37,6 @@ def test_pieces_share_their_ends_and_cover_the_line(seed):
         assert len(own) == 1 or min(lengths) >= SLIVER_M
 
 
-def test_a_cut_is_where_the_line_enters_another_cell():
-    line, pieces = cut(*edges([(x + 0.5, 10.5) for x in range(100)]), np.array([[0, 1]]))
-    np.testing.assert_array_equal(line[pieces[1:, 0], 0], [25.5, 50.5, 75.5])
-
-
 def test_a_ring_begins_at_a_cut_and_touches_no_node():
     turns = np.linspace(0, 2 * np.pi, 251)
     ring = 100 + 40 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
@@ -57,11 +52,3 @@ def test_a_ring_begins_at_a_cut_and_touches_no_node():
 def test_what_is_shorter_than_a_machine_is_nothing():
     _, pieces = cut(*edges([(0.5, 0.5), (0.5 + LEAST_M - 1, 0.5)], [(50, 0), (90, 0)]), np.zeros((2, 2), np.int64))
     assert pieces[:, :2].tolist() == [[2, 3]]
-
-
-def test_lines_are_turned_round_and_measured():
-    points = np.array([(0.0, 0.0), (3.0, 4.0), (3.0, 5.0)])
-    lines, ends, length_m = gathered(points, np.array([0, 1]), np.array([2, 2]), np.array([True, False]))
-    assert lines.tolist() == [[3, 5], [3, 4], [0, 0], [3, 4], [3, 5]]
-    assert ends.tolist() == [0, 3, 5]
-    assert length_m.tolist() == [6.0, 1.0]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapserver.evidence.fold_config import name_hash
-from mapserver.roads.ledger import Ledgers, resistance
+from mapserver.roads.ledger import Ledgers
 from mapserver.roads.loss import losses
 from mapserver.roads.tally import PER_C, PER_M, Tally
 from mapserver.roads.worklist import theil_sen, trends
@@ -70,16 +70,6 @@ def test_there_and_back_are_told_apart_ahead_and_in_reverse(sign):
     assert ledger.placed == 1.0
 
 
-def test_a_crossing_keeps_its_roads_apart():
-    across = along([(100, -40), (100, 60)])
-    ledger, segments = ledger_of(passes(LINE, 6, mass_kg=10_000.0), passes(across, 6, seed=1, mass_kg=80_000.0))
-    totals = ledger.totals()
-    kg = totals["kg"].sum(axis=1) / totals["weighed"].sum(axis=1)
-    east = np.abs(segments.ahead[:, 0]) > 0.9
-    assert kg[east] == pytest.approx(10_000, rel=0.1)
-    assert kg[~east] == pytest.approx(80_000, rel=0.1)
-
-
 def test_two_soils_have_their_own_resistance():
     rows = passes(LINE, 8)
     rows["c_rr"] += np.where(rows["x_m"] > 110.0, 0.04, 0.0).astype(np.float32)
@@ -99,18 +89,6 @@ def test_the_mean_is_over_places_not_over_what_was_measured():
     ledger, segments = ledger_of(rows)
     at = segments.ids.index("4_0_e")
     assert losses(ledger, segments, 0.02).c_rr[at] == pytest.approx(0.056, rel=0.1)
-
-
-def test_gaps_are_filled_from_both_sides():
-    rows = passes(LINE, 4)
-    rows["c_rr"] = np.where(rows["x_m"] < 110, 0.02, 0.04)
-    gap = (rows["x_m"] > 101) & (rows["x_m"] < 119)
-    rows["c_rr"][gap] = rows["c_rr_var"][gap] = np.nan
-    ledger, segments = ledger_of(rows)
-    assert losses(ledger, segments, 0.02).unmeasured.max() > 0.3
-    c = resistance(ledger)
-    assert np.isfinite(c).all()
-    assert ((c > 0.0195) & (c < 0.0405)).all()
 
 
 def test_work_lost_is_mass_times_gravity_times_way_times_excess():

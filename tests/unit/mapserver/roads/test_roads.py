@@ -11,7 +11,7 @@ from mapserver.roads.cutting import LATTICE_M, SLIVER_M
 from mapserver.roads.segments import Segments
 from mapserver.roads.skeleton import Skeletons
 from protocol.arrays import Floats
-from tests.unit.mapserver.roads.drives import EVERYWHERE, along, grid_of, passes, ring, roads, roads_of
+from tests.unit.mapserver.roads.drives import along, grid_of, passes, ring, roads, roads_of
 
 END_M = 3.5  # a road ends within so much of where machines turned round
 
@@ -127,15 +127,6 @@ def test_halves_of_the_samples_have_the_same_names():
     one, other = (roads(passes(line, 6, seed=seed)) for seed in (1, 2))
     kept = sum(length for name, length in zip(one.ids, one.length_m, strict=True) if name in other.ids)
     assert kept / one.length_m.sum() > 0.97
-
-
-def test_small_cells_show_the_same_roads():
-    rows = passes(along([(20, 20), (180, 60)]))
-    grid = Grid(0.5, FoldConfig())
-    grid.fold(rows, "truck-0")
-    blocks = grid.blocks_in(EVERYWHERE)
-    pages = dict(zip(blocks, grid.pages(blocks), strict=True))
-    assert Skeletons(0.5).skeleton(pages).raster_m == 1.0
 
 
 @pytest.mark.parametrize("rounds", [1, 8])

@@ -40,12 +40,6 @@ def test_steps_divide_a_line_evenly() -> None:
     assert cut.direction[50:] == pytest.approx(np.tile([0.0, 1.0], (30, 1)))
 
 
-def test_a_line_that_is_no_whole_number_of_steps_keeps_its_length() -> None:
-    cut = steps(np.array([[0.0, 0.0], [3.0, 4.4]]), 1.0)
-    assert cut.length_m.sum() == pytest.approx(math.hypot(3.0, 4.4))
-    assert len(steps(np.array([[0.0, 0.0], [0.1, 0.0]]), 1.0).length_m) == 1
-
-
 def test_a_circle_is_driven_as_its_radius_allows() -> None:
     angle = np.linspace(0, math.pi, 200)
     circle = 20.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)

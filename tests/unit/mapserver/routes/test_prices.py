@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from mapserver.routes.ground import Squares
-from mapserver.routes.prices import COARSE, LOOSE, NEEDS, RESISTANCE, Prices, Rises, bare, heights, slopes
+from mapserver.routes.prices import LOOSE, NEEDS, RESISTANCE, Prices, bare
 
 EDGE = 32
 HERE = {(0, 0)}
-SIZE = 15 * COARSE
 
 
 def squares(made: dict[tuple[int, int], dict[str, object]], std: float = 0.001) -> Squares:
@@ -63,13 +62,3 @@ def test_squares_are_bare_where_any_cell_was_never_driven() -> None:
     driven[3, 4] = False
     some = squares({(0, 0): {"resistance": 0.03}, (1, 0): {"resistance": 0.03, "driven": driven}})
     assert bare(some, {(0, 0), (1, 0), (5, 5)}) == {(1, 0), (5, 5)}
-
-
-def test_a_plane_goes_on_between_what_is_known_of_it() -> None:
-    known = np.ones((SIZE, SIZE), bool)
-    known[30:90, 36:84] = False
-    rises = Rises.of_slopes(np.full((SIZE, SIZE), 0.05), np.full((SIZE, SIZE), -0.02), known)
-    east, north = slopes(heights(rises))
-    inner = slice(36 - COARSE, 84 - COARSE), slice(42 - COARSE, 78 - COARSE)
-    assert east[inner] == pytest.approx(np.full((48, 36), 0.05), abs=0.002)
-    assert north[inner] == pytest.approx(np.full((48, 36), -0.02), abs=0.002)

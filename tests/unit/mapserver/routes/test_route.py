@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mapserver.routes.ground import Squares
-from mapserver.routes.prices import Prices
 from mapserver.routes.route import LAYERS, STEP_M, route
 from protocol.arrays import Floats
 from protocol.errors import QueryError
@@ -40,18 +39,6 @@ def line(*corners: tuple[float, float]) -> Floats:
     return np.array(corners, float)
 
 
-def test_on_a_plane_a_route_costs_resistance_and_height() -> None:
-    ahead = line((10, 10), (170, 130))
-    layers = fields(0.03, east=0.004, north=0.01)
-    steps, totals = route(ahead, layers, SLOW, stops=ROLLING)
-    assert totals.length_m == pytest.approx(200)
-    assert totals.lift_m == pytest.approx(160 * 0.004 + 120 * 0.01)
-    assert totals.energy_j == pytest.approx(WEIGHT_N * (0.03 * 200 + totals.lift_m))
-    assert totals.fuel_j == pytest.approx(totals.energy_j / SLOW.efficiency)
-    assert (totals.time_s, totals.unknown, totals.braked_j) == pytest.approx((100, 0, 0), abs=1e-6)
-    assert steps.slope == pytest.approx(np.full(8, totals.lift_m / 200))
-
-
 def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
     ahead = line((10, 10), (170, 130))
     _, sure = route(ahead, fields(0.03, std=0.001), SLOW)
@@ -80,20 +67,6 @@ def test_no_line_is_so_long_that_errors_of_a_map_vanish() -> None:
     _, totals = route(line((1, 1), (219, 219), (1, 219), (219, 1)), fields(0.1, std=1e-6), SLOW, stops=ROLLING)
     half = (totals.energy_high_j - totals.energy_low_j) / 2 / totals.energy_j
     assert half == pytest.approx(1.645 * math.hypot(0.03, 0.02), rel=0.1)
-
-
-def test_unknown_ground_counts_as_the_dearest_and_is_said() -> None:
-    soils = np.where(np.arange(SIZE) < 150, 0.02, 0.08) + np.zeros((SIZE, 1))
-    soils[:, 80:120] = np.nan
-    layers = fields(soils)
-    layers.layers["visits"][0, :, 80:120] = np.nan
-    steps, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, step_m=10)
-    assert (totals.unknown, totals.unmeasured) == (pytest.approx(40 / 130, abs=0.02), 0.0)
-    assert steps.resistance[8] == totals.unknown_resistance == pytest.approx(0.08, rel=0.02)
-    assert np.isnan(steps.confidence[8])
-    _, given = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, prices=Prices(layers, 0.02))
-    assert given.energy_j == pytest.approx(WEIGHT_N * 0.02 * 130, rel=0.01)
-    assert totals.energy_high_j - totals.energy_low_j > given.energy_high_j - given.energy_low_j
 
 
 def test_what_was_driven_on_and_not_measured_lies_between_what_was() -> None:
