@@ -75,9 +75,6 @@ def test_each_span_has_its_own_correction_and_rows_of_none_stay_bytes_as_they_we
     assert corrected(rows, []) is rows
 
 
-# --- machines that calibrate themselves ------------------------------------------------------------------------------
-
-
 def calibrated_by_itself(rows: Table, zero: Floats, scale: Floats) -> Table:
     """What the machine would have sent with these zeros and scales (n,) applied: agents/estimation/ground.py."""
     out = rows.copy()
@@ -103,8 +100,6 @@ def test_what_a_machine_applied_is_undone_sample_by_sample(direction: float) -> 
     assert not back["applied_scale"].any()
     assert measured(back) is back
 
-
-# --- all machines ----------------------------------------------------------------------------------------------------
 
 MANY = [
     Correction("a", 0, START_NS + 600 * 10**9, 0.01, 0.03, 0.002, ()),

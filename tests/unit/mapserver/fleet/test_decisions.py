@@ -102,12 +102,6 @@ def test_what_differs_by_less_than_it_is_unsure_changes_nothing(off, counts):
     assert [solver.hears(one(**off)) for _ in range(2)] == [0, int(counts)]
 
 
-def test_a_doubtful_machine_does_not_go_to_and_fro():
-    solver = Solver()
-    solver.hears(one(0.003), after_ns=EVERY_NS)
-    assert [solver.hears(one(zero)) for zero in (0.0, 0.003, 0.0, 0.003)] == [0] * 4
-
-
 def test_the_solver_decides_at_most_once_in_ten_minutes_of_site_time_unless_it_is_asked():
     solver = Solver()
     counts = [solver.hears(one(0.002 + 0.002 * (minute // 2))) for minute in range(14)]
@@ -219,9 +213,6 @@ def test_painted_spans_are_what_painting_each_time_by_itself_gives():
         assert np.array_equal([each.zero if each else np.nan for each in by_time], times, equal_nan=True)
 
 
-# --- where a machine's first correction begins, what is confirmed, and many of them -----------------------------------
-
-
 @pytest.mark.parametrize(
     ("begins", "applied", "expected"),
     [
@@ -280,9 +271,6 @@ def test_what_is_known_of_a_machine_that_stands_is_as_of_its_last_epoch():
     assert solver.decisions.as_of_ns("a") == NOW_NS + EPOCH_NS
 
 
-# --- what is known late ----------------------------------------------------------------------------------------------
-
-
 def unknown(zero: float, epoch: int, across_std: float = 0.0045, **more: float) -> Correction:
     """Of samples on slopes nothing was known."""
     covariance = np.diag([1e-6, 2e-3, across_std**2]).tolist()
@@ -321,9 +309,6 @@ def test_what_was_shown_of_a_scale_then_stays():
     for _ in range(2):
         solver.hears(one(0.001, 1100, scale=0.4))
     assert [each.scale for each in solver.decisions.corrections.each] == [0.0, 0.4]
-
-
-# --- machines that are not solved together ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("groups", [1, 2, 3])

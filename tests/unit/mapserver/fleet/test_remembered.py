@@ -42,10 +42,6 @@ def level(seed: int = 7) -> dict[str, Table]:
     return ledgers({name: drive(LOW, e, seed=seed + i) for i, (name, e) in enumerate(ERRORS.items())})
 
 
-def scales_of(errors: Mapping[str, Errors]) -> dict[str, float]:
-    return {name: error.scale for name, error in errors.items()}
-
-
 def scales(result: Calibration) -> dict[str, float]:
     return {name: state.scale for name, state in result.machines.items()}
 
@@ -97,7 +93,7 @@ def test_a_scale_that_was_shown_counts_where_slopes_contradict_each_other(site: 
     assert (alone.common.reason, {one.most_share for one in alone.corrections}) == (reason, {LEVEL_SHARE})
     result = calibrate(ledgers(rows), remembered=remembered_of(KNOWN))
     assert {one.most_share for one in result.corrections} == {ANY_SHARE}
-    assert scales(result) == pytest.approx(scales_of(ERRORS), abs=0.015)
+    assert scales(result) == pytest.approx({name: error.scale for name, error in ERRORS.items()}, abs=0.015)
 
 
 def test_a_quarter_of_an_hour_in_which_nothing_is_shown_erases_nothing() -> None:
@@ -132,9 +128,6 @@ def test_a_gain_that_is_remembered_has_no_say_on_the_level() -> None:
     result = calibrate(rows, remembered=remembered_of(bad))
     assert result.machines["a"].beyond[1] > 6.7
     assert scales(result) == pytest.approx({"a": 0.6, "b": 0.0, "c": 0.03}, abs=0.02)
-
-
-# --- what the machines stated ----------------------------------------------------------------------------------------
 
 
 def applied(rows: Table, zero: Floats | float) -> Table:
@@ -173,9 +166,6 @@ def test_a_machine_that_changes_its_mind_within_an_epoch_is_corrected() -> None:
         assert (each.zero, each.zero_std) == pytest.approx((0.012, 0.006), abs=0.001)
         assert (each.scale, each.scale_std) == (0.0, 0.0)
     assert decided({"a": applied(rows, to_and_fro)}).corrections.each != ()
-
-
-# --- nobody can be named ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("errors", [Errors(11 * ZERO_STD), Errors(-6 * ZERO_STD), Errors(0.0, 15 * SCALE_STD)])

@@ -87,9 +87,6 @@ def test_answers_travel_as_bytes(answers):
     assert info.samples_merged == 80
 
 
-# --- change and gaps across the borders of blocks --------------------------------------------------------------------
-
-
 def driven(
     cell_m: float, half: int, changed: tuple[int, int, int, int], step: int = 1, c_rr: float = 0.2
 ) -> list[np.ndarray]:

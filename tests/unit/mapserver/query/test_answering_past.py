@@ -59,9 +59,6 @@ def equal(one, other, names=NAMES) -> bool:
     return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)
 
 
-# --- as of -----------------------------------------------------------------------------------------------------------
-
-
 def test_the_map_as_of_now_is_the_map_to_the_bit(answers):
     here = answers.region(RegionQuery(BOX, NAMES))
     then = answers.region(RegionQuery(BOX, NAMES, when=When(as_of_ns=NEWEST_NS)))
@@ -115,9 +112,6 @@ def test_excluded_machines_are_excluded_from_the_past(answers, served):
     assert not equal(here, answers.region(RegionQuery(BOX, ("resistance",), when=when)), ["resistance"])
 
 
-# --- differences -----------------------------------------------------------------------------------------------------
-
-
 def test_a_difference_is_value_by_value_and_unknown_where_either_is(answers):
     names = ("resistance", "visits", "resistance_filled")
     middle_ns = NOW_NS + 900 * S
@@ -147,9 +141,6 @@ def test_axes_have_no_difference(answers):
         answers.point(PointQuery(0.0, 0.0, ("visits", "heading"), when=When(minus_ns=NOW_NS)))
     values = answers.point(PointQuery(0.0, 0.0, when=When(minus_ns=NOW_NS))).values
     assert set(values) == set(LAYERS) - {"heading"}
-
-
-# --- history ---------------------------------------------------------------------------------------------------------
 
 
 def hours(*rates: float):
@@ -209,20 +200,15 @@ def test_a_history_leaves_out_machines_and_filled_layers(served):
     assert served(rows, excluded="a").history(HistoryQuery(8.5, 8.5)).spans == ()
     with refused(Refusal.UNKNOWN_LAYER, "`resistance_filled` is made from a cell's neighbours"):
         served(rows).history(HistoryQuery(8.5, 8.5, ("visits", "resistance_filled")))
-    with pytest.raises(QueryError, match="`colour` is not known"):
-        served(rows).history(HistoryQuery(8.5, 8.5, ("colour",)))
 
 
-# --- the journal -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("query", [PointQuery(0, 0, when=When(1)), HistoryQuery(0, 0)])
-def test_a_past_that_cannot_be_read_is_refused(tmp_path, query):
+def test_a_past_that_cannot_be_read_is_refused(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
         writer.location = JournalLocation(tmp_path / "elsewhere")
-        with pytest.raises(QueryError, match="no usable journal") as caught:
-            getattr(answers_of(writer), query.name)(query)
-    assert caught.value.reason == Refusal.STORE
+        answers = answers_of(writer)
+        for query in (PointQuery(0, 0, when=When(1)), HistoryQuery(0, 0)):
+            with refused(Refusal.STORE, "no usable journal"):
+                answers.answer(query)
 
 
 def test_questions_about_the_past_are_recognised():
@@ -230,9 +216,6 @@ def test_questions_about_the_past_are_recognised():
     assert reads_past(PointQuery(0, 0, when=When(as_of_ns=1)))
     assert reads_past(RegionQuery(BOX, when=When(minus_ns=1)))
     assert not reads_past(PointQuery(0, 0, fresh=Freshness(3)))
-
-
-# --- machines, changes, commands -------------------------------------------------------------------------------------
 
 
 def test_the_upkeep_is_asked(served):

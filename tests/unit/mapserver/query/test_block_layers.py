@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import closing
 
 import numpy as np
-import pytest
 
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.writer import Writer
@@ -81,31 +79,6 @@ def test_beside_new_samples_no_block_is_derived_again_whose_pages_count_as_befor
         same(read(kept, writer, wide, names), read(fresh(), writer, wide, names))
         folded = writer.run(lambda state: state.grid.folded_since(turn)[0])
         assert kept.derived - derived == len(folded) > 0
-
-
-def test_a_block_is_derived_again_where_what_came_in_beside_it_shows_that_its_ground_changed(tmp_path):
-    """A strip that is too narrow to be a change becomes one, once the strip beside it in the next block changes."""
-    names, window = ("resistance", "resistance_filled"), CellWindow(0, 0, 32, 16)
-    kept, sent = fresh(), 0
-
-    def drive(writer: Writer, columns: Sequence[int], c_rr: float, after_s: float) -> float:
-        nonlocal sent
-        x, y = (grid.ravel() + 0.5 for grid in np.meshgrid(np.array(columns), np.arange(16)))
-        rows = samples(len(x), x_m=x, y_m=y, distance_m=4.0, c_rr=c_rr, cov_xx_m2=1e-4, cov_yy_m2=1e-4)
-        rows["stamp_ns"] += int(after_s * 1e9)
-        send(writer, [incoming(rows, first_seq=1 + sent)])
-        sent += len(rows)
-        now = read(kept, writer, window, names)
-        same(now, read(fresh(), writer, window, names))
-        return float(now["resistance"][8, 14])
-
-    with closing(open_writer(tmp_path)) as writer:
-        drive(writer, [*range(32)], 0.02, 0.0)
-        drive(writer, [*range(13), *range(16, 32)], 0.02, 3600.0)
-        narrow = drive(writer, [13, 14, 15], 0.2, 3600.0)
-        wide = drive(writer, [16, 17, 18], 0.2, 7200.0)
-        assert wide == pytest.approx(0.2, rel=0.1)
-        assert narrow < wide / 2
 
 
 def test_a_point_that_is_kept_is_what_its_region_says_until_something_comes_in_beside_it(tmp_path):

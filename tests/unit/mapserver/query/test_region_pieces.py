@@ -89,8 +89,6 @@ def test_pieces_cover_every_cell_once_and_stay_small(layers):
             assert all(end == begin and end % BLOCK_CELLS == 0 for (_, end), (begin, _) in pairwise(spans))
 
 
-# --- how long a region is kept ----------------------------------------------------------------------------------------
-
 LARGE = Reading(CellWindow(0, 0, 4000, 4000), ("visits",), ())
 
 

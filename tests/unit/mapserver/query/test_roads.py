@@ -77,12 +77,16 @@ def worklist(answers, **parameters):
     return decode_worklist(answered(answers, "worklist", encode_query(WorklistQuery(**parameters))))
 
 
-def test_an_empty_map_has_an_empty_list(tmp_path):
+def test_an_empty_map_has_an_empty_list_and_traffic_of_one_stamp_a_finite_one(tmp_path):
     with closing(open_writer(tmp_path)) as opened:
         answers = answers_of(opened)
         assert segments(answers).segments == ()
         assert worklist(answers).rows == ()
         assert worklist(answers).total_kwh_ph == 0.0
+        rows = passes(LINE, 1)
+        rows["stamp_ns"] = START_NS
+        send(opened, [incoming(rows)])
+        assert all(np.isfinite(row.kwh_ph).all() for row in worklist(answers).rows)
 
 
 def test_segments_say_what_drove_on_them(writer):
@@ -194,15 +198,6 @@ def test_what_cannot_be_answered_is_refused_with_what_to_do(writer, monkeypatch)
     with refused(Refusal.TOO_LARGE, "at most 10 are answered: ask for less with `bounds`"):
         segments(answers)
     assert segments(answers, bounds=Bounds(0, 0, 100, 50)).segments
-
-
-def test_traffic_of_one_stamp_is_no_division_by_nothing(tmp_path):
-    rows = passes(LINE, 1)
-    rows["stamp_ns"] = START_NS
-    with closing(open_writer(tmp_path)) as opened:
-        send(opened, [incoming(rows)])
-        answer = worklist(answers_of(opened))
-    assert all(np.isfinite(row.kwh_ph).all() for row in answer.rows)
 
 
 def test_a_repair_is_told_and_counts(tmp_path):

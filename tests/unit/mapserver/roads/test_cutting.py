@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.roads.cutting import LATTICE_M, LEAST_M, SLIVER_M, cut
+from mapserver.roads.cutting import LEAST_M, SLIVER_M, cut
 
 
 def edges(*lines):
@@ -35,18 +35,6 @@ def test_pieces_share_their_ends_and_cover_the_line(seed):
         assert (own[:-1, 3] == -1).all()
         lengths = [np.hypot(*np.diff(line[a : b + 1], axis=0).T).sum() for a, b in own[:, :2]]
         assert len(own) == 1 or min(lengths) >= SLIVER_M
-
-
-def test_a_ring_begins_at_a_cut_and_touches_no_node():
-    turns = np.linspace(0, 2 * np.pi, 251)
-    ring = 100 + 40 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    ring[-1] = ring[0]
-    line, pieces = cut(*edges(ring), np.array([[5, 5]]))
-    assert (pieces[:, 2:] == -1).all()
-    np.testing.assert_array_equal(line[pieces[0, 0]], line[pieces[-1, 1]])
-    start = np.floor(line[pieces[0, 0]] / LATTICE_M)
-    assert (start != np.floor(line[pieces[-1, 1] - 1] / LATTICE_M)).any()
-    assert np.hypot(*(line - 100).T) == pytest.approx(40, abs=0.5)
 
 
 def test_what_is_shorter_than_a_machine_is_nothing():

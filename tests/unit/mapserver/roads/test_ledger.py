@@ -70,16 +70,6 @@ def test_there_and_back_are_told_apart_ahead_and_in_reverse(sign):
     assert ledger.placed == 1.0
 
 
-def test_two_soils_have_their_own_resistance():
-    rows = passes(LINE, 8)
-    rows["c_rr"] += np.where(rows["x_m"] > 110.0, 0.04, 0.0).astype(np.float32)
-    ledger, segments = ledger_of(rows)
-    c = losses(ledger, segments, 0.02).c_rr
-    middle = np.array([segments.line(i)[:, 0].mean() for i in range(len(c))])
-    assert c[middle < 95] == pytest.approx(0.02, abs=0.001)
-    assert c[middle > 130] == pytest.approx(0.06, abs=0.001)
-
-
 def test_the_mean_is_over_places_not_over_what_was_measured():
     rows = passes(LINE, 8)
     bad = (rows["x_m"] > 100) & (rows["x_m"] < 115)
@@ -118,16 +108,6 @@ def test_without_a_mass_it_is_guessed_and_said():
     lost = losses(ledger, segments, 0.02)
     assert lost.guessed.all()
     assert (lost.work_j > 0).all()
-
-
-def test_samples_without_resistance_are_traffic_and_nothing_more():
-    rows = passes(LINE, 4)
-    rows["c_rr"] = rows["c_rr_var"] = np.nan
-    ledger, segments = ledger_of(rows)
-    lost = losses(ledger, segments, 0.02)
-    assert np.isnan(lost.c_rr).all()
-    assert (lost.work_j == 0).all()
-    assert lost.passes[1:-1, 0] == pytest.approx(4.0, rel=0.06)
 
 
 def test_a_trend_needs_three_days():
