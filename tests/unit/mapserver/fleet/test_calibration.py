@@ -25,7 +25,7 @@ from mapserver.fleet.hysteresis import differs
 from mapserver.fleet.ledger import EPOCH_NS, EPOCHS, newest
 from mapserver.fleet.observability import FAULT_SIGMAS, MachineState, state_of
 from mapserver.fleet.passages import passages
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD, known_cells
 from protocol.arrays import Floats, Table
 from protocol.site.site_config import KnownGround
 from tests.unit.mapserver.fleet.drives import (
@@ -347,16 +347,6 @@ def test_cells_at_the_edge_of_known_ground_are_not_known() -> None:
     outside = ((p.place_m < 4.5) | (p.place_m > 35.5)).any(axis=1)
     assert set(known[inside].tolist()) == {True}
     assert set(known[outside].tolist()) == {False}
-
-
-def test_a_machine_that_is_known_pins_the_others() -> None:
-    rows = {"a": drive(OPEN, Errors(0.0), seconds=200.0, closed=False, site=concrete)}
-    rows |= {"b": drive(OPEN, Errors(0.007), seconds=200.0, closed=False, site=concrete, seed=1)}
-    pinned = Prior(0.0, 0.0, ((0.0005**2, 0.0), (0.0, 0.005**2)))
-    result = solve(rows, remembered={"a": pinned})
-    assert result.machines["a"].zero_by == ("remembered",)
-    assert result.machines["b"].zero == pytest.approx(0.007, abs=0.0015)
-    assert "same_ground" in result.machines["b"].zero_by
 
 
 def test_any_order_of_samples_and_machines_gives_the_same_facts() -> None:

@@ -81,24 +81,6 @@ def test_far_places_and_floods_of_samples_do_no_harm() -> None:
     assert len(p) == len(passages({"a": stays_of([rows])})[0]) - 1  # the stay of the flood
 
 
-def test_passages_measure_what_samples_say() -> None:
-    rows = drive(RAMP, Errors(), seconds=60.0, withheld=False, late=False)
-    p, epochs, _ = passages({"a": stays_of([rows])})
-    assert len(epochs.number) == 1
-    on_ramp = (p.place_m[:, 0] > 54) & (p.place_m[:, 0] < 70) & (p.place_m[:, 1] < 20)
-    assert on_ramp.sum() >= 7
-    assert p.along[on_ramp] == pytest.approx(SLOPE, abs=0.02)
-    assert p.c_rr[on_ramp] == pytest.approx(0.04, abs=0.02)
-    assert p.speed_mps == pytest.approx(4.0, abs=1e-3)
-    assert (np.diff(p.time_s) > 0).all()
-
-
-def test_a_stay_that_the_clock_cuts_in_two_is_one_passage() -> None:
-    rows = drive(LOW, seconds=300.0)
-    p, _, _ = passages({"a": stays_of([rows])})
-    assert (p.cell[1:] != p.cell[:-1]).all()
-
-
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_links_rise_by_the_slope_and_sum_up_to_the_height_of_the_ramp(direction: float) -> None:
     rows = drive(RAMP, Errors(), seconds=25.0, withheld=False, direction=direction)

@@ -95,8 +95,6 @@ def test_filled_class_follows_the_boundaries_of_the_read_options():
     assert split[12, 19:21].tolist() == [2.0, 3.0]
     together = fill(cells, "resistance_filled", config=ReadConfig(boundaries=(0.1,)))
     assert together[12, 19] == pytest.approx(np.exp(np.average(np.log([0.02, 0.03]), weights=[0.65, 0.35])), rel=0.06)
-    apart = fill(cells, "resistance_filled", config=ReadConfig(boundaries=(0.025,)))
-    assert apart[12, 19] == pytest.approx(0.02, rel=1e-5)
 
 
 def test_more_and_surer_evidence_has_the_say():

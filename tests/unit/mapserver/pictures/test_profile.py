@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapserver.pictures import profile
 from mapserver.pictures.plotter import draw_resistance
 from mapserver.pictures.profile import LINE, UNKNOWN, draw_drive
 from protocol.queries.answers import Region
@@ -37,13 +36,3 @@ def test_unknown_ground_is_grey_in_the_profile():
         for unknown in ([0, 0], [0, 1])
     )
     assert count(half, UNKNOWN) > count(known, UNKNOWN) + 10_000
-
-
-def test_both_ends_of_a_drive_are_marked_and_named(monkeypatch):
-    asked = []
-    monkeypatch.setattr(profile, "draw_resistance", lambda *words: asked.append(words) or draw_resistance(*words))
-    draw_drive(REGION, DRIVE)
-    ((_, tracks, _, notes),) = asked
-    ends = {track.name: (track.x_m[-1], track.y_m[-1]) for track in tracks}
-    assert ends == {"start": tuple(DRIVE.line_m[0]), "end": tuple(DRIVE.line_m[-1])}
-    assert "50% of it unknown, taken as 0.062" in notes

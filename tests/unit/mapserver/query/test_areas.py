@@ -7,12 +7,12 @@ import pytest
 
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answering import WITHOUT_MEAN
-from mapserver.query.areas import cells_to_a_side, inside
+from mapserver.query.areas import cells_to_a_side
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_points, decode_region
 from protocol.queries.pieces import joined
 from protocol.queries.requests import PieceQuery, PointQuery, PointsQuery, RegionQuery, When, encode_query, parse_query
-from protocol.site.geometry import Bounds, CellWindow
+from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, refused, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
@@ -43,17 +43,6 @@ def winding(x, y, outline) -> bool:
     corners = np.array([*outline, outline[0]]) - (x, y)
     angles = np.unwrap(np.arctan2(corners[:, 1], corners[:, 0]))
     return bool(abs(angles[-1] - angles[0]) > np.pi)
-
-
-@pytest.mark.parametrize(("cell_m", "direction"), [(1.0, -1), (0.5, 1)])
-def test_a_centre_is_inside_where_the_outline_turns_around_it(cell_m, direction):
-    window = CellWindow(-70, -50, 130, 120)
-    outline = STAR[::direction]
-    image = inside(outline, window, cell_m)
-    for row in range(0, window.rows, 3):
-        for column in range(0, window.columns, 3):
-            x, y = (window.column + column + 0.5) * cell_m, (window.row + row + 0.5) * cell_m
-            assert image[row, column] == winding(x, y, outline), (x, y)
 
 
 def test_an_outline_cuts_the_rectangle_around_it(answers):

@@ -13,9 +13,9 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_region, encode_region
 from protocol.queries.answers import Region
 from protocol.queries.pieces import joined
-from protocol.queries.requests import PieceQuery, RegionQuery, When
+from protocol.queries.requests import PieceQuery, RegionQuery
 from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow
-from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, refused, send
+from tests.unit.mapserver.data import incoming, open_writer, random_samples, refused, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
 NAMES = ("resistance", "visits", "resistance_filled", "grade_filled_std")
@@ -40,21 +40,6 @@ def read(answers: Answers, query: RegionQuery) -> list[Region]:
 def same(a: Region, b: Region) -> bool:
     layers = all(np.array_equal(a[name], b[name], equal_nan=True) for name in a.layers)
     return list(a.layers) == list(b.layers) and np.allclose(a.x_m, b.x_m) and np.allclose(a.y_m, b.y_m) and layers
-
-
-@pytest.mark.slow
-def test_pieces_make_up_the_region(served, monkeypatch):
-    _, answers = served
-    for bounds in ((-93.5, 7, 61, 51.2), (-100, 3, 100, 4), (2, -80, 3, 90)):
-        when = When(minus_ns=NOW_NS + 900 * 10**9) if bounds[0] == -93.5 else When()
-        query = RegionQuery(Bounds(*bounds), NAMES, when=when)
-        whole = answers.region(query)
-        assert whole.piece is None
-        with monkeypatch.context() as patched:
-            patched.setattr(region_pieces, "PIECE_BYTES", 16 * len(NAMES) * BLOCK_CELLS)
-            parts = read(answers, query)
-        assert len(parts) > 1
-        assert same(joined(parts), whole)
 
 
 def test_pieces_are_of_one_version_while_samples_come_in(served, monkeypatch):

@@ -40,13 +40,6 @@ def test_steps_divide_a_line_evenly() -> None:
     assert cut.direction[50:] == pytest.approx(np.tile([0.0, 1.0], (30, 1)))
 
 
-def test_a_circle_is_driven_as_its_radius_allows() -> None:
-    angle = np.linspace(0, math.pi, 200)
-    circle = 20.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    limit = limits(circle, steps(circle, 1.0).end_m, 0.9)
-    assert limit[5:-5] == pytest.approx(np.full(len(limit) - 10, math.sqrt(0.9 * 20.0)), rel=0.03)
-
-
 def test_a_corner_slows_down_around_it_alone() -> None:
     limit = limits(CORNER, steps(CORNER, 1.0).end_m, 0.9)
     assert np.isinf(limit[: 50 - math.ceil(CURVE_M / 2)]).all()
