@@ -172,8 +172,6 @@ def test_samples_that_come_hours_late_are_corrected():
     late = one(0.004, machine="late")
     assert [solver.hears(one(0.003), late, after_ns=EVERY_NS) for _ in range(2)] == [1, 0]
     assert solver.zero(machine="late") == 0.004
-    solver.watches(FROZEN_NS + EVERY_NS, one(0.003), late)
-    assert [solver.hears(one(0.003), one(0.04, machine="late")) for _ in range(3)] == [0] * 3
 
 
 def person(zero: float | None, *, machine: str = "a") -> CalibrationDecision:
@@ -333,17 +331,6 @@ def test_what_cannot_be_decided_now_is_not_forgotten():
     assert [each.machine for each in others] == ["a"]
     decisions.add(others[0])
     assert decisions.judge(solved(one(0.001, machine="b")), NOW_NS + EVERY_NS + 3)[0].machine == "b"
-
-
-def test_what_is_wanted_no_more_does_not_wait():
-    solver = Solver()
-    solver.hears(one(0.002), one(0.002, machine="b"))
-    solver.hears(one(0.002), one(0.002, machine="b"))
-    for zero in (0.009, 0.009, 0.002):
-        solver.hears(one(zero, machine="b"))
-    solver.decisions.add(person(0.02))
-    assert solver.hears(one(0.009), after_ns=EVERY_NS) == 0
-    assert solver.hears(one(0.002, machine="b")) == 0
 
 
 def test_neighbours_that_do_the_same_become_one():

@@ -8,7 +8,7 @@ from mapserver.fleet.ledger import EPOCH_NS, EPOCH_SLOTS, EPOCHS, Ledger, epochs
 from mapserver.fleet.passages import links, passages
 from protocol.arrays import Table
 from tests.unit.mapserver.data import random_samples
-from tests.unit.mapserver.fleet.drives import LOW, RAMP, SLOPE, Errors, drive
+from tests.unit.mapserver.fleet.drives import LOW, RAMP, Errors, drive
 
 
 def stays_of(parts: list[Table]) -> Table:
@@ -79,14 +79,6 @@ def test_far_places_and_floods_of_samples_do_no_harm() -> None:
     p, _, _ = passages({"a": stays_of([rows, far, flood])})
     assert np.isfinite(p.along).all()
     assert len(p) == len(passages({"a": stays_of([rows])})[0]) - 1  # the stay of the flood
-
-
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_links_rise_by_the_slope_and_sum_up_to_the_height_of_the_ramp(direction: float) -> None:
-    rows = drive(RAMP, Errors(), seconds=25.0, withheld=False, direction=direction)
-    p, _, _ = passages({"a": stays_of([rows])})
-    rise_m = links(p).rise_m.sum()
-    assert rise_m == pytest.approx(24 * SLOPE, abs=0.4)
 
 
 def test_nobody_drove_where_a_position_jumped() -> None:

@@ -142,13 +142,6 @@ def test_noise_of_the_votes_is_their_spread(start, noise_bins):
     assert value(grid, "grade_std") == pytest.approx(grade_deviation(slope, noise_bins / 32), rel=0.05)
 
 
-def test_noise_below_a_third_of_a_bin_reads_as_no_more_than_that():
-    z = np.random.default_rng(8).normal(size=2000)
-    grid = folded(samples(2000, grade_e=(0.25 + 0.15 * z) / 32, grade_n=0.0))
-    third = 1 / 3 / (32 * np.sqrt(2))  # of a bin, root mean square of two components of which one is zero
-    assert value(grid, "grade_std") < grade_deviation(0.25 / 32, third)
-
-
 @pytest.mark.parametrize("degrees", [-80.0, 0.0, 33.75, 88.0])
 def test_heading_is_the_axis_driven_both_ways(degrees):
     angle = np.radians(degrees)

@@ -123,13 +123,6 @@ def test_uncertainty_grows_with_distance_up_to_the_prior(name, known, prior):
     assert 0.9 * prior < std[13] <= prior
 
 
-def test_uncertainty_shows_that_the_neighbours_disagree():
-    sides = columns((0, 18), (22, COLUMNS))
-    alike = fill(window(c_rr=0.25, known=sides), "resistance_filled_std")
-    mixed = fill(window(c_rr=np.where(columns((0, 20)), 0.008, 0.25), known=sides), "resistance_filled_std")
-    assert mixed[12, 20] > 2 * alike[12, 20]
-
-
 def test_a_plane_is_filled_between_its_sides():
     cells = window(grade_e=np.linspace(-0.2, 0.2, COLUMNS), grade_n=0.05, known=columns((0, 18), (22, COLUMNS)))
     made = fill(cells, "grade_east_filled", "grade_north_filled", "grade_filled")

@@ -1,11 +1,13 @@
 """Maps as of any time, their differences, the history of a point; machines, changes and commands."""
 
 from contextlib import closing
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from mapserver.journal.facts import Facts
+from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.location import JournalLocation
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answering import Answers
@@ -234,3 +236,19 @@ def test_the_upkeep_is_asked(served):
         commands.obey("trust", {"machine": "c", "trusted": "yes"})
     with pytest.raises(QueryError, match="row 9 is not merged"):
         answered(answers, "machines", {"after": "9", "wait": "0.01"})
+
+
+@pytest.mark.parametrize(
+    ("error", "reason", "problem"),
+    [
+        (UnwrittenError("here", "the disk is full"), Refusal.STORE, "does not count: the disk is full; make room"),
+        (UnwrittenError("here", "it was cut", unsure=True), Refusal.AFTER_TIMEOUT, "not known whether .* it was cut"),
+        (FencedError("here", "another one took over"), Refusal.NOT_WRITER, "is not written: another one took over"),
+    ],
+)
+def test_an_accepted_store_that_is_not_written_is_refused_as_a_decision_is(tmp_path, error, reason, problem):
+    with closing(open_writer(tmp_path)) as writer:
+        writer._store.journal.append_event = Mock(side_effect=error)
+        with refused(reason, problem):
+            Commands(writer, None, dict).obey("accept", {"store": "0123456789abcdef", "reason": "its disk died"})
+        assert not writer._store.accepted

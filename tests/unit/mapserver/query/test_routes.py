@@ -1,22 +1,24 @@
-"""Routes and ways over maps that samples made: their costs, their lines, and what is refused, by name."""
+"""Routes and ways over maps that samples made: costs, lines, machines that are named, and what is refused."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mapserver.query.answering import Answers
+from mapserver.query.named_machines import LOOK_BACK_NS, NamedMachines
 from protocol.arrays import Table
-from protocol.errors import QueryError
+from protocol.errors import QueryError, Refusal
 from protocol.queries.requests import encode_query, parse_query
 from protocol.queries.route_requests import REFUSE, TIME, RouteQuery, WayQuery
-from protocol.queries.routing import RouteAnswer, RouteMachine, decode_answer
+from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteAnswer, RouteMachine, decode_answer
 from protocol.units import GRAVITY_MPS2
-from tests.unit.mapserver.data import incoming, open_writer, samples, send
+from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
 HALF = 60
@@ -58,6 +60,7 @@ def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
         )
         assert there.totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 40 + 0.06 * 40 + 0.015 * 80), rel=0.02)
         assert back.totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 40 + 0.06 * 40 - 0.015 * 80), rel=0.03)
+        assert there.totals.energy_j - back.totals.energy_j == pytest.approx(2 * WEIGHT_N * 0.015 * 80, rel=0.01)
         assert max(there.totals.braked_j, back.totals.braked_j) < 0.01 * back.totals.energy_j  # of one border
         assert there.totals.time_s == pytest.approx(80 / SLOW.speed_mps)
         assert there.machine == SLOW
@@ -202,3 +205,67 @@ def test_what_lies_off_the_site_is_refused_by_name(tmp_path):
         ):
             with pytest.raises(QueryError, match=f"parameter `{name}`: .* is off the site"):
                 ask(answers, query)
+
+
+S = 10**9
+LINE = ((0.0, 8.5), (20.0, 8.5))
+
+
+def drive(stamp_ns: int, mass_kg: float, speed_mps: float = 5.0, n: int = 20):
+    rows = samples(n, x_m=np.arange(n) + 0.5, stamp_ns=stamp_ns + np.arange(n) * S, mass_kg=mass_kg)
+    rows["speed_mps"] = speed_mps
+    return rows
+
+
+@pytest.fixture
+def answers(tmp_path):
+    """A truck that is loaded after half an hour, one without a scale, and a loader that sent two hours ago."""
+    with closing(open_writer(tmp_path)) as writer:
+        half_hour, hours = 1800 * S, 7200 * S
+        batches = [
+            incoming(drive(NOW_NS, 9e3, 9.0), machine="loader-9"),
+            incoming(drive(NOW_NS + hours, 22e3, 7.5), machine="truck-1"),
+            incoming(drive(NOW_NS + hours + half_hour, 47e3, 6.0), 21, machine="truck-1"),
+            incoming(drive(NOW_NS + hours + half_hour, np.nan, -0.5), machine="dumper"),
+        ]
+        send(writer, batches)
+        yield answers_of(writer)
+
+
+def asked(answers, machine: NamedMachine, as_of_ns: int | None = None):
+    query = RouteQuery(LINE, machine, stops=(False, False), as_of_ns=as_of_ns)
+    return decode_answer(answers.answer(query))
+
+
+def test_a_named_machine_weighs_what_it_said_last_and_drives_as_fast_as_it_did(answers):
+    truck = asked(answers, NamedMachine("truck-1")).machine
+    assert truck == replace(MACHINES["truck"], mass_kg=47e3, speed_mps=7.5)
+    given = asked(answers, NamedMachine("truck-1", (("mass_kg", 30e3), ("speed_mps", 3.0)))).machine
+    assert given == replace(truck, mass_kg=30e3, speed_mps=3.0), "what is given holds"
+    then = asked(answers, NamedMachine("truck-1"), NOW_NS + 7200 * S + 60 * S).machine
+    assert then.mass_kg == 22e3
+    early = asked(answers, NamedMachine("loader-9"), NOW_NS + 60 * S).machine
+    assert (early.mass_kg, early.speed_mps) == (9e3, 9.0)
+    assert asked(answers, NamedMachine("loader-9")).machine == MACHINES["loader"], "it said so long ago"
+    assert asked(answers, NamedMachine("dumper")).machine == LOADER, "it hardly moved: that is no speed"
+
+
+def test_a_name_that_sent_nothing_is_refused_with_those_that_did(answers):
+    problem = "'truck-7' has sent nothing to this site; machines: dumper, loader-9, truck-1; kinds:"
+    with refused(Refusal.OUT_OF_RANGE, problem):
+        asked(answers, NamedMachine("truck-7"))
+
+
+def test_new_samples_are_followed_and_old_ones_forgotten(tmp_path):
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(drive(NOW_NS, 22e3), machine="truck-1")])
+        answers = answers_of(writer)
+        machines = NamedMachines(answers.source)
+        assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == 22e3
+        send(writer, [incoming(drive(NOW_NS + 60 * S, 40e3), 21, machine="truck-1")])
+        assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == 40e3
+        late_ns = NOW_NS + 3 * LOOK_BACK_NS
+        send(writer, [incoming(drive(late_ns, np.nan), 41, machine="truck-1")])
+        assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == MACHINES["truck"].mass_kg
+        fresh = NamedMachines(answers.source)
+        assert fresh.resolve(NamedMachine("truck-1"), None) == machines.resolve(NamedMachine("truck-1"), None)

@@ -27,15 +27,6 @@ def test_on_even_ground_energy_is_resistance_times_way_and_what_the_brakes_take(
     assert done.stalls == -1
 
 
-def test_uphill_less_downhill_is_twice_the_height_where_nothing_is_braked() -> None:
-    """c > s, and so far to go that the machine rolls out."""
-    height_m = 0.01 * N
-    gentle = RouteMachine(mass_kg=20_000.0, speed_mps=2.0, power_w=200_000.0)
-    up, down = (rolling(0.03, slope, gentle) for slope in (0.01, -0.01))
-    assert up.braked_j.sum() == down.braked_j.sum() == 0.0
-    assert up.energy_j.sum() - down.energy_j.sum() == pytest.approx(2 * 20_000 * GRAVITY_MPS2 * height_m)
-
-
 def test_power_bounds_the_speed_uphill() -> None:
     done = rolling(0.03, 0.1)
     top = 200_000 / (20_000 * GRAVITY_MPS2 * 0.13)
