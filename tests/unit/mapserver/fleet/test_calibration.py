@@ -295,16 +295,6 @@ def test_of_a_sensor_that_measures_no_force_slopes_alone_are_corrected(factor: f
     check(result.machines["ramp"], FLEET["ramp"][1])
 
 
-def test_a_fault_is_one_also_against_ground_that_may_itself_be_off_by_what_data_sheets_allow() -> None:
-    site: Site = lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x)  # noqa: E731
-    for scale, fault in ((0.6, True), (0.36, False)):
-        result = solve(with_bad(scale, off_m=0.0, site=site), ("bad",))
-        assert not result.common.observed
-        state = result.machines["bad"]
-        assert state.scale == pytest.approx(scale, abs=0.1)
-        assert (state.beyond[1] > FAULT_SIGMAS[1]) == fault
-
-
 def test_on_level_ground_a_gain_unlike_all_others_is_a_fault_and_corrected() -> None:
     rows = {name: drive(LOW, Errors(0.002), seed=i) for i, name in enumerate("abc")}
     rows["d"] = drive(LOW, Errors(0.002, 0.6), seed=9)

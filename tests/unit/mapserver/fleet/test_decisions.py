@@ -10,13 +10,7 @@ import pytest
 
 from mapserver.fleet.calibration import Calibration
 from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, at, paint
-from mapserver.fleet.decisions import (
-    EVERY_NS,
-    PERSON,
-    SOLVER,
-    CalibrationDecision,
-    CalibrationDecisions,
-)
+from mapserver.fleet.decisions import EVERY_NS, PERSON, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.fleet.hysteresis import FROZEN_NS
 from mapserver.fleet.ledger import EPOCH_NS, Stated
 from mapserver.fleet.observability import CommonScale

@@ -5,7 +5,6 @@ import pytest
 import scipy.sparse as sp
 
 from mapserver.fleet.equations import AT_ONCE, Equations, eliminate, equations, sparse
-from protocol.arrays import Floats
 
 N, UNKNOWNS = 300, 20
 
@@ -22,12 +21,6 @@ def system(seed: int, blocks: int, parameters: int = 7) -> Equations:
     return equations(A.tocsr(), B, draw.normal(size=N), draw.uniform(0.5, 2.0, N), blocks)
 
 
-def whole(eq: Equations, weights: Floats) -> Floats:
-    """All unknowns by dense least squares."""
-    root = np.sqrt(weights)[:, None]
-    return np.linalg.lstsq(root * np.hstack([eq.A.toarray(), eq.B.toarray()]), root[:, 0] * eq.b, rcond=None)[0]
-
-
 @pytest.mark.parametrize("blocks", [0, 1, 2])
 @pytest.mark.parametrize("parameters", [7, AT_ONCE + 5])
 def test_elimination_is_the_solution_of_the_whole_system(blocks: int, parameters: int) -> None:
@@ -35,7 +28,8 @@ def test_elimination_is_the_solution_of_the_whole_system(blocks: int, parameters
     weights = eq.weights(np.zeros(parameters), None)
     information = eliminate(eq, weights)
     x = np.linalg.solve(information.matrix, information.vector)
-    expected = whole(eq, weights)
+    root = np.sqrt(weights)[:, None]
+    expected = np.linalg.lstsq(root * np.hstack([eq.A.toarray(), eq.B.toarray()]), root[:, 0] * eq.b, rcond=None)[0]
     assert x == pytest.approx(expected[:parameters], abs=1e-6)
     assert information.ground(x) == pytest.approx(expected[parameters:], abs=1e-6)
 

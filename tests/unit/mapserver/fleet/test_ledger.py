@@ -8,7 +8,7 @@ from mapserver.fleet.ledger import EPOCH_NS, EPOCH_SLOTS, EPOCHS, Ledger, epochs
 from mapserver.fleet.passages import links, passages
 from protocol.arrays import Table
 from tests.unit.mapserver.data import random_samples
-from tests.unit.mapserver.fleet.drives import LOW, RAMP, Errors, drive
+from tests.unit.mapserver.fleet.drives import LOW, drive
 
 
 def stays_of(parts: list[Table]) -> Table:
@@ -89,13 +89,3 @@ def test_nobody_drove_where_a_position_jumped() -> None:
     apart = np.hypot(*np.diff(p.place_m, axis=0).T)
     assert len(link.rise_m) == len(p) - 2
     assert apart.max() > 20
-
-
-def test_distances_are_those_of_the_positions() -> None:
-    rows = drive(RAMP, Errors(), seconds=25.0)  # up the ramp, with gaps at foot and top
-    rows["speed_mps"] *= 1.2  # wheels that slip
-    p, _, _ = passages({"a": stays_of([rows])})
-    over = links(p)
-    assert (over.bend_m > 0.5).sum() == 2
-    assert (over.per_zero_m[over.bend_m > 0.5] > 4).all()
-    assert over.per_zero_m == pytest.approx(np.hypot(*np.diff(p.place_m, axis=0).T))

@@ -52,8 +52,7 @@ def test_wrong_cells_are_loud():
 
 
 @pytest.mark.parametrize(
-    ("columns", "rows", "cell"),
-    [(1, 1, 1.0), (30, 400, 1.0), (400, 30, 1.0), (1241, 3, 1.0), (9, 5, 0.05)],
+    ("columns", "rows", "cell"), [(1, 1, 1.0), (30, 400, 1.0), (400, 30, 1.0), (1241, 3, 1.0), (9, 5, 0.05)]
 )
 def test_every_size_fits_a_screen(columns, rows, cell):
     track = Track("m" * 63, np.array([0.0, 1.0]), np.array([0.0, 1.0]))

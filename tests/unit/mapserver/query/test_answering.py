@@ -14,16 +14,7 @@ from protocol.errors import Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
 from protocol.queries.requests import PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    incoming,
-    open_writer,
-    refused,
-    samples,
-    send,
-)
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
 
 # One sample in each cell of two diagonals, the value tells the cell.
