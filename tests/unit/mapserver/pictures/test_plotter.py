@@ -1,11 +1,8 @@
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
 
 from mapserver.pictures import frame, plotter
-from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side
 from protocol.queries.answers import Region
 from protocol.site.ground_classes import ZONES
 from tests.unit.records import version
@@ -70,14 +67,6 @@ def test_track_has_its_colour_and_a_marker_at_its_end():
     assert cell_colour(image, 90, 40, 50, 12) == plotter.TRACK_COLOURS[0]
     assert min(cell_colour(image, 30, 10, 50, 12)) > 150  # a thin white line, smoothed
     assert cell_colour(image, 70, 25, 50, 12) == ZONES[2].bgr  # NaN breaks the line
-
-
-def test_written_picture_reads_back_and_leaves_nothing_beside_it(tmp_path: Path):
-    image = draw_resistance(region(5, 5, resistance=0.02))
-    for _ in range(2):  # a second write replaces the first
-        write_image(tmp_path / "map.png", image)
-    assert (cv2.imread(str(tmp_path / "map.png")) == image).all()
-    assert [p.name for p in tmp_path.iterdir()] == ["map.png"]
 
 
 def test_grade_difference_takes_a_region_as_truth():

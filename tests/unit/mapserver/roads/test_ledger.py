@@ -7,7 +7,7 @@ from mapserver.evidence.fold_config import name_hash
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.loss import losses
 from mapserver.roads.tally import PER_C, PER_M, Tally
-from mapserver.roads.worklist import theil_sen, trends
+from mapserver.roads.worklist import theil_sen
 from protocol.units import GRAVITY_MPS2
 from tests.unit.mapserver.roads.drives import along, passes, roads
 
@@ -102,14 +102,6 @@ def test_a_descent_that_brakes_anyway_costs_nothing():
     both, segments = ledger_of(rows, up)
     ascent = both.totals()["metres"][:, 1].sum() / PER_M
     assert losses(both, segments, 0.02).work_j.sum() == pytest.approx(40_000 * GRAVITY_MPS2 * ascent * 0.03, rel=0.02)
-
-
-def test_a_trend_needs_three_days():
-    days = [passes(LINE, 2, c_rr=0.02 + 0.004 * day, seed=day, after_s=86_400.0 * day) for day in range(4)]
-    two, _ = ledger_of(*days[:2])
-    assert np.isnan(trends(two)).all()
-    four, _ = ledger_of(*days)
-    assert trends(four) == pytest.approx(0.004, rel=0.1)
 
 
 def test_one_day_of_rain_is_no_trend():
