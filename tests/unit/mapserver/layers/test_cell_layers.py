@@ -141,6 +141,14 @@ def test_noise_of_the_votes_is_their_spread(start, noise_bins):
     assert value(grid, "grade_std") == pytest.approx(grade_deviation(slope, noise_bins / 32), rel=0.05)
 
 
+def test_a_minority_does_not_widen_the_spread():
+    z = np.random.default_rng(8).normal(size=2000)
+    alone = samples(2000, c_rr=0.04 * np.exp(0.15 * z))
+    mixed = alone.copy()
+    mixed["c_rr"][::5] = 0.3
+    assert value(folded(mixed), "resistance_std") == pytest.approx(value(folded(alone), "resistance_std"), rel=0.1)
+
+
 @pytest.mark.parametrize("degrees", [-80.0, 0.0, 33.75, 88.0])
 def test_heading_is_the_axis_driven_both_ways(degrees):
     angle = np.radians(degrees)

@@ -100,7 +100,9 @@ def test_unknown_cells_count_nothing_and_alone_are_unknown() -> None:
     assert np.isnan(field.at(np.array([[2.4, 1.5], [2.4, 2.4], [-5.0, 1.0], [100.0, 1.0]]))["a"]).all()
 
 
-def test_steps_divide_a_line_evenly() -> None:
+def test_steps_divide_a_line_evenly_and_keep_its_length() -> None:
+    assert steps(np.array([[0.0, 0.0], [3.0, 4.4]]), 1.0).length_m.sum() == pytest.approx(math.hypot(3.0, 4.4))
+    assert len(steps(np.array([[0.0, 0.0], [0.1, 0.0]]), 1.0).length_m) == 1
     cut = steps(CORNER, 1.0)
     assert len(cut.length_m) == 80
     assert cut.length_m == pytest.approx(np.ones(80))
