@@ -55,16 +55,6 @@ def hashes(rows: np.ndarray) -> list[str]:
     return [content_hash(row) for row in rows]
 
 
-def test_samples_are_numbered_from_one_and_come_out_in_order(spool: Spool) -> None:
-    assert spool.head(10) is None
-    assert spool.record(ROWS[:4]) == 1
-    assert spool.record(ROWS[4:9]) == 5
-    head = spool.head(7)
-    assert (head.spool_id, head.first_seq, head.lost_before) == (spool.spool_id, 1, 0)
-    assert hashes(head.rows) == hashes(ROWS[:7])
-    assert spool.newest == 9
-
-
 def test_commits_are_full_and_logged_ahead(spool: Spool) -> None:
     assert spool._db.execute("PRAGMA synchronous").fetchone()[0] == 2
     assert spool._db.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
@@ -82,25 +72,6 @@ def test_acknowledged_samples_are_deleted_and_stay_so(tmp_path: Path) -> None:
     assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 7, 4, 0)
     assert again.counters()["depth"] == 4
     again.close()
-
-
-def test_every_opening_has_an_identity_of_its_own(tmp_path: Path) -> None:
-    ids = set()
-    for name in ("a", "a", "a", "b"):
-        spool = opened(tmp_path / name)
-        assert spool.record(ROWS[:1]) == 1
-        ids.add(spool.spool_id)
-        spool.close()
-    assert len(ids) == 4
-    assert 0 < min(ids) <= max(ids) < 2**64
-
-
-def test_openings_that_record_nothing_leave_nothing(tmp_path: Path) -> None:
-    for _ in range(5):
-        spool = opened(tmp_path)
-        assert spool.head(9) is None
-        assert spool.is_settled()
-        spool.close()
 
 
 def test_runs_come_out_one_after_the_other_and_are_closed(tmp_path: Path) -> None:
@@ -200,17 +171,6 @@ def test_spool_survives_kill_in_the_middle_of_writing(tmp_path: Path) -> None:
     assert list(read_audit(tmp_path / "audit.txt").values()) == [(content,) for content in hashes(head.rows)]
 
 
-def test_kill_while_the_file_is_made_leaves_no_broken_spool(tmp_path: Path) -> None:
-    def killed() -> int:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        Spool(tmp_path / "spool.db", SpoolConfig(), draw_id=killed)
-    spool = opened(tmp_path)
-    assert spool.record(ROWS[:2]) == 1
-    spool.close()
-
-
 # --- pending and final -----------------------------------------------------------------------------------------------
 
 
@@ -259,19 +219,6 @@ def test_pending_samples_are_final_after_a_crash(tmp_path: Path) -> None:
     again.close()
 
 
-def test_pending_samples_keep_their_place_under_a_new_identity(spool: Spool) -> None:
-    spool.record(ROWS[:2])
-    spool.record(ROWS[2:6], pending=4)
-    old = spool.spool_id
-    spool.acknowledge(old, 1)
-    spool.start_new_run()
-    spool.record(ROWS[:0], finals=better(ROWS[2:4]))
-    closing = spool.head(99)
-    head = closing if closing.spool_id == spool.spool_id else spool.head(99)
-    assert head.spool_id != old
-    assert (head.first_seq, hashes(head.rows)) == (1, hashes(np.concatenate([ROWS[1:2], better(ROWS[2:4])])))
-
-
 def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(tmp_path: Path) -> None:
     """Whoever opens a copy takes them as they are, and sends them under the numbers that they have here."""
     spool = opened(tmp_path, 2, AuditLog(tmp_path / "audit"))
@@ -289,15 +236,6 @@ def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(t
     assert list(read_audit(tmp_path / "audit").values()) == [(content,) for content in hashes(rows)]
 
 
-def test_damage_of_a_pending_sample_is_mended_by_its_final_value(spool: Spool) -> None:
-    spool.record(ROWS[:2], pending=2)
-    spool._db.execute("UPDATE sample SET row = zeroblob(80) WHERE number = 1")
-    assert spool.head(99) is None
-    spool.record(ROWS[:0], finals=better(ROWS[:2]))
-    assert hashes(spool.head(99).rows) == hashes(better(ROWS[:2]))
-    assert spool.counters()["put_aside"] == 0
-
-
 @pytest.mark.parametrize("limit", [1, 3])
 def test_full_spool_drops_no_pending_sample(tmp_path: Path, limit: int) -> None:
     """They do not count: else a spool that holds less than the lag would drop each sample before it may be sent."""
@@ -312,38 +250,7 @@ def test_full_spool_drops_no_pending_sample(tmp_path: Path, limit: int) -> None:
     spool.close()
 
 
-def test_a_write_that_fails_leaves_what_is_pending_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spool = SpoolOnFullDisk(tmp_path / "spool.db", SpoolConfig())
-    spool.record(ROWS[:3], pending=3)
-    for statement in ("UPDATE sample", "INSERT INTO sample", "REPLACE INTO meta", "COMMIT"):
-        with monkeypatch.context() as patch:
-            patch.setattr(FullDisk, "full_at", statement)
-            with pytest.raises(StoreError):
-                spool.record(ROWS[3:5], pending=1, finals=better(ROWS[:3]))
-        assert spool.head(99) is None
-        assert spool.counters() == {**EMPTY, "depth": 3, "pending": 3, "recorded": 3}
-    spool.record(ROWS[3:5], pending=1, finals=better(ROWS[:3]))
-    assert hashes(spool.head(99).rows) == hashes(np.concatenate([better(ROWS[:3]), ROWS[3:4]]))
-    spool.close()
-
-
 # --- holes, bounds, and samples that the server refuses --------------------------------------------------------------
-
-
-def test_head_ends_before_a_hole(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
-    spool.record(ROWS[:10])
-    bad = spool.head(99)
-    spool.acknowledge(spool.spool_id, 3)
-    spool.quarantine(type(bad)(bad.spool_id, 6, ROWS[5:6], 0), "too bad")
-    first = spool.head(99)
-    assert (first.first_seq, len(first.rows), first.lost_before) == (4, 2, 0)
-    spool.acknowledge(spool.spool_id, 5)
-    rest = spool.head(99)
-    assert (rest.first_seq, len(rest.rows), rest.lost_before) == (7, 4, 1)
-    assert spool.counters()["put_aside"] == 1
-    spool.close()
-    assert quarantined(tmp_path) == [(6, ROWS[5].tobytes(), "too bad")]
 
 
 @pytest.mark.parametrize("limit", [1, 10])
@@ -366,7 +273,9 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
     spool.close()
-    spool = opened(changed(tmp_path, "UPDATE sample SET row = zeroblob(80) WHERE number IN (1, 2, 3, 6)"))
+    for numbers, row in (("1, 2", "zeroblob(80)"), ("3", "x'0102'"), ("6", "5")):
+        changed(tmp_path, f"UPDATE sample SET row = {row} WHERE number IN ({numbers})")
+    spool = opened(tmp_path)
     first = spool.head(2)
     assert (first.first_seq, first.lost_before) == (4, 3)
     assert hashes(first.rows) == hashes(ROWS[3:5])
@@ -378,40 +287,6 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool.close()
     problem = "damaged on the machine's disk"
     assert [(seq, why) for seq, _, why in quarantined(tmp_path)] == [(seq, problem) for seq in (1, 2, 3, 6)]
-
-
-# --- servers and files that are set back ------------------------------------------------------------------------------
-
-
-def test_server_that_knows_less_than_it_acknowledged_is_told_what_is_lost(spool: Spool) -> None:
-    spool.record(ROWS[:10])
-    spool.acknowledge(spool.spool_id, 8)
-    spool.lower_watermark(spool.spool_id, 5)
-    head = spool.head(99)
-    assert (head.first_seq, head.lost_before) == (9, 3)
-
-
-def test_earlier_runs_are_declared_again_to_a_server_that_was_set_back(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
-    earlier = spool.spool_id
-    spool.record(ROWS[:3])
-    spool.acknowledge(earlier, 3)
-    spool.close()
-    spool = opened(tmp_path)
-    spool.acknowledge(earlier, 3)
-    spool.record(ROWS[3:5])
-    spool.acknowledge(spool.spool_id, 1)
-    spool.lower_watermark(spool.spool_id, 0)
-    head = spool.head(9)
-    assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 4, 0, 3)
-    spool.close()
-
-
-def test_ack_never_goes_back_nor_beyond_the_end(spool: Spool) -> None:
-    spool.record(ROWS[:6])
-    for watermark, expected in ((4, 4), (2, 4), (99, 6)):
-        spool.acknowledge(spool.spool_id, watermark)
-        assert spool.acknowledged == expected
 
 
 # --- errors ----------------------------------------------------------------------------------------------------------
@@ -500,18 +375,6 @@ def test_failed_commit_leaves_no_transaction_open(
 
 
 # --- damage that SQLite does not see ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("row", ["x'0102'", "5", "'text'"])
-def test_a_sample_that_is_none_is_quarantined_and_the_others_are_sent(tmp_path: Path, row: str) -> None:
-    spool = opened(tmp_path)
-    spool.record(ROWS[:3])
-    spool.close()
-    spool = opened(changed(tmp_path, f"UPDATE sample SET row = {row} WHERE number = 1"))
-    head = spool.head(10)
-    assert (head.first_seq, len(head.rows), head.lost_before) == (2, 2, 1)
-    assert spool.counters()["put_aside"] == 1
-    spool.close()
 
 
 def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop(tmp_path: Path) -> None:

@@ -11,9 +11,8 @@ import pytest
 from agents.dead_reckoning import DeadReckonedPose, DeadReckoning
 from agents.estimation import calibration as module
 from agents.estimation.balance import Balance
-from agents.estimation.calibration import FLOOR, SCALE_STD, STRETCH_STD, UNCALIBRATED, ZERO_STD, Calibration, Calibrator
+from agents.estimation.calibration import FLOOR, SCALE_STD, STRETCH_STD, ZERO_STD, Calibration, Calibrator
 from agents.estimation.closed_tours import Tour
-from protocol.arrays import Floats
 from protocol.machine.samples import LIMITS
 from tests.unit.agents.drives import START_NS
 from tests.unit.agents.ground import STEADY, STEP_S
@@ -115,9 +114,9 @@ def test_flat_ground_there_and_back_shows_the_zero(zero: float, c_rr: float) -> 
     assert calibration.passages > 6 * 70
 
 
-@pytest.mark.parametrize("scale", [0.05, -0.05])
-def test_a_slope_shows_the_scale_too(scale: float) -> None:
+def test_a_slope_shows_the_scale_too() -> None:
     """40 m of flat ground, then a ramp of 12 degrees."""
+    scale = -0.05
     on = course(zero=0.004, scale=scale, slope=lambda x: math.radians(12) if x > 20 else 0.0, noise=NOISE, seed=2)
     on.there_and_back(40, 8)
     calibration = on.calibrator.calibration
@@ -125,16 +124,6 @@ def test_a_slope_shows_the_scale_too(scale: float) -> None:
     assert calibration.scale == pytest.approx(scale, abs=0.012)
     corrected = [calibration.corrected(on._balance(d, 2.0)) * d for d in (1.0, -1.0)]
     assert np.mean(corrected) == pytest.approx(0.04, abs=0.02)
-
-
-def test_one_direction_alone_shows_nothing() -> None:
-    on = course(zero=0.005)
-    for _ in range(3):
-        on.drive(40)
-        on.place.x_m = 0.0
-        on.wait(1)
-    assert on.calibrator.calibration == UNCALIBRATED
-    assert not on.calibrator.counters
 
 
 def test_a_passage_counts_once() -> None:
@@ -176,40 +165,6 @@ def test_what_is_the_same_ground(change: dict[str, float], pairs: bool) -> None:
     assert bool(on.calibrator.counters["pairs"]) is pairs
 
 
-def test_turning_round_makes_no_pair() -> None:
-    """Driving home forwards: the gravity of the slope is not seen from the other side, so nothing is learnt."""
-    on = course(zero=0.004)
-    on.drive(20)
-    on.place.angle_rad = math.pi
-    on.wait(3)
-    on.drive(20)
-    assert not on.calibrator.counters["pairs"]
-
-
-@pytest.mark.parametrize("speed_mps", [0.5, 3.0])
-def test_speed_on_the_return_does_not_matter(speed_mps: float) -> None:
-    on = course(zero=0.004)
-    on.drive(20)
-    on.wait(1)
-    on.drive(20, -1.0, speed_mps=speed_mps)
-    assert on.calibrator.counters["pairs"] >= 25
-    assert on.calibrator.calibration.zero == pytest.approx(0.004, abs=3e-4)
-
-
-def test_pairs_across_a_border_are_excluded() -> None:
-    """Ground that became sand in between: half the difference is no zero."""
-    on = course(zero=0.004)
-    on.there_and_back(20, 2)
-    before = on.calibrator.calibration
-    on.drive(4)
-    on.wait(1)
-    on._c_rr = lambda _: 0.25
-    on.drive(4, -1.0)
-    assert on.calibrator.counters["off"] >= 5
-    assert on.calibrator.calibration.zero == pytest.approx(before.zero, abs=1e-9)
-    assert on.calibrator.calibration.passages == before.passages
-
-
 def test_pairs_beyond_three_standard_deviations_are_excluded() -> None:
     """Those of the zero are 0.0045, of the mean of two stretches 0.008 / sqrt(2)."""
     for sigmas, excluded in ((3.3, True), (2.7, False)):
@@ -227,42 +182,6 @@ def test_a_zero_far_beyond_its_class_is_found_in_the_end() -> None:
     assert on.calibrator.calibration.zero == pytest.approx(0.03, abs=0.003)
 
 
-def test_interrupted_stretches_are_not_used() -> None:
-    on = course(zero=0.004)
-    for direction in (1.0, -1.0):
-        for _ in range(40):
-            on.drive(0.4, direction)  # shorter than a stretch
-            on.calibrator.interrupt()
-    assert not on.calibrator.counters["pairs"]
-
-
-# --- known ground ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_known_ground_alone_shows_the_zero(direction: float) -> None:
-    on = course(zero=0.006, noise=NOISE, seed=6)
-    on.drive(120, direction, known_c_rr=0.04)
-    calibration = on.calibrator.calibration
-    assert calibration.zero == pytest.approx(0.006, abs=0.003)
-    assert on.calibrator.counters["known_ground"] >= 200
-    assert not on.calibrator.counters["pairs"]
-
-
-def test_known_ground_on_a_slope_counts_with_its_cosine() -> None:
-    on = course(zero=0.006, c_rr=lambda _: 0.2, slope=lambda _: 0.3)
-    for direction in (1.0, -1.0):
-        on.drive(60, direction, known_c_rr=0.2)
-    assert on.calibrator.calibration.zero == pytest.approx(0.006, abs=3e-4)
-
-
-def test_known_ground_that_is_not_as_stated_is_excluded() -> None:
-    on = course()
-    on.drive(4, known_c_rr=0.2)
-    assert on.calibrator.counters["off"] >= 6
-    assert on.calibrator.calibration.passages == 0
-
-
 # --- how sure it is --------------------------------------------------------------------------------------------------
 
 
@@ -275,7 +194,7 @@ def no_floor(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_covariance_is_honest() -> None:
     """Rms of normalised errors over drives with zero and scale as they are assumed to be."""
     errors = []
-    for seed in range(50):
+    for seed in range(25):
         rng = np.random.default_rng(1000 + seed)
         zero, scale = ZERO_STD * rng.standard_normal(), SCALE_STD * rng.standard_normal()
         on = course(zero=zero, scale=scale, slope=lambda x: 0.2 if x > 10 else 0.0, noise=NOISE, seed=seed)
@@ -297,40 +216,11 @@ def test_no_number_of_pairs_gets_below_the_floor() -> None:
     assert math.sqrt(ss) == pytest.approx(10 * FLOOR)
 
 
-@pytest.mark.usefixtures("no_floor")
-def test_known_stretch_counts_as_one_and_a_pair_as_two(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ZERO_WALK", 0.0)
-    vague = Calibration(0.0, 0.0, ((1.0, 0.0), (0.0, 1e-18)))
-    on, known = course(vague), course(vague)
-    on.there_and_back(20)
-    known.drive(20, known_c_rr=0.04)
-    for course_, stretches in (
-        (on, 2 * on.calibrator.counters["pairs"]),
-        (known, known.calibrator.counters["known_ground"]),
-    ):
-        zz = course_.calibrator.calibration.covariance[0][0]
-        assert zz == pytest.approx(STRETCH_STD**2 / stretches, rel=1e-3)
-
-
-def test_variance_of_a_balance_is_that_of_zero_and_scale_together() -> None:
-    P: Floats = np.array([[4e-6, -1e-6], [-1e-6, 9e-6]])
-    known = Calibration(0.001, 0.02, ((4e-6, -1e-6), (-1e-6, 9e-6)))
-    for share in (0.0, 0.3, -0.3):
-        h = np.array([1.0, share])
-        assert known.variance(share) == pytest.approx(h @ P @ h)
-    assert known.corrected(replace(STEADY, unbalanced=0.05, share=0.1)) == pytest.approx(0.05 - 0.001 - 0.002)
-
-
 # --- given from before -----------------------------------------------------------------------------------------------
 
 
 def given(age_s: float = 0.0) -> Calibration:
     return Calibration(0.005, 0.01, ((1e-6, 0.0), (0.0, 1e-4)), START_NS - round(age_s * 1e9), 50)
-
-
-def test_calibration_from_before_is_the_first() -> None:
-    first = Calibrator(given()).calibration
-    assert (first.zero, first.scale, first.passages, first.stamp_ns) == (0.005, 0.01, 50, START_NS)
 
 
 @pytest.mark.usefixtures("no_floor")
@@ -342,18 +232,6 @@ def test_zero_grows_unsure_as_time_passes_but_never_more_than_at_first(age_s: fl
     (zz, _), (_, ss) = calibrator.calibration.covariance
     assert math.sqrt(zz) == pytest.approx(std, rel=1e-3)
     assert math.sqrt(ss) == pytest.approx(1e-2)
-
-
-def test_old_zero_that_moved_is_found_again() -> None:
-    on = course(zero=0.009, calibration=given(3600.0), noise=NOISE, seed=8)
-    on.there_and_back(40, 4)
-    assert on.calibrator.calibration.zero == pytest.approx(0.009, abs=0.0015)
-    assert on.calibrator.calibration.stamp_ns > START_NS
-
-
-def test_uncalibrated_is_how_large_errors_usually_are() -> None:
-    assert (UNCALIBRATED.zero, UNCALIBRATED.scale, UNCALIBRATED.stamp_ns, UNCALIBRATED.passages) == (0.0, 0.0, 0, 0)
-    assert np.array(UNCALIBRATED.covariance) == pytest.approx(np.diag([0.0045**2, 0.045**2]))
 
 
 # --- closed tours ----------------------------------------------------------------------------------------------------
@@ -374,13 +252,6 @@ def test_a_tour_is_one_measurement_of_the_zero() -> None:
     assert (calibration.passages, calibrator.counters["tours"]) == (1, 1)
 
 
-def test_no_number_of_tours_gets_below_the_floor() -> None:
-    calibrator = Calibrator()
-    for i in range(100):
-        calibrator.add_tour(tour(0.006, 0.01 * i))
-    assert calibrator.calibration.covariance[0][0] == FLOOR**2
-
-
 def test_one_tour_that_is_far_off_is_excluded_and_three_that_agree_are_right() -> None:
     calibrator = Calibrator()
     for i in range(module.RELOCK_TOURS):
@@ -389,20 +260,6 @@ def test_one_tour_that_is_far_off_is_excluded_and_three_that_agree_are_right() -
     calibrator.add_tour(tour(0.03, 300.0))
     assert calibrator.calibration.zero == pytest.approx(0.03, abs=1e-3)
     assert (calibrator.counters["off"], calibrator.counters["relocked"]) == (module.RELOCK_TOURS, 1)
-
-
-def test_stretches_that_were_excluded_do_not_make_a_tour_right() -> None:
-    """A border of zones counts after twelve of them in a row, a bridge after three tours: neither helps the other."""
-    course = Course(Calibrator(replace(UNCALIBRATED, covariance=((1e-6, 0.0), (0.0, 1e-4)))), zero=0.05)
-    for _ in range(module.RELOCK - 1):
-        course.drive(module.STRETCH_M, known_c_rr=0.04)
-    calibrator = course.calibrator
-    before = calibrator.counters["off"]
-    for i in range(module.RELOCK_TOURS - 1):
-        calibrator.add_tour(tour(0.03, 90.0 * i))
-    assert calibrator.counters["off"] == before + module.RELOCK_TOURS - 1
-    assert before >= module.RELOCK_TOURS
-    assert (calibrator.counters["relocked"], calibrator.calibration.zero) == (0, 0.0)
 
 
 def test_what_is_applied_can_be_stated_in_a_sample() -> None:

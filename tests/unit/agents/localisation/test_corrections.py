@@ -106,8 +106,6 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 def test_base_that_is_not_heard_changes_nothing(readings: list[Reading]) -> None:
     alone, beside = usual("alone"), locate(with_base(machine()), readings)
-    assert alone.pose
-    assert beside.pose
     assert beside.pose.x_m == pytest.approx(alone.pose.x_m, abs=1e-6)
     assert np.allclose(beside.pose.covariance_m2, alone.pose.covariance_m2, rtol=1e-6)
     assert beside.localiser.base_report() == {
@@ -131,18 +129,9 @@ def test_base_that_errs_as_the_machine_does_takes_most_of_the_error(
     located = locate(with_base(vehicle), mixed(readings, corrections(ramp, 60)), engine)
     assert error_m(located, driven) < 0.65 * error_m(without, driven)
     state = located.localiser.base_report()
-    assert state
     assert state["used"]
     assert state["age_s"] < 0.5
     assert located.counters["base-1_used"] > 40
-
-
-@pytest.mark.slow
-def test_corrections_come_late_and_still_help(made: Drive, readings: list[Reading], known: None) -> None:
-    at_once = error_m(usual("beside"), made)
-    late = error_m(locate(with_base(machine()), mixed(readings, corrections(ramp, 60), link_s=4.0)), made)
-    without = error_m(usual("alone"), made)
-    assert at_once < late < 0.8 * without
 
 
 @pytest.mark.slow
@@ -196,12 +185,9 @@ def test_what_does_not_count_is_refused_counted_and_named(readings: list[Reading
         ) == located.counters["correction_not_newer"] + (reason == "in_future")
         if reason:
             assert located.counters[f"correction_{reason}"] >= 1
-            state = located.localiser.base_report()
-            assert state
-            assert state["why_not"] == f"the last one was {reason.replace('_', ' ')}"
+            assert located.localiser.base_report()["why_not"] == f"the last one was {reason.replace('_', ' ')}"
     assert located.pose is pose  # a correction alone moves nothing, and its stamp is nobody's clock
     located.step([r for r in readings if r.stamp_ns >= START_NS + 30e9])
-    assert located.pose
     assert located.pose.stamp_ns > START_NS + 50e9
     assert "gap_restarts" not in located.counters
 
@@ -219,7 +205,6 @@ def test_old_and_repeated_ones_are_not_used(readings: list[Reading]) -> None:
     assert stuck.counters["base-1_used"] <= REPEATS
     assert stuck.counters["correction_repeated"] > 200
     state = stuck.localiser.base_report()
-    assert state
     assert (state["used"], state["why_not"]) == (False, "the last one was repeated")
 
 
@@ -227,12 +212,9 @@ def test_old_and_repeated_ones_are_not_used(readings: list[Reading]) -> None:
 def test_base_that_falls_silent_is_reported_and_fades(made: Drive, readings: list[Reading], known: None) -> None:
     located = locate(with_base(machine()), mixed(readings, corrections(ramp, 20)))
     state = located.localiser.base_report()
-    assert state
     assert not state["used"]
     assert "s old" in state["why_not"]
     sure = usual("beside")
-    assert located.pose
-    assert sure.pose
     assert located.pose.covariance_m2[0, 0] > 1.2 * sure.pose.covariance_m2[0, 0]
 
 
@@ -270,16 +252,6 @@ def test_all_that_a_link_held_up_count_when_they_come_at_once(judged: list[Corre
     assert len(judged) < 25 + 5 * MAX_AGE_S + 2
 
 
-@pytest.mark.parametrize("gap_s", [1.0, 0.999, 0.95])
-def test_each_correction_of_one_a_second_counts(gap_s: float, judged: list[Correction]) -> None:
-    taking, made = Corrections(BASE, LAYOUT), [correction(gap_s * (i + 1), 0.1 * i, 0.0) for i in range(10)]
-    measured = []
-    for one in made:
-        taking.take(one, one.stamp_ns)
-        measured.append(taking.measurement(replace(believed(0.0), stamp_ns=one.stamp_ns + 1)))
-    assert [m.z[0] for m in measured if m] == pytest.approx([c.east_m for c in made])
-
-
 def test_results_that_could_not_be_computed_say_nothing_of_a_base() -> None:
     taking, belief = Corrections(BASE, LAYOUT), believed(1.0)
     before = taking.report(belief.stamp_ns)
@@ -288,14 +260,6 @@ def test_results_that_could_not_be_computed_say_nothing_of_a_base() -> None:
         taking.confirm(nothing)
     assert taking.report(belief.stamp_ns) == before
     assert not taking.counters
-
-
-def test_corrections_of_another_base_are_readings_of_an_unknown_sensor() -> None:
-    pipeline = Pipeline(SITE, with_base(machine()), PipelineConfig())
-    pipeline.step([replace(correction(1.0, 0.0, 0.0), sensor="base-2")])
-    health = pipeline.health()
-    assert health["counters"]["reading_unknown_sensor"] == 1
-    assert health["base"]["used"] is False
 
 
 def test_profile_paper_says_that_it_uses_none() -> None:
