@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,11 @@ import pytest
 from agents.agent import EVERY_S, SILENT_S, Agent, Places
 from agents.config import AgentConfig
 from agents.delivery.spool import Spool, SpoolConfig
-from agents.estimation.ground import EstimationConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import LAG_S
 from protocol.machine.readings import Reading
-from protocol.wire.messages import CalibrationOffer
-from protocol.wire.offer_codec import encode_offer
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from tests.unit.agents.drives import S_BEND, SITE, START, VEHICLE, drive, thinned
 
@@ -150,28 +146,3 @@ def test_an_agent_that_is_asked_to_end_leaves_the_smoothed_places_of_all_samples
     assert (report["delivered"], report["spool"]["pending"]) == (False, 0)
     taken = [r for span in stream.silent[0][: len(stream.seen)] for r in span]
     assert in_spool(tmp_path).tobytes() == np.concatenate(by_pipeline(taken)).tobytes()
-
-
-class Offering(Stream):
-    """A stream during which the map server offers something."""
-
-    offer: Any = None
-
-    def read(self, timeout_s: float) -> Sequence[Reading] | None:
-        readings = super().read(timeout_s)
-        if readings and self.agent and self.now_s < 55.0:
-            self.agent._uplink.offer = self.offer  # as an acknowledgement does
-        return readings
-
-
-@pytest.mark.slow
-def test_an_offer_reaches_the_samples_of_an_agent_that_accepts_it(session: Any, tmp_path: Path) -> None:
-    stream = Offering([replace(r) for r in READINGS])
-    stamp_ns = READINGS[0].stamp_ns
-    stream.offer = encode_offer(CalibrationOffer(VEHICLE.name, stamp_ns, 0.004, 0.02, 4e-7, 2e-5, 0.0))
-    config = replace(CONFIG, estimation=EstimationConfig(accept_calibration=True))
-    report = run(session, tmp_path, stream, config=config)
-    calibration = report["pipeline"]["ground"]["calibration"]
-    assert (calibration["offers"], calibration["offer_ns"]) == (1, stamp_ns)
-    zeros = in_spool(tmp_path)["applied_zero"]
-    assert (np.abs(zeros - 0.004) < 1e-4).all()

@@ -55,15 +55,6 @@ def test_files_name_every_option() -> None:
     assert {f.name for f in fields(Mount)} == set(named["sensor"][0]["mount"])
 
 
-@pytest.mark.parametrize("name", ["agent.toml", "site.toml"])
-def test_every_option_has_a_comment_and_lines_are_short(name: str) -> None:
-    lines = (CONFIG / name).read_text(encoding="utf-8").splitlines()
-    assert max(map(len, lines)) <= 120
-    plain = ("wheel_radius_m", "use")  # their names are enough
-    commented = {line.split(" = ")[0] for line in lines if " = " in line and "#" in line} | set(plain) | {"mount"}
-    assert {line.split(" = ")[0] for line in lines if " = " in line and not line.startswith("#")} <= commented
-
-
 def written(folder: Path, text: str) -> Path:
     path = folder / "agent.toml"
     path.write_text(text)

@@ -32,6 +32,7 @@ from tests.unit.agents.drives import (
     Leg,
     changed_sensor,
     drive,
+    seconds,
     simulated,
     thinned,
 )
@@ -120,36 +121,6 @@ def test_any_cutting_of_the_stream_gives_the_same_samples(
 
 
 @pytest.mark.slow
-def test_positioning_alone_makes_the_very_poses_of_the_whole_pipeline(
-    vehicle: MachineConfig, recorded: list[Reading]
-) -> None:
-    """To the last bit, and after a restart too: the ground and samples of it have no part in localisation."""
-    first = recorded[: len(recorded) // 2]
-    after_gap = [replace(r, stamp_ns=r.stamp_ns + 100 * SECOND) for r in first]
-    delayed = changed_sensor(vehicle, "wheels", delay_s=0.02)
-    site, config = simulated(3, 26.0)[0], lagging(LAG)
-    whole, half = Pipeline(site, delayed, config), Positioning(site, delayed, config)
-    stream, known = [*first, *after_gap], 0
-    for i in range(0, len(stream), 20):
-        whole.step(stream[i : i + 20])
-        half.step(stream[i : i + 20])
-        assert same(whole.pose, half.pose)
-        assert same(*(each.pose_at(stream[i].stamp_ns - SECOND) for each in (whole, half)))
-        known += half.pose is not None
-    assert known > 40
-    counted = whole.health()["counters"]
-    assert counted["gap_restarts"] == 1
-    assert counted.items() >= half.counters.items()
-
-
-def same(a: PoseBelief | None, b: PoseBelief | None) -> bool:
-    """Whether two poses are bit for bit the same."""
-    if a is None or b is None:
-        return a is b
-    return repr(a) == repr(b) and a.covariance_m2.tobytes() == b.covariance_m2.tobytes()
-
-
-@pytest.mark.slow
 def test_strange_and_doubled_readings_are_counted_and_change_nothing(
     vehicle: MachineConfig, recorded: list[Reading], base: Base
 ) -> None:
@@ -158,29 +129,6 @@ def test_strange_and_doubled_readings_are_counted_and_change_nothing(
     assert samples == [*base[:2]]
     assert health["counters"]["reading_unknown_sensor"] == 2
     assert health["counters"]["reading_duplicate"] + health["counters"]["reading_late"] >= 50
-
-
-@pytest.mark.slow
-def test_long_pause_starts_localisation_anew_and_keeps_the_counts() -> None:
-    made = drive([*S_BEND, Leg(8), *S_BEND[2:]], VEHICLE)
-    silent = (START_NS + 30 * SECOND, START_NS + 38 * SECOND)
-    readings = [r for r in thinned(made.readings, 20) if not silent[0] < r.stamp_ns < silent[1]]
-    pipeline = Pipeline(SITE, VEHICLE, STARTED)
-    before = pipeline.step([r for r in readings if r.stamp_ns <= silent[0]]).pending
-    used = pipeline.health()["counters"]["gps-1_used"]
-    first = pipeline.step([r for r in readings if r.stamp_ns >= silent[1]][:50]).pending
-    assert pipeline.pose is None
-    assert len(first) > 3
-    assert (first["stamp_ns"] < silent[1]).all()  # what still waited
-    assert pipeline.pending == 0  # a pause ends the smoother's say
-    rest = pipeline.step([r for r in readings if r.stamp_ns >= silent[1]][50:])
-    after = joined([rest, pipeline.finish()]).pending
-    assert len(before) > 80
-    assert len(after) > 50
-    assert int(after["stamp_ns"][0]) >= silent[1]
-    counters = pipeline.health()["counters"]
-    assert counters["gap_restarts"] == 1
-    assert counters["gps-1_used"] > used
 
 
 @pytest.mark.slow
@@ -315,10 +263,6 @@ def off_m(made: Drive, row: np.void) -> float:
     """How far a sample lies from where the load centre was."""
     x, y, heading = made.at(int(row["stamp_ns"]))
     return math.dist((row["x_m"] - 1.5 * math.cos(heading), row["y_m"] - 1.5 * math.sin(heading)), (x, y))
-
-
-def seconds(reading: Reading) -> float:
-    return (reading.stamp_ns - START_NS) * 1e-9
 
 
 @pytest.mark.slow
@@ -469,7 +413,7 @@ def test_fixes_far_from_the_site_are_refused_and_counted() -> None:
     pipeline = Positioning(SITE, VEHICLE, PipelineConfig())
     pipeline.step(lost)
     assert pipeline.counters["fix_outside_site"] == 25
-    assert math.dist((pipeline.pose.x_m, pipeline.pose.y_m), made.at(pipeline.pose.stamp_ns)[:2]) < 0.5
+    assert made.off_m(pipeline.pose) < 0.5
 
 
 @pytest.mark.slow

@@ -18,7 +18,17 @@ from agents.positioning import PipelineConfig
 from agents.sampling import joined
 from protocol.arrays import Floats
 from protocol.machine.readings import Gps, Reading
-from tests.unit.agents.drives import PROJECTION, SITE, START_NS, VEHICLE, Leg, changed_sensor, drive, noisy, thinned
+from tests.unit.agents.drives import (
+    PROJECTION,
+    SITE,
+    VEHICLE,
+    Leg,
+    changed_sensor,
+    drive,
+    noisy,
+    seconds,
+    thinned,
+)
 
 STD_M, SLOW_SHARE, SLOW_S = 1.2, 0.75, 45.0  # of the receiver, as it states and as a machine's description has it
 RECEIVER = changed_sensor(VEHICLE, "gps-1", drift_share=SLOW_SHARE, drift_time_s=SLOW_S)
@@ -26,10 +36,6 @@ LEGS = (Leg(3), Leg(4, 1.0), Leg(6), *[Leg(5, 0.0, 0.25), Leg(7), Leg(4, 0.0, -0
 SETTLED_S = 25.0  # of good input
 SEED = 1
 Fault = Callable[[list[Reading]], list[Reading]]
-
-
-def since(reading: Reading) -> float:
-    return (reading.stamp_ns - START_NS) * 1e-9
 
 
 def shifted(fix: Gps, east_m: float, north_m: float, std_m: float = STD_M) -> Gps:
@@ -42,7 +48,7 @@ def off(metres: Callable[[float], float], *, states: bool) -> Fault:
     """A receiver that has just started is so far off after some seconds."""
 
     def changed(fix: Gps) -> Gps:
-        off_m = metres(since(fix))
+        off_m = metres(seconds(fix))
         return shifted(fix, 0.6 * off_m, 0.8 * off_m, math.hypot(STD_M, off_m) if states else STD_M)
 
     return lambda readings: [changed(r) if isinstance(r, Gps) else r for r in readings]
@@ -52,9 +58,9 @@ def frozen(begin_s: float, end_s: float) -> Fault:
     """A receiver that hangs: it repeats its last fix bit for bit."""
 
     def changed(readings: list[Reading]) -> list[Reading]:
-        last = next(r for r in reversed(readings) if isinstance(r, Gps) and since(r) < begin_s)
+        last = next(r for r in reversed(readings) if isinstance(r, Gps) and seconds(r) < begin_s)
         return [
-            replace(last, stamp_ns=r.stamp_ns) if isinstance(r, Gps) and begin_s <= since(r) < end_s else r
+            replace(last, stamp_ns=r.stamp_ns) if isinstance(r, Gps) and begin_s <= seconds(r) < end_s else r
             for r in readings
         ]
 
@@ -124,13 +130,13 @@ def replayed(fault: str = "") -> Outcome:
     made.append(pipeline.finish())
     errors = np.array([(p.x_m, p.y_m) for p in poses]) - [made_up.at(p.stamp_ns)[:2] for p in poses]
     nees = np.array([e @ np.linalg.solve(p.covariance_m2, e) for e, p in zip(errors, poses, strict=True)])
-    seconds = (np.array([p.stamp_ns for p in poses]) - START_NS) * 1e-9
+    times_s = np.array([seconds(p) for p in poses])
     final, ahead_m = joined(made).final, VEHICLE.load_centre_m
     true = np.array([made_up.at(stamp_ns) for stamp_ns in final["stamp_ns"].tolist()])
     east_m = final["x_m"] - true[:, 0] - ahead_m * np.cos(true[:, 2])
     north_m = final["y_m"] - true[:, 1] - ahead_m * np.sin(true[:, 2])
     counters = pipeline.health()["counters"]
-    return Outcome(seconds, np.hypot(*errors.T), nees, np.hypot(east_m, north_m), counters, repeating)
+    return Outcome(times_s, np.hypot(*errors.T), nees, np.hypot(east_m, north_m), counters, repeating)
 
 
 @pytest.mark.slow

@@ -94,15 +94,6 @@ def test_estimator_is_asked_for_the_stamp_of_the_mark_once_the_lag_has_passed() 
     assert asked.stamps_ns == [ns(0)]
 
 
-def test_an_estimate_is_asked_in_time_even_if_no_pose_is_known_yet() -> None:
-    """An estimator remembers seconds, a late alignment takes minutes."""
-    sampler, asked = Sampler(0.0), Asked(ESTIMATE)
-    for i in range(1, 400):
-        sampler.mark(ns(i * 0.25), i * 0.5)
-        assert not len(sampler.due_samples(ns(i * 0.25), asked))
-    assert asked.stamps_ns == [ns(i * 0.25) for i in range(1, 392)]
-
-
 # --- pending and final -----------------------------------------------------------------------------------------------
 
 

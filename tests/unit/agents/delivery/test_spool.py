@@ -1,4 +1,5 @@
 import contextlib
+import random
 import signal
 import sqlite3
 import subprocess
@@ -10,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.delivery.audit import AuditLog, read_audit
+from agents.delivery.audit import AuditLog, Contents, read_audit
 from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
 from agents.delivery.spool_file import connect
+from agents.delivery.write_buffer import WriteBuffer
 from protocol.errors import StoreError
-from protocol.machine.samples import content_hash
+from protocol.machine.samples import content_hash, empty
 from tests.paths import ROOT
 from tests.unit.agents.drives import made_up_samples
 
@@ -72,23 +74,6 @@ def test_acknowledged_samples_are_deleted_and_stay_so(tmp_path: Path) -> None:
     assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 7, 4, 0)
     assert again.counters()["depth"] == 4
     again.close()
-
-
-def test_runs_come_out_one_after_the_other_and_are_closed(tmp_path: Path) -> None:
-    ids = []
-    for i in range(3):
-        spool = opened(tmp_path)
-        spool.record(ROWS[4 * i : 4 * i + 4])
-        ids.append(spool.spool_id)
-        if i < 2:
-            kill(spool)
-    heads = []
-    while head := spool.head(3):
-        heads.append((ids.index(head.spool_id), head.first_seq, len(head.rows), head.lost_before))
-        spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
-    assert heads == [(i, *part) for i in range(3) for part in ((1, 3, 0), (4, 1, 0))]
-    assert spool.is_settled()
-    spool.close()
 
 
 def test_runs_that_are_closed_are_declared_again_at_each_opening_and_forgotten_in_the_end(tmp_path: Path) -> None:
@@ -388,3 +373,141 @@ def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop
         spool.head(10)
     assert spool.counters()["put_aside"] == 0
     spool.close()
+
+
+# --- the audit --------------------------------------------------------------------------------------------------------
+
+HASHES = [content_hash(row) for row in ROWS]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "logs" / "audit.txt"
+
+
+def numbered(spool_id: int, first: int, hashes: list[str]) -> dict[tuple[int, int], Contents]:
+    return {(spool_id, first + i): (h,) for i, h in enumerate(hashes)}
+
+
+def test_what_a_crash_kept_from_being_noted_is_added(path: Path) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.close()
+    again = AuditLog(path)
+    again.complete([(7, 3, ROWS[2]), (7, 4, ROWS[3]), (8, 1, ROWS[4])])
+    again.close()
+    assert read_audit(path) == numbered(7, 1, HASHES[:4]) | numbered(8, 1, HASHES[4:5])
+    assert path.read_text().count("\n") == 5, "what is known is not repeated"
+
+
+def test_sample_that_is_on_disk_with_another_content_is_noted_so(path: Path) -> None:
+    """Its final value was not noted, or is gone with a damaged log; who knows which of the two has been delivered?"""
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    for _ in range(2):
+        audit.complete([(7, 2, ROWS[12])])
+    assert read_audit(path) == numbered(7, 1, HASHES[:3]) | {(7, 2): (HASHES[1], HASHES[12])}
+    assert path.read_text().count("\n") == 4
+    audit.recorded(7, 2, ROWS[13:14])
+    audit.close()
+    assert read_audit(path) == numbered(7, 1, [HASHES[0], HASHES[13], HASHES[2]])
+
+
+@pytest.mark.parametrize("cut", [1, 18])
+def test_line_that_a_crash_cut_off_counts_for_nothing(path: Path, cut: int) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.close()
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert read_audit(path) == numbered(7, 1, HASHES[:2])
+    again = AuditLog(path)
+    again.complete([(7, 3, ROWS[2])])
+    again.recorded(7, 4, ROWS[3:4])
+    again.close()
+    assert read_audit(path) == numbered(7, 1, HASHES[:4])
+
+
+def test_spool_notes_what_it_records_finalises_and_numbers_anew(tmp_path: Path, path: Path) -> None:
+    spool = Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([5, 6]).__next__)
+    spool.record(ROWS[:2])
+    spool.record(ROWS[2:5], pending=3)
+    assert read_audit(path) == numbered(5, 1, HASHES[:5])
+    spool.record(ROWS[:0], finals=ROWS[12:14])
+    assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14], HASHES[4]])
+    spool.acknowledge(5, 1)
+    spool.start_new_run()
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14], HASHES[4]])
+    spool.record(ROWS[:0], finals=ROWS[14:15])
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:15]])
+    spool.close()
+
+
+def test_audit_on_a_full_disk_keeps_no_sample_from_the_spool(tmp_path: Path, path: Path) -> None:
+    audit = AuditLog(path)
+    audit._file.close()
+    with Path("/dev/full").open("w", encoding="ascii", buffering=1) as full:
+        audit._file = full
+        spool = Spool(tmp_path / "spool.db", SpoolConfig(), None, iter([5, 6]).__next__)
+        spool._audit = audit
+        assert spool.record(ROWS[:2]) == 1
+        spool._db.close()
+        with contextlib.suppress(OSError):
+            full.close()
+    Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([6]).__next__).close()
+    assert read_audit(path) == numbered(5, 1, HASHES[:2])
+
+
+# --- what waits for the disk ------------------------------------------------------------------------------------------
+
+MANY = made_up_samples(400)
+BETTER = better(MANY)
+
+
+def sendable(spool: Spool) -> bytes:
+    head = spool.head(1000)
+    return head.rows.tobytes() if head else b""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_the_disk_does_each_sample_gets_its_own_final_value(tmp_path: Path, seed: int) -> None:
+    """New samples, final values, writes and full disks in any order, against a list."""
+    rng, buffer = random.Random(seed), WriteBuffer()
+    spool = Spool(tmp_path / "spool.db", SpoolConfig())
+    made = final = 0
+    for _ in range(60):
+        n = rng.randint(0, min(6, len(MANY) - made))
+        k = rng.choice((0, rng.randint(0, made + n - final)))
+        buffer.add(MANY[made : made + n], BETTER[final : final + k])
+        made, final = made + n, final + k
+        if rng.random() < 0.5 and not buffer.is_clean:
+            spool._db.execute(f"PRAGMA query_only = {rng.choice(('ON', 'OFF'))}")
+            try:
+                buffer.write(spool)
+            except StoreError:
+                assert not buffer.is_clean
+                continue
+            assert buffer.is_clean
+            assert sendable(spool) == BETTER[:final].tobytes(), f"seed={seed}"
+            assert spool.counters()["pending"] == made - final
+    spool._db.execute("PRAGMA query_only = OFF")
+    buffer.add(empty(), BETTER[final:made])
+    buffer.write(spool)
+    assert sendable(spool) == BETTER[:made].tobytes()
+    assert (spool.counters()["recorded"], buffer.given_up) == (made, 0)
+    spool.close()
+
+
+def test_memory_gives_up_the_oldest_that_are_final_and_counts_them(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("agents.delivery.write_buffer.MOST_UNSAVED", 8)
+    buffer, final = WriteBuffer(), empty()
+    for i in range(20):
+        final = BETTER[i - 3 : i - 2] if i >= 3 else empty()
+        buffer.add(MANY[i : i + 1], final)
+    assert (len(buffer), buffer.given_up) == (8, 12)
+    buffer.write(spool)
+    assert sendable(spool) == BETTER[12:17].tobytes()
+    buffer.add(empty(), BETTER[17:20])
+    buffer.write(spool)
+    assert sendable(spool) == BETTER[12:20].tobytes()

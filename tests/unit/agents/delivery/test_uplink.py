@@ -21,7 +21,7 @@ from agents.delivery.uplink import (
     Wait,
 )
 from agents.delivery.uplink_thread import perform
-from protocol.errors import Refusal, StoreError
+from protocol.errors import Refusal
 from protocol.machine.samples import SAMPLE_DTYPE, content_hash
 from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
@@ -30,7 +30,6 @@ from tests.unit.agents.drives import SITE, made_up_samples
 ROWS = made_up_samples(500)
 QUICK_S = 0.01  # an exchange over a good link
 TIMEOUT_S = UplinkConfig().timeout_s
-LAST_NS = int(ROWS["stamp_ns"].max())
 
 
 class Delivery:
@@ -97,26 +96,6 @@ def test_first_payload_of_an_empty_spool_is_a_question() -> None:
     assert (batch.first_seq, len(batch.rows), batch.lost_before) == (1, 0, 0)
     d.reply(Ack(0, 0))
     assert d.payload() is None
-
-
-def test_held_uplink_sends_nothing() -> None:
-    d = Delivery(5)
-    d.uplink.held = "another agent has this name"
-    assert d.payload() is None
-    d.uplink.held = ""
-    assert len(d.batch().rows) == 5
-
-
-def test_nothing_is_deleted_before_the_acknowledgement() -> None:
-    d = met(5)
-    for reply in (None, Refused(Refusal.OVERLOADED, ""), Refused(Refusal.STORE, "")):
-        d.batch()
-        d.reply(reply)
-        assert d.counter("depth") == 5
-    d.batch()
-    d.reply(Ack(5, 1))
-    assert d.counter("depth") == 0
-    assert d.uplink.counters["batches"] == 1
 
 
 def test_batch_is_halved_on_a_time_out_and_doubled_on_success() -> None:
@@ -322,27 +301,6 @@ def test_runs_are_closed_again_when_the_journal_has_lost_rows(
         d.reply(Ack(5, row, 0, FIRST))
         assert d.spool.is_settled()
     d.spool.close()
-
-
-def test_failing_disk_pauses_the_uplink_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Acknowledged samples that cannot be deleted are sent once more; pauses grow meanwhile."""
-    d = met(5)
-    batch, pauses = d.batch(), []
-    with monkeypatch.context() as patch:
-        patch.setattr(d.spool, "acknowledge", fail)
-        for _ in range(4):
-            pauses.append(d.reply(Ack(5, 1)))
-            assert d.batch().first_seq == batch.first_seq
-    assert all(most / 2 <= pause <= most for pause, most in zip(pauses, (0.2, 0.4, 0.8, 1.6), strict=True))
-    assert "disk is full; look at the machine's disk" in d.uplink.problem
-    assert d.uplink.counters["disk_errors"] == 4
-    assert d.counter("depth") == 5
-    d.reply(Ack(5, 1))
-    assert (d.uplink.problem, d.counter("depth")) == ("", 0)
-
-
-def fail(*_: object) -> None:
-    raise StoreError("spool.db", "cannot be used: disk is full; look at the machine's disk")
 
 
 def test_the_longest_acknowledgement_counts_from_the_first_sending():

@@ -51,18 +51,6 @@ def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad:
         assert estimate.reason == "", estimator
 
 
-@pytest.mark.parametrize(("estimator", "turn_radps"), [("kalman", 0.2), ("rls", 0.0)])
-def test_slope_across_the_driving_direction(estimator: str, turn_radps: float) -> None:
-    """A machine that turns on a plane takes its slope from another side; the bend's own acceleration is no slope."""
-    ground = Ground(0.04, left_rad=SLOPE_RAD)
-    made = drive([STAND, START, Leg(10, 0.0, turn_radps)], VEHICLE, ground=ground)
-    run = EstimatorRun(VEHICLE, EstimationConfig(estimator=estimator)).feed(made.readings)
-    here = ground.turned(turn_radps * (10 - 1.5))
-    assert run.last.slope_y == pytest.approx(math.tan(here.left_rad), abs=0.01)
-    assert run.last.slope_x == pytest.approx(math.tan(here.ahead_rad), abs=0.01 if estimator == "kalman" else 0.1)
-    assert run.last.c_rr == pytest.approx(0.04, abs=0.003)
-
-
 # --- the mass --------------------------------------------------------------------------------------------------------
 
 
@@ -237,15 +225,3 @@ def test_a_jolt_on_the_way_does_not_hide_the_zero() -> None:
     assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)  # one tour, and the data sheet
     plain = EstimatorRun(VEHICLE, EstimationConfig(closed_tours=False), knows_place=True).feed(readings)
     assert plain.estimator.health()["calibration"]["zero"] == 0.0
-
-
-def test_calibration_from_before_is_used_at_once() -> None:
-    zero = -0.06 / GRAVITY_MPS2
-    known = Calibration(zero, 0.0, ((1e-7, 0.0), (0.0, 1e-4)), START_NS - 10**10, 400)
-    readings = off(drive(FORWARDS, VEHICLE).readings, 0.06)
-    estimates = [e for e in EstimatorRun(VEHICLE, calibration=known).feed(readings).between(6, 14) if not e.reason]
-    assert np.mean([e.c_rr for e in estimates]) == pytest.approx(0.04, abs=0.0015)
-    unknown = [e for e in EstimatorRun(VEHICLE).feed(readings).between(6, 14) if not e.reason]
-    assert np.mean([e.c_rr_var for e in estimates]) < 0.5 * np.mean([e.c_rr_var for e in unknown])
-    health = EstimatorRun(VEHICLE, calibration=known).feed(readings).estimator.health()["calibration"]
-    assert health["age_s"] == pytest.approx(10 + 16, abs=0.5)

@@ -46,17 +46,12 @@ CASES = [  # a change of the steady balance, and why it is withheld
     ({"wheels_s": 0.6}, "no_wheels"),
     ({"torque_s": math.inf}, "no_torque"),
     ({"share": 1.3}, "torque_implausible"),
-    ({"share": -1.3}, "torque_implausible"),
     ({"speed_mps": 0.39}, "standstill"),
-    ({"speed_mps": -0.39}, "standstill"),
     ({"pitch_radps": 0.03}, "pitch_transient"),
-    ({"pitch_radps": -0.03}, "pitch_transient"),
     ({"pitch_radps": -0.03, "speed_mps": 0.5}, "pitch_transient"),
     ({"pitch_radps": 0.11, "speed_mps": 8.0}, "pitch_transient"),
-    ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.0}, "braking"),
     ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.019}, "braking"),  # coasts, by a torque sensor with a zero
     ({"accel_mps2": 1.6, "body_mps2": 1.6, "speed_mps": -2.0, "unbalanced": -0.04}, "braking"),
-    ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": -0.1}, "braking"),
     ({"unbalanced": 0.46}, "digging"),
     ({"unbalanced": -0.46, "speed_mps": -2.0}, "digging"),
     ({"accel_mps2": 8.0}, "slip"),  # low-passed: a sixth of it counts at once
@@ -66,10 +61,8 @@ CASES = [  # a change of the steady balance, and why it is withheld
     ({"speed_mps": 0.1, "accel_mps2": -3.0, "pitch_radps": 0.1}, "standstill"),
     # below the thresholds
     ({"speed_mps": 0.41}, ""),
-    ({"speed_mps": -0.41, "unbalanced": -0.04}, ""),
     ({"pitch_radps": 0.025}, ""),
     ({"pitch_radps": 0.1, "speed_mps": 8.0}, ""),  # the same crown as at 2 m/s, passed four times as fast
-    ({"pitch_radps": 0.1, "speed_mps": -8.0, "unbalanced": -0.04}, ""),
     ({"accel_mps2": 1.6, "body_mps2": 1.6}, ""),  # accelerates
     ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.03, "unbalanced": 0.25}, ""),  # pulls: sand slows it down
     ({"accel_mps2": 1.6, "body_mps2": 1.6, "speed_mps": -2.0, "share": -0.03, "unbalanced": -0.25}, ""),  # in reverse

@@ -1,7 +1,8 @@
 """The filter against least squares, its smoother against the joint Gaussian, borders, memory, and the mass."""
 
+import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from agents.estimation import borders as border_search
 from agents.estimation import resistance_kalman
 from agents.estimation.balance import BalanceStep
-from agents.estimation.borders import FIRST_C_RR, FIRST_STD
+from agents.estimation.borders import COLOURED, FIRST_C_RR, FIRST_STD, JUMP_STD, MOST, UNEVEN, BorderSearch
 from agents.estimation.resistance_kalman import NOISE, KalmanResistance
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
@@ -103,53 +104,6 @@ def joint(raw: Floats, border: int | None, wheelbase_m: float = 0.0) -> tuple[Fl
             H[i, i], H[i, border - 1] = 0.6, 0.4
     gain = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + NOISE**2 / STEP_S * np.eye(n))
     return mean + gain @ (raw - H @ mean), prior - gain @ H @ prior
-
-
-def test_smoother_with_the_mass_is_the_joint_gaussian(tune: Tune) -> None:
-    """Two states that walk, by one large least squares."""
-    seed, n = 3, 25
-    rng = np.random.default_rng(seed)
-    tune(**NO_BORDERS, WALK=0.01, SCALE_WALK=0.01, SCALE_STD=0.1)
-    share = 0.1 + 0.1 * rng.standard_normal(n)
-    raw = 0.05 + 0.03 * share + white_noise(QUIET, n, rng)
-    kalman = KalmanResistance(estimates_mass=True)
-    feed(kalman, level_steps(raw, share=share))
-    q = np.array([0.01**2 * 2.0 * STEP_S, 0.01**2 * STEP_S])
-    rows, values, weights = [], [], []
-    for i in range(n):
-        for state in range(2):  # prior of the first, walks between
-            row = np.zeros(2 * n)
-            row[2 * i + state] = 1.0
-            if i:
-                row[2 * i - 2 + state] = -1.0
-            first = (FIRST_STD**2, 0.1**2)[state]
-            rows.append(row)
-            values.append((FIRST_C_RR, 0.0)[state] if not i else 0.0)
-            weights.append(1 / (q[state] if i else q[state] + first))
-        row = np.zeros(2 * n)
-        row[2 * i : 2 * i + 2] = 1.0, share[i]
-        rows.append(row)
-        values.append(raw[i])
-        weights.append(STEP_S / NOISE**2)
-    A, W = np.array(rows), np.array(weights)
-    information = A.T @ (W[:, None] * A)
-    x, P = np.linalg.solve(information, A.T @ (W * values)), np.linalg.inv(information)
-    for i in range(n):
-        assert at_step(kalman, i) == pytest.approx((x[2 * i], P[2 * i, 2 * i]), rel=1e-3), f"{seed=} {i=}"
-
-
-@pytest.mark.slow
-def test_noise_is_measured_where_it_is_more_than_assumed(tune: Tune) -> None:
-    tune(**STILL)
-    seed, density, errors = 6, 0.012, []
-    rng = np.random.default_rng(seed)
-    for _ in range(4):
-        kalman = fed(0.05 + white_noise(density, 1600, rng))
-        c_rr, variance = at_step(kalman, 1599)
-        assert variance == pytest.approx(density**2 / 80, rel=0.5)
-        errors.append((c_rr - 0.05) / math.sqrt(variance))
-    rms = float(np.sqrt(np.mean(np.square(errors))))
-    assert 0.4 < rms < 1.6, f"{seed=} {rms=}"
 
 
 # --- borders ---------------------------------------------------------------------------------------------------------
@@ -300,3 +254,69 @@ def test_a_change_of_the_calibration_soon_after_a_turn_is_no_border() -> None:
     feed(kalman, [replace(s, raw=s.raw - zero) for s in steps[300 + reverse :]])
     assert not [border for border in borders(kalman) if border >= 300 + reverse]
     assert at_step(kalman, n - 1)[0] == pytest.approx(0.04, abs=4e-3)
+
+
+# --- the search for borders, against all histories that there are -----------------------------------------------------
+
+WHITE = 0.004
+R = WHITE**2 / STEP_S
+STEP_M = 0.1
+
+
+def borders_after(steps: Sequence[BalanceStep], remembered: int = 200) -> list[tuple[int, ...]]:
+    """The borders after each step, by its index."""
+    search = BorderSearch(remembered)
+    return [search.update(index, step, step.raw, R) for index, step in enumerate(steps)]
+
+
+def evidence(raw: Floats, history: Sequence[int]) -> float:
+    """How likely raw values (n,) of one axle are, in logarithms, with borders before these: Gaussians, part by part."""
+    total, mean, first_var = 0.0, FIRST_C_RR, FIRST_STD**2
+    for begin, end in itertools.pairwise([0, *history, len(raw)]):
+        part, walked = raw[begin:end], np.arange(1, end - begin + 1) * UNEVEN**2 * STEP_M
+        prior = first_var + np.minimum(walked[:, None], walked)
+        covariance = prior + COLOURED * R * np.eye(len(part))
+        off = part - mean
+        solved = np.linalg.solve(covariance, off)
+        total -= 0.5 * (off @ solved + np.linalg.slogdet(covariance)[1])
+        mean, first_var = mean + float(prior[-1] @ solved), JUMP_STD**2
+    return total + len(history) * math.log(math.expm1(border_search.BORDERS_PER_M * STEP_M))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_no_history_is_likelier_than_the_one_that_is_found(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """All with two borders at most. A border is known by what is behind it, so the last steps have none."""
+    monkeypatch.setattr(border_search, "LIKELY", 1e12)
+    rng = np.random.default_rng(seed)
+    levels = rng.choice([0.02, 0.06, 0.1, 0.25], 3, replace=False)
+    raw = levels[np.minimum(np.arange(30) // 10, 2)] + white_noise(WHITE, 30, rng)
+    histories = [h for count in range(3) for h in itertools.combinations(range(1, 30), count)]
+    likeliest = max(histories, key=lambda history: evidence(raw, history))
+    assert borders_after(level_steps(raw))[-1] == likeliest
+
+
+def test_one_ground_has_no_border_and_a_jolt_is_none() -> None:
+    raw = 0.05 + white_noise(WHITE, 400, np.random.default_rng(1))
+    raw[200:203] += 0.3
+    assert borders_after(level_steps(raw))[-1] == ()
+
+
+def test_histories_are_few_and_forget_what_nobody_asks_for() -> None:
+    raw = np.where(np.arange(2000) // 100 % 2, 0.02, 0.12) + white_noise(WHITE, 2000, np.random.default_rng(3))
+    search = BorderSearch(300)
+    for index, step in enumerate(level_steps(raw)):
+        history = search.update(index, step, step.raw, R)
+        assert len(search._borders) == search._rows.shape[1] <= MOST
+    assert len(history) in (3, 4)
+    assert all(border > 1500 for border in history)
+
+
+def test_after_a_long_way_of_which_nothing_is_known_another_ground_is_no_surprise() -> None:
+    """Digging for a minute: a difference that is too small for a border on 0.1 m is one after 60 m."""
+    raw = 0.03 + 0.02 * (np.arange(60) >= 40)
+    near = level_steps(raw)
+    far = [replace(step, distance_m=60.0) if index == 40 else step for index, step in enumerate(near)]
+    assert borders_after(near)[-1] == ()
+    assert borders_after(far)[-1] == (40,)
+    endless = [replace(step, distance_m=1e6) if index == 40 else step for index, step in enumerate(near)]
+    assert borders_after(endless)[-1] == (40,)

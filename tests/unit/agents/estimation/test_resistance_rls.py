@@ -47,16 +47,6 @@ def test_it_is_the_algorithm_of_the_paper() -> None:
         assert squares.variance == pytest.approx(p, rel=1e-9), f"{seed=}"
 
 
-def test_wrong_mass_is_found_where_forces_vary_faster_than_the_ground() -> None:
-    n = round(600 / STEP_S)
-    share = 0.05 + 0.2 * np.sin(0.3 * np.arange(n))
-    rls = RecursiveResistance(estimates_mass=True)
-    feed(rls, level_steps(0.05 + 0.1 * share, share=share))
-    assert 0.05 < rls._squares.parameters[0] < 0.11  # slowly: ten minutes
-    estimate = rls.at(START_NS + (n - 1) * 50_000_000)
-    assert estimate[0] == pytest.approx(0.05, abs=0.01)
-
-
 def test_grade_is_the_slope_of_the_mean_sine() -> None:
     seed, slope_rad, grade = 6, -0.3, RecursiveGrade()
     rng = np.random.default_rng(seed)

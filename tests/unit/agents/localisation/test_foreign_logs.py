@@ -162,13 +162,10 @@ IMU, FORCE = SensorConfig("imu", "imu"), SensorConfig("force", "imu", measures=(
     [
         ((IMU,), "default", True),
         ((GYRO,), "default", False),
-        ((FORCE,), "default", False),
         ((GYRO, FORCE), "default", True),
-        ((replace(IMU, use=False),), "default", False),
         ((replace(IMU, frame=FRONT),), "default", False),  # nobody knows how it lies against the rear frame
         ((replace(IMU, frame=FRONT), JOINT), "default", True),
         ((AHRS,), "paper", True),
-        ((AHRS,), "default", False),
         ((replace(AHRS, mode="relative"), GYRO), "default", True),
         ((replace(AHRS, mode="differential"), GYRO), "default", False),
         ((replace(AHRS, mode="differential"), FORCE), "default", True),

@@ -1,6 +1,7 @@
 """Receivers that share their errors: a machine at rest, many draws of what its receivers err, and single faults."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,17 +12,23 @@ from agents.localisation.filters.belief import Belief, Conditioned
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import RELOCK, Fusion
 from agents.localisation.filters.motion import MotionModel
-from agents.localisation.filters.state import POSITION, VELOCITY
+from agents.localisation.filters.state import POSITION, SPEED, VELOCITY
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Receivers
+from agents.localisation.gps_velocity import MIN_STD_MPS, gps_velocity
 from agents.localisation.tracker import layout_of
 from protocol.arrays import Floats
-from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder
+from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.readings import Encoder, Gps, GpsVelocity, Reading
 from tests.unit.agents.drives import (
+    LEVER_M,
     PROJECTION,
     S_BEND,
+    START,
     START_NS,
+    TRUE_STEP_S,
+    VEHICLE,
+    Drive,
     Leg,
     after,
     changed_sensor,
@@ -104,10 +111,8 @@ def test_a_receiver_that_goes_off_for_long_does_not_take_the_place_with_it(share
     vehicle = sharing(3, share)
     made = drive([*S_BEND, Leg(18)], vehicle)
     located = localiser(vehicle)
-    off = []
-    for pose in located.run(moved(thinned(made.readings), off_m, "gps-2", from_s=18, to_s=36)):
-        x, y, _ = made.at(pose.stamp_ns)
-        off.append(math.dist((pose.x_m, pose.y_m), (x, y)))
+    readings = moved(thinned(made.readings), off_m, "gps-2", from_s=18, to_s=36)
+    off = [made.off_m(pose) for pose in located.run(readings)]
     assert max(off) < 1.8
     assert off[-1] < 1.0
     assert located.counters["gps-1_relocked"] == located.counters["gps-3_relocked"] == 0
@@ -215,7 +220,7 @@ def test_a_lone_receiver_is_followed_where_the_wheels_are_stuck() -> None:
         for r in thinned(made.readings)
     ]
     poses = localiser(vehicle, lag_s=0.0).run(readings)
-    assert max(math.dist((p.x_m, p.y_m), made.at(p.stamp_ns)[:2]) for p in poses) < 20.0
+    assert max(map(made.off_m, poses)) < 20.0
 
 
 def test_a_receiver_without_a_place_does_not_vote_on_it() -> None:
@@ -270,6 +275,83 @@ def test_two_right_receivers_outvote_a_wrong_one_that_the_filter_believes() -> N
     away = [r for r in thinned(made.readings) if r.sensor not in ("gps-1", "gps-3") or not after(r, 18) or after(r, 32)]
     located = localiser(vehicle)
     pose = located.run(moved(away, 60.0, "gps-2", from_s=20))[-1]
-    x, y, _ = made.at(pose.stamp_ns)
     assert located.counters["gps-2_relocked"] >= 1
-    assert math.dist((pose.x_m, pose.y_m), (x, y)) < 4.0
+    assert made.off_m(pose) < 4.0
+
+
+# --- velocity by Doppler ----------------------------------------------------------------------------------------------
+
+DOPPLER = SensorConfig("doppler", "gps_velocity", Mount(LEVER_M))
+WITH_DOPPLER = replace(VEHICLE, sensors=(*VEHICLE.sensors, DOPPLER))
+LONG = (*S_BEND, Leg(10), Leg(6, 0, 0.25), Leg(20))
+
+
+def doppler(made: Drive, seed: int = 0, std_mps: float = 0.0, every: int = 20) -> list[GpsVelocity]:
+    """Velocity of the antenna 5 times a second, of a machine on the plane."""
+    rng = np.random.default_rng(seed)
+    turn = np.gradient(made.heading_rad, TRUE_STEP_S)
+    ahead, left = made.speed_mps - turn * LEVER_M[1], turn * LEVER_M[0]
+    c, s = np.cos(made.heading_rad), np.sin(made.heading_rad)
+    moving = np.stack([c * ahead - s * left, s * ahead + c * left], axis=1)
+    moving += std_mps * rng.standard_normal(moving.shape)
+    variance = max(std_mps, 0.1) ** 2
+    rows = zip(made.stamps_ns[::every], moving[::every].tolist(), strict=True)
+    return [GpsVelocity("doppler", stamp, east, north, variance, variance) for stamp, (east, north) in rows]
+
+
+def merged(*readings: Sequence[Reading]) -> list[Reading]:
+    return sorted((r for some in readings for r in some), key=lambda r: r.stamp_ns)
+
+
+def silenced(readings: Sequence[Reading], from_s: float) -> list[Reading]:
+    """Without fixes from some time on."""
+    return [r for r in readings if not (isinstance(r, Gps) and after(r, from_s))]
+
+
+def larger_wheels(readings: Sequence[Reading], scale: float) -> list[Reading]:
+    """Wheels that count too many ticks."""
+    return [
+        replace(r, left_ticks=r.left_ticks * scale, right_ticks=r.right_ticks * scale) if isinstance(r, Encoder) else r
+        for r in readings
+    ]
+
+
+def end_error_m(vehicle: MachineConfig, made: Drive, readings: Sequence[Reading]) -> float:
+    poses = localiser(vehicle, filter="ekf").run(readings)
+    return made.off_m(poses[-1])
+
+
+# --- the model -------------------------------------------------------------------------------------------------------
+
+
+def test_a_stated_error_has_a_least_value_and_a_configured_one_counts_as_it_is() -> None:
+    reading = GpsVelocity("doppler", 7, 1.0, 2.0, 1e-6, 0.09)
+    assert np.diag(gps_velocity(reading, DOPPLER).R) == pytest.approx([MIN_STD_MPS**2, 0.09])
+    configured = replace(DOPPLER, std={"velocity": 0.01})
+    assert np.diag(gps_velocity(reading, configured).R) == pytest.approx([1e-4, 1e-4])
+    assert gps_velocity(reading, replace(DOPPLER, gate_sigma=9.0)).gate_sigma == 9.0
+
+
+# --- in the filter ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_it_holds_the_position_while_fixes_are_away_and_the_wheels_are_wrong() -> None:
+    """A scale that is wrong by a tenth is outside of what the filter takes wheels for before it has seen them."""
+    made = drive(LONG, WITH_DOPPLER)
+    blind = silenced(larger_wheels(thinned(made.readings), 1.1), 20.0)
+    alone = end_error_m(WITH_DOPPLER, made, blind)
+    aided = end_error_m(WITH_DOPPLER, made, merged(blind, doppler(made)))
+    assert aided < 1.0
+    assert aided < 0.5 * alone
+
+
+def test_without_a_fix_and_without_a_start_there_is_no_pose_and_with_a_start_there_is() -> None:
+    made = drive((Leg(4, 0.5), Leg(6)), WITH_DOPPLER, without=("gps-1",))
+    readings = merged(made.readings, doppler(made))
+    assert localiser(WITH_DOPPLER, filter="ekf").run(readings) == []
+    located = localiser(WITH_DOPPLER, filter="ekf", start=START)
+    pose = located.run(readings)[-1]
+    assert made.off_m(pose) < 0.5
+    assert located.belief.x[SPEED] == pytest.approx(2.0, abs=0.05)
+    assert pose.stamp_ns > START_NS

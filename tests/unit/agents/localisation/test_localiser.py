@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.state import BASE_STATES, YAW, Layout
 from agents.localisation.localiser import LocalisationConfig
 from protocol.arrays import Floats
@@ -17,7 +16,6 @@ from tests.unit.agents.drives import (
     START,
     START_NS,
     VEHICLE,
-    Drive,
     Leg,
     RunLocaliser,
     after,
@@ -40,10 +38,6 @@ def state(located: RunLocaliser) -> Floats:
     return located.belief.x
 
 
-def position_errors(beliefs: list[PoseBelief], made: Drive) -> list[float]:
-    return [math.dist((b.x_m, b.y_m), made.at(b.stamp_ns)[:2]) for b in beliefs]
-
-
 @pytest.mark.parametrize(  # each pair of choices once
     ("receivers", "profile", "engine"),
     [
@@ -60,9 +54,8 @@ def test_noiseless_readings_give_a_small_error(receivers: int, profile: str, eng
     beliefs = located.run(made.readings)
     assert located.is_aligned
     assert not [name for name in located.counters if not name.endswith("_used")]
-    assert max(position_errors(beliefs, made)) < 0.3
-    heading_errors = [abs(math.remainder(b.heading_rad - made.at(b.stamp_ns)[2], math.tau)) for b in beliefs]
-    assert max(heading_errors) < 0.05
+    assert max(map(made.off_m, beliefs)) < 0.3
+    assert max(map(made.turned_rad, beliefs)) < 0.05
     assert all(-math.pi <= b.heading_rad <= math.pi for b in beliefs)
 
 
@@ -73,7 +66,7 @@ def test_late_receiver_brings_its_own_unknown_error() -> None:
     made = drive(S_BEND, vehicle)
     readings = moved([r for r in thinned(made.readings) if r.sensor != "gps-2" or after(r, 20)], 3.0, "gps-2")
     beliefs = localiser(vehicle).run(readings)
-    errors = position_errors(beliefs, made)
+    errors = [made.off_m(b) for b in beliefs]
     first = next(i for i, b in enumerate(beliefs) if b.stamp_ns > START_NS + 20_200_000_000)
     assert errors[first] - errors[first - 3] < 1.5
     assert max(errors) < 2.0
@@ -88,7 +81,7 @@ def test_turning_on_the_spot_is_no_gyro_bias() -> None:
     assert located.counters["standstill_gated"] >= 30
     assert located.counters["standstill_relocked"] == 0
     assert abs(state(located)[GYRO_BIAS]) < 1e-3
-    assert abs(math.remainder(state(located)[YAW] - made.heading_rad[-1], math.tau)) < 0.01
+    assert made.turned_rad(located.belief) < 0.01
 
 
 @pytest.mark.slow
@@ -126,8 +119,8 @@ def test_a_given_start_needs_no_gps(profile: str, engine: str) -> None:
     located = localiser(vehicle, start=START, profile=profile, filter=engine)
     beliefs = located.run(made.readings)
     assert beliefs[0].stamp_ns <= START_NS + 70_000_000
-    assert max(position_errors(beliefs, made)) < 0.6
-    assert abs(math.remainder(beliefs[-1].heading_rad - made.heading_rad[-1], math.tau)) < 0.02
+    assert max(map(made.off_m, beliefs)) < 0.6
+    assert made.turned_rad(beliefs[-1]) < 0.02
 
 
 BENDS = (Leg(4, 1.0), *(Leg(3, 0.0, rate) for rate in (0.3, -0.2, 0.25, -0.35, 0.3, -0.3)))
@@ -143,8 +136,7 @@ def test_without_gps_the_motion_teaches_nothing_that_it_does_not_show(engine: st
     beliefs = located.run(noisy(off, 1))
     layout = Layout(imus=1, wheel_scale=True)
     assert state(located)[layout.gyro_biases.start : layout.wheel_scales.stop].tolist() == [0.0, 0.0]
-    turned = [abs(math.remainder(b.heading_rad - made.at(b.stamp_ns)[2], math.tau)) for b in beliefs]
-    assert max(turned) < 0.06  # noise of the gyro, and a step in which it turns at 0.35 rad/s
+    assert max(map(made.turned_rad, beliefs)) < 0.06  # noise of the gyro, and a step in which it turns at 0.35 rad/s
 
 
 def test_fixes_that_are_refused_are_as_no_gps() -> None:
@@ -168,8 +160,7 @@ def test_without_gps_a_standstill_still_shows_the_gyro_bias() -> None:
     located = localiser(vehicle, start=START)
     beliefs = located.run(biased(made.readings, 0.004))
     assert state(located)[GYRO_BIAS] == pytest.approx(0.004, abs=1e-4)
-    off_rad = math.remainder(beliefs[-1].heading_rad - made.heading_rad[-1], math.tau)
-    assert abs(off_rad) < 0.25 * 0.004 * 28  # and most of what it turned the machine by
+    assert made.turned_rad(beliefs[-1]) < 0.25 * 0.004 * 28  # and most of what it turned the machine by
 
 
 @pytest.mark.slow

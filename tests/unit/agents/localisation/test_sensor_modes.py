@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from agents.localisation.filters.belief import Belief
-from agents.localisation.filters.motion import map_from_base
-from agents.localisation.filters.state import YAW
+from agents.localisation.filters.ekf import Ekf
+from agents.localisation.filters.motion import HeadingError, MotionModel, motion
+from agents.localisation.filters.state import Layout
+from agents.localisation.headings import heading_references
 from agents.localisation.localiser import LocalisationConfig
 from agents.localisation.sensor_modes import PAIR_S, StampedValue, rate_between
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Gps
+from protocol.machine.readings import Attitude, Gps, Reading
 from tests.unit.agents.drives import (
-    PROJECTION,
     S_BEND,
     SITE,
     START,
     START_NS,
     VEHICLE,
-    Drive,
     Leg,
     after,
     changed_sensor,
@@ -45,15 +45,6 @@ EACH_PAIR = pytest.mark.parametrize(  # of choices once
         ("relative", "paper", "ekf"),
     ],
 )
-
-
-def errors(made: Drive, beliefs: list[Belief], east_m: float = 0.0, north_m: float = 0.0) -> list[float]:
-    """Distances [m] from the truth, or from what lies so far off it."""
-    distances = []
-    for b in beliefs:
-        x, y, _ = made.at(b.stamp_ns)
-        distances.append(math.dist(b.x[:2], (x + east_m, y + north_m)))
-    return distances
 
 
 def of_gps(mode: str, receivers: int = 1) -> MachineConfig:
@@ -98,7 +89,7 @@ def test_a_machine_with_such_a_receiver_alone_never_aligns_but_runs_from_a_start
     lost = localiser(vehicle, profile=profile, filter=engine)
     assert lost.beliefs(readings) == []
     located = localiser(vehicle, profile=profile, filter=engine, start=START)
-    assert max(errors(made, located.beliefs(readings))) < 0.6
+    assert max(map(made.off_m, located.beliefs(readings))) < 0.6
     assert located.counters["gps-1_used"] > 100
     assert located.counters["gps-1_gated"] == 0
 
@@ -113,7 +104,7 @@ def test_velocity_of_an_antenna_far_off_the_axle_is_free_of_bias_in_a_bend(hz: i
     readings = sorted([*(r for r in made.readings if not isinstance(r, Gps)), *fixes], key=lambda r: r.stamp_ns)
     located = localiser(vehicle, start=START, filter=engine)
     last = located.beliefs(readings)[-1]
-    assert abs(math.remainder(last.x[YAW] - made.at(last.stamp_ns)[2], math.tau)) < 0.01
+    assert made.turned_rad(last) < 0.01
     assert last.x[6] == pytest.approx(2.0, abs=0.03)
     assert located.counters["gps-1_used"] >= len(fixes) - 2
 
@@ -127,7 +118,7 @@ def test_a_first_fix_that_is_too_late_is_no_reference() -> None:
     old = moved(fixes[40:41], 900.0)  # of second 8, and elsewhere
     readings = [*others[:cut], *old, *sorted([*others[cut:], *fixes[100:]], key=lambda r: r.stamp_ns)]
     located = localiser(vehicle, start=START)
-    assert max(errors(made, located.beliefs(readings))) < 0.6
+    assert max(map(made.off_m, located.beliefs(readings))) < 0.6
     assert (located.counters["too_late"], located.counters["gps-1_gated"]) == (1, 0)
 
 
@@ -154,43 +145,11 @@ def test_a_restart_takes_a_new_reference() -> None:
     assert pipeline.health()["counters"].get("gps-2_gated", 0) == 0
 
 
-def test_relative_fixes_are_those_of_the_paper_s_transform_seen_from_the_shared_map() -> None:
-    """The paper maps fixes into the vehicle's world by a rigid transform, of a receiver's first fix and the start's
-    roll, pitch and yaw. With the same start, world to map is its inverse at the believed antenna. The site's plane
-    stands for UTM: both are transverse Mercator.
-    """
-    rng, sensor = np.random.default_rng(11), SensorConfig("gps-1", "gps", mode="relative")
-    vehicle = replace(machine(receivers=0), sensors=(*machine(receivers=0).sensors, sensor))
-    located = localiser(vehicle, start=START)
-    located.beliefs(drive([Leg(1)], vehicle, without=("gps-1",)).readings)
-    fusion = located._tracker.fusion
-    roll_pitch_yaw = rng.normal(size=3) * (0.1, 0.1, 2.0)
-    turn = map_from_base(roll_pitch_yaw)
-    places = np.array([100.0, -50.0, 7.0]) + rng.normal(size=(5, 3)) * 30
-    world_from_utm, map_from_world = np.eye(4), np.eye(4)
-    world_from_utm[:3, :3], world_from_utm[:3, 3] = turn.T, -turn.T @ places[0]
-    stamp = located.belief.stamp_ns
-    believed = fusion.at(stamp).x[:3]  # no lever arm: the antenna is the machine
-    map_from_world[:3, :3], map_from_world[:3, 3] = turn, believed
-    for i, place in enumerate(places):
-        geodetic = PROJECTION.to_geodetic(*place.tolist())
-        raw = located._tracker.receivers.fix(Gps("gps-1", stamp, *geodetic, 1.0, 1.0, 1.0), located.dead_reckoning.pose)
-        if i == 0:
-            located._tracker.receivers.anchor(raw, fusion.at(stamp))
-        shifted = located._tracker.receivers.measurement(raw)
-        paper = map_from_world @ world_from_utm @ np.append(place, 1.0)
-        assert shifted.z == pytest.approx(paper[:2], abs=1e-5)
-
-
 # --- attitude --------------------------------------------------------------------------------------------------------
 
 
 def of_ahrs(**options: Any) -> MachineConfig:
     return replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("ahrs", "attitude", **options)))
-
-
-def yaw_error(made: Drive, belief: Belief) -> float:
-    return abs(math.remainder(belief.x[YAW] - made.at(belief.stamp_ns)[2], math.tau))
 
 
 @pytest.mark.slow
@@ -199,8 +158,8 @@ def test_a_relative_heading_leaves_a_wrong_start_to_be_corrected_by_fixes() -> N
     vehicle = of_ahrs(mode="relative")
     made = drive([*S_BEND, Leg(40)], vehicle)
     beliefs = localiser(vehicle, start=(10.0, 20.0, 0.76)).beliefs(thinned(with_ahrs(made, 1.0)))
-    assert yaw_error(made, beliefs[20]) > 0.04
-    assert yaw_error(made, beliefs[-1]) < 0.02
+    assert made.turned_rad(beliefs[20]) > 0.04
+    assert made.turned_rad(beliefs[-1]) < 0.02
 
 
 # --- standard deviations ---------------------------------------------------------------------------------------------
@@ -216,3 +175,81 @@ def test_a_configured_position_replaces_what_fixes_state() -> None:
     located = localiser(known).beliefs(boasting)[-1]
     assert located.x == pytest.approx(expected.x, abs=1e-9)
     assert np.abs(located.P - expected.P).max() < 1e-9
+
+
+# --- absolute headings: slow errors that have states, and what they do without GPS ------------------------------------
+
+STATED = math.radians(1.5) ** 2
+LAPS = (Leg(4, 1.0), *([Leg(8), Leg(6, 0.0, 0.25), Leg(5), Leg(6, 0.0, -0.25)] * 6))
+
+
+def until(readings: list[Reading], fixes_s: float) -> list[Reading]:
+    """Fixes up to there, nothing of them afterwards."""
+    return [r for r in thinned(readings) if not (isinstance(r, Gps) and after(r, fixes_s))]
+
+
+def turned(readings: list[Reading], by_rad: float, from_s: float) -> list[Reading]:
+    """The reference off by an angle from a time on."""
+    c, s = math.cos(by_rad / 2), math.sin(by_rad / 2)
+    return [
+        replace(r, qz=r.qz * c + r.qw * s, qw=r.qw * c - r.qz * s)
+        if isinstance(r, Attitude) and after(r, from_s)
+        else r
+        for r in readings
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong_deg", [pytest.param(8.0, marks=pytest.mark.nightly), -25.0])
+def test_an_error_larger_than_stated_is_learnt_and_does_no_harm(wrong_deg: float) -> None:
+    """While fixes show the heading, and in the two minutes without them that follow."""
+    vehicle = of_ahrs()
+    made = drive(LAPS, vehicle)
+    readings = until(with_ahrs(made, math.radians(wrong_deg), variance=STATED), 60.0)
+    with_it, without = localiser(vehicle), localiser(VEHICLE)
+    with_it.run(readings)
+    without.run([r for r in readings if r.sensor != "ahrs"])
+    assert made.turned_rad(with_it.belief) < max(made.turned_rad(without.belief), math.radians(2))
+    assert (
+        made.off_m(with_it.belief) < made.off_m(without.belief) + 3.0
+    )  # of 300 m; not learnt, 8 degrees would cost 40 m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fixes_s", [pytest.param(1000.0, marks=pytest.mark.nightly), 60.0])
+def test_a_reference_that_jumps_is_refused_then_learnt_anew(fixes_s: float) -> None:
+    """A load of steel beside the sensor: 60 degrees at once, with GPS and without."""
+    vehicle = of_ahrs()
+    made = drive(LAPS, vehicle)
+    located = localiser(vehicle)
+    located.run(turned(until(with_ahrs(made, variance=STATED), fixes_s), math.radians(60), 90.0))
+    assert located.counters["ahrs_gated"] >= 15
+    assert located.counters["ahrs_relocked"] == 1
+    assert made.turned_rad(located.belief) < 0.05
+
+
+def test_without_readings_its_error_becomes_what_it_was_at_first() -> None:
+    """Stationary: an error that is known fades, and its variance comes back, in steps of any length."""
+    layout = Layout(imus=1, references=1)
+    error = layout.heading_errors.start
+    model = MotionModel(layout, heading_errors=(HeadingError(0.05, 100.0),))
+    x, P = np.zeros(layout.n), np.eye(layout.n) * 1e-6
+    x[error] = 0.1
+    one = Belief(0, x, P)
+    once = Ekf().predict(one, motion(model, one, 60.0), 60_000_000_000)
+    for i in range(60):
+        one = Ekf().predict(one, motion(model, one, 1.0), (i + 1) * 1_000_000_000)
+    for belief in (once, one):
+        assert belief.x[error] == pytest.approx(0.1 * math.exp(-0.6))
+        assert belief.P[error, error] == pytest.approx(0.05**2 + (1e-6 - 0.05**2) * math.exp(-1.2))
+
+
+def test_headings_of_the_front_frame_and_of_pairs_have_no_state() -> None:
+    sensors = [
+        SensorConfig("relative", "attitude", mode="relative"),
+        SensorConfig("front", "attitude", frame="front_link"),
+        SensorConfig("pairs", "attitude", mode="differential"),
+        SensorConfig("tilt", "attitude", measures=("tilt",)),
+        SensorConfig("absolute", "attitude"),
+    ]
+    assert [s.name for s in heading_references(sensors)] == ["absolute", "relative"]

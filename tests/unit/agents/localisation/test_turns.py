@@ -7,16 +7,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.dead_reckoning import DeadReckonedPose, WheelSpeed, turn_source
+from agents.dead_reckoning import turn_source
 from agents.localisation.filters.belief import Belief
 from agents.localisation.filters.motion import motion
-from agents.localisation.filters.state import YAW, YAW_RATE, Layout
-from agents.localisation.imu_steps import FilterStep, Turn
-from agents.localisation.measurements import RATE_RADPS
-from agents.localisation.motion_sensors import STEERED_S, MotionSensors
+from agents.localisation.filters.state import YAW_RATE, Layout
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Odometry, Reading, Steering
-from tests.unit.agents.drives import LEVER_M, START_NS, Drive, Leg, RunLocaliser, drive, localiser, reckoned, thinned
+from tests.unit.agents.drives import (
+    LEVER_M,
+    START_NS,
+    Drive,
+    Leg,
+    RunLocaliser,
+    drive,
+    localiser,
+    reckoned,
+    seconds,
+    thinned,
+)
 
 WHEELBASE_M = 2.5
 EIGHT = [Leg(6, 0.5), Leg(4), *[Leg(25, 0, 0.25), Leg(25, 0, -0.25)] * 2]  # at 3 m/s, circles of 12 m
@@ -69,17 +77,12 @@ def run(vehicle: MachineConfig, readings: list[Reading], **options: Any) -> tupl
     return located, located.beliefs(readings)
 
 
-def seconds(stamp_ns: int) -> float:
-    return (stamp_ns - START_NS) * 1e-9
-
-
 def without_fixes(readings: list[Reading]) -> list[Reading]:
-    return [r for r in readings if not isinstance(r, Gps) or not DARK_S[0] < seconds(r.stamp_ns) < DARK_S[1]]
+    return [r for r in readings if not isinstance(r, Gps) or not DARK_S[0] < seconds(r) < DARK_S[1]]
 
 
 def errors(made: Drive, beliefs: list[Belief], from_s: float = 0.0, to_s: float = 1e9) -> list[float]:
-    chosen = [b for b in beliefs if from_s <= seconds(b.stamp_ns) <= to_s]
-    return [math.dist(b.x[:2], made.at(b.stamp_ns)[:2]) for b in chosen]
+    return [made.off_m(b) for b in beliefs if from_s <= seconds(b) <= to_s]
 
 
 # --- who tells the turn ----------------------------------------------------------------------------------------------
@@ -128,32 +131,6 @@ def test_old_steering_angle_turns_nothing() -> None:
     assert reckoning.angle_rad == pytest.approx(turned_m * math.tan(0.2) / WHEELBASE_M, rel=0.03)
 
 
-@pytest.mark.parametrize(("speed", "angle", "dt_ms"), [(-3.0, 0.4, 50), (6.0, 0.2, 200)])
-def test_the_noise_of_a_steered_turn_is_that_of_its_angle(speed: float, angle: float, dt_ms: int) -> None:
-    """As strong in the long run as an angle that is wrong by the same for a second: e v / (L cos^2 angle)."""
-    vehicle = truck(ENCODER, replace(STEERING, std={"angle": 0.02}))
-    body = MotionSensors(vehicle, Layout(imus=1, wheel_scale=True), 0.05, (0.0, 0.0), on_plane=True)
-    curvature = math.tan(angle) / WHEELBASE_M
-    steps = [
-        FilterStep(
-            START_NS + i * dt_ms * 1_000_000,
-            DeadReckonedPose(0, 0.0, 0.0, 0.0, 0.0),
-            {},
-            {},
-            WheelSpeed(speed, is_known=True),
-            True,
-            0.0,
-            0.0,
-            Turn(speed * curvature, speed),
-        )
-        for i in range(2)
-    ]
-    (measurement,) = [body.turn(step) for step in steps][-1]
-    of_angle = 0.02 * speed / (WHEELBASE_M * math.cos(angle) ** 2)
-    expected = RATE_RADPS**2 + of_angle**2 * 2 * STEERED_S / (dt_ms * 1e-3)
-    assert float(measurement.R[0, 0]) == pytest.approx(expected)
-
-
 # --- what comes of it ------------------------------------------------------------------------------------------------
 
 
@@ -175,7 +152,7 @@ def test_a_machine_without_imu_is_located_and_holds_through_ten_seconds_without_
     shown = f"seed={seed} {located.counters}"
     assert max(errors(made, beliefs, 30.0)) < 4.5, shown
     assert max(errors(made, beliefs, *DARK_S)) < 4.0, shown
-    assert abs(math.remainder(beliefs[-1].x[YAW] - made.heading_rad[-1], math.tau)) < 0.15, shown
+    assert made.turned_rad(beliefs[-1]) < 0.15, shown
     assert located.counters["gps-1_gated"] == 0, shown
 
 
@@ -205,7 +182,7 @@ def test_a_step_without_a_turn_leaves_the_rate_to_what_is_known() -> None:
     """Odometry falls silent in a bend: the rate is soon unknown, not zero."""
     vehicle = truck(ENCODER, replace(ODOMETRY, measures=("rate",)))
     made = driven(vehicle, Wrong(fixes=False), [Leg(6, 0.5), Leg(6), Leg(20, 0, 0.25)])
-    readings = [r for r in made.readings if not isinstance(r, Odometry) or seconds(r.stamp_ns) < 20]
+    readings = [r for r in made.readings if not isinstance(r, Odometry) or seconds(r) < 20]
     last = run(vehicle, readings)[1][-1]
     assert last.P[YAW_RATE, YAW_RATE] > 0.01
     assert last.x[YAW_RATE] == pytest.approx(0.25, abs=0.2)

@@ -109,10 +109,8 @@ def test_a_filter_that_failed_starts_again_and_is_counted(monkeypatch: pytest.Mo
             lost = True
             assert positioning.pose is None  # the start that was configured is far behind by now
     assert positioning.counters["filter_restarts"] == 1
-    assert positioning.pose is not None
-    x, y, heading = made.at(positioning.pose.stamp_ns)
-    assert math.dist((positioning.pose.x_m, positioning.pose.y_m), (x, y)) < 0.5
-    assert abs(positioning.pose.heading_rad - heading) < 0.1
+    assert made.off_m(positioning.pose) < 0.5
+    assert made.turned_rad(positioning.pose) < 0.1
 
 
 class FailsOnce:
