@@ -69,19 +69,15 @@ def test_receiver_that_is_away_for_a_moment_stops_the_others_and_later_not() -> 
     assert min(c.stamp_ns for c in alone) - T0 > 5.0 * 1e9  # no jump to the error of one of the two
 
 
-@pytest.mark.parametrize("wrong_m", [0.0, 1.0, 5.0])
 @pytest.mark.slow
-@pytest.mark.nightly
+@pytest.mark.parametrize("wrong_m", [0.0, 5.0])
 def test_lasting_error_of_a_wrong_survey_is_found_within_what_it_states(wrong_m: float) -> None:
-    off = []
-    for seed in range(4):
-        base = station(place=(PLACE[0] - wrong_m, PLACE[1]))
-        made = base.step([fix(error, i) for i, error in enumerate(drifting(5 * 1800, seed), 1)])
-        last = made[-1]
-        off += [(last.offset_e_m - wrong_m) / last.offset_m2**0.5, last.offset_n_m / last.offset_m2**0.5]
-        assert last.offset_m2**0.5 < 0.4
-        assert ("check `place`" in base.problem) == (wrong_m == 5.0) or wrong_m == 1.0
-    assert np.sqrt(np.mean(np.square(off))) < 1.8  # of 8 values of variance 1
+    base = station(place=(PLACE[0] - wrong_m, PLACE[1]))
+    last = base.step([fix(error, i) for i, error in enumerate(drifting(5 * 1800, 0), 1)])[-1]
+    std_m = last.offset_m2**0.5
+    assert std_m < 0.4
+    assert np.abs([last.offset_e_m - wrong_m, last.offset_n_m]).max() < 2.5 * std_m
+    assert ("check `place`" in base.problem) is bool(wrong_m)
 
 
 def test_lasting_error_follows_a_base_that_was_moved_after_a_while() -> None:

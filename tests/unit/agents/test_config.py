@@ -122,9 +122,6 @@ def test_page_of_ground_estimation_names_every_reason_and_none_else() -> None:
     assert given | FAULTS | {NOTHING_KNOWN.reason, "settling"} == reasons
 
 
-# --- base stations ---------------------------------------------------------------------------------------------------
-
-
 def base_file(folder: Path, *lines: str, sensor: str = 'kind = "gps"') -> Path:
     path = folder / "base.toml"
     text = "\n".join([*lines, "[machine]", 'name = "base-1"', "[[sensor]]", 'name = "gps-1"', sensor])

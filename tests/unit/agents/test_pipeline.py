@@ -1,6 +1,8 @@
 import csv
 import math
 from dataclasses import replace
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +120,16 @@ def test_any_cutting_of_the_stream_gives_the_same_samples(
     made = [pipeline.step(recorded[a:b]) for a, b in zip([0, *cuts], [*cuts, len(recorded)], strict=True)]
     pending, final = (np.concatenate(rows).tobytes() for rows in zip(*made, strict=True))
     assert (pending, final, pipeline.health()) == base
+
+
+@pytest.mark.slow
+def test_no_order_of_sensor_tables_and_of_readings_of_a_stamp_changes_a_bit(
+    vehicle: MachineConfig, recorded: list[Reading], base: Base
+) -> None:
+    groups = [[*group] for _, group in groupby(recorded, key=attrgetter("stamp_ns"))]
+    readings = [reading for group in groups for reading in reversed(group)]
+    assert readings != recorded
+    assert run(replace(vehicle, sensors=vehicle.sensors[::-1]), readings) == base
 
 
 @pytest.mark.slow
@@ -252,8 +264,6 @@ def test_every_sample_becomes_final_whatever_happens(
     assert [*done, *end.final["stamp_ns"].tolist()] == [*made, *end.pending["stamp_ns"].tolist()]
     assert len([*made, *end.pending]) > 20, f"seed={seed}"
 
-
-# --- sensors that fail -----------------------------------------------------------------------------------------------
 
 LONG = [Leg(2), Leg(4, 0.5), *[Leg(3, 0.4), Leg(3, -0.4)] * 5]  # 36 s
 FAIL_S, HEAL_S = 10.0, 22.0

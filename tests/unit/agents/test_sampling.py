@@ -80,9 +80,6 @@ def test_load_centre_lies_ahead_and_the_gradient_is_turned_into_the_map(heading:
     assert (row["cov_xx_m2"], row["cov_xy_m2"], row["cov_yy_m2"]) == (1.0, 0.0, 2.0)
 
 
-# --- later than the machine was there --------------------------------------------------------------------------------
-
-
 def test_estimator_is_asked_for_the_stamp_of_the_mark_once_the_lag_has_passed() -> None:
     sampler, asked = Sampler(0.0), Asked(ESTIMATE)
     for t in (0.0, 0.5, LAG_S - 0.001, LAG_S, LAG_S + 0.2):
@@ -92,9 +89,6 @@ def test_estimator_is_asked_for_the_stamp_of_the_mark_once_the_lag_has_passed() 
         rows = sampler.due_samples(ns(t), asked)
         assert (len(rows), sampler.waiting) == ((1, 0) if t == LAG_S else (0, int(t < LAG_S)))
     assert asked.stamps_ns == [ns(0)]
-
-
-# --- pending and final -----------------------------------------------------------------------------------------------
 
 
 def moved(by_m: float, turn_rad: float, variance_m2: float) -> Callable[[PoseBelief], PoseBelief]:

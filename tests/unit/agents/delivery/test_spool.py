@@ -359,9 +359,6 @@ def test_failed_commit_leaves_no_transaction_open(
     spool.close()
 
 
-# --- damage that SQLite does not see ---------------------------------------------------------------------------------
-
-
 def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:3])

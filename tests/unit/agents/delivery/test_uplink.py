@@ -89,8 +89,11 @@ def met(n: int = 0, **options: Any) -> Delivery:
     return delivery
 
 
-def test_first_payload_of_an_empty_spool_is_a_question() -> None:
+def test_first_payload_of_an_empty_spool_is_a_question_until_somebody_answers() -> None:
     d = Delivery()
+    d.batch()
+    d.reply(None)
+    assert d.uplink.problem == "no answer from the map server within 3 s"
     batch = d.batch()
     assert (batch.machine, batch.spool_id, batch.frame) == ("loader-1", d.spool.spool_id, SITE.frame)
     assert (batch.first_seq, len(batch.rows), batch.lost_before) == (1, 0, 0)

@@ -106,6 +106,15 @@ def test_tyres_that_slip_in_a_bend_are_no_slope(slip: float, speed_mps: float) -
     assert left < 1.2e-3
 
 
+def test_wild_gyros_do_not_make_tyres_slip() -> None:
+    """A gyro that reads 50 rad/s for a second at full speed."""
+    slope = SlopeFilter()
+    bends(slope, 0.01, 8.0, 60)
+    for _ in range(20):
+        slope.update(STEP_S, (0.0, 0.0, 50.0), LEVEL, (8.0, 0.0))
+    assert np.abs(bends(slope, 0.01, 8.0, 100)[-400:]).max() < 2e-3
+
+
 @pytest.mark.parametrize("jump_mps", [0.3, -2.5])
 def test_wheels_that_slip_and_grip_again_are_no_slope(jump_mps: float) -> None:
     """Sand takes a tenth of the wheels' speed; locked wheels lose all of it."""

@@ -190,6 +190,14 @@ def test_a_zero_far_beyond_its_class_is_found_in_the_end() -> None:
     assert on.calibrator.calibration.zero == pytest.approx(0.03, abs=0.003)
 
 
+def test_known_ground_on_a_slope_counts_with_its_cosine_in_both_directions() -> None:
+    on = course(zero=0.006, c_rr=lambda _: 0.2, slope=lambda _: 0.3)
+    for direction in (1.0, -1.0):
+        on.drive(60, direction, known_c_rr=0.2)
+    assert on.calibrator.calibration.zero == pytest.approx(0.006, abs=3e-4)
+    assert (on.calibrator.counters["known_ground"] > 200, on.calibrator.counters["pairs"]) == (True, 0)
+
+
 # --- how sure it is --------------------------------------------------------------------------------------------------
 
 
@@ -222,9 +230,6 @@ def test_no_number_of_pairs_gets_below_the_floor() -> None:
     (zz, _), (_, ss) = on.calibrator.calibration.covariance
     assert math.sqrt(zz) == pytest.approx(FLOOR)
     assert math.sqrt(ss) == pytest.approx(10 * FLOOR)
-
-
-# --- given from before -----------------------------------------------------------------------------------------------
 
 
 def given(age_s: float = 0.0) -> Calibration:
@@ -289,9 +294,6 @@ def table(**changes: Any) -> dict[str, Any]:
     return {**encode_offer(OFFER), **changes}
 
 
-# --- which are taken -------------------------------------------------------------------------------------------------
-
-
 def test_a_good_offer_waits_and_is_taken_once() -> None:
     offers = Offers(NAME, 0)
     for _ in range(3):
@@ -310,7 +312,7 @@ def test_a_good_offer_waits_and_is_taken_once() -> None:
         ({"zero": 0.3}, "out_of_range"),
         ({"scale_var": None}, "missing_field"),
         ({"machine": "loader-9"}, "wrong_machine"),
-        ({"stamp_ns": START_NS}, "not_newer"),
+        ({"stamp_ns": START_NS - S}, "not_newer"),
         ({"stamp_ns": START_NS + TOO_OLD_NS - S}, "too_old"),
         ({"stamp_ns": START_NS + 2 * TOO_OLD_NS + AHEAD_NS + S}, "in_future"),
     ],
@@ -320,9 +322,6 @@ def test_a_bad_offer_is_refused_and_counted(changes: Any, reason: str) -> None:
     offers.consider(table(**changes), START_NS + 2 * TOO_OLD_NS)
     assert offers.counters == {f"refused_offer_{reason}": 1}
     assert offers.take() is None
-
-
-# --- what it is worth ------------------------------------------------------------------------------------------------
 
 
 def own(zero: float = 0.0, scale: float = 0.0, stds: tuple[float, float] = (ZERO_STD, SCALE_STD)) -> Calibrator:
@@ -384,9 +383,6 @@ def test_an_intersection_is_consistent_whatever_the_correlation(seed: int) -> No
         cross = gain_a @ AB @ gain_b.T
         true = gain_a @ A @ gain_a.T + gain_b @ B @ gain_b.T + cross + cross.T
         assert (np.linalg.eigvalsh(P - true) > -1e-9).all()
-
-
-# --- when it counts --------------------------------------------------------------------------------------------------
 
 
 def test_an_offer_counts_from_the_next_standstill_on_and_health_says_so() -> None:
@@ -479,3 +475,8 @@ def test_no_flipped_bit_is_used(tmp_path: Path) -> None:
             assert "c.json" in str(error)  # noqa: PT017 # blanks between values may be anything that is blank
             refused += 1
     assert refused > 0.9 * len(bits)
+
+
+def test_a_folder_that_is_not_there_is_an_error_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="cannot be written"):
+        save(tmp_path / "none" / "c.json", "loader-1", KNOWN)

@@ -183,6 +183,14 @@ def test_a_parked_machine_whose_position_wanders_shows_nothing() -> None:
     assert [tour.zero for tour in track.shown] == pytest.approx([ZERO], abs=2e-4)
 
 
+def test_a_tour_closes_after_a_steep_slope_and_not_on_it() -> None:
+    track = Track(lambda x, y: 2 * ramp(x, y)).drive((45.0, 0.0), *SQUARE[1:], (59.0, 0.0))
+    assert not track.shown
+    track.drive((59.0, 0.0), (75.0, 0.0))
+    assert [tour.zero for tour in track.shown] == pytest.approx([ZERO], abs=3e-4)
+    assert track.shown[0].std == pytest.approx(RISE_STD_M / LAP_M, rel=0.1)
+
+
 def test_short_tours_do_not_count_and_long_ones_are_surer() -> None:
     def lap(side_m: float) -> list[Tour]:
         corners = ((0.0, 0.0), (side_m, 0.0), (side_m, side_m), (0.0, side_m), (0.0, 0.0), (side_m / 2, 0.0))

@@ -35,9 +35,6 @@ def weighing(**options: Any) -> MachineConfig:
     return replace(vehicle, sensors=(*vehicle.sensors, SensorConfig("scale", "payload")))
 
 
-# --- physics ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("legs", "c_rr", "ahead_rad"), [(FORWARDS, 0.25, SLOPE_RAD), (REVERSE, 0.05, -SLOPE_RAD)])
 def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad: float) -> None:
@@ -49,9 +46,6 @@ def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad:
         assert estimate.slope_x == pytest.approx(math.tan(ahead_rad), abs=0.005), estimator
         assert estimate.slope_y == pytest.approx(0.0, abs=0.002), estimator
         assert estimate.reason == "", estimator
-
-
-# --- the mass --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("mass", "stated_kg"), [("message", 22_500.0), ("known", 17_500.0), ("estimated", math.nan)])

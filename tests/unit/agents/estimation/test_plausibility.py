@@ -31,14 +31,9 @@ def at_work(seconds: float, gain: float = 1.0, offset: float = 0.0, c_rr: float 
     return judged
 
 
-# --- nothing is wrong ------------------------------------------------------------------------------------------------
-
-
 def test_a_loader_at_work_is_believed() -> None:
     assert set(reasons(at_work(300))) == {""}
 
-
-# --- one balance is enough -------------------------------------------------------------------------------------------
 
 CASES = [  # a change of the steady balance, and why it is withheld
     ({"norm_mps2": 1.0}, "accelerometer"),  # in g

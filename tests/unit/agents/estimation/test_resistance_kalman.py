@@ -65,9 +65,6 @@ def scale_of(kalman: KalmanResistance) -> tuple[float, float]:
     return float(newest.x[2]), float(newest.P[2, 2])
 
 
-# --- one ground ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("border", "wheelbase_m"), [(12, 0.0), (None, 0.5), (12, 0.5)])
 def test_smoother_is_the_joint_gaussian(tune: Tune, border: int | None, wheelbase_m: float) -> None:
     """All states at once: c_rr walks, jumps where a border is; a step sees the ground of both axles."""
@@ -162,7 +159,20 @@ def test_border_that_two_axles_cross_is_one(before: float, behind: float) -> Non
             )
 
 
-# --- asked and remembered --------------------------------------------------------------------------------------------
+def test_back_across_a_border_half_crossed() -> None:
+    """The front axle 1 m on the new ground, then home: the old ground is found again behind."""
+    kalman = KalmanResistance()
+    there = crossing(0.03, 0.12, 9.0, 10.0)
+    feed(kalman, there)
+    home = []
+    for i, step in enumerate(level_steps(np.zeros(60))):
+        front_m = 10.0 - 0.1 * (i + 1)
+        raw = -(0.45 * (0.12 if front_m > 9.0 else 0.03) + 0.55 * 0.03)
+        lead = {**AXLES, "lead_m": 1.5, "lead_share": 0.55}
+        step = replace(step, stamp_ns=there[-1].stamp_ns + (i + 20) * STEP_NS, raw=raw, regressor=-1.0, **lead)
+        home.append(step)
+    feed(kalman, home)
+    assert kalman.at(home[-1].stamp_ns)[0] == pytest.approx(0.03, abs=0.01)
 
 
 def test_memory_is_bounded_and_answers_stay_right(tune: Tune) -> None:
@@ -320,3 +330,8 @@ def test_after_a_long_way_of_which_nothing_is_known_another_ground_is_no_surpris
     assert borders_after(far)[-1] == (40,)
     endless = [replace(step, distance_m=1e6) if index == 40 else step for index, step in enumerate(near)]
     assert borders_after(endless)[-1] == (40,)
+
+
+def test_a_machine_that_stands_crosses_no_border() -> None:
+    steps = [replace(step, distance_m=0.0) for step in level_steps(0.02 + 0.1 * (np.arange(100) >= 50))]
+    assert not any(borders_after(steps))

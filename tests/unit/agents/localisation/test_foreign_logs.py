@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby
-from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -115,42 +113,6 @@ def test_wheels_that_pause_while_the_machine_brakes_come_back_with_their_new_spe
     positioning, _, _ = located(vehicle, readings)
     assert positioning.counters["wheels_gated"] == 0
     assert positioning.counters["standstill_used"] == 0
-
-
-# --- any order -------------------------------------------------------------------------------------------------------
-
-MANY = (
-    replace(GPS, delay_s=0.1),
-    SensorConfig("gps-2", "gps", delay_s=0.1),
-    SensorConfig("imu", "imu"),
-    SensorConfig("gyro", "imu", measures=("rate",)),
-    SensorConfig("wheels", "odometry", measures=("speed",)),
-    SensorConfig("left", "encoder", Mount((0.0, 0.7, 0.0))),
-)
-
-
-def shuffled_stamps(readings: Sequence[Reading], rng: np.random.Generator) -> list[Reading]:
-    """Readings of each stamp in another order."""
-    groups = [list(group) for _, group in groupby(readings, key=attrgetter("stamp_ns"))]
-    return [group[i] for group in groups for i in rng.permutation(len(group))]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("engine", "rate_hz"), [("ekf", 20), ("ukf", 5)])
-@pytest.mark.nightly
-def test_no_order_of_sensor_tables_and_of_readings_of_a_stamp_changes_a_bit(engine: str, rate_hz: float) -> None:
-    vehicle = cart(*MANY)
-    readings = readings_of(vehicle, drive(TOUR, vehicle), rate_hz, seed=4)[: 25 * rate_hz * len(MANY)]
-    _, poses, _ = located(vehicle, readings, engine)
-    assert len(poses) > 50
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        swapped = replace(vehicle, sensors=tuple(MANY[i] for i in rng.permutation(len(MANY))))
-        _, others, _ = located(swapped, shuffled_stamps(readings, rng), engine)
-        assert [repr(p) for p in others] == [repr(p) for p in poses], f"seed={seed}"
-
-
-# --- what a sensor provides decides what is estimated ----------------------------------------------------------------
 
 
 AHRS, JOINT = SensorConfig("ahrs", "attitude"), SensorConfig("joint", "articulation")

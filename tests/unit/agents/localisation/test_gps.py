@@ -89,9 +89,6 @@ def sharing(receivers: int, share: float | None, **options: str) -> MachineConfi
     return vehicle
 
 
-# --- many draws ------------------------------------------------------------------------------------------------------
-
-
 def test_the_more_is_shared_the_less_is_known_and_all_shared_is_one_receiver() -> None:
     nothing, place = np.zeros((60, 3, 2)), np.zeros(2)
     variance = [at_rest(sharing(3, share), nothing, place).P[0, 0] for share in (0.0, 0.3, 0.6, 0.9, 1.0)]
@@ -99,9 +96,6 @@ def test_the_more_is_shared_the_less_is_known_and_all_shared_is_one_receiver() -
     one = at_rest(sharing(1, None), nothing[:, :1], place).P[0, 0]
     assert variance[0] < 0.5 * one
     assert 0.85 * one < variance[-1] < one
-
-
-# --- faults ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -321,18 +315,12 @@ def end_error_m(vehicle: MachineConfig, made: Drive, readings: Sequence[Reading]
     return made.off_m(poses[-1])
 
 
-# --- the model -------------------------------------------------------------------------------------------------------
-
-
 def test_a_stated_error_has_a_least_value_and_a_configured_one_counts_as_it_is() -> None:
     reading = GpsVelocity("doppler", 7, 1.0, 2.0, 1e-6, 0.09)
     assert np.diag(gps_velocity(reading, DOPPLER).R) == pytest.approx([MIN_STD_MPS**2, 0.09])
     configured = replace(DOPPLER, std={"velocity": 0.01})
     assert np.diag(gps_velocity(reading, configured).R) == pytest.approx([1e-4, 1e-4])
     assert gps_velocity(reading, replace(DOPPLER, gate_sigma=9.0)).gate_sigma == 9.0
-
-
-# --- in the filter ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

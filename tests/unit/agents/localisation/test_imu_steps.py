@@ -61,9 +61,6 @@ def test_a_mounted_imu_is_turned_into_base_link(rpy_deg: tuple[float, float, flo
     assert step.imu_means["imu"].force_mps2 == pytest.approx(force)
 
 
-# --- the front frame of an articulated machine -----------------------------------------------------------------------
-
-
 def articulated(angle_rad: float, rate_radps: float, seconds: float) -> list[FilterStep]:
     """The rear frame turns at 0.2 rad/s and is pulled ahead by 1 m/s2; the IMU rides on the front frame."""
     vehicle = with_imu(Mount((1.0, 0.0, 0.5), (0.0, 0.0, 90.0)), FRONT, (SensorConfig("joint", "articulation"),))
@@ -123,7 +120,7 @@ def test_an_attitude_becomes_roll_pitch_yaw_at_any_mount(
     ("vehicle", "readings", "counter"),
     [
         (with_imu(frame=FRONT), [imu(t, (0, 0, 1)) for t in (0, 100)], "front_imu_without_articulation"),
-        (with_ahrs(Mount(), FRONT), [attitude((0, 0, 1), Mount(), t) for t in (0, 100)], "attitude_of_front_frame"),
+        (with_ahrs(Mount(), FRONT), [attitude((0, 0, 1), Mount(), t) for t in (0, 100)], "front_attitude_unused"),
         (with_ahrs(Mount()), [attitude((0, 0, 1), Mount(), t, 0.0) for t in (0, 100)], "attitude_without_direction"),
     ],
 )

@@ -194,9 +194,6 @@ def test_paper_has_15_states_and_follows_orientations_whose_error_the_default_le
     assert abs(off["default"]) < 0.03
 
 
-# --- configuration ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -71,9 +71,6 @@ def test_many_states_are_predicted_as_each_alone(layout: Layout) -> None:
         assert measurement.h(states) == pytest.approx(alone, abs=1e-12), measurement.sensor
 
 
-# --- GPS -------------------------------------------------------------------------------------------------------------
-
-
 def test_an_antenna_is_and_moves_as_the_body_carries_it() -> None:
     x = somewhere(2, PAPER)
     turn = map_from_base(x[ATTITUDE])
@@ -81,9 +78,6 @@ def test_an_antenna_is_and_moves_as_the_body_carries_it() -> None:
     velocity = measurements.velocity(0, "gps-1", np.zeros(2), np.eye(2), LEVER_M, 0.0)
     assert predicted(fix, x) == pytest.approx((x[POSITION] + turn @ LEVER_M)[:2])
     assert predicted(velocity, x) == pytest.approx((turn @ (x[VELOCITY] + np.cross(x[RATE], LEVER_M)))[:2])
-
-
-# --- IMU -------------------------------------------------------------------------------------------------------------
 
 
 def imu(rates: Floats, force: Floats, lever_m: Floats | None = None, bias: int | None = None) -> Measurement:
@@ -109,9 +103,6 @@ def test_specific_force_is_the_second_derivative_of_the_sensors_path() -> None:
     acceleration = (speed_of_point(h) - speed_of_point(-h)) / (2 * h)
     force = map_from_base(x[ATTITUDE]).T @ (acceleration + np.array([0.0, 0.0, GRAVITY_MPS2]))
     assert predicted(imu(np.zeros(3), np.zeros(3), lever), x)[3:] == pytest.approx(force, abs=1e-6)
-
-
-# --- wheels, orientation, standstill ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("engine", [Ekf(), Ukf()], ids=["ekf", "ukf"])

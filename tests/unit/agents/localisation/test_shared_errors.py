@@ -26,15 +26,13 @@ def slow_errors(seed: int, seconds: float, receivers: int, share: float, slow_m2
     return np.sqrt(slow_m2) * (np.sqrt(share) * parts[:, :1] + np.sqrt(1 - share) * parts[:, 1:])
 
 
-def fixes_of(
-    errors_m: Floats, seed: int = SEED, *, staggered: bool = False, white_m2: float = WHITE_M2
-) -> list[SharedFix]:
-    """Fixes of receivers on a machine that drives circles with 2 m/s; staggered: each at instants of its own."""
+def fixes_of(errors_m: Floats, seed: int = SEED) -> list[SharedFix]:
+    """Fixes of receivers on a machine that drives circles with 2 m/s, each at instants of its own."""
     rng, made = np.random.default_rng(seed + 10_000), []
-    white = np.sqrt(white_m2) * rng.standard_normal(errors_m.shape)
+    white = np.sqrt(WHITE_M2) * rng.standard_normal(errors_m.shape)
     c, s = np.cos(ROTATION_RAD), np.sin(ROTATION_RAD)
     for i, j in np.ndindex(errors_m.shape[:2]):
-        t = (i + (0.3 * j if staggered else 0.0)) / RATE_HZ
+        t = (i + 0.3 * j) / RATE_HZ
         heading = 0.2 * t
         lever = LEVERS_M[j, 0] + 1j * LEVERS_M[j, 1]
         reckoned = 500 + 10 * np.sin(heading) - 10j * np.cos(heading) + lever * np.exp(1j * heading)
@@ -45,10 +43,10 @@ def fixes_of(
     return made
 
 
-def estimate(fixes: Sequence[SharedFix], receivers: int, rotation_rad: float = ROTATION_RAD) -> ShareEstimator:
+def estimate(fixes: Sequence[SharedFix], receivers: int) -> ShareEstimator:
     estimator = ShareEstimator(receivers)
     for fix in fixes:
-        estimator.add(fix, rotation_rad)
+        estimator.add(fix, ROTATION_RAD)
     return estimator
 
 

@@ -75,9 +75,6 @@ def definite_enough(P: Floats) -> bool:
     return bool(np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > 0)
 
 
-# --- the Kalman filter -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ALL, ids=name)
 def test_on_a_linear_model_it_is_the_kalman_filter(kind: Filter) -> None:
     seed, n = 1, 6
@@ -104,9 +101,6 @@ def test_on_a_linear_model_it_is_the_kalman_filter(kind: Filter) -> None:
         np.testing.assert_allclose(belief.x, x, rtol=1e-6, atol=1e-6, err_msg=f"{seed=} {step=}")
         np.testing.assert_allclose(belief.P, P, rtol=1e-6, atol=1e-6, err_msg=f"{seed=} {step=}")
         assert belief.stamp_ns == step
-
-
-# --- first order -----------------------------------------------------------------------------------------------------
 
 
 def small(scale: float) -> tuple[Belief, Motion, list[Measurement]]:

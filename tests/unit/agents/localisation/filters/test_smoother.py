@@ -93,9 +93,6 @@ def same(poses: Sequence[SmoothedPose], others: Sequence[SmoothedPose], toleranc
         assert pose.correction == pytest.approx(other.correction, abs=tolerance)
 
 
-# --- it is the textbook's smoother -----------------------------------------------------------------------------------
-
-
 class Augmented:
     """A Kalman filter whose state holds the past too: copies of what is kept of it, which never move."""
 
@@ -210,9 +207,6 @@ def test_after_a_gap_longer_than_the_lag_nothing_of_before_waits() -> None:
     assert not [s for s in final if 5.01 < s < 12]
 
 
-# --- covariances -----------------------------------------------------------------------------------------------------
-
-
 @BOTH
 def test_smoothing_never_makes_a_place_less_sure(engine: Filter) -> None:
     groups, filtered = drive(8), {START_NS: start()}
@@ -226,9 +220,6 @@ def test_smoothing_never_makes_a_place_less_sure(engine: Filter) -> None:
         assert filtered[pose.stamp_ns].x[:2] + pose.correction[:2] == pytest.approx((pose.x_m, pose.y_m))
         middle.append(np.trace(pose.covariance_m2) / np.trace(P))
     assert np.mean(middle[3:-6]) < 0.9
-
-
-# --- headings, and who may change a belief ---------------------------------------------------------------------------
 
 
 def test_headings_are_smoothed_across_the_back() -> None:
