@@ -24,6 +24,7 @@ from protocol.site.site_config import KnownGround
 from sim.config import SimConfig
 from sim.recorder import record
 from tests.unit.agents.drives import (
+    PROJECTION,
     S_BEND,
     SITE,
     START,
@@ -424,6 +425,24 @@ def test_fixes_far_from_the_site_are_refused_and_counted() -> None:
     pipeline.step(lost)
     assert pipeline.counters["fix_outside_site"] == 25
     assert made.off_m(pipeline.pose) < 0.5
+
+
+@pytest.mark.slow
+def test_a_proven_heading_that_fixes_refute_is_found_anew() -> None:
+    """A machine that is turned by a crane after 45 s, while its gyro sleeps."""
+    made = drive([Leg(4, 1.5), Leg(56)], VEHICLE)
+    about, turn_rad, readings = complex(*made.at(START_NS + 45 * SECOND)[:2]), 1.5, []
+    for r in thinned(made.readings):
+        if isinstance(r, Gps) and seconds(r) > 45:
+            x, y, z = PROJECTION.to_map(r.lat_deg, r.lon_deg, r.height_m)
+            turned = about + (complex(x, y) - about) * np.exp(1j * turn_rad)
+            lat, lon, _ = PROJECTION.to_geodetic(turned.real, turned.imag, z)
+            r = replace(r, lat_deg=lat, lon_deg=lon)
+        readings.append(r)
+    pipeline = Positioning(SITE, VEHICLE, PipelineConfig(LocalisationConfig("ekf")))
+    pipeline.step(readings)
+    assert pipeline.counters["heading_refuted"] == 1
+    assert pipeline.pose.heading_rad == pytest.approx(0.7 + turn_rad, abs=0.1)
 
 
 @pytest.mark.slow

@@ -143,6 +143,7 @@ def test_base_with_another_error_does_no_harm_where_nothing_is_shared(
     wild = corrections(lambda t: (5 * math.cos(t / 5), -4.0), 60)
     located = locate(with_base(machine()), mixed(readings, wild))
     assert error_m(located, made) == pytest.approx(error_m(usual("alone"), made), rel=1e-6)
+    assert located.localiser.base_report()["why_not"].startswith("its errors are not those of this machine")
 
 
 @pytest.mark.slow

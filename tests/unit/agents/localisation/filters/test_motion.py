@@ -159,8 +159,10 @@ def test_slip_lies_along_and_across_the_body() -> None:
         (lambda: MotionModel(FULL, gps_errors=ERRORS[:1]), "1 GPS errors for 2 receivers"),
         (lambda: MotionModel(PAPER, heading_errors=(HeadingError(0.05, 100.0),)), "1 heading errors for 0 references"),
         (lambda: Layout(imus=-1), "negative"),
+        (lambda: FULL.gyro_bias(2), "no IMU 2 among 2"),
+        (lambda: FULL.gps_error(-1), "no receiver -1 among 2"),
     ],
 )
 def test_what_makes_no_model_is_refused(make: Callable[[], object], problem: str) -> None:
-    with pytest.raises(ValueError, match=problem):
+    with pytest.raises((ValueError, IndexError), match=problem):
         make()
