@@ -102,6 +102,7 @@ def base(vehicle: MachineConfig, recorded: list[Reading]) -> Base:
 # --- what goes in and comes out --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_made_up_drive_gives_right_samples() -> None:
     made = drive([*S_BEND, *S_BEND], VEHICLE)
     rows = Pipeline(SITE, VEHICLE, PipelineConfig()).step(thinned(made.readings, 20)).pending

@@ -36,15 +36,6 @@ from tests.unit.agents.drives import (
 )
 
 SECOND = 1_000_000_000
-EACH_PAIR = pytest.mark.parametrize(  # of choices once
-    ("mode", "profile", "engine"),
-    [
-        ("differential", "default", "ekf"),
-        pytest.param("differential", "paper", "ukf", marks=pytest.mark.nightly),  # filterpy's is slow
-        ("relative", "default", "ukf"),
-        ("relative", "paper", "ekf"),
-    ],
-)
 
 
 def of_gps(mode: str, receivers: int = 1) -> MachineConfig:
@@ -74,24 +65,6 @@ def test_a_pair_is_the_rate_at_its_middle_and_as_unsure_as_both(
 
 
 # --- GPS -------------------------------------------------------------------------------------------------------------
-
-
-@EACH_PAIR
-@pytest.mark.nightly
-def test_a_machine_with_such_a_receiver_alone_never_aligns_but_runs_from_a_start(
-    mode: str, profile: str, engine: str
-) -> None:
-    """Its fixes are a kilometre off, and it drives on from the given start."""
-    vehicle = of_gps(mode)
-    made = drive(S_BEND, vehicle)
-    readings = moved(made.readings, 1000.0)
-    assert not localiser(vehicle, profile=profile).is_aligned
-    lost = localiser(vehicle, profile=profile, filter=engine)
-    assert lost.beliefs(readings) == []
-    located = localiser(vehicle, profile=profile, filter=engine, start=START)
-    assert max(map(made.off_m, located.beliefs(readings))) < 0.6
-    assert located.counters["gps-1_used"] > 100
-    assert located.counters["gps-1_gated"] == 0
 
 
 @pytest.mark.parametrize(("hz", "engine"), [(1, "ekf"), (5, "ukf")])
