@@ -32,7 +32,7 @@ from tests.integration.site_run import SiteRun, kill
 from tests.integration.test_evidence import Senders
 from tests.journals import history_beside
 from tests.reference.correction import in_numpy
-from tests.unit.mapserver.data import same, same_evidence
+from tests.unit.mapserver.data import same
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
 
 pytestmark = pytest.mark.processes
@@ -198,24 +198,6 @@ def test_a_fact_of_another_version_keeps_the_server_from_starting_in_one_line(si
     assert said("fold", site.folder / "store", "--out", site.folder / "new").code == 1
     with closing(sqlite3.connect(path)) as database:
         assert database.execute("SELECT COUNT(*) FROM events").fetchone() == (1,), "it is still there"
-
-
-@pytest.mark.nightly
-def test_the_map_of_an_archive_and_its_facts_is_the_live_one(site: SiteRun):
-    pytest.importorskip("pyarrow.parquet")
-    (site.folder / "server.toml").write_text(ASKED.replace("0.0", "0.000001"))
-    server, folder = serve(site), site.folder
-    with site.connect() as client:
-        client.info(after=Senders(site, client).send(DRIVES))
-        client.correct("a", "levelled", zero=ZERO)
-        assert client.info().corrections == 1
-    server.stop()
-    with stored(folder / "store", site) as store:
-        live = store.grid
-    archived = said("fold", folder / "store", "--site-file", site.site_file, "--out", folder / "of-store")
-    assert archived.code == 0, archived.err
-    with stored(folder / "of-store", site) as store:
-        assert same_evidence(store.grid, live)
 
 
 @pytest.mark.nightly

@@ -97,19 +97,6 @@ def committed(store: Path) -> dict[str, int]:
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.nightly
-def test_a_router_with_many_sessions_ends_in_time(site: SiteRun):
-    router = site.start_router()
-    with contextlib.ExitStack() as opened:
-        sessions = [opened.enter_context(session_of(site.endpoint)) for _ in range(10)]
-        for session in sessions:
-            session.declare_queryable("sitegrid/paper/map/*", lambda query: None)
-        replies = [session.get("sitegrid/paper/map/info", timeout=0.5) for session in sessions]
-        end(router)
-        for reply in replies:
-            list(reply)
-
-
 def old_rows(store: Path, site: SiteConfig) -> None:
     """Fill a store with what has to be archived at once."""
     with closing(Store(JournalLocation(store), site, ServerConfig(), lambda: NOW_NS)) as opened:
@@ -156,14 +143,6 @@ def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: Site
     end(server)
     assert not server.lines(), "it was not ready yet"
     assert committed(store) == {"old": 50_000}
-
-
-@pytest.mark.nightly
-def test_a_server_that_waits_for_a_router_ends_in_time(site: SiteRun, children: Children):
-    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "store", "--verbose")
-    server = children.start("server", "server", *words)
-    wait_for_handlers(server)
-    end(server)
 
 
 def wait_for_handlers(child: Child) -> None:

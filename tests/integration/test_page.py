@@ -128,29 +128,6 @@ def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab, web: Web
 
 
 @pytest.mark.nightly
-def test_play_back_runs_to_now(tab: Tab):
-    tab.page.locator("#play").click()
-    tab.until("sitegrid.time.playing !== 0 && sitegrid.time.at !== null")
-    tab.page.locator("#play").click()
-    tab.until("sitegrid.time.playing === 0")
-    tab.page.locator("#live").click()
-    tab.until("sitegrid.time.at === null")
-
-
-@pytest.mark.nightly
-def test_layers_palettes_and_fading_cost_no_traffic(tab: Tab):
-    tab.page.wait_for_timeout(500)
-    before = len(tab.asked)
-    for key in ("2", "3", "4", "5", "1", "u", "o", "u", "o"):
-        tab.page.keyboard.press(key)
-        tab.page.wait_for_timeout(60)
-    tab.page.get_by_role("button", name="Kinds of ground").click()
-    tab.until("sitegrid.palette === 'kinds'")
-    assert len(tab.asked) == before
-    assert "dry concrete" in tab.page.locator("#legend").inner_text()
-
-
-@pytest.mark.nightly
 def test_the_keyboard_alone_is_enough(tab: Tab):
     tab.page.keyboard.press("Tab")
     assert tab.js("document.activeElement.className") == "skip"
@@ -211,18 +188,6 @@ def test_a_phone_shows_map_legend_and_panel(browser, web: WebSite):
     assert small == []
     assert tab.js("document.documentElement.scrollWidth") <= 390
     assert tab.complaints == []
-    tab.close()
-
-
-@pytest.mark.nightly
-def test_dark_is_dark_and_is_kept(browser, web: WebSite):
-    tab = Tab(browser, web.url, color_scheme="dark").loaded()
-    assert tab.js("document.documentElement.dataset.theme") == "dark"
-    tab.page.locator("#theme").click()
-    assert tab.js("document.documentElement.dataset.theme") == "light"
-    tab.page.reload()
-    tab.loaded()
-    assert tab.js("document.documentElement.dataset.theme") == "light"
     tab.close()
 
 

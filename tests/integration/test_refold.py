@@ -14,7 +14,6 @@ import pytest
 
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.ingest.store import Store
 from mapserver.journal.location import JournalLocation
 from protocol.errors import QueryError, Refusal
@@ -26,7 +25,6 @@ from sitegrid.process.children import Child, Children
 from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.integration.test_operation import Sender, end, session_of
 from tests.patience import until
-from tests.reference.correction import in_numpy
 from tests.site_work import batches, write_store
 from tests.unit.mapserver.data import same
 
@@ -128,39 +126,6 @@ def test_a_server_killed_between_decision_and_map_comes_back_without_the_machine
         serve(site)
         assert list(client.info().distrusted) == ["loader-3"]
         assert not next(row for row in client.machines() if row.name == "loader-3").trusted
-
-
-@pytest.mark.nightly
-def test_a_server_killed_between_a_correction_and_its_map_comes_back_with_it(site: SiteRun):
-    server, zero = serve(site), 0.02
-    with site.connect() as client, pytest.raises(QueryError, match="the decision is kept") as late:
-        client.correct("loader-3", "a test", zero=zero, wait_s=0.0)
-    kill(server)
-    assert late.value.reason == Refusal.AFTER_TIMEOUT
-    server = serve(site)
-    with site.connect() as client:
-        info = client.info()
-        assert (info.fact, info.decided, info.corrections) == (1, 1, 1)
-    end(server)
-    correction = Correction("loader-3", 0, LAST_NS, zero, 0.0, 0.0, ())
-    expected = Grid(load_site(site.site_file).cell_m, ServerConfig().fold)
-    for name, rows in islice(batches(), ROWS):
-        expected.fold(in_numpy(rows, correction) if name == "loader-3" else rows, name)
-    with store_of(site) as store:
-        assert same(store.grid, expected)
-
-
-@pytest.mark.nightly
-def test_decisions_of_several_operators_at_once_all_count(site: SiteRun):
-    serve(site)
-    names = [f"loader-{number}" for number in range(1, 7)]
-    with site.connect() as client:
-        threads = [threading.Thread(target=client.distrust, args=(name, "a test")) for name in names]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert sorted(client.info().distrusted) == names
 
 
 @pytest.mark.nightly

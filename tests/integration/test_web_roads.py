@@ -149,20 +149,12 @@ def test_what_nobody_knows_is_null_and_told(web: WebSite):
     ("path", "parameters", "status", "reason", "word"),
     [
         ("worklist", {"target": 0}, 400, "out_of_range", "target"),
-        ("worklist", {"limit": "2.5"}, 400, "out_of_range", "limit"),
         ("worklist", {"from": "2026-01-02", "to": "2026-01-01"}, 400, "out_of_range", "after"),
         ("worklist", {"machine": "hauler-9"}, 404, "unknown_machine", "hauler-9"),
         ("segments", {"bounds": "9e14,0,9.1e14,5"}, 400, "out_of_range", "off the site"),
-        ("features/segments", {"as_of": "yesterday"}, 400, "wrong_type", "as_of"),
-        ("route", {}, 400, "missing_field", "line"),
-        ("route", {"line": "1,1;east,2"}, 400, "wrong_type", "line"),
         ("route", {"line": "0,0;1e14,0"}, 413, "too_large", "km"),
-        ("route", {"line": "0,0;9e4,0"}, 400, "out_of_range", "off the site"),
-        ("route", {"line": "20,10;90,10", "mass": "2e6"}, 400, "out_of_range", "mass"),
         ("route", {"line": "20,10;90,10", "machine": "<img src=x>"}, 400, "out_of_range", "machine"),
-        ("way", {"from": "20,10"}, 400, "missing_field", "to"),
         ("way", {"from": "20,10;30,10", "to": "20,10"}, 400, "out_of_range", "from"),
-        ("way", {"from": "20,10", "to": "90,10", "cost": "money"}, 400, "out_of_range", "cost"),
     ],
 )
 def test_bad_input_is_one_clear_problem(web: WebSite, path, parameters, status, reason, word):

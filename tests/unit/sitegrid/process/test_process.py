@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from sitegrid.door import build_parser
+from sitegrid.process import progress
 from sitegrid.process.children import Children, ProcessError
-from sitegrid.process.progress import COMPILING
+from sitegrid.process.progress import COMPILING, Display
 
 STUBBORN = """
 import sys, time
@@ -102,11 +104,6 @@ def test_who_does_not_end_is_ended_and_that_is_logged():
     assert took_s >= 0.3
 
 
-def test_who_needs_time_gets_it():
-    code, output, errors, _ = ended(STUBBORN.format(end_s=None, late_s=0.5))
-    assert (code, output, errors) == (3, "done\n", "")
-
-
 def test_a_process_that_is_stuck_outside_of_python_is_ended_too():
     assert ended(STUCK)[0] == 0
 
@@ -124,13 +121,6 @@ def test_a_process_that_is_stuck_outside_of_python_is_ended_too():
 def test_metrics_are_for_this_host_unless_told(words: list[str], address: tuple[str, int] | None):
     arguments = build_parser().parse_args(["server", "--site-file", "s", "--store", "x", *words])
     assert arguments.metrics == address
-
-
-@pytest.mark.parametrize("text", ["", "http", "host:", "1.2.3.4:65536", "-1", "9464/metrics"])
-def test_what_is_no_address_is_a_usage_error(text: str):
-    with pytest.raises(SystemExit) as end:
-        build_parser().parse_args(["server", "--site-file", "s", "--store", "x", f"--metrics={text}"])
-    assert end.value.code == 2
 
 
 @pytest.mark.slow
@@ -182,3 +172,20 @@ with compilation_reported():
     first, second = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2))
     assert json.loads(first) == {"compiling": 1, "note": COMPILING}
     assert second == ""
+
+
+def test_plain_lines_come_now_and_then_only(monkeypatch, capsys):
+    now = iter([100.0, 100.0, 101.0, 106.0, 106.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    display = Display("machines drive", headless=True)
+    for second in (1, 2, 3):
+        display.show(second, 10, "recording")
+    assert capsys.readouterr().err.count("recording") == 2
+
+
+@pytest.mark.parametrize("kept", [None, Path("out")])
+def test_who_interrupts_is_told_whether_the_command_goes_on(kept: Path | None, capsys):
+    with pytest.raises(KeyboardInterrupt), Display("machines drive", headless=True, kept=kept):
+        raise KeyboardInterrupt
+    said = capsys.readouterr().err
+    assert ("interrupted; what is done is kept in out, and the same command goes on with it" in said) == bool(kept)

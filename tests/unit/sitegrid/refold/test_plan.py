@@ -30,7 +30,7 @@ def kept_of(planned: Plan) -> list[tuple[str, int, int]]:
     ]
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_each_sample_is_kept_once_however_archives_overlap(seed: int, tmp_path: Path) -> None:
     """Archives that have stretches of the same spools, in batches that were cut otherwise."""
     rng = np.random.default_rng(seed)
@@ -83,13 +83,6 @@ def test_a_file_that_holds_a_sample_twice_is_named(tmp_path: Path) -> None:
         plan([write(tmp_path / "one", both)], ALL, ENGINE)
 
 
-def test_a_file_that_is_named_twice_is_not_compared(tmp_path: Path, monkeypatch) -> None:
-    part = write(tmp_path / "one", [JournalRow(1, "a", 7, 1, samples(np.random.default_rng(1), 20), T0)])
-    monkeypatch.setattr("sitegrid.refold.plan.compare", lambda _: pytest.fail("the same file was read again"))
-    planned = plan([part, part], ALL, ENGINE)
-    assert (planned.kept.total(), planned.excluded["twice"]) == (20, 20)
-
-
 def numbered(rows: JournalRows) -> dict[tuple[object, int], bytes]:
     """Bytes of samples by their identity."""
     spools = ((spool, seqs, at) for spool, seqs, at in by_spool(rows))
@@ -105,7 +98,7 @@ def order_of(rows: JournalRows) -> list[int]:
     return [i for _, _, at in by_spool(rows) for i in at.tolist()]
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_cut_keeps_identity_and_bytes_of_what_is_kept(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = JournalRows.joined(

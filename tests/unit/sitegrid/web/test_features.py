@@ -45,11 +45,6 @@ def test_areas_follow_the_edges_of_cells_with_their_holes():
     assert gravel[0][0] == gravel[0][-1], "closed"
 
 
-def test_an_empty_map_has_no_areas():
-    empty = TilesAnswer(MapVersion("s", 0, 0), 0, 1.0, whole=True, tiles=())
-    assert features.zones(empty, BOUNDARIES, PROJECTION) == {"type": "FeatureCollection", "features": []}
-
-
 def test_a_change_is_a_rectangle_with_its_times():
     change = GroundChange(3, 10**9, 2 * 10**9, (0.0, 0.0, 10.0, 20.0), 200, 0.02, None, None, None)
     (feature,) = features.changes([change], PROJECTION)["features"]

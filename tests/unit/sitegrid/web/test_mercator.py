@@ -67,10 +67,3 @@ def test_unknown_is_transparent_and_colours_grow_lighter():
     assert image[0, 0, 1] < image[0, 1, 1] < image[0, 2, 1]
     assert decoded(mercator.empty_png("colour"))[..., 3].max() == 0
     assert decoded(mercator.empty_png("value")).shape == decoded(value_png(values, "resistance")).shape
-
-
-@pytest.mark.parametrize("layer", ["resistance_class", "grade", "confidence", "age_s", "visits", "heading"])
-def test_every_layer_has_colours(layer: str):
-    image = decoded(colour_png(np.full((256, 256), 1.0), layer))
-    assert image.shape == (256, 256, 4)
-    assert (image[..., 3] == 255).all()
