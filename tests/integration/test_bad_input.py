@@ -21,7 +21,7 @@ from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
 from sitegrid.process.children import Children
-from tests.integration.site_run import SiteRun  # beside this file
+from tests.integration.site_run import NOBODY_DRIVES, SiteRun  # beside this file
 from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
@@ -72,7 +72,7 @@ class Probe:
 def probe(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Probe]:
     folder = tmp_path_factory.mktemp("bad-input")
     with Children(folder) as children:
-        sim = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
+        sim = NOBODY_DRIVES
         opened = Probe(SiteRun(folder, children, free_endpoint(), sim))
         opened.takes_a_good_one()
         yield opened

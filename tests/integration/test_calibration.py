@@ -47,10 +47,9 @@ ZERO = 0.02
 
 
 @pytest.fixture
-def site(tmp_path: Path, children: Children) -> SiteRun:
-    run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
-    run.start_router()
-    return run
+def site(site: SiteRun) -> SiteRun:
+    site.start_router()
+    return site
 
 
 def serve(site: SiteRun) -> Child:

@@ -28,7 +28,6 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from sim.config import SimConfig
 from sitegrid.process.children import Child, Children
 from tests.command_lines import said
 from tests.integration.site_run import SiteRun  # beside this file
@@ -38,11 +37,6 @@ pytestmark = pytest.mark.processes
 
 END_S = 25.0  # ten times what it gives itself; what it must not wait for, Zenoh's replies and links, takes 30
 NOW_NS = 1_767_225_600_000_000_000
-
-
-@pytest.fixture
-def site(tmp_path: Path, children: Children) -> SiteRun:
-    return SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
 
 
 def end(child: Child) -> None:

@@ -18,7 +18,6 @@ from tests.integration.site_run import kill
 from tests.integration.web_site import WebSite
 
 pytestmark = needs_browser
-PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 QUIET = "document.querySelector('#panel .asking') === null"
 
 
@@ -345,36 +344,6 @@ def test_a_server_that_goes_in_the_middle_is_named_and_the_panel_comes_back(brow
     assert "page's server does not answer" in tab.page.locator("#panel .failed").inner_text()
     web.web = web.start_web(port=port)
     tab.until(f"sitegrid.panel === 'work' && sitegrid.work.rows.length === 10 && {QUIET}")
-    tab.close()
-
-
-@pytest.mark.nightly
-def test_a_phone_has_the_list_beneath_the_map_and_shows_what_is_tapped(browser, web: WebSite):
-    tab = Tab(browser, web.url, **PHONE).loaded()
-    tab.page.locator("#open-work").tap()
-    tab.until(f"sitegrid.panel === 'work' && {QUIET}")
-    row = listed(web)[0]
-    row_of(tab, row).tap()
-    tab.until("sitegrid.view.flight === null && sitegrid.view.moved")
-    panel = tab.page.locator("#panel").bounding_box()
-    for point in row.segment.line:
-        left, top = tab.pixel_of(*point)
-        assert 0 < left < 390
-        assert 130 < top < panel["y"]
-    tab.page.get_by_role("button", name="Close").tap()
-    tab.page.locator("#open-route").tap()
-    tab.until(f"sitegrid.panel === 'route' && {QUIET}")
-    for left, top in ((120, 200), (270, 300)):
-        tab.page.touchscreen.tap(left, top)
-        tab.page.wait_for_timeout(400)
-    tab.until(f"{QUIET} && sitegrid.route.answer !== null")
-    small = "(b) => b.offsetParent && b.offsetHeight < 44"
-    assert (
-        tab.js(f"[...document.querySelectorAll('#panel button, #panel select, #panel input')].filter({small}).length")
-        == 0
-    )
-    assert tab.js("document.documentElement.scrollWidth") <= 390
-    assert tab.complaints == []
     tab.close()
 
 

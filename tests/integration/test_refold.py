@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from itertools import islice
-from pathlib import Path
 
 import pytest
 
@@ -18,10 +17,8 @@ from mapserver.ingest.store import Store
 from mapserver.journal.location import JournalLocation
 from protocol.errors import QueryError, Refusal
 from protocol.site.site_file import load_site
-from protocol.wire.session import free_endpoint
-from sim.config import SimConfig
 from sitegrid import Client
-from sitegrid.process.children import Child, Children
+from sitegrid.process.children import Child
 from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.integration.test_operation import Sender, end, session_of
 from tests.patience import until
@@ -34,14 +31,12 @@ ROWS = 3000  # of 100 samples: their fold takes a good part of a second
 
 
 @pytest.fixture
-def site(tmp_path: Path, children: Children) -> SiteRun:
+def site(site: SiteRun) -> SiteRun:
     """A site whose store has samples of ten machines, and no snapshot."""
-    run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
-    options = tmp_path / "server.toml"
-    options.write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
-    write_store(tmp_path / "store", load_site(run.site_file), ROWS, tail_rows=ROWS)
-    run.start_router()
-    return run
+    (site.folder / "server.toml").write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
+    write_store(site.folder / "store", load_site(site.site_file), ROWS, tail_rows=ROWS)
+    site.start_router()
+    return site
 
 
 def serve(site: SiteRun) -> Child:

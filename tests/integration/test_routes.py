@@ -12,17 +12,17 @@ import pytest
 from protocol.errors import QueryError
 from protocol.queries.places import MAX_PLACES
 from protocol.wire.session import free_endpoint
-from sim.config import SimConfig
 from sitegrid import MACHINES
 from sitegrid.process.children import Children
 from tests.command_lines import said
+from tests.integration.site_run import NOBODY_DRIVES
 from tests.integration.test_followers import Followed, Sender
 
 pytestmark = [pytest.mark.processes, pytest.mark.nightly]
 
 
 def test_a_line_of_ten_thousand_places_and_a_way_are_answered_while_samples_come_in(tmp_path: Path, children: Children):
-    sim = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
+    sim = NOBODY_DRIVES
     run = Followed(tmp_path, children, free_endpoint(), sim)
     run.start_router()
     server = run.serve()

@@ -50,13 +50,24 @@ def test_every_command_in_the_readme_is_one_that_the_parser_takes(root: Path, mo
         door.build_parser().parse_args(words)  # a usage error exits, and fails the test
 
 
-def test_help_imports_only_the_base_install():
-    code = "import sys; import sitegrid.door as d; d.build_parser(); print(*sorted(sys.modules))"
+BEYOND_BASE = {"cryptography", "cv2", "filterpy", "matplotlib", "numba", "pyarrow", "pybullet", "pyproj", "rich"}
+BEYOND_BASE |= {"scipy", "agents", "mapserver", "sim", "lab"}
+
+
+@pytest.mark.parametrize(
+    ("imports", "needed", "not_needed"),
+    [
+        ("sitegrid.door; sitegrid.door.build_parser()", {"sitegrid", "zenoh"}, BEYOND_BASE),
+        ("sitegrid.client, sitegrid.security.join, sitegrid.commands.router", {"sitegrid"}, {"cryptography"}),
+        ("sitegrid.logs.check, sitegrid.logs.run", {"agents", "scipy"}, BEYOND_BASE - {"agents", "scipy", "pyproj"}),
+    ],
+)
+def test_whoever_asks_for_help_joins_with_keys_or_reads_a_log_needs_no_more_than_that(imports, needed, not_needed):
+    code = f"import sys, {imports}; print(*sorted(sys.modules))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     packages = {name.partition(".")[0] for name in output.split()}
-    extras = {"cryptography", "cv2", "filterpy", "matplotlib", "numba", "pyarrow", "pybullet", "pyproj", "rich"}
-    assert not packages & {*extras, *("scipy", "agents", "mapserver", "sim", "lab")}
-    assert {"sitegrid", "zenoh"} <= packages
+    assert needed <= packages
+    assert not packages & not_needed
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,6 @@ from __future__ import annotations
 import inspect
 import json
 import stat
-import subprocess
-import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -201,21 +199,6 @@ def test_a_folder_without_register_or_authority_says_what_to_do(folder: Path, ca
     (folder / "register.toml").unlink()
     for words in (("list",), ("add", "x"), ("revoke", "x")):
         assert "sitegrid keys init --dir" in refused(capsys, folder, *words)
-
-
-def test_without_cryptography_it_says_what_to_install(tmp_path: Path, monkeypatch, capsys):
-    for name in ("certificates", "key_folder"):
-        monkeypatch.delitem(sys.modules, f"sitegrid.security.{name}", raising=False)
-    monkeypatch.setitem(sys.modules, "cryptography", None)
-    assert act(tmp_path / "keys", "init") == 1
-    assert "pip install '.[security]'" in capsys.readouterr().err
-
-
-def test_whoever_only_has_keys_needs_no_cryptography():
-    code = "import sys, sitegrid.client, sitegrid.security.join, sitegrid.commands.router; print(*sorted(sys.modules))"
-    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert "cryptography" not in modules
-    assert "sitegrid.security.access" in modules
 
 
 # --- the register ----------------------------------------------------------------------------------------------------

@@ -1,8 +1,6 @@
 """`sitegrid log`, in process: tables, JSON, exit codes, and errors of one line."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -58,15 +56,6 @@ def test_run_prints_rows_and_what_it_cannot_compare_and_draws(circle: Path, caps
     report = json.loads(capsys.readouterr().out)
     assert report["rows"][0]["truth_net_m"] < 1.0
     assert list(report["missing"]) == ["ground"]
-
-
-@pytest.mark.slow
-def test_a_log_needs_the_extra_of_agents_alone() -> None:
-    code = "import sys, sitegrid.logs.check, sitegrid.logs.run; print(*sorted(sys.modules))"
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    packages = {name.partition(".")[0] for name in output.split()}
-    assert {"agents", "scipy"} <= packages
-    assert not packages & {"cv2", "filterpy", "mapserver", "matplotlib", "numba", "pyarrow", "pybullet", "sim", "lab"}
 
 
 REFUSED = {  # what is written to which file, words of the command, what is said

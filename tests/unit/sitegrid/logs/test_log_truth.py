@@ -12,19 +12,9 @@ from protocol.machine.log_folder import open_log
 from protocol.site.site_config import Projection
 from sitegrid.logs.log_truth import LogTruth, read_log_truth
 from sitegrid.logs.replay import Trace, score
+from tests.unit.sitegrid.logs.data import MANIFEST
 
 START_NS = 1_700_000_000_000_000_000
-MANIFEST = f"""
-log = {{ name = "yard", start_ns = {START_NS} }}
-site = {{ name = "yard", origin_lat_deg = 50.0, origin_lon_deg = 8.0 }}
-machine = {{ name = "mower" }}
-[[sensor]]
-name = "gps-1"
-kind = "gps"
-file = "gps.csv"
-std = {{ position = 1.0 }}
-columns = {{ stamp = "t", x_m = "x", y_m = "y" }}
-"""
 METRES = 'stamp = "t"\nx_m = "x"\ny_m = "y"'
 
 

@@ -8,13 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.filters.belief import PoseBelief
-from agents.pipeline import Pipeline, PoseSource
-from agents.positioning import PipelineConfig, Positioning
 from protocol.machine.readings import Articulation, Reading
-from sim.config import SimConfig
-from sim.simulator import Simulator
 from sitegrid.logs.replay import STEP_NS, Trace, Track, covered, replay, score
 from sitegrid.proof.tracks import Truth
 
@@ -107,25 +102,3 @@ def test_a_belief_is_taken_once_per_step_with_nothing_that_came_later():
     assert trace.stamp_ns.tolist() == [readings[7].stamp_ns, readings[11].stamp_ns]
     assert trace.covariance_m2.shape == (2, 2, 2)
     assert trace.seconds == pytest.approx(0.275)
-
-
-@pytest.mark.slow
-def test_positioning_leaves_the_trace_and_holds_out_the_fixes_of_the_whole_pipeline():
-    simulator = Simulator(SimConfig(world="fast", machines=1, seed=3, seconds=16.0), bundle_ms=1000)
-    readings = [r for _ in range(simulator.bundles or 0) for r in simulator.advance()["loader-1"]]
-    site, machine = simulator.site, simulator.machines[0]
-    traces, judged = [], []
-    for kind in (Pipeline, Positioning):
-        core: PoseSource = kind(site, machine, PipelineConfig())
-        holdout = Holdout(site, machine, HoldoutConfig(), settle_s=5.0)
-        traces.append(replay(core, readings, holdout))
-        judged.append(holdout.report())
-    whole, half = traces
-    assert len(whole.stamp_ns) > 50
-    assert judged[0] == judged[1]
-    assert judged[0]["fixes"]
-    assert not len(whole.smoothed.stamp_ns)
-    assert np.diff(half.smoothed.stamp_ns[:-1]).min() > 0.9e9
-    assert len(half.smoothed.stamp_ns) >= 10
-    for name in ("stamp_ns", "position_m", "covariance_m2"):
-        assert getattr(whole, name).tobytes() == getattr(half, name).tobytes()

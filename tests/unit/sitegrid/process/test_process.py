@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 import signal
 import subprocess
 import sys
@@ -52,25 +51,6 @@ except KeyboardInterrupt:
 sys.exit(3)
 """
 # Blocks that are freed between others that stay: the second of each size used to lie in the heap.
-GREEDY = """
-import os, sys
-import numpy as np
-from sitegrid.process.lifetime import return_large_blocks
-
-def resident_mib():
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-if sys.argv[1] == "steady" and not return_large_blocks():
-    sys.exit("no such thing in this C library")
-before, kept = resident_mib(), []
-for _ in range(8):
-    np.ones(30 * 2**17)
-    block = np.ones(30 * 2**17)
-    kept.append(np.ones(2**14))
-    del block
-print(resident_mib() - before)
-"""
 
 
 def ended(code: str, number: signal.Signals = signal.SIGTERM) -> tuple[int, str, str, float]:
@@ -121,17 +101,6 @@ def test_a_process_that_is_stuck_outside_of_python_is_ended_too():
 def test_metrics_are_for_this_host_unless_told(words: list[str], address: tuple[str, int] | None):
     arguments = build_parser().parse_args(["server", "--site-file", "s", "--store", "x", *words])
     assert arguments.metrics == address
-
-
-@pytest.mark.slow
-@pytest.mark.skipif("glibc" not in platform.libc_ver()[0], reason="other C libraries keep no such blocks")
-def test_large_blocks_go_back_to_the_system():
-    def grown_mib(how: str) -> float:
-        words = [sys.executable, "-c", GREEDY, how]
-        return float(subprocess.run(words, capture_output=True, text=True, check=True, timeout=60).stdout)
-
-    assert grown_mib("steady") < 10
-    assert grown_mib("as it is") > 25
 
 
 def test_a_child_is_waited_for_as_long_as_it_says_that_it_goes_on(tmp_path, monkeypatch):
