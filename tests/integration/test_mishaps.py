@@ -18,7 +18,7 @@ from protocol.wire.session import free_endpoint
 from sitegrid.door import INTERRUPTED
 from tests.command_lines import COMMANDS
 from tests.integration.site_run import SiteRun  # beside this file
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
@@ -121,6 +121,26 @@ def test_nohup_keeps_a_process(tmp_path: Path):
             assert router.wait(PATIENCE_S) == 0
         finally:
             router.kill()
+
+
+@pytest.mark.nightly
+def test_a_demo_whose_terminal_is_closed_leaves_nothing(tmp_path: Path):
+    words = ("demo", "--headless", "--machines", 1, "--world", "fast", "--out", tmp_path / "out")
+    with subprocess.Popen(sitegrid(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo:
+        try:
+            until(lambda: len(children_of(demo.pid)) >= 2, "router and server")
+            started = children_of(demo.pid)
+            demo.send_signal(signal.SIGHUP)
+            _, errors = demo.communicate(timeout=PATIENCE_S)
+        finally:
+            demo.kill()
+    assert "SIGHUP" in errors
+    assert "Traceback" not in errors
+    assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
+
+
+def children_of(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 @pytest.mark.nightly

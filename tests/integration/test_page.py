@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -281,24 +280,6 @@ def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
         tab.until("sitegrid.state === 'refused'")
         assert "Ask the office" in tab.page.locator("#notice").inner_text()
         tab.close()
-
-
-@pytest.mark.nightly
-def test_a_picture_of_the_site_lies_beneath_the_map(tab: Tab, tmp_path: Path):
-    picture, world = tmp_path / "site.png", tmp_path / "site.pgw"
-    assert cv2.imwrite(str(picture), np.full((30, 40, 3), (0, 0, 255), np.uint8))
-    world.write_text("10.0\n0.0\n0.0\n-10.0\n-995.0\n995.0\n")  # 400 x 300 m, north-western corner at -1000, 1000
-    tab.page.set_input_files("#plan-file", [picture])
-    tab.page.get_by_text("world file").first.wait_for(timeout=WAIT_MS)
-    assert tab.js("sitegrid.picture") is None
-    tab.page.set_input_files("#plan-file", [picture, world])
-    tab.until("sitegrid.picture !== null")
-    tab.js("(sitegrid.view.x = -800, sitegrid.view.y = 850, sitegrid.view.scale = 1, sitegrid.redraw())")
-    tab.page.wait_for_timeout(300)
-    pixels = tab.js("[...document.getElementById('map').getContext('2d').getImageData(640, 50, 1, 351).data]")
-    north, middle = pixels[:4], pixels[-4:]
-    assert middle[0] > middle[2] + 60, "the middle of the picture is red"
-    assert abs(north[0] - north[2]) < 20, "north of it there is none"
 
 
 @pytest.mark.nightly

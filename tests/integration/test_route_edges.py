@@ -9,7 +9,6 @@ from dataclasses import replace
 import pytest
 
 from protocol.errors import QueryError
-from protocol.queries.places import MAX_PLACES
 from protocol.queries.routing import MACHINES, NamedMachine
 from sitegrid import Client, RouteAnswer
 from tests.command_lines import Said, said
@@ -89,15 +88,6 @@ def named(**values: float) -> NamedMachine:
 
 def blocked(client: Client) -> RouteAnswer:
     return client.way(*ROAD, margin_m=1.0, avoid=ACROSS, unknown="refuse")
-
-
-def test_more_places_than_a_line_may_have_are_named(site: WebSite):
-    many = tuple((20.0 + 0.01 * i, 10.0) for i in range(MAX_PLACES + 1))
-    with pytest.raises(QueryError, match=f"{MAX_PLACES + 1} places"):
-        site.client.route(many)
-    refused = command(site, "route", *numbers(many))
-    assert refused.code in (1, 2)
-    assert f"{MAX_PLACES + 1} places" in refused.err
 
 
 def test_a_way_is_never_dearer_to_drive_than_straight_on(site: WebSite):

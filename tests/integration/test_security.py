@@ -364,19 +364,6 @@ def test_what_is_forged_reaches_nobody(guarded: Guarded, what: str):
         assert set(received) == {b"true"}, guarded.still_works()
 
 
-def test_nobody_ends_what_another_shows_and_a_base_sends_no_samples(guarded: Guarded):
-    with (
-        guarded.session("guest") as guest,
-        guarded.session("loader-1") as loader,
-        guarded.session("base-1") as base,
-        listening(guest, keys.poses_all(SITE)) as received,
-    ):
-        loader.delete(POSE)
-        put_until(received, b"own", lambda: loader.put(POSE, b"own"))
-        assert set(received) == {b"own"}, guarded.still_works()
-        assert not acknowledged(base, keys.ingest(SITE, "base-1"), guarded.batch("base-1"))
-
-
 def test_nobody_shows_presence_in_anothers_name(guarded: Guarded):
     with guarded.session("guest") as guest, guarded.session("loader-2") as loader:
         tokens = [loader.liveliness().declare_token(keys.alive(SITE, name)) for name in ("loader-1", "loader-2")]

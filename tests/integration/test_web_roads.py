@@ -171,21 +171,3 @@ def test_a_long_line_is_answered_or_named(web: WebSite):
     assert web.get("route", {"line": line}).json["totals"]["length_m"] > 2500
     longer = web.get("route", {"line": ";".join([line] * 7)})  # 10 500 places
     assert (longer.status, longer.json["reason"]) == (414, "too_large")
-
-
-def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
-    for path, parameters in (("worklist", {}), ("segments", {}), ("route", {"line": "20,10;90,10"})):
-        first = web.get(path, parameters)
-        assert (first.status, first.headers["cache-control"]) == (200, "private, no-cache")
-        again = web.get(path, parameters, If_None_Match=first.headers["etag"])
-        assert (again.status, again.body) == (304, b"")
-
-
-def test_everything_is_in_the_description(web: WebSite):
-    paths = web.get("/api/v1/openapi.json").json["paths"]
-    features = (f"features/{name}" for name in ("segments", "worklist", "repairs"))
-    for name in ("segments", "worklist", "route", "way", "points", *features):
-        assert f"/api/v1/sites/{{site}}/{name}" in paths
-    route = paths["/api/v1/sites/{site}/route"]["get"]
-    kinds = {one["name"]: one["schema"]["type"] for one in route["parameters"]}
-    assert (kinds["line"], kinds["mass"], kinds["step"]) == ("string", "number", "number")

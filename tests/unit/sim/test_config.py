@@ -1,6 +1,5 @@
 import dataclasses
 import tomllib
-from pathlib import Path
 
 import pytest
 
@@ -60,10 +59,3 @@ def test_options_go_over_the_scenario() -> None:
     assert {speed for _, speed, _ in scenario.journeys()} == {2.0}
     names = {s.name for s in scenario.rigs()[0].machine.sensors}
     assert names == {"gps-3", "imu-1", "imu-4", "attitude-4", "torque", "wheels", "articulation", "payload"}
-
-
-def test_unknown_key_is_refused_with_its_file(tmp_path: Path) -> None:
-    path = tmp_path / "sim.toml"
-    path.write_text("sped = 4\n")
-    with pytest.raises(ConfigError, match=r"sim\.toml.*sped"):
-        load_sim(path)

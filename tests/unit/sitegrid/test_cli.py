@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from sitegrid import cli, commands, door
-from sitegrid.process.lifetime import plain
 
 COMMANDS = sorted(path.stem for path in Path(commands.__path__[0]).rglob("[a-z]*.py"))
 
@@ -89,12 +88,6 @@ def test_a_missing_extra_is_that_of_the_command(command, words, missing, extras,
     assert f"pip install '.[{extras}]'" in capsys.readouterr().err
 
 
-def test_where_pybullet_has_no_wheels_the_fast_world_is_named(monkeypatch):
-    missing = ModuleNotFoundError("No module named 'pybullet'", name="pybullet")
-    monkeypatch.setattr("sitegrid.door.sys.version_info", (3, 12))
-    assert "--world fast" in door._extra_for(missing, "sim")
-
-
 @pytest.mark.parametrize(
     "missing",
     [
@@ -109,7 +102,3 @@ def test_a_bug_is_not_hidden(monkeypatch, missing: str):
     monkeypatch.setattr("sitegrid.commands.sim.run", fail)
     with pytest.raises(ModuleNotFoundError):
         cli.main(["sim"])
-
-
-def test_json_knows_no_nan():
-    assert plain({"a": [float("nan"), 1.0], "b": {"c": float("nan")}}) == {"a": [None, 1.0], "b": {"c": None}}

@@ -3,9 +3,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from protocol.errors import ConfigError
-from protocol.machine.machine_config import MachineConfig
-from sim.machines.model import BASE, FRONT, PAYLOAD, WHEELS, MachineModel, load_model
+from sim.machines.model import BASE, FRONT, PAYLOAD, WHEELS, MachineModel
 from sim.machines.urdf import Mass, Transform, combined, read_urdf, rigid_urdf
 from tests.unit.sim.planes import BOTH, LOADER
 
@@ -21,28 +19,6 @@ def test_lengths_and_masses_are_those_of_the_urdf(model: MachineModel) -> None:
     assert model.weight().mass_kg == pytest.approx(model.mass_kg)
     assert robot.links[PAYLOAD].mass.mass_kg == model.payload_kg
     assert {robot.links[wheel].mass.inertia_kgm2[1, 1] for wheel in WHEELS} == {model.wheel_inertia_kgm2}
-
-
-def test_the_loader_is_the_machine_that_configs_describe_by_default() -> None:
-    nominal = MachineConfig("x")
-    for name in ("mass_kg", "wheel_radius_m", "rotating_mass_factor"):
-        assert getattr(LOADER, name) == pytest.approx(getattr(nominal, name)), name
-
-
-@BOTH
-def test_payload_moves_the_weight_to_where_it_lies(model: MachineModel) -> None:
-    place = model.robot.place(PAYLOAD, BASE).xyz_m
-    full = model.weight(model.payload_kg)
-    empty = model.weight()
-    assert full.mass_kg == model.mass_kg + model.payload_kg
-    expected = (model.mass_kg * empty.centre_m + model.payload_kg * place) / full.mass_kg
-    np.testing.assert_allclose(full.centre_m, expected, atol=1e-9)
-    assert 0.2 < model.front_share(model.payload_kg) < 0.8
-
-
-def test_unknown_machine_is_refused_with_those_that_exist() -> None:
-    with pytest.raises(ConfigError, match=r"no 'crane'; known: dump_truck, wheel_loader"):
-        load_model("crane")
 
 
 @pytest.mark.parametrize("name", [f.name for f in fields(MachineModel) if f.type == "float"])

@@ -116,17 +116,6 @@ def site() -> Driven:
 
 
 @pytest.mark.slow
-@pytest.mark.nightly
-def test_machines_go_where_their_drivers_wander() -> None:
-    driven, config = site(), load_scenario("paper_site_driven").driving
-    off_aim = driven.left_m - driven.aim_m
-    assert off_aim.std(axis=0).max() < 0.1 * config.wander_m
-    assert abs(off_aim).max() < 0.5
-    assert 0.6 * config.wander_m < driven.left_m.std() < 1.4 * config.wander_m  # 25 correlation lengths each
-    assert abs(np.corrcoef(driven.left_m[500:].T)[np.triu_indices(3, 1)]).max() < 0.8  # each his own
-
-
-@pytest.mark.slow
 def test_machines_stand_where_and_as_long_as_their_drivers_stop() -> None:
     driven = site()
     with closing(Simulator(SimConfig(scenario="paper_site_driven", world="fast", seed=3))) as simulator:

@@ -47,12 +47,6 @@ def test_foot_and_crown_of_a_ramp_are_rounded() -> None:
     assert bends.max() < 0.2 * math.tan(math.radians(15))  # no kink: at least five cells share the bend
 
 
-def test_ramps_may_face_any_way() -> None:
-    ground = GroundConfig(100, 100, "gravel", 0.5, 0.0, ramp=(RampConfig((30.0, 30.0), (60.0, 70.0), 5.0),))
-    east, north = build_terrain(ground, 0).gradient(np.array([45.0]), np.array([50.0]))
-    np.testing.assert_allclose([east[0], north[0]], np.array([0.6, 0.8]) * 5.0 / 50.0, atol=1e-3)
-
-
 def test_roughness_has_the_deviation_asked_for_and_follows_the_seed() -> None:
     rough = [build_terrain(replace(PAPER, roughness_m=0.02), seed).heights_m - SMOOTH.heights_m for seed in (3, 3, 4)]
     assert rough[0].std() == pytest.approx(0.02, rel=1e-6)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.files import load_toml
 from sim.scenario.file import FOLDER, load_scenario
 from sim.scenario.ground import build_terrain
 
@@ -44,14 +43,9 @@ def test_machines_weigh_their_payload_where_a_route_changes_it_or_as_the_fleet_s
     assert weigh("paper_site") == [False] * 3
     assert weigh("haul_road") == [True] * 5
     assert weigh("loading") == [True] * 4
-    fleet = '[[fleet]]\nname = "{}"\nroutes = ["{}"]\n{}'
-    assert weigh(write(tmp_path, fleet.format("a", "west", "payload = true\n"))) == [True]
-    own = fleet.format("a", "haul", "payload = false\n") + fleet.format("b", "haul", "")
-    lap = '[[route]]\nname = "lap"\ncorners = [[30, 30], [90, 30], [90, 90], [30, 90]]\n'
-    haul = load_toml(FOLDER / "haul_road.toml")["route"][0]["leg"]
-    legs = "".join(f"[[route.leg]]\ncorners = {leg['corners']}\npayload_kg = {leg['payload_kg']}\n" for leg in haul)
-    text = own + fleet.format("c", "lap", "") + f'[[route]]\nname = "haul"\n{legs}' + lap
-    assert weigh(write(tmp_path, text.replace("22000", "2000"), "haul_road")) == [False, True, False]
+    fleet = '[[fleet]]\nname = "a"\nroutes = ["{}"]\npayload = {}\nmodel = "dump_truck"\n'
+    assert weigh(write(tmp_path, fleet.format("west", "true"))) == [True]
+    assert weigh(write(tmp_path, fleet.format("haul", "false"), "haul_road")) == [False]
 
 
 def test_scenario_over_a_base_replaces_key_by_key(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from sim.sensors.presets import Preset
 from sim.sensors.rigs import Rig
 from tests.unit.sim.sensor_rigs import (
     DGPS,
-    PROJECTION,
     SEED,
     check_deviation,
     errors,
@@ -98,10 +97,3 @@ def test_antennas_sit_on_their_lever_arms() -> None:
     np.testing.assert_allclose(nose_up[0, 1], 50 + 0.8 * math.cos(0.2) - 3.35 * math.sin(0.2), atol=1e-5)
     left_up = to_map(groups([one], still(20, 1, **place, roll_rad=0.2))["gps"].values)[0]
     np.testing.assert_allclose(left_up[0, 0], 100 + 3.35 * math.sin(0.2), atol=1e-5)
-
-
-def test_many_places_are_projected_like_single_ones() -> None:
-    places = np.random.default_rng(SEED).uniform(-500, 500, (3, 4, 5))
-    geodetic = PROJECTION.to_geodetic_many(*places)
-    for i, j in np.ndindex(4, 5):
-        assert tuple(geodetic[:, i, j]) == PROJECTION.to_geodetic(*places[:, i, j].tolist())

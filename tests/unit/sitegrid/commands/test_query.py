@@ -316,3 +316,24 @@ def test_a_history_is_a_table_for_people(session: Session, capsys):
     ]
     main(["query", "history", "-1", "2"])
     assert capsys.readouterr().out == "nobody was there\n"
+
+
+def test_a_probe_is_one_line_or_one_object(session: Session, capsys):
+    assert main(["query", "alive"]) == 0
+    assert capsys.readouterr().out == "batches are taken: journal row 18, merged 17\n"
+    assert main(["query", "alive", "--json"]) == 0
+    expected = {"store": STORE, "journalled": 18, "merged": 17, "busy_s": 0.5}
+    assert json.loads(capsys.readouterr().out) == expected
+
+
+def test_people_see_the_time_of_an_answer(session: Session, capsys):
+    def first_line(*words: str) -> str:
+        assert main(["query", *words]) == 0
+        return capsys.readouterr().out.splitlines()[0]
+
+    assert first_line("point", "1", "2") == "cell at 0.5, 1.5 m"
+    as_of, minus = ["--as-of", str(T0 - 40 * S)], ["--minus", str(T0 - 100 * S)]
+    assert first_line("point", "1", "2", *as_of) == "cell at 0.5, 1.5 m, as of 2025-06-15 15:06:00Z"
+    assert first_line("point", "1", "2", *minus) == "cell at 0.5, 1.5 m, minus that of 2025-06-15 15:05:00Z"
+    line = first_line("region", "0", "1", "1", "2", *as_of, *minus)
+    assert "as of 2025-06-15 15:06:00Z, minus that of 2025-06-15 15:05:00Z, journal row 17" in line

@@ -18,14 +18,6 @@ def plan_of(tmp_path: Path, *words: str) -> DemoPlan:
     return make_plan(build_parser().parse_args(["demo", "--out", str(tmp_path), *words]))
 
 
-def test_options_reach_the_simulation(tmp_path: Path):
-    words = ("--seconds", "33", "--speed", "7", "--machines", "2", "--seed", "9", "--scenario", "repaved")
-    demo = plan_of(tmp_path, *words, "--world", "fast")
-    scenario = demo.scenario
-    assert (scenario.seconds, scenario.seed, scenario.world, len(scenario.change)) == (33, 9, "fast", 2)
-    assert (scenario.machine_names, demo.config.speed) == (("loader-1", "loader-2"), 7)
-
-
 def test_every_option_is_passed_on_to_the_simulator(tmp_path: Path):
     class Started:
         def start(self, name: str, *words: object) -> list[str]:

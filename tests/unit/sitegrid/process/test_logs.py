@@ -54,11 +54,6 @@ def test_a_traceback_stays_in_the_line_of_json_and_follows_for_people():
     assert lines[1].startswith("Traceback")
 
 
-def test_people_read_one_line_per_event():
-    line = TextFormatter().format(record("stopped why=%s", "a\r\nb"))
-    assert line == "2026-01-01T00:00:00.500Z level=WARNING logger=mapserver stopped why=a\\r\\nb"
-
-
 @pytest.mark.parametrize(("terminal", "read"), [(True, lambda s: "event one=1" in s), (False, json.loads)])
 def test_a_terminal_decides(terminal: bool, read: Callable[[str], Any], monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from protocol.queries.answers import Region
-from protocol.site.ground_classes import SLOPE_LIMIT, UNKNOWN
+from protocol.site.ground_classes import SLOPE_LIMIT
 from protocol.wire.messages import Pose
-from sitegrid.proof.figures import root_mean_square, rounded
-from sitegrid.proof.map_score import by_border_distance, driven_cells, score, score_driven
+from sitegrid.proof.figures import root_mean_square
+from sitegrid.proof.map_score import driven_cells, score, score_driven
 from sitegrid.proof.tracks import Truth, position_rmse, read_track
 from tests.unit.records import version
 
@@ -91,24 +91,9 @@ def test_cells_without_truth_do_not_count():
     assert driven.by_border[-1]["cells"] == 2  # what is not known is no border
 
 
-def test_distance_counts_from_the_lower_edge_of_a_bin():
-    estimated, true = np.array([1, 1, UNKNOWN]), np.array([1, 2, 2])
-    parts = by_border_distance(estimated, true, np.array([0.99, 1.0, np.inf]))
-    assert [part["cells"] for part in parts] == [1, 1, 0, 0, 0, 0, 1]
-    assert (parts[0]["wrong_pct"], parts[1]["wrong_pct"], parts[6]["known_pct"]) == (0.0, 100.0, 0.0)
-
-
 def test_root_mean_square_of_nothing_is_not_known():
     assert root_mean_square(np.array([3.0, -4.0])) == pytest.approx(math.sqrt(12.5))
     assert math.isnan(root_mean_square(np.empty(0)))
-
-
-def test_rounding_reaches_every_float_and_leaves_the_rest():
-    row = {"name": "a", "count": 12345, "met": True, "net_m": 1.23456, "max_m": None, "reasons": {"gap": 2}}
-    inner = {"by_seed": [0.11111, math.inf], "parts": [{"share": 2 / 3}]}
-    expected = {"net_m": 1.23, "by_seed": [0.1111, math.inf], "parts": [{"share": 0.67}]}
-    assert rounded({**row, **inner}, 2, by_seed=4) == {**row, **expected}
-    assert rounded(row, 2)["met"] is True
 
 
 START_NS = 1_767_225_600_000_000_000

@@ -176,23 +176,6 @@ def test_corrections_go_with_the_samples_and_the_map_is_the_live_one(tmp_path: P
         assert same_evidence(again.grid, live)
 
 
-def test_a_correction_that_was_taken_back_and_given_again_counts(tmp_path: Path):
-    source = make_store(tmp_path / "source", archived=9)
-    back = CalibrationDecision("b", PERSON, "", T0 + 700 * S, ())
-    decided = [FACTS[1], back, FACTS[1]]
-    with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
-        opened_store.decide(*decided)
-        archived_decisions.save(source / FOLDER, opened_store.identity.id, decided[:2])  # a little behind
-    with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
-        live = opened_store.grid
-    for i, paths in enumerate(([source], [source, source / FOLDER], [source / FOLDER])):
-        out = tmp_path / str(i)
-        assert run(*paths, "--out", out) == 0
-        with closing(opened(out)) as new:
-            assert same_evidence(new.grid, live) == (i < 2)
-            assert new.fact == (3 if i < 2 else 2)
-
-
 def test_a_copy_of_a_history_that_is_behind_brings_nothing_back():
     """Of two stores, with the archive of the second as it was, and a store that was folded of both and went on."""
 
@@ -310,18 +293,6 @@ def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsy
     again.close()
 
 
-def test_samples_out_of_time_in_the_middle_of_a_batch_cut_it_in_two(tmp_path: Path):
-    folder = make_store(tmp_path / "store", "a", batch=120)
-    rows = TRACKS["a"][:6].copy()
-    rows["stamp_ns"] = T0 + S * np.array([5, 6, 900, 7, 8, 901])
-    store = Store(JournalLocation(folder), SITE, ServerConfig(), lambda: T0)
-    store.commit([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
-    store.close()
-    assert run(folder, "--out", tmp_path / "new", "--until", "2026-01-01T00:00:10") == 0
-    pieces = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
-    assert pieces == [(1, 2), (4, 2)]
-
-
 # --- several archives ------------------------------------------------------------------------------------------------
 
 
@@ -337,19 +308,6 @@ def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, cap
     assert same_evidence(again.grid, folded())
     assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(120, 0)}
     again.close()
-
-
-def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tmp_path: Path):
-    one = make_store(tmp_path / "one", "a", spool_id=1, batch=30)
-    two = make_store(tmp_path / "two", "ab", spool_id=2, batch=40, archived=2)
-    orders = [(store, one, two), (two, store, one), (one, two / FOLDER, two, store)]
-    for i, order in enumerate(orders):
-        assert run(*order, "--out", tmp_path / f"new{i}") == 0
-    made = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
-    assert made[0] == made[1] == made[2]
-    parts = [path.name for path in sorted((tmp_path / "new0" / FOLDER).glob("*.parquet"))]
-    assert parts == [path.name for path in sorted((tmp_path / "new2" / FOLDER).glob("*.parquet"))]
-    assert parts == sorted(parts, key=lambda name: name.partition("_")[2]), "hours of reception, as rows go on"
 
 
 def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Path, capsys):
@@ -383,16 +341,6 @@ def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys):
     error = refused(capsys, store, "--site-file", moved / "site.toml", *out)
     assert f"{moved}/site.toml: is site 'pit', frame" in error
     assert not (tmp_path / "new").exists()
-
-
-def test_a_journal_alone_needs_a_site_file(tmp_path: Path, capsys):
-    folder = make_store(tmp_path / "store", "a")
-    site_file = (folder / "site.toml").rename(tmp_path / "pit.toml")
-    assert "give --site-file" in refused(capsys, folder, "--out", tmp_path / "new")
-    assert run(folder, "--out", tmp_path / "new", "--site-file", site_file) == 0
-    with_archive = make_store(tmp_path / "archived", "a", archived=3)
-    (with_archive / "site.toml").unlink()
-    assert run(with_archive, "--out", tmp_path / "newer") == 0
 
 
 @pytest.mark.parametrize(
