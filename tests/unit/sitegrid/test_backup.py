@@ -224,16 +224,8 @@ def test_backups_that_are_killed_leave_no_backup_and_the_one_that_ends_has_all_t
         live = ending.enter_context(subprocess.Popen([sys.executable, "-c", SERVE, str(store), str(noted)]))
         ending.callback(live.kill)
         wait_until(lambda: noted.exists() and noted.read_text() != "", WAIT_S, "the first batch")
-        command = [
-            sys.executable,
-            "-m",
-            "sitegrid.cli",
-            "backup",
-            str(store),
-            "--out",
-            str(tmp_path / "copy"),
-            "--json",
-        ]
+        words = ("backup", str(store), "--out", str(tmp_path / "copy"), "--json")
+        command = [sys.executable, "-m", "sitegrid.cli", *words]
         killed = 0
         for _ in range(KILLS):
             with subprocess.Popen(command, stdout=subprocess.DEVNULL) as copier:

@@ -88,13 +88,7 @@ def test_a_missing_extra_is_that_of_the_command(command, words, missing, extras,
     assert f"pip install '.[{extras}]'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "missing",
-    [
-        "sim.nothing",
-        "sitegrid.nothing",
-    ],
-)
+@pytest.mark.parametrize("missing", ["sim.nothing", "sitegrid.nothing"])
 def test_a_bug_is_not_hidden(monkeypatch, missing: str):
     def fail(_: object) -> int:
         raise ModuleNotFoundError(f"No module named {missing!r}", name=missing)

@@ -6,13 +6,10 @@ import json
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
-from typing import Any
 
 import pytest
 
 from agents.config import AgentConfig
-from mapserver.config import ServerConfig
 from protocol.errors import ConfigError
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import machine_toml
@@ -21,7 +18,7 @@ from sim.config import resolve
 from sim.scenario.file import load_scenario
 from sim.truth import TruthMap
 from sitegrid.cli import main
-from sitegrid.commands import agent, server, sim
+from sitegrid.commands import agent, sim
 from sitegrid.door import build_parser
 from tests.paths import ROOT
 
@@ -98,37 +95,6 @@ def test_what_an_agent_lacks_is_named(files: Path):
 
 
 # --- options that only act inside a running command -------------------------------------------------------------------
-
-
-class Nothing:
-    """Stands for a client or a session."""
-
-    def __enter__(self) -> Nothing:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch):
-    options, site = tmp_path / "server.toml", tmp_path / "site.toml"
-    options.write_text("query_threads = 5\n[fold]\nstd_cap_m = 2.0\n")
-    site.write_text('name = "pit"\norigin_lat_deg = 49.0\norigin_lon_deg = 8.0\n')
-    configs: list[ServerConfig] = []
-
-    class Failed(Nothing):
-        failed = True  # so that the command ends at once
-
-        def __init__(self, *given: Any, **_: Any) -> None:
-            configs.append(given[4])
-
-    monkeypatch.setattr(server, "stop_flag", Event)
-    monkeypatch.setattr("sitegrid.commands.server.open_session", lambda _: Nothing())
-    monkeypatch.setattr("mapserver.server.Server", Failed)
-    words = ["server", "--site-file", str(site), "--store", str(tmp_path / "store"), "--config", str(options)]
-    assert server.run(build_parser().parse_args(words)) == 1
-    assert (configs[0].query_threads, configs[0].fold.std_cap_m) == (5, 2.0)
 
 
 @pytest.mark.parametrize(("words", "expected"), [([], "a.calibration.json"), (["--calibration", "b.json"], "b.json")])

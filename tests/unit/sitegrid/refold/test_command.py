@@ -204,19 +204,13 @@ def test_corrections_are_beside_the_files_of_an_archive_too(tmp_path: Path):
         assert same_evidence(plain_store.grid, folded())
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        (lambda text: text.replace("0.02", "0.03"), "calibration.json: is damaged"),
-    ],
-)
-def test_damaged_corrections_of_an_archive_are_not_folded_without(tmp_path: Path, capsys, change, problem):
+def test_damaged_corrections_of_an_archive_are_not_folded_without(tmp_path: Path, capsys):
     source = make_store(tmp_path / "source", archived=9)
     decide(source)
     path = source / FOLDER / archived_decisions.FILE
-    path.write_text(change(path.read_text()))
+    path.write_text(path.read_text().replace("0.02", "0.03"))
     assert run(source / FOLDER, "--out", tmp_path / "new") == 1
-    assert problem in capsys.readouterr().err
+    assert "calibration.json: is damaged" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
