@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 import time
 from collections.abc import Callable
@@ -109,31 +108,6 @@ def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
     with stored(folder / "again", site) as store:
         assert same(store.grid, live)
         assert store.facts.corrections == corrections
-
-
-@pytest.mark.nightly
-def test_two_servers_with_the_same_facts_have_the_same_map_however_the_samples_came(site: SiteRun):
-    """One corrects at the beginning, live, the other all in the end, in one refold."""
-    grids = []
-    for early in (True, False):
-        server = serve(site)
-        with site.connect() as client:
-            senders = Senders(site, client)
-            for part in np.array_split(np.arange(len(DRIVES["a"])), 3):
-                row = senders.send({name: rows[part[0] : part[-1] + 1] for name, rows in DRIVES.items()})
-                if early and part[0] == 0:
-                    client.correct("a", "levelled", zero=ZERO)
-            if not early:
-                client.info(after=row)
-                client.correct("a", "levelled", zero=ZERO)
-            assert client.info(after=row).fact == 1
-        server.stop()
-        with stored(site.folder / "store", site) as store:
-            grids.append(store.grid)
-        shutil.rmtree(site.folder / "store")
-    assert same(*grids)
-    sent = {name: rows[: len(DRIVES["a"])] for name, rows in DRIVES.items()}
-    assert same(grids[0], folded(site, by_person("a"), sent))
 
 
 def killed_with_a_fact_on_disk(site: SiteRun, server: Child) -> None:

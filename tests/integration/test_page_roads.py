@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
 from protocol.queries.roads import WorklistRow
 from protocol.queries.routing import MACHINES
-from tests.integration.browser_tab import Tab, axe_script, needs_browser, watched
+from tests.integration.browser_tab import Tab, needs_browser, watched
 from tests.integration.hauling_site import DAY_NS, FIRST_NS
-from tests.integration.site_run import kill
 from tests.integration.web_site import WebSite
 
 pytestmark = needs_browser
@@ -321,39 +318,3 @@ def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
         held[0].continue_()
     tab.page.wait_for_timeout(500)
     assert tab.js("sitegrid.route.answer.line.length") == 3
-
-
-@pytest.mark.nightly
-def test_a_server_that_goes_in_the_middle_is_named_and_the_panel_comes_back(browser, web: WebSite):
-    tab = Tab(browser, web.url).loaded()
-    opened(tab)
-    kill(web.server)
-    tab.page.keyboard.press("r")
-    tab.until(f"sitegrid.panel === 'route' && {QUIET}")
-    for place in ((20, 10), (90, 10)):
-        tab.page.mouse.click(*tab.pixel_of(*place))
-    tab.until("document.querySelector('#panel .failed') !== null")
-    assert "no map server answers" in tab.page.locator("#panel .failed").inner_text()
-    assert tab.page.locator("#machine").is_visible(), "what was chosen stays"
-    web.server = web.start_server()
-    tab.until(f"sitegrid.route.answer !== null && {QUIET}")
-    port = web.port
-    kill(web.web)
-    tab.page.keyboard.press("w")
-    tab.until("document.querySelector('#panel .failed') !== null")
-    assert "page's server does not answer" in tab.page.locator("#panel .failed").inner_text()
-    web.web = web.start_web(port=port)
-    tab.until(f"sitegrid.panel === 'work' && sitegrid.work.rows.length === 10 && {QUIET}")
-    tab.close()
-
-
-@pytest.mark.nightly
-def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
-    axe = axe_script(tmp_path)
-    for theme in ("light", "dark"):
-        for words in ("panel=work", "panel=route&line=20,10;20,60;90,70&cost=energy"):
-            tab = Tab(browser, f"{web.url}?theme={theme}&{words}", bypass_csp=True).loaded()
-            tab.until(f"sitegrid.panel !== null && {QUIET}")
-            assert tab.serious_faults(axe) == []
-            assert "panel" in parse_qs(urlsplit(tab.page.url).query)
-            tab.close()
