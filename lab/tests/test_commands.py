@@ -5,7 +5,6 @@ import math
 from argparse import Action, ArgumentParser
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +14,6 @@ from lab import commands
 from sitegrid.door import build_parser, run
 from sitegrid.options.values import count, positive, seed
 
-NAMES = [info.name for info in iter_modules(commands.__path__)]
 # Where the work of each command begins: module and function; these take seeds.
 WORK = {
     "calibration": "lab.calibration.experiment",
@@ -50,14 +48,6 @@ def wrong_words() -> list[tuple[str, ...]]:
     return [
         words for name, parser in all_of.items() for option in parser._actions if (words := wrong_word(name, option))
     ]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_command_declares_itself(name: str):
-    module = import_module(f"lab.commands.{name}")
-    assert module.HELP[0].islower()
-    assert (module.EXTRA, callable(module.add_options), callable(module.run)) == ("lab", True, True)
-    assert f"`python -m lab {name}`" in module.__doc__
 
 
 def test_every_wrong_value_is_a_usage_error(capsys):
@@ -115,18 +105,3 @@ def test_options_that_do_not_fit_together_are_one_line(words: tuple[str, ...], c
     assert main(*words) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert words[1] in line
-
-
-def test_people_read_tables_without_lists(monkeypatch, capsys, tmp_path: Path):
-    from lab.ground import experiment
-
-    monkeypatch.setattr(experiment, "run", lambda *_, **__: (REPORT, []))
-    assert main("ground", "--out", str(tmp_path)) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        "scenario: paper_site",
-        "",
-        "seconds: None",
-        "",
-        "name  net_m",
-        "   a    1.5",
-    ]

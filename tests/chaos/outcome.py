@@ -12,20 +12,8 @@ from typing import Any
 TimeSpan = tuple[float, float]  # [s] of one clock
 
 COLUMNS = (
-    *(
-        "fault",
-        "count",
-        "recorded",
-        "merged",
-        "declared",
-        "lost",
-        "named",
-        "double",
-        "silent",
-        "longest ack",
-        "longest pause",
-    ),
-    *("memory", "answer", ""),
+    *("fault", "count", "recorded", "merged", "declared", "lost", "named", "double", "silent"),
+    *("longest ack", "longest pause", "memory", "answer", ""),
 )
 LINE = "{:<17}{:>6}{:>10}{:>9}{:>10}{:>6}{:>7}{:>8}{:>8}{:>13}{:>15}{:>8}{:>8}  {}"
 

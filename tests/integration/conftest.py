@@ -13,7 +13,7 @@ from sim.config import SimConfig
 from sitegrid.process.children import Children
 from tests.integration.browser_tab import launched
 from tests.integration.hauling_site import hauling_site
-from tests.integration.site_run import SiteRun  # beside this file
+from tests.integration.site_run import NOBODY_DRIVES, SiteRun  # beside this file
 from tests.integration.web_site import WebSite
 
 
@@ -44,6 +44,12 @@ def hauling(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
 def children(tmp_path: Path) -> Iterator[Children]:
     with Children(tmp_path) as started:
         yield started
+
+
+@pytest.fixture
+def site(tmp_path: Path, children: Children) -> SiteRun:
+    """A site where nobody drives; nothing of it runs yet."""
+    return SiteRun(tmp_path, children, free_endpoint(), NOBODY_DRIVES)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from sitegrid.proof.delivery import AuditResult, audit_store
 from tests.patience import PATIENCE_S, until
 
 LAG_S = 4.0  # of the smoother: most drives here are shorter than its usual lag, and tests wait for samples
+NOBODY_DRIVES = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
 
 
 class SiteRun:

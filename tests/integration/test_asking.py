@@ -14,10 +14,9 @@ from protocol.errors import LinkError
 from protocol.queries.answers import MapInfo
 from protocol.wire import keys
 from protocol.wire.session import free_endpoint
-from sim.config import SimConfig
 from sitegrid import Client, connect
 from sitegrid.process.children import Children
-from tests.integration.site_run import SiteRun, kill  # beside this file
+from tests.integration.site_run import NOBODY_DRIVES, SiteRun, kill  # beside this file
 from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
@@ -26,7 +25,7 @@ pytestmark = pytest.mark.processes
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SiteRun]:
     """Router and server, which each test leaves as it found them."""
-    folder, sim = tmp_path_factory.mktemp("asked"), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
+    folder, sim = tmp_path_factory.mktemp("asked"), NOBODY_DRIVES
     with Children(folder) as children:
         run = SiteRun(folder, children, free_endpoint(), sim)
         run.start_router()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 import time
 from collections.abc import Callable
@@ -32,7 +31,7 @@ from tests.integration.site_run import SiteRun, kill
 from tests.integration.test_evidence import Senders
 from tests.journals import history_beside
 from tests.reference.correction import in_numpy
-from tests.unit.mapserver.data import same, same_evidence
+from tests.unit.mapserver.data import same
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
 
 pytestmark = pytest.mark.processes
@@ -47,10 +46,9 @@ ZERO = 0.02
 
 
 @pytest.fixture
-def site(tmp_path: Path, children: Children) -> SiteRun:
-    run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
-    run.start_router()
-    return run
+def site(site: SiteRun) -> SiteRun:
+    site.start_router()
+    return site
 
 
 def serve(site: SiteRun) -> Child:
@@ -110,31 +108,6 @@ def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
     with stored(folder / "again", site) as store:
         assert same(store.grid, live)
         assert store.facts.corrections == corrections
-
-
-@pytest.mark.nightly
-def test_two_servers_with_the_same_facts_have_the_same_map_however_the_samples_came(site: SiteRun):
-    """One corrects at the beginning, live, the other all in the end, in one refold."""
-    grids = []
-    for early in (True, False):
-        server = serve(site)
-        with site.connect() as client:
-            senders = Senders(site, client)
-            for part in np.array_split(np.arange(len(DRIVES["a"])), 3):
-                row = senders.send({name: rows[part[0] : part[-1] + 1] for name, rows in DRIVES.items()})
-                if early and part[0] == 0:
-                    client.correct("a", "levelled", zero=ZERO)
-            if not early:
-                client.info(after=row)
-                client.correct("a", "levelled", zero=ZERO)
-            assert client.info(after=row).fact == 1
-        server.stop()
-        with stored(site.folder / "store", site) as store:
-            grids.append(store.grid)
-        shutil.rmtree(site.folder / "store")
-    assert same(*grids)
-    sent = {name: rows[: len(DRIVES["a"])] for name, rows in DRIVES.items()}
-    assert same(grids[0], folded(site, by_person("a"), sent))
 
 
 def killed_with_a_fact_on_disk(site: SiteRun, server: Child) -> None:
@@ -198,24 +171,6 @@ def test_a_fact_of_another_version_keeps_the_server_from_starting_in_one_line(si
     assert said("fold", site.folder / "store", "--out", site.folder / "new").code == 1
     with closing(sqlite3.connect(path)) as database:
         assert database.execute("SELECT COUNT(*) FROM events").fetchone() == (1,), "it is still there"
-
-
-@pytest.mark.nightly
-def test_the_map_of_an_archive_and_its_facts_is_the_live_one(site: SiteRun):
-    pytest.importorskip("pyarrow.parquet")
-    (site.folder / "server.toml").write_text(ASKED.replace("0.0", "0.000001"))
-    server, folder = serve(site), site.folder
-    with site.connect() as client:
-        client.info(after=Senders(site, client).send(DRIVES))
-        client.correct("a", "levelled", zero=ZERO)
-        assert client.info().corrections == 1
-    server.stop()
-    with stored(folder / "store", site) as store:
-        live = store.grid
-    archived = said("fold", folder / "store", "--site-file", site.site_file, "--out", folder / "of-store")
-    assert archived.code == 0, archived.err
-    with stored(folder / "of-store", site) as store:
-        assert same_evidence(store.grid, live)
 
 
 @pytest.mark.nightly

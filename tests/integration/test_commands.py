@@ -131,22 +131,3 @@ def is_alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return True
-
-
-def test_wrong_usage_exits_with_2():
-    for words in (("query", "point", "north", "1"), ("plot", "--bounds", "0"), ("fly",)):
-        assert said(*words).code == 2
-
-
-def test_what_is_missing_is_one_line_that_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(tmp_path)
-    for words, problem in (
-        (("agent", "--spool", "x.db"), "see config/agent.toml"),
-        (("agent", "--spool", "x.db", "--driver", "replay"), "--driver replay needs --log"),
-        (("sim", "--machines", 0), "machines: 0 is not between"),
-        (("demo", "--machines", 0), "machines: 0 is not between"),
-    ):
-        refused = said(*words)
-        assert refused.code == 1
-        assert problem in refused.err
-        assert len(refused.err.strip().splitlines()) == 1

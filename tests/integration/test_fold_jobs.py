@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -89,20 +87,6 @@ def evidence(out: Path) -> list[Path]:
 
 
 @pytest.mark.nightly
-def test_processes_make_the_same_store(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
-    seen: set[int] = set()
-    out = tmp_path / "out"
-    with started(archive, "--out", out, "--jobs", 2) as fold:
-        until(lambda: fold.poll() is not None or not seen.update(children_of(fold.pid)), "a look")
-        while fold.poll() is None:
-            seen |= children_of(fold.pid)
-    assert fold.returncode == 0
-    assert len(seen - {fold.pid}) >= 2, "processes of their own"
-    assert contents(out) == expected
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.nightly
 def test_a_fold_that_is_killed_goes_on(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     with started(archive, "--out", out, "--jobs", 2) as fold:
@@ -120,31 +104,6 @@ def test_a_fold_that_is_killed_goes_on(archive: Path, expected: dict[str, str], 
         assert fold.wait(PATIENCE_S) == 0
     assert contents(out) == expected
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.nightly
-def test_processes_that_are_killed_are_replaced(archive: Path, expected: dict[str, str], tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with started(archive, "--out", out, "--jobs", 2) as fold:
-        until(lambda: len(evidence(out)) >= 2, "some tasks")
-        killed = children_of(fold.pid)
-        for pid in killed:
-            os.kill(pid, signal.SIGKILL)
-        assert fold.wait(PATIENCE_S) == 0
-    assert killed
-    assert contents(out) == expected
-
-
-@pytest.mark.nightly
-def test_a_damaged_file_in_the_middle_ends_the_fold_and_leaves_nothing(archive: Path, tmp_path: Path, capsys) -> None:
-    shutil.copytree(archive, tmp_path / "archive")
-    damaged = sorted((tmp_path / "archive").iterdir())[5]
-    damaged.write_bytes(damaged.read_bytes()[:-1000])
-    assert main(["fold", str(tmp_path / "archive"), "--out", str(tmp_path / "out"), "--jobs", "2"]) == 1
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert f"{damaged}: is damaged" in error
-    assert [path.name for path in tmp_path.iterdir()] == ["archive"]
 
 
 # --- a cluster -------------------------------------------------------------------------------------------------------

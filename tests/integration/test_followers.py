@@ -23,18 +23,17 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from sim.config import SimConfig
 from sitegrid import Client
 from sitegrid.process.children import Child, Children
 from tests.command_lines import said
-from tests.integration.site_run import SiteRun, kill
+from tests.integration.site_run import NOBODY_DRIVES, SiteRun, kill
 from tests.patience import PATIENCE_S, until
 from tests.unit.mapserver.data import random_samples
 
 pytestmark = pytest.mark.processes
 
 WHOLE = "bounds=-80,-80,80,80;layers=resistance,grade_east,visits,age_s,resistance_filled,grade_filled_std"
-SIM = SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast")
+SIM = NOBODY_DRIVES
 QUIET = "[store]\narchive_after_h = 0.0\n[trust]\nexclude = false\n[calibration]\nautomatic = false\n"
 
 

@@ -117,8 +117,6 @@ def test_a_log_in_metres_is_located_and_mapped_where_the_machine_was(site_run: S
         ),
         ('x_m = "east"', 'x_m = { column = "east", offset = 4e5 }', "none of its rows can be used; line 2: x_m: 4000"),
         ('kind = "gps"\n', 'kind = "gps"\nmode = "differential"\n', "robot: no sensor in use shows its place"),
-        ("delay_s = -0.1", "delay_s = 0.5", "tracker: delay_s must be between -10 and 0.4"),
-        ("origin_lat_deg = 50.0", "", "log.toml [site]: key `origin_lat_deg` is missing"),
     ],
 )
 def test_a_log_that_cannot_be_run_is_one_line(tmp_path: Path, old: str, new: str, problem: str):

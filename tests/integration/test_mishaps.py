@@ -15,9 +15,7 @@ import pytest
 
 from protocol.machine.log_folder import open_log
 from protocol.wire.session import free_endpoint
-from sim.config import SimConfig
 from sitegrid.door import INTERRUPTED
-from sitegrid.process.children import Children
 from tests.command_lines import COMMANDS
 from tests.integration.site_run import SiteRun  # beside this file
 from tests.patience import PATIENCE_S, until
@@ -59,11 +57,6 @@ print(results)
 
 def sitegrid(*words: object) -> list[str]:
     return [sys.executable, "-m", "sitegrid.cli", *map(str, words)]
-
-
-@pytest.fixture
-def site(tmp_path: Path, children: Children) -> SiteRun:
-    return SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
 
 
 @pytest.mark.nightly

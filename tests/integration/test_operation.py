@@ -28,7 +28,6 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
-from sim.config import SimConfig
 from sitegrid.process.children import Child, Children
 from tests.command_lines import said
 from tests.integration.site_run import SiteRun  # beside this file
@@ -38,11 +37,6 @@ pytestmark = pytest.mark.processes
 
 END_S = 25.0  # ten times what it gives itself; what it must not wait for, Zenoh's replies and links, takes 30
 NOW_NS = 1_767_225_600_000_000_000
-
-
-@pytest.fixture
-def site(tmp_path: Path, children: Children) -> SiteRun:
-    return SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
 
 
 def end(child: Child) -> None:
@@ -97,19 +91,6 @@ def committed(store: Path) -> dict[str, int]:
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.nightly
-def test_a_router_with_many_sessions_ends_in_time(site: SiteRun):
-    router = site.start_router()
-    with contextlib.ExitStack() as opened:
-        sessions = [opened.enter_context(session_of(site.endpoint)) for _ in range(10)]
-        for session in sessions:
-            session.declare_queryable("sitegrid/paper/map/*", lambda query: None)
-        replies = [session.get("sitegrid/paper/map/info", timeout=0.5) for session in sessions]
-        end(router)
-        for reply in replies:
-            list(reply)
-
-
 def old_rows(store: Path, site: SiteConfig) -> None:
     """Fill a store with what has to be archived at once."""
     with closing(Store(JournalLocation(store), site, ServerConfig(), lambda: NOW_NS)) as opened:
@@ -156,14 +137,6 @@ def test_a_server_that_folds_a_long_journal_at_its_start_ends_in_time(site: Site
     end(server)
     assert not server.lines(), "it was not ready yet"
     assert committed(store) == {"old": 50_000}
-
-
-@pytest.mark.nightly
-def test_a_server_that_waits_for_a_router_ends_in_time(site: SiteRun, children: Children):
-    words = ("--endpoint", site.endpoint, "--site-file", site.site_file, "--store", site.folder / "store", "--verbose")
-    server = children.start("server", "server", *words)
-    wait_for_handlers(server)
-    end(server)
 
 
 def wait_for_handlers(child: Child) -> None:

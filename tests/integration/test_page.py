@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -128,29 +127,6 @@ def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab, web: Web
 
 
 @pytest.mark.nightly
-def test_play_back_runs_to_now(tab: Tab):
-    tab.page.locator("#play").click()
-    tab.until("sitegrid.time.playing !== 0 && sitegrid.time.at !== null")
-    tab.page.locator("#play").click()
-    tab.until("sitegrid.time.playing === 0")
-    tab.page.locator("#live").click()
-    tab.until("sitegrid.time.at === null")
-
-
-@pytest.mark.nightly
-def test_layers_palettes_and_fading_cost_no_traffic(tab: Tab):
-    tab.page.wait_for_timeout(500)
-    before = len(tab.asked)
-    for key in ("2", "3", "4", "5", "1", "u", "o", "u", "o"):
-        tab.page.keyboard.press(key)
-        tab.page.wait_for_timeout(60)
-    tab.page.get_by_role("button", name="Kinds of ground").click()
-    tab.until("sitegrid.palette === 'kinds'")
-    assert len(tab.asked) == before
-    assert "dry concrete" in tab.page.locator("#legend").inner_text()
-
-
-@pytest.mark.nightly
 def test_the_keyboard_alone_is_enough(tab: Tab):
     tab.page.keyboard.press("Tab")
     assert tab.js("document.activeElement.className") == "skip"
@@ -211,18 +187,6 @@ def test_a_phone_shows_map_legend_and_panel(browser, web: WebSite):
     assert small == []
     assert tab.js("document.documentElement.scrollWidth") <= 390
     assert tab.complaints == []
-    tab.close()
-
-
-@pytest.mark.nightly
-def test_dark_is_dark_and_is_kept(browser, web: WebSite):
-    tab = Tab(browser, web.url, color_scheme="dark").loaded()
-    assert tab.js("document.documentElement.dataset.theme") == "dark"
-    tab.page.locator("#theme").click()
-    assert tab.js("document.documentElement.dataset.theme") == "light"
-    tab.page.reload()
-    tab.loaded()
-    assert tab.js("document.documentElement.dataset.theme") == "light"
     tab.close()
 
 
@@ -316,24 +280,6 @@ def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
         tab.until("sitegrid.state === 'refused'")
         assert "Ask the office" in tab.page.locator("#notice").inner_text()
         tab.close()
-
-
-@pytest.mark.nightly
-def test_a_picture_of_the_site_lies_beneath_the_map(tab: Tab, tmp_path: Path):
-    picture, world = tmp_path / "site.png", tmp_path / "site.pgw"
-    assert cv2.imwrite(str(picture), np.full((30, 40, 3), (0, 0, 255), np.uint8))
-    world.write_text("10.0\n0.0\n0.0\n-10.0\n-995.0\n995.0\n")  # 400 x 300 m, north-western corner at -1000, 1000
-    tab.page.set_input_files("#plan-file", [picture])
-    tab.page.get_by_text("world file").first.wait_for(timeout=WAIT_MS)
-    assert tab.js("sitegrid.picture") is None
-    tab.page.set_input_files("#plan-file", [picture, world])
-    tab.until("sitegrid.picture !== null")
-    tab.js("(sitegrid.view.x = -800, sitegrid.view.y = 850, sitegrid.view.scale = 1, sitegrid.redraw())")
-    tab.page.wait_for_timeout(300)
-    pixels = tab.js("[...document.getElementById('map').getContext('2d').getImageData(640, 50, 1, 351).data]")
-    north, middle = pixels[:4], pixels[-4:]
-    assert middle[0] > middle[2] + 60, "the middle of the picture is red"
-    assert abs(north[0] - north[2]) < 20, "north of it there is none"
 
 
 @pytest.mark.nightly

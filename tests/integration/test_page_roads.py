@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
-import cv2
-import numpy as np
 import pytest
 
 from protocol.queries.roads import WorklistRow
 from protocol.queries.routing import MACHINES
-from sitegrid.process.children import Children
-from tests.integration.browser_tab import Tab, axe_script, needs_browser, watched
+from tests.integration.browser_tab import Tab, needs_browser, watched
 from tests.integration.hauling_site import DAY_NS, FIRST_NS
-from tests.integration.site_run import kill
 from tests.integration.web_site import WebSite
 
 pytestmark = needs_browser
-PHONE: dict[str, Any] = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 QUIET = "document.querySelector('#panel .asking') === null"
 
 
@@ -54,13 +47,6 @@ def row_of(tab: Tab, row: WorklistRow) -> Any:
     return tab.page.locator(f'[id="stretch-{row.segment.id}"]')
 
 
-def pixel(tab: Tab, x_m: float, y_m: float) -> list[int]:
-    """What is painted at a place of the site: red, green, blue."""
-    left, top = tab.pixel_of(x_m, y_m)
-    image = tab.page.screenshot(clip={"x": round(left), "y": round(top), "width": 1, "height": 1})
-    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR_RGB)[0, 0].tolist()
-
-
 # --- where to send the grader
 
 
@@ -88,21 +74,6 @@ def test_the_ten_stretches_that_cost_most_stand_in_their_order_with_reasons(tab:
     assert "5.0 % → 3.0 %" in repaired
 
 
-@pytest.mark.nightly
-def test_a_mass_that_nobody_stated_is_called_a_guess(tab: Tab, web: WebSite):
-    panel = opened(tab)
-    assert not any(row.segment.guessed for row in listed(web))
-    assert panel.locator(".guess").count() == 0
-    tab.page.keyboard.press("Escape")
-    guessed = [row for row in web.get("worklist").json["rows"] if row["segment"]["guessed"]]
-    answers(tab, "worklist", {**answer_of(web), "rows": guessed[:10]})
-    panel = opened(tab)
-    assert "guess" in panel.locator(".guess").inner_text()
-    shown = panel.locator("ol .lost b").all_inner_texts()
-    assert shown
-    assert all(text.startswith("~") for text in shown)
-
-
 def answer_of(web: WebSite) -> dict[str, Any]:
     return web.get("worklist", {"limit": 10}).json
 
@@ -110,23 +81,6 @@ def answer_of(web: WebSite) -> dict[str, Any]:
 def answers(tab: Tab, resource: str, body: Any, status: int = 200) -> None:
     """From now on, in place of the server."""
     tab.page.route(f"**/{resource}?**", lambda route: route.fulfill(status=status, json=body))
-
-
-@pytest.mark.nightly
-def test_resting_on_a_row_lights_its_stretch_on_the_map(tab: Tab, web: WebSite):
-    opened(tab)
-    row = listed(web)[2]
-    x_m, y_m = row.segment.line[1]
-    tab.js("(sitegrid.shows.machines = false)")
-    dim = pixel(tab, x_m, y_m)
-    row_of(tab, row).hover()
-    tab.until(f"sitegrid.work.lit === '{row.segment.id}' && !sitegrid.dirty")
-    lit = pixel(tab, x_m, y_m)
-    assert lit != dim
-    assert lit == [0xB3, 0x36, 0x1C], "the colour of alarms"
-    tab.page.mouse.move(640, 300)
-    tab.until("sitegrid.work.lit === null && !sitegrid.dirty")
-    assert pixel(tab, x_m, y_m) == dim
 
 
 def test_a_click_on_a_row_flies_to_its_stretch_beside_the_panel(tab: Tab, web: WebSite):
@@ -140,38 +94,6 @@ def test_a_click_on_a_row_flies_to_its_stretch_beside_the_panel(tab: Tab, web: W
         left, top = tab.pixel_of(*point)
         assert 250 < left < 1280 - 380
         assert 60 < top < 720
-
-
-@pytest.mark.nightly
-def test_keys_alone_find_a_stretch_and_fly_to_it(tab: Tab, web: WebSite):
-    tab.page.locator("#open-work").focus()
-    tab.page.keyboard.press("Enter")
-    tab.until(f"sitegrid.panel === 'work' && {QUIET}")
-    assert tab.page.locator("#open-work").get_attribute("aria-pressed") == "true"
-    first = f"stretch-{listed(web)[0].segment.id}"
-    for _ in range(12):
-        tab.page.keyboard.press("Tab")
-        if tab.js("document.activeElement.id") == first:
-            break
-    assert tab.js("document.activeElement.id") == first
-    assert tab.js("sitegrid.work.lit") == listed(web)[0].segment.id
-    tab.page.keyboard.press("Enter")
-    tab.until("sitegrid.view.flight === null && sitegrid.view.moved")
-    tab.js("sitegrid.openPanel('work')")
-    tab.until(QUIET)
-    assert tab.js("document.activeElement.id") == first, "a list that is made anew keeps the place of who reads it"
-    tab.page.keyboard.press("Escape")
-    assert tab.page.locator("#panel").is_hidden()
-
-
-@pytest.mark.nightly
-def test_a_click_on_a_stretch_finds_its_row(tab: Tab, web: WebSite):
-    opened(tab)
-    row = listed(web)[4]
-    tab.page.mouse.click(*tab.pixel_of(*row.segment.line[1]))
-    tab.until(f"document.activeElement.id === 'stretch-{row.segment.id}'")
-    tab.page.mouse.click(*tab.pixel_of(85.0, 100.0))  # none is near
-    tab.until("sitegrid.panel === 'why'")
 
 
 @pytest.mark.nightly
@@ -208,23 +130,6 @@ def test_the_list_is_of_the_time_that_is_shown(tab: Tab, web: WebSite):
     assert panel.locator("ol .stretch").count() == len(rows)
     assert figure(rows[0].kwh_ph[0]) in panel.locator("ol .stretch").first.inner_text()
     assert panel.locator(".stretch.short").count() == 0, "the repair came later"
-
-
-@pytest.mark.nightly
-def test_an_empty_map_has_no_roads_and_says_so(browser, tmp_path: Path):
-    with Children(tmp_path) as children:
-        web = WebSite(tmp_path, children)
-        tab = Tab(browser, web.url)
-        tab.until("document.getElementById('notice').textContent.includes('No ground known yet')")
-        panel = opened(tab)
-        assert "No roads are known yet" in panel.inner_text()
-        tab.page.keyboard.press("r")
-        tab.until(f"sitegrid.panel === 'route' && {QUIET}")
-        for place in ((300, 650), (500, 700)):  # beside the notice
-            tab.page.mouse.click(*place)
-        tab.until("document.querySelector('#panel .failed') !== null")
-        assert "nobody has driven near this line yet" in panel.inner_text()
-        tab.close()
 
 
 # --- what a drive costs
@@ -337,21 +242,6 @@ def test_a_link_opens_the_same_drive(tab: Tab, browser, cheapest: bool):
     other.close()
 
 
-@pytest.mark.nightly
-def test_places_are_set_with_the_keyboard(tab: Tab):
-    opened(tab, "r")
-    tab.page.locator("#map").focus()
-    tab.page.keyboard.press("Enter")
-    tab.until("sitegrid.route.places.length === 1")
-    tab.page.keyboard.press("Enter")  # twice at the same place is one
-    for _ in range(2):
-        tab.page.keyboard.press("ArrowRight")
-    tab.page.keyboard.press("Enter")
-    tab.until(f"sitegrid.route.places.length === 2 && {QUIET}")
-    tab.page.keyboard.press("Backspace")
-    tab.until("sitegrid.route.places.length === 1")
-
-
 # --- what goes wrong
 
 
@@ -428,69 +318,3 @@ def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
         held[0].continue_()
     tab.page.wait_for_timeout(500)
     assert tab.js("sitegrid.route.answer.line.length") == 3
-
-
-@pytest.mark.nightly
-def test_a_server_that_goes_in_the_middle_is_named_and_the_panel_comes_back(browser, web: WebSite):
-    tab = Tab(browser, web.url).loaded()
-    opened(tab)
-    kill(web.server)
-    tab.page.keyboard.press("r")
-    tab.until(f"sitegrid.panel === 'route' && {QUIET}")
-    for place in ((20, 10), (90, 10)):
-        tab.page.mouse.click(*tab.pixel_of(*place))
-    tab.until("document.querySelector('#panel .failed') !== null")
-    assert "no map server answers" in tab.page.locator("#panel .failed").inner_text()
-    assert tab.page.locator("#machine").is_visible(), "what was chosen stays"
-    web.server = web.start_server()
-    tab.until(f"sitegrid.route.answer !== null && {QUIET}")
-    port = web.port
-    kill(web.web)
-    tab.page.keyboard.press("w")
-    tab.until("document.querySelector('#panel .failed') !== null")
-    assert "page's server does not answer" in tab.page.locator("#panel .failed").inner_text()
-    web.web = web.start_web(port=port)
-    tab.until(f"sitegrid.panel === 'work' && sitegrid.work.rows.length === 10 && {QUIET}")
-    tab.close()
-
-
-@pytest.mark.nightly
-def test_a_phone_has_the_list_beneath_the_map_and_shows_what_is_tapped(browser, web: WebSite):
-    tab = Tab(browser, web.url, **PHONE).loaded()
-    tab.page.locator("#open-work").tap()
-    tab.until(f"sitegrid.panel === 'work' && {QUIET}")
-    row = listed(web)[0]
-    row_of(tab, row).tap()
-    tab.until("sitegrid.view.flight === null && sitegrid.view.moved")
-    panel = tab.page.locator("#panel").bounding_box()
-    for point in row.segment.line:
-        left, top = tab.pixel_of(*point)
-        assert 0 < left < 390
-        assert 130 < top < panel["y"]
-    tab.page.get_by_role("button", name="Close").tap()
-    tab.page.locator("#open-route").tap()
-    tab.until(f"sitegrid.panel === 'route' && {QUIET}")
-    for left, top in ((120, 200), (270, 300)):
-        tab.page.touchscreen.tap(left, top)
-        tab.page.wait_for_timeout(400)
-    tab.until(f"{QUIET} && sitegrid.route.answer !== null")
-    small = "(b) => b.offsetParent && b.offsetHeight < 44"
-    assert (
-        tab.js(f"[...document.querySelectorAll('#panel button, #panel select, #panel input')].filter({small}).length")
-        == 0
-    )
-    assert tab.js("document.documentElement.scrollWidth") <= 390
-    assert tab.complaints == []
-    tab.close()
-
-
-@pytest.mark.nightly
-def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
-    axe = axe_script(tmp_path)
-    for theme in ("light", "dark"):
-        for words in ("panel=work", "panel=route&line=20,10;20,60;90,70&cost=energy"):
-            tab = Tab(browser, f"{web.url}?theme={theme}&{words}", bypass_csp=True).loaded()
-            tab.until(f"sitegrid.panel !== null && {QUIET}")
-            assert tab.serious_faults(axe) == []
-            assert "panel" in parse_qs(urlsplit(tab.page.url).query)
-            tab.close()

@@ -8,25 +8,20 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from itertools import islice
-from pathlib import Path
 
 import pytest
 
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.ingest.store import Store
 from mapserver.journal.location import JournalLocation
 from protocol.errors import QueryError, Refusal
 from protocol.site.site_file import load_site
-from protocol.wire.session import free_endpoint
-from sim.config import SimConfig
 from sitegrid import Client
-from sitegrid.process.children import Child, Children
+from sitegrid.process.children import Child
 from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.integration.test_operation import Sender, end, session_of
 from tests.patience import until
-from tests.reference.correction import in_numpy
 from tests.site_work import batches, write_store
 from tests.unit.mapserver.data import same
 
@@ -36,14 +31,12 @@ ROWS = 3000  # of 100 samples: their fold takes a good part of a second
 
 
 @pytest.fixture
-def site(tmp_path: Path, children: Children) -> SiteRun:
+def site(site: SiteRun) -> SiteRun:
     """A site whose store has samples of ten machines, and no snapshot."""
-    run = SiteRun(tmp_path, children, free_endpoint(), SimConfig(machines=1, seconds=0, speed=4, seed=3, world="fast"))
-    options = tmp_path / "server.toml"
-    options.write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
-    write_store(tmp_path / "store", load_site(run.site_file), ROWS, tail_rows=ROWS)
-    run.start_router()
-    return run
+    (site.folder / "server.toml").write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
+    write_store(site.folder / "store", load_site(site.site_file), ROWS, tail_rows=ROWS)
+    site.start_router()
+    return site
 
 
 def serve(site: SiteRun) -> Child:
@@ -128,39 +121,6 @@ def test_a_server_killed_between_decision_and_map_comes_back_without_the_machine
         serve(site)
         assert list(client.info().distrusted) == ["loader-3"]
         assert not next(row for row in client.machines() if row.name == "loader-3").trusted
-
-
-@pytest.mark.nightly
-def test_a_server_killed_between_a_correction_and_its_map_comes_back_with_it(site: SiteRun):
-    server, zero = serve(site), 0.02
-    with site.connect() as client, pytest.raises(QueryError, match="the decision is kept") as late:
-        client.correct("loader-3", "a test", zero=zero, wait_s=0.0)
-    kill(server)
-    assert late.value.reason == Refusal.AFTER_TIMEOUT
-    server = serve(site)
-    with site.connect() as client:
-        info = client.info()
-        assert (info.fact, info.decided, info.corrections) == (1, 1, 1)
-    end(server)
-    correction = Correction("loader-3", 0, LAST_NS, zero, 0.0, 0.0, ())
-    expected = Grid(load_site(site.site_file).cell_m, ServerConfig().fold)
-    for name, rows in islice(batches(), ROWS):
-        expected.fold(in_numpy(rows, correction) if name == "loader-3" else rows, name)
-    with store_of(site) as store:
-        assert same(store.grid, expected)
-
-
-@pytest.mark.nightly
-def test_decisions_of_several_operators_at_once_all_count(site: SiteRun):
-    serve(site)
-    names = [f"loader-{number}" for number in range(1, 7)]
-    with site.connect() as client:
-        threads = [threading.Thread(target=client.distrust, args=(name, "a test")) for name in names]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert sorted(client.info().distrusted) == names
 
 
 @pytest.mark.nightly

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,7 +9,6 @@ from dataclasses import replace
 import pytest
 
 from protocol.errors import QueryError
-from protocol.queries.places import MAX_PLACES
 from protocol.queries.routing import MACHINES, NamedMachine
 from sitegrid import Client, RouteAnswer
 from tests.command_lines import Said, said
@@ -54,16 +52,10 @@ def asked(site: WebSite, kind: str, places: tuple[Place, ...], values: dict[str,
     ("kind", "places", "values", "ask", "words"),
     [
         ("route", ((20.0, 10.0),), {}, lambda c: c.route([(20.0, 10.0)]), "a line has at least two"),
-        ("route", (ROAD[0],) * 2, {}, lambda c: c.route([ROAD[0]] * 2), "places 1 and 2 are the same"),
-        ("route", (ROAD[0], (math.nan, 1.0)), {}, lambda c: c.route([ROAD[0], (math.nan, 1.0)]), "`line`"),
         ("route", (ROAD[0], (9e4, 1.0)), {}, lambda c: c.route([ROAD[0], (9e4, 1.0)]), "is off the site"),
-        ("route", (ROAD[0], (2e5, 1.0)), {}, lambda c: c.route([ROAD[0], (2e5, 1.0)]), "km, over 100 km"),
         ("route", ROAD, {"mass": "0"}, lambda c: c.route(ROAD, named(mass_kg=0.0)), "mass"),
-        ("route", ROAD, {"mass": "2e6"}, lambda c: c.route(ROAD, named(mass_kg=2e6)), "mass"),
         ("route", ROAD, {"efficiency": "0"}, lambda c: c.route(ROAD, named(efficiency=0.0)), "efficiency"),
-        ("route", ROAD, {"efficiency": "1.5"}, lambda c: c.route(ROAD, named(efficiency=1.5)), "efficiency"),
         ("route", ROAD, {"machine": "digger-7"}, lambda c: c.route(ROAD, "digger-7"), "'digger-7' has sent nothing"),
-        ("way", (ROAD[0],) * 2, {}, lambda c: c.way(ROAD[0], ROAD[0]), "the same place as `from`"),
         ("way", ROAD, BLOCKED, lambda c: blocked(c), "no way: `margin` leaves none"),
         ("way", ROAD, {"max_grade": "0"}, lambda c: c.way(*ROAD, max_grade=0.0), "max_grade"),
         (
@@ -96,15 +88,6 @@ def named(**values: float) -> NamedMachine:
 
 def blocked(client: Client) -> RouteAnswer:
     return client.way(*ROAD, margin_m=1.0, avoid=ACROSS, unknown="refuse")
-
-
-def test_more_places_than_a_line_may_have_are_named(site: WebSite):
-    many = tuple((20.0 + 0.01 * i, 10.0) for i in range(MAX_PLACES + 1))
-    with pytest.raises(QueryError, match=f"{MAX_PLACES + 1} places"):
-        site.client.route(many)
-    refused = command(site, "route", *numbers(many))
-    assert refused.code in (1, 2)
-    assert f"{MAX_PLACES + 1} places" in refused.err
 
 
 def test_a_way_is_never_dearer_to_drive_than_straight_on(site: WebSite):

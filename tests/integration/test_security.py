@@ -174,17 +174,6 @@ def test_a_follower_with_keys_answers_under_its_own_name_alone(guarded: Guarded)
     follower.stop()
 
 
-@pytest.mark.nightly
-def test_agent_and_simulator_work_with_keys_as_without(guarded: Guarded, tmp_path: Path):
-    agent, sim = guarded.drive(tmp_path / "spool.db", 15)
-    with guarded.session("guest") as session, listening(session, keys.poses_all(SITE)) as poses:
-        report = agent.expect("ended", PATIENCE_S)["ended"]
-        until(lambda: len(poses) > 5, "a visitor sees poses")
-    assert report["delivered"], f"agent pid {agent.pid}, sim pid {sim.pid}"
-    assert report["samples"] > 20
-    assert sim.wait(PATIENCE_S) == 0
-
-
 def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_path: Path, children: Children):
     site = Guarded(tmp_path, children, signed=True)
     key, batch = keys.ingest(SITE, "loader-1"), site.batch("loader-1")
@@ -221,13 +210,6 @@ def test_a_visitor_reads_and_writes_nothing(guarded: Guarded):
             with guarded.session("loader-1") as loader:
                 put_until(received, b"own", lambda: loader.put(keys.pose(SITE, "loader-1"), b"own"))
             assert set(received) == {b"own"}
-
-
-def test_only_an_admin_commands(guarded: Guarded):
-    with guarded.session("loader-1") as loader:
-        assert is_taken(guarded, loader, "loader-1")
-    with connect(guarded.endpoint, SITE, keys=guarded.keys / "boss") as client:
-        assert client.trust("loader-1", "seen to").trusted
 
 
 # --- who has no name that counts -------------------------------------------------------------------------------------
@@ -380,19 +362,6 @@ def test_what_is_forged_reaches_nobody(guarded: Guarded, what: str):
             answers(sessions[name], keys.map_query(SITE, "info"))  # what was put before it has been judged
         put_until(received, b"true", lambda: sessions[owner].put(own, b"true"))
         assert set(received) == {b"true"}, guarded.still_works()
-
-
-def test_nobody_ends_what_another_shows_and_a_base_sends_no_samples(guarded: Guarded):
-    with (
-        guarded.session("guest") as guest,
-        guarded.session("loader-1") as loader,
-        guarded.session("base-1") as base,
-        listening(guest, keys.poses_all(SITE)) as received,
-    ):
-        loader.delete(POSE)
-        put_until(received, b"own", lambda: loader.put(POSE, b"own"))
-        assert set(received) == {b"own"}, guarded.still_works()
-        assert not acknowledged(base, keys.ingest(SITE, "base-1"), guarded.batch("base-1"))
 
 
 def test_nobody_shows_presence_in_anothers_name(guarded: Guarded):

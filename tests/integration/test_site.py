@@ -104,34 +104,6 @@ def test_a_process_killed_in_mid_run_loses_nothing(shift: Shift, victim: str):
 
 
 @pytest.mark.nightly
-def test_two_sites_do_not_mix(tmp_path, children: Children):
-    endpoint = free_endpoint()
-    runs = []
-    for name, seed in (("north", 4), ("south", 5)):
-        folder = tmp_path / name
-        folder.mkdir()
-        sim = SimConfig(site=name, machines=1, names=(f"{name}-loader",), seconds=20, speed=8, seed=seed)
-        runs.append(SiteRun(folder, children, endpoint, sim))
-    runs[0].start_router()
-    servers = [run.start_server() for run in runs]
-    for run in runs:
-        run.start_agents()
-        config = tmp_path / f"{run.site}-sim.toml"
-        config.write_text(f'site = "{run.site}"\nmachines = 1\nnames = ["{run.sim.names[0]}"]\n')
-        words = ("--seconds", run.sim.seconds, "--speed", run.sim.speed, "--seed", run.sim.seed)
-        children.start("sim", "sim", "--endpoint", endpoint, "--config", config, *words, "--json")
-    reports = [run.end_of_agents() for run in runs]
-    for run, report in zip(runs, reports, strict=True):
-        with run.connect() as client:
-            info = client.info()
-        assert list(info.machines) == [run.sim.names[0]]
-        assert info.machines[run.sim.names[0]].samples == report[run.sim.names[0]]["samples"] > 50
-    for server, run in zip(servers, runs, strict=True):
-        server.stop()
-        assert (run.audit().lost, run.audit().unrecorded) == (0, 0)
-
-
-@pytest.mark.nightly
 def test_an_agent_runs_on_without_a_router_and_catches_up(site_run: SiteRun, children: Children, tmp_path):
     recording = ("--record", tmp_path / "logs", "--seconds", 60, "--machines", 1, "--world", "fast")
     assert said("sim", *recording).code == 0

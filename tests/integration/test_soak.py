@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.soak import Look, Soak, SoakMachine, main, soak
+from tests.soak import Look, Soak, main, soak
 
 pytestmark = pytest.mark.processes
 
@@ -39,10 +39,3 @@ def test_memory_that_grows_is_a_failure(last: float, code: int, monkeypatch: pyt
     lines = capsys.readouterr().out.splitlines()
     assert json.loads(lines[-1])["growth_pct"] == pytest.approx(last - 100, abs=0.01)
     assert "% of resident memory" in lines[-2]
-
-
-def test_a_machine_drives_on_where_it_was():
-    one, other = SoakMachine("a", 1), SoakMachine("a", 1)
-    first = one.drive(0.0, "frame")
-    assert first == other.drive(0.0, "frame")
-    assert one.drive(4.0, "frame") != first

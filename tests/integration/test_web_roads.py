@@ -149,20 +149,12 @@ def test_what_nobody_knows_is_null_and_told(web: WebSite):
     ("path", "parameters", "status", "reason", "word"),
     [
         ("worklist", {"target": 0}, 400, "out_of_range", "target"),
-        ("worklist", {"limit": "2.5"}, 400, "out_of_range", "limit"),
         ("worklist", {"from": "2026-01-02", "to": "2026-01-01"}, 400, "out_of_range", "after"),
         ("worklist", {"machine": "hauler-9"}, 404, "unknown_machine", "hauler-9"),
         ("segments", {"bounds": "9e14,0,9.1e14,5"}, 400, "out_of_range", "off the site"),
-        ("features/segments", {"as_of": "yesterday"}, 400, "wrong_type", "as_of"),
-        ("route", {}, 400, "missing_field", "line"),
-        ("route", {"line": "1,1;east,2"}, 400, "wrong_type", "line"),
         ("route", {"line": "0,0;1e14,0"}, 413, "too_large", "km"),
-        ("route", {"line": "0,0;9e4,0"}, 400, "out_of_range", "off the site"),
-        ("route", {"line": "20,10;90,10", "mass": "2e6"}, 400, "out_of_range", "mass"),
         ("route", {"line": "20,10;90,10", "machine": "<img src=x>"}, 400, "out_of_range", "machine"),
-        ("way", {"from": "20,10"}, 400, "missing_field", "to"),
         ("way", {"from": "20,10;30,10", "to": "20,10"}, 400, "out_of_range", "from"),
-        ("way", {"from": "20,10", "to": "90,10", "cost": "money"}, 400, "out_of_range", "cost"),
     ],
 )
 def test_bad_input_is_one_clear_problem(web: WebSite, path, parameters, status, reason, word):
@@ -179,21 +171,3 @@ def test_a_long_line_is_answered_or_named(web: WebSite):
     assert web.get("route", {"line": line}).json["totals"]["length_m"] > 2500
     longer = web.get("route", {"line": ";".join([line] * 7)})  # 10 500 places
     assert (longer.status, longer.json["reason"]) == (414, "too_large")
-
-
-def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
-    for path, parameters in (("worklist", {}), ("segments", {}), ("route", {"line": "20,10;90,10"})):
-        first = web.get(path, parameters)
-        assert (first.status, first.headers["cache-control"]) == (200, "private, no-cache")
-        again = web.get(path, parameters, If_None_Match=first.headers["etag"])
-        assert (again.status, again.body) == (304, b"")
-
-
-def test_everything_is_in_the_description(web: WebSite):
-    paths = web.get("/api/v1/openapi.json").json["paths"]
-    features = (f"features/{name}" for name in ("segments", "worklist", "repairs"))
-    for name in ("segments", "worklist", "route", "way", "points", *features):
-        assert f"/api/v1/sites/{{site}}/{name}" in paths
-    route = paths["/api/v1/sites/{site}/route"]["get"]
-    kinds = {one["name"]: one["schema"]["type"] for one in route["parameters"]}
-    assert (kinds["line"], kinds["mass"], kinds["step"]) == ("string", "number", "number")

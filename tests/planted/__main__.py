@@ -6,7 +6,8 @@
 
 60 faults are written by hand (`faults.toml`), 200 drawn by --seed over functions that FOLDER and --common both have.
 One run of the suite with coverage by test says which tests a fault is given to; they stop at the first that fails.
-What survives is given to the tests of `make nightly` that run its lines.
+What survives is given to the tests of `make nightly` that run its lines. --quick does without that run: a fault is
+given to the unit tests of its module's folder, then to those of its package.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from tests.paths import ROOT
 from tests.planted.faults import Fault, drawn, written
 from tests.planted.suite import Suite, trial
 
+UNMARKED = ("-m", "not nightly")  # the tests of --quick
 RESULTS = "results.jsonl"
 NO_PLACE, SURVIVED = "no place", "survived"
 MOST_S = 300.0  # of tests, as long as they took in the run with coverage, that one fault is given to
@@ -33,7 +35,8 @@ MOST_S = 300.0  # of tests, as long as they took in the run with coverage, that 
 def run(suite: Suite, faults: Sequence[Fault], processes: int, most_s: float) -> dict[str, dict[str, str]]:
     """What became of each fault; kept line by line in RESULTS."""
     suite.folder.mkdir(parents=True, exist_ok=True)
-    suite.measure(processes)
+    if not suite.quick:
+        suite.measure(processes)
     kept, results = suite.folder / RESULTS, results_of(suite.folder)
     waiting = [fault for fault in faults if fault.name not in results]
     trees = SimpleQueue[Path]()
@@ -62,6 +65,9 @@ def judged(suite: Suite, fault: Fault, tree: Path, most_s: float) -> dict[str, s
         tests = suite.tests_of(fault)
     except KeyError:
         return {**row, "tier": NO_PLACE}
+    if suite.quick:
+        by = next(filter(None, (trial(tree, fault, [*UNMARKED, test]) for test in tests)), "")
+        return {**row, "tier": "test" if by else SURVIVED, "by": by}
     for tier, own in (
         ("test", [test for test in tests if test not in suite.nightly]),
         ("nightly", [test for test in tests if test in suite.nightly]),
@@ -109,6 +115,7 @@ def main(words: Sequence[str] | None = None) -> int:
     planting.add_argument("--common", type=Path, help="a checkout that must have the functions, too")
     planting.add_argument("--survivors", type=Path, help="only faults that survive in this run of another checkout")
     planting.add_argument("--tests", nargs="+", default=["tests"], help="files and folders of the suite (%(default)s)")
+    planting.add_argument("--quick", action="store_true", help="by the folders that mirror a module, without coverage")
     planting.add_argument("--out", type=Path, default=Path("planted-output"))
     planting.add_argument("--seed", type=int, default=1000)
     planting.add_argument("--drawn", type=int, default=200, help="how many are drawn (%(default)s)")
@@ -127,7 +134,8 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.survivors:
         left = {name for name, row in results_of(options.survivors).items() if row["tier"] == SURVIVED}
         faults = [fault for fault in faults if fault.name in left]
-    results = run(Suite(root, options.out.resolve(), tuple(options.tests)), faults, options.processes, options.seconds)
+    suite = Suite(root, options.out.resolve(), tuple(options.tests), quick=options.quick)
+    results = run(suite, faults, options.processes, options.seconds)
     tiers = Counter(results[fault.name]["tier"] for fault in faults)
     print(", ".join(f"{tier} {n}" for tier, n in tiers.most_common()))
     return int(tiers[SURVIVED] > 0)

@@ -19,18 +19,20 @@ from tests.planted.faults import PACKAGES, Fault
 
 LIMIT_S = 1800.0  # of one trial: a suite that runs so long hangs
 NIGHTLY = "nightly"
+NO_TESTS = 5  # exit code of pytest where none is selected
 
 
 @dataclass(frozen=True)
 class Suite:
     """The tests of a checkout. folder: of their times and coverage, and of the copies in which faults are planted.
 
-    tests: files and folders of the suite.
+    tests: files and folders of the suite. quick: whether to do without coverage.
     """
 
     root: Path
     folder: Path
     tests: tuple[str, ...] = ("tests",)
+    quick: bool = False
 
     @property
     def coverage_file(self) -> Path:
@@ -93,7 +95,7 @@ class Suite:
         return data
 
     def tests_of(self, fault: Fault) -> list[str]:
-        """Tests that may catch a fault, the likeliest and quickest first; KeyError where it has no place here.
+        """Tests, or folders, that may catch a fault, the likeliest first; KeyError where it has no place here.
 
         Those that ran its lines. Compiled code and constants leave no trace: those then that ran anything of the
         module, or stand in the folder of tests that mirrors it.
@@ -101,11 +103,14 @@ class Suite:
         root = self.copy(0)
         if (place := fault.place(root)) is None:
             raise KeyError(fault.name)
+        module = place.path.relative_to(root)
+        mirror = f"tests/unit/{module.parent.as_posix()}/"
+        if self.quick:
+            package = f"tests/unit/{module.parts[0]}"
+            return [folder for folder in dict.fromkeys([mirror, package]) if (root / folder).is_dir()]
         lines = self._data.contexts_by_lineno(str(place.path))
         wanted = range(place.lines[0], place.lines[1] + 1)
         of_lines = _ids(lines, wanted)
-        module = place.path.relative_to(root)
-        mirror = f"tests/unit/{module.parent.as_posix()}/"
         named = f"{mirror}test_{module.stem}.py"
         ids = of_lines or _ids(lines, lines) | {test for test in self.seconds if test.startswith(mirror)}
         own = [test for test in self.seconds if test in ids]
@@ -125,7 +130,7 @@ def trial(tree: Path, fault: Fault, tests: Sequence[str]) -> str:
     finally:
         place.path.write_bytes(original)
         os.utime(place.path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-    if done.returncode == 0:
+    if done.returncode in (0, NO_TESTS):
         return ""
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
     return failed.group(1) if failed else f"pytest ends with {done.returncode}"

@@ -10,7 +10,7 @@ import pytest
 from lab.benchmark import adapters
 from lab.benchmark.adapters import files
 from lab.benchmark.adapters.cell_filter import cell_filter
-from lab.benchmark.adapters.files import COLUMNS, enter
+from lab.benchmark.adapters.files import enter
 from lab.benchmark.entries import read_map
 from lab.benchmark.recordings import write_samples
 from protocol.machine.samples import empty
@@ -60,14 +60,6 @@ def test_a_method_knows_both_kinds_of_ground_and_the_slope(name: str, recording:
     if name == "gaussian_process":
         assert layers["confidence"][10, 5] > 0.9
         assert layers["confidence"][10, 17] < layers["confidence"][10, 5]
-
-
-def test_a_value_beyond_the_gate_changes_no_estimate_at_once():
-    rows = samples()[:8].copy()
-    rows["x_m"], rows["y_m"], rows["c_rr"], rows["c_rr_var"] = 5.5, 5.5, 0.04, 1e-5
-    rows["stamp_ns"], rows["c_rr"][-1] = np.arange(8), 0.25
-    table = {name: rows[name].astype(float) for name in COLUMNS}
-    assert cell_filter(table)[5, 5]["resistance"] == pytest.approx(0.04)
 
 
 def test_adapters_import_nothing_of_this_project():

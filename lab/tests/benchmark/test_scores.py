@@ -6,16 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab import commands
 from lab.benchmark import recordings, scores
-from lab.benchmark.recordings import FULL, QUICK, part_hash
-from lab.benchmark.scores import FIGURES, Entry, figures_of, summarise
+from lab.benchmark.recordings import QUICK, part_hash
+from lab.benchmark.scores import FIGURES, figures_of
 from lab.calibration.drives import Scene, scene
 from lab.campaign.experiment import Runner
 from lab.campaign.true_maps import region_of, true_layers
 from lab.tests.calibration.scenes import made_scene
 from protocol.errors import ConfigError
-from sitegrid.door import run
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.map_score import driven_cells
 from tests.arithmetic import ARITHMETIC, arithmetic
@@ -58,21 +56,6 @@ def test_confidence_counts_where_it_is_stated(true: Scene):
     assert 0.1 < figures_of(layers, true)["calibration_error"] < 0.5
     layers["confidence"][:] = np.nan
     assert figures_of(layers, true)["calibration_error"] is None
-
-
-def test_rows_are_means_over_recordings():
-    one = dict.fromkeys(FIGURES, 2.0) | {"brier": None}
-    row = summarise(Entry("x"), {"a": one, "b": {**one, "right_pct": 4.0}})
-    assert (row["right_pct"], row["brier"], row["by_recording"]) == (3.0, None, {"a": 2.0, "b": 4.0})
-    assert row["ci95"] == pytest.approx(12.706)
-
-
-def test_there_are_24_recordings_on_seeds_that_nothing_else_has():
-    drives = FULL.drives
-    assert len({drive.name for drive in drives}) == 24
-    assert {drive.seed for drive in drives} == set(range(2000, 2008))
-    assert {drive.machines for drive in drives} == {4, 5}
-    assert not {drive.name for drive in drives} & {drive.name for drive in QUICK.drives}
 
 
 def test_hashes_are_of_names_and_contents_and_of_an_archive_s_numbers(tmp_path: Path):
@@ -151,7 +134,7 @@ def test_without_recordings_one_line_says_what_to_do(tmp_path: Path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["truth/tracks/loader-1.csv", "truth/truth_map.npz", "samples.csv"])
+@pytest.mark.parametrize("part", ["truth/tracks/loader-1.csv", "samples.csv"])
 def test_a_recording_that_was_cut_is_not_scored_on(made, data: Path, part: str):
     path = QUICK.drives[0].folder(data) / part
     whole = path.read_bytes()
@@ -164,53 +147,3 @@ def test_a_recording_that_was_cut_is_not_scored_on(made, data: Path, part: str):
                 recordings.make(Runner(data), QUICK)
     finally:
         path.write_bytes(whole)
-
-
-@pytest.mark.slow
-def test_entries_are_looked_at_before_anything_is_scored(made, data: Path, tmp_path: Path):
-    def entry(name: str) -> Path:
-        folder = tmp_path / name
-        folder.mkdir(parents=True)
-        for drive in QUICK.drives:
-            (folder / f"{drive.name}.csv").write_text("x_m,y_m,resistance,grade_east,grade_north\n5,5,0.02,0,0\n")
-        return folder
-
-    none, cut = tmp_path / "none", entry("cut")
-    (cut / f"{QUICK.drives[1].name}.csv").unlink()
-    for folders, problem in (
-        ([entry("a/mine"), entry("b/mine")], "'mine' stands in the table already; rename it"),
-        ([entry("soft_votes")], "'soft_votes' stands in the table already; rename it"),
-        ([entry("two\nlines")], "cannot be printed; rename it"),
-        ([none], "is no folder"),
-        ([cut], "an entry has one for each recording"),
-    ):
-        with pytest.raises(ConfigError, match=problem):
-            scores.run(data, QUICK, folders, 1)
-
-
-@pytest.mark.slow
-def test_a_recording_that_differs_from_the_published_one_is_seen_and_can_be_published(
-    made, data: Path, monkeypatch, tmp_path
-):
-    key, hashes = recordings.edition_key(QUICK), tmp_path / "hashes.json"
-    changed = {name: {**parts, "samples.csv": "0"} for name, parts in PUBLISHED[key].items()}
-    hashes.write_text(json.dumps({"other": {}, key: changed}))
-    monkeypatch.setattr(recordings, "HASHES", hashes)
-    rows = recordings.make(Runner(data), QUICK)
-    assert [row["published"] for row in rows] == [False, False]
-    recordings.publish({"edition": key, "rows": plain(rows)})
-    assert list(recordings.published_hashes()) == ["other", key]
-    assert [row["published"] for row in recordings.make(Runner(data), QUICK)] == [True, True]
-    hashes.write_text("{}")
-    assert [row["published"] for row in recordings.make(Runner(data), QUICK)] == [None, None]
-
-
-@pytest.mark.slow
-def test_the_command_makes_and_scores(made, data: Path, capsys: pytest.CaptureFixture[str]):
-    words = ["--data", str(data), "--quick", "--processes", "1", "--json"]
-    assert run(["bench", "make", *words], commands, "python -m lab") == 0
-    assert [row["name"] for row in json.loads(capsys.readouterr().out)["rows"]] == [d.name for d in QUICK.drives]
-    assert run(["bench", "score", *words], commands, "python -m lab") == 0
-    assert len(json.loads(capsys.readouterr().out)["rows"]) == 6
-    assert run(["bench", "score", str(data / "nobody"), *words], commands, "python -m lab") == 1
-    assert "nobody: is no folder" in capsys.readouterr().err

@@ -56,16 +56,6 @@ def test_what_is_only_said_in_another_way_is_the_same(project: Path):
     assert len(set(seen)) == 3
 
 
-def test_a_module_that_is_not_there_is_an_error():
-    with pytest.raises(ModuleNotFoundError, match="nowhere"):
-        version("solver", "nowhere")
-
-
-def test_a_digest_tells_where_one_text_ends():
-    assert code.digest("ab", "c") != code.digest("a", "bc")
-    assert len(code.digest("a")) == 10
-
-
 def test_nothing_that_results_are_made_of_is_imported_by_a_name_made_at_run_time():
     """It would not be seen; a library may be."""
     root = Path(__file__).parents[3]

@@ -71,13 +71,6 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path):
     assert done(tmp_path) == ["seed2-power1", "seed2-power2", "seed2-power-1", "seed3-power1", "seed3-power2"]
 
 
-@pytest.mark.slow
-def test_worker_processes_do_what_one_process_does(tmp_path: Path):
-    several = Runner(tmp_path, processes=2).run(POWERS, TASKS)
-    assert [numbers.value for numbers in several] == [2, 4, 3, 9]
-    assert sorted(done(tmp_path)) == sorted(task.name for task in TASKS)
-
-
 def test_every_input_of_a_result_names_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     drive = PlannedDrive(2, 5.0)
     tasks = [TASKS[0], TASKS[1], replace(TASKS[0], seed=4), replace(TASKS[0], seconds=6.0)]
@@ -131,14 +124,3 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path):
     assert json.dumps(result.counts) == '{"b": 1, "a": 2}'
     assert np.isnan(result.error)
     assert result.median is None
-
-
-def test_a_result_that_is_damaged_is_named_with_what_to_do(tmp_path: Path):
-    path = tmp_path / "result.npz"
-    with path.open("wb") as file:
-        write_result(Numbers(3, np.arange(3.0)), file)
-    whole = path.read_bytes()
-    for cut in (len(whole) // 2, 0):
-        path.write_bytes(whole[:cut])
-        with pytest.raises(SitegridError, match=r"result.npz: is damaged .*; delete it, and start again"):
-            read_result(Numbers, path)

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.campaign.pages import NOT_MEASURED, filled, main, text_of
+from lab.campaign.pages import filled, main
 from protocol.errors import ConfigError
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -75,16 +75,6 @@ def test_rows_and_columns_that_are_not_there_are_named(folder, table: str, probl
         filled(page(table), folder)
 
 
-def test_what_was_not_measured_is_said(tmp_path):
-    assert NOT_MEASURED in filled(page("goals"), tmp_path)
-
-
-def test_an_unknown_table_is_named_with_the_known_ones(folder):
-    known = "made, goals, rows, ways, maps"
-    with pytest.raises(ConfigError, match=f"`haul`; known: {known}"):
-        filled(page("haul"), folder)
-
-
 def test_a_page_is_written_only_where_it_is_another_one(folder, capsys):
     path = folder / "roads.md"
     path.write_text(page("goals"))
@@ -93,13 +83,6 @@ def test_a_page_is_written_only_where_it_is_another_one(folder, capsys):
     main([str(path)])
     assert capsys.readouterr().out == ""
     assert "0.91235" in path.read_text()
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(None, ""), (float("nan"), ""), (3, "3"), (123456.7, "123457"), ("a", "a"), (True, "yes")]
-)
-def test_figures_are_short(value, text):
-    assert text_of(value) == text
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*.md")), ids=lambda path: path.name)

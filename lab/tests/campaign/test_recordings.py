@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lab.campaign import recordings
-from lab.campaign.recordings import PAPER, SETUPS, PlannedDrive
+from lab.campaign.recordings import PAPER, PlannedDrive
 from lab.ground.experiment import LOADING
 
 DRIVE = PlannedDrive(3, 0.5, setup=replace(PAPER, world="fast"))
@@ -18,26 +18,6 @@ DRIVE = PlannedDrive(3, 0.5, setup=replace(PAPER, world="fast"))
 )
 def test_routes_take_turns_with_the_seeds(setup, tours):
     assert [PlannedDrive(seed, 1.0, setup=setup).tour for seed in range(5)] == tours
-
-
-def test_a_machine_has_the_sensors_and_the_route_of_its_setup():
-    drive = PlannedDrive(3, 1.0, "dgps", LOADING)
-    sensors = {sensor.name for sensor in drive.machine.sensors}
-    assert {"gps-1", "gps-2", "imu-3", "torque"} <= sensors
-    assert "gps-3" not in sensors
-    assert 'base = "loading"' in drive.scenario_toml
-    assert 'routes = ["yard"]' in drive.scenario_toml
-
-
-@pytest.mark.parametrize("name", SETUPS)
-def test_drives_of_the_table_have_the_habits_and_the_shared_errors_of_their_scenario(name: str):
-    setup = SETUPS[name]
-    drive = PlannedDrive(3, 1.0, setup.preset, setup)
-    gps = drive.scenario.preset(drive.preset).gps
-    people = name.endswith("_driven")
-    assert (drive.scenario.driving.wander_m > 0) == (drive.scenario.driving.stop_every_m is not None) == people
-    assert (gps.machine_share, gps.site_share) == ((0.8, 0.5) if people else (0.0, 0.0))
-    assert len([s for s in drive.machine.sensors if s.kind in ("gps", "imu", "attitude")]) == 9
 
 
 @pytest.mark.slow

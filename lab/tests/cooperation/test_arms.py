@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from lab.campaign.recordings import make
-from lab.cooperation.drives import ALWAYS, LOST, SLOW, STANDALONE, TWO, Arm, arms, logs_of
+from lab.cooperation.drives import LOST, STANDALONE, TWO, Arm, logs_of
 from protocol.machine.log_folder import open_log
 from protocol.machine.readings import Gps
 from protocol.site.site_config import Projection
 from sim.sensors.presets import load_preset
-from tests.tcp_proxy import FAIR
 
 SECONDS = 30.0
 
@@ -40,21 +39,6 @@ def test_a_link_is_lost_a_fifth_of_the_time_by_turns():
     assert cut.mean(axis=1).tolist() == [0.2] * 4
     assert cut.sum(axis=0).max() == 1  # never two machines at once
     assert np.diff(np.flatnonzero(np.diff(cut[0].astype(int)) == 1)).tolist() == [300] * 9
-
-
-def test_a_slow_link_is_as_much_faster_as_the_replay():
-    assert SLOW.weather(0, 5.0, 1.0).bytes_per_s == 37_500.0
-    assert SLOW.weather(0, 5.0, 8.0).bytes_per_s == 300_000.0
-    assert ALWAYS.weather(3, 1e4, 8.0) == FAIR
-
-
-def test_every_arm_has_a_name_of_its_own_and_no_more_machines_than_its_recording():
-    everything = arms(1200.0)
-    assert len({each.name for each in everything}) == len(everything)
-    for each in everything:
-        drive = each.drive(0)
-        assert each.names(drive) == drive.machines[: each.machines]
-        assert each.machines <= len(drive.machines)
 
 
 @pytest.mark.slow

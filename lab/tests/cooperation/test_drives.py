@@ -1,9 +1,7 @@
 """What is driven: tours that one machine drives in turn as several drive them at once."""
 
-from itertools import combinations
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from lab.cooperation.drives import (
@@ -14,9 +12,7 @@ from lab.cooperation.drives import (
     REPAVED,
     TOURS,
     TWO,
-    corners,
     length_m,
-    lines,
     planned,
 )
 from sim.config import SimConfig, resolve
@@ -40,14 +36,3 @@ def test_a_lone_machine_drives_what_all_others_would_and_no_more():
     assert whole == tuple(TOURS)
     halves = planned(0, 1.0, TWO, None).tours.values()
     assert sorted(name for half in halves for name in half) == sorted(TOURS)
-
-
-def test_machines_start_far_from_each_other():
-    starts = [np.array(corners((name,))[0]) for name in TOURS]
-    assert min(float(np.hypot(*(a - b))) for a, b in combinations(starts, 2)) > 30.0
-
-
-def test_the_shared_stretch_is_in_every_tour():
-    for leg in lines().values():
-        off_m = np.hypot(leg.points[:, 0] - 96.0, leg.points[:, 1] - 66.0)
-        assert off_m.min() < 0.5

@@ -91,12 +91,6 @@ def test_by_arrival_a_decision_counts_once_the_sites_now_has_arrived(run: LiveRu
     assert [(when - START_NS) / 1e9 for when, _ in line.facts[1:]] == [42.0]
 
 
-def test_corrections_are_taken_off(run: LiveRun):
-    (layers,) = Timeline.of_run(with_events(run, event(1, corrects("a", 0.008, 5.0)))).maps(at(30), WINDOW)
-    assert layers["resistance"][10, 25] == pytest.approx(0.012, abs=0.002)
-    assert layers["resistance"][30, 25] == pytest.approx(0.06, abs=0.006)
-
-
 def test_arrivals_are_in_the_time_of_each_machines_log():
     rows = [
         JournalRow(1, "a", 1, 1, driving(0, 2), received_ns=1_002 * SECOND_NS),

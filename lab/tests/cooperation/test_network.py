@@ -60,18 +60,6 @@ def test_errors_are_what_they_were_made(cells: Network):
     assert np.hypot(got["grade_pct"], got["grade_across_pct"]) == pytest.approx(0.3)
 
 
-def test_errors_near_borders_and_breaks_are_told_apart(cells: Network):
-    layers = perfect(cells)
-    near, broken = cells.border_m <= 2.0, cells.break_m <= 5.0
-    layers["resistance"][cells.row[near], cells.column[near]] *= 1.2
-    layers["grade_east"][cells.row[broken], cells.column[broken]] += 0.1
-    layers["grade_north"][cells.row[broken], cells.column[broken]] += 0.1
-    got = figures(layers, cells)
-    assert got["c_rr_pct"] == got["grade_pct"] == got["grade_across_pct"] == 0.0
-    assert got["c_rr_all_pct"] > 1.0
-    assert got["grade_all_pct"] > 0.5
-
-
 def test_distance_from_a_break_of_slope_counts_from_the_ramps_foot():
     slope = np.zeros((5, 40, 2))
     slope[:, 20:, 0] = 0.1

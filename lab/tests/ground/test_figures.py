@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.ground.comparison import Comparison, cell_means, compare, crossings, lags, place, pool
-from lab.ground.figures import c_rr_bias, figures, soils
+from lab.ground.comparison import Comparison, cell_means, compare, crossings, lags, place
+from lab.ground.figures import figures, soils
 from lab.ground.truth import TrueGround, true_ground
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.ground_classes import UNKNOWN
@@ -90,24 +90,6 @@ def test_a_change_that_is_never_noticed_has_no_lag_and_one_that_is_noticed_befor
     assert np.isnan(figures(compared(0.04))["lag_s"])
 
 
-@pytest.mark.parametrize(("soil", "width_m", "count"), [("wet dirt", 3.0, 0), ("wet dirt", 5.0, 2), ("gravel", 5.0, 2)])
-def test_only_zones_that_last_have_a_lag(soil, width_m, count):
-    strip = ZoneConfig(soil, ((20.0, 0.0), (20.0 + width_m, 0.0), (20.0 + width_m, 20.0), (20.0, 20.0)))
-    assert len(crossings(EAST, ground(strip), START_NS)) == count
-
-
-def test_nothing_is_judged_before_the_machine_has_settled():
-    wrong_at_first = samples_of(EAST, lambda x: np.where(x < 10, 0.25, np.where(x < BORDER_M, 0.04, 0.06)))
-    row = figures(compare(wrong_at_first, EAST, HERE, LAG_S, START_NS + 5_000_000_000))
-    assert (row["right_class_pct"], row["cells"]) == (100.0, 30)
-
-
-def test_a_bias_is_found_on_flat_ground_away_from_borders():
-    judged = compared(steps_at(BORDER_M, off=0.004))
-    assert c_rr_bias(judged.placed) == pytest.approx(0.004, abs=1e-6)
-    assert figures(judged)["normalised_error"] == pytest.approx(2.0, abs=1e-3)
-
-
 def test_cells_take_the_mean_over_the_distance_that_samples_stand_for():
     """1 m at 0.03 and 3 m at 0.06 are 0.0525: wet dirt, where plain means would say dry."""
     rows = samples_of(EAST)[:2]
@@ -138,19 +120,6 @@ def test_slopes_have_cells_and_edges_of_their_own():
     assert row["grade_std_deg"] == pytest.approx(0.0, abs=0.05)
     flat = figures(compared(here=ramped, track=track))
     assert flat["wrong_slope_cells_pct"] == pytest.approx(100 * 10 / 40)
-
-
-def test_pooled_tours_weigh_by_their_samples():
-    right, wrong = (compared(c, ground()) for c in (0.04, 0.06))
-    assert figures(pool([right, wrong, wrong]))["right_class_pct"] == pytest.approx(100 / 3)
-    assert isinstance(pool([right]), Comparison)
-
-
-def test_nothing_judged_is_nothing_known():
-    judged = compare(samples_of(EAST)[:0], EAST, HERE, LAG_S, START_NS)
-    row = figures(judged)
-    assert row["cells"] == row["judged_samples"] == 0
-    assert np.isnan([row["right_class_pct"], row["wrong_cells_pct"], row["lag_s"], c_rr_bias(judged.placed)]).all()
 
 
 def test_borders_are_as_far_as_the_other_zone_is():

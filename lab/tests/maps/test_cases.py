@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.maps.cases import CASES, CaseMachine, MapCase, parking_place, select
-from lab.maps.samples import BUCKET_NS, STEP_M, cell_of, gauss_markov, simulate, sweep_lanes
+from lab.maps.cases import CaseMachine, MapCase, parking_place, select
+from lab.maps.samples import BUCKET_NS, cell_of, gauss_markov, simulate, sweep_lanes
 
 
 def case(name: str, columns: int = 60, rows: int = 40, index: int = 0) -> MapCase:
@@ -17,12 +17,6 @@ def rows_of(scene, machine: str):
     return np.concatenate([delivery.rows for delivery in scene.deliveries if delivery.machine == machine])
 
 
-def test_cases_come_in_the_order_of_the_table_and_by_name():
-    assert select([]) == CASES
-    assert [c.title for c in select(["slope_15", "repaved"])] == ["repaved, 1 after", "repaved, 2 after", "slope_15"]
-    assert len({c.name for c in CASES}) == len(CASES) == 12
-
-
 def test_position_errors_last_and_have_the_deviation_that_is_stated():
     """From the first sample on; 150 samples are 30 s."""
     draw = np.random.default_rng(2)
@@ -30,15 +24,6 @@ def test_position_errors_last_and_have_the_deviation_that_is_stated():
     assert np.std(errors) == pytest.approx(1.3, rel=0.05)
     assert np.std(first) == pytest.approx(1.3, rel=0.05)
     assert np.corrcoef(errors[:-150], errors[150:])[0, 1] == pytest.approx(np.exp(-1), abs=0.06)
-
-
-def test_headings_point_ahead():
-    sweep = sweep_lanes(case("1x1"), CaseMachine(passes=2), np.random.default_rng(3))
-    moved = np.stack([np.diff(sweep.x_m), np.diff(sweep.y_m)])
-    on_a_lane = np.hypot(*moved) < STEP_M + 1e-6
-    ahead = moved[0] * np.cos(sweep.heading_rad[1:]) + moved[1] * np.sin(sweep.heading_rad[1:])
-    np.testing.assert_allclose(ahead[on_a_lane], STEP_M)
-    assert on_a_lane.mean() > 0.95
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(9, 40), (60, 1)])
@@ -69,7 +54,7 @@ def test_the_parked_machine_stands_sends_all_the_time_and_drives_nothing():
     assert simulate(alone, 4).driven.sum() == simulate(case("1x1"), 4).driven.sum()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_zone_is_repaved_inside_a_bucket_while_the_fourth_pass_is_in_it(seed: int):
     scene = simulate(case("repaved", columns=150, rows=100), seed)
     assert scene.repaved_ns is not None

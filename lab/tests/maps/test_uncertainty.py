@@ -8,12 +8,9 @@ import pytest
 from lab.maps.methods import Hits
 from lab.maps.uncertainty import (
     Believed,
-    Forecast,
     by_frequency,
     by_mean,
     coverage_pct,
-    forecast_row,
-    layers_forecast,
     pooled,
 )
 from protocol.site.ground_classes import UNKNOWN
@@ -44,28 +41,6 @@ def test_scores_of_a_single_cell():
     assert both.calibration_error == pytest.approx((0.2 + 1.0) / 2)
 
 
-def test_bins_hold_every_cell_once_and_the_surest_are_in_the_last():
-    believed = Believed(np.array([0.0, 0.05, 0.1, 0.95, 1.0]), np.array([True, False, True, True, True]))
-    rows = believed.reliability
-    assert [row["cells"] for row in rows] == [2, 1, 0, 0, 0, 0, 0, 0, 0, 2]
-    assert (rows[0]["said"], rows[0]["right"], rows[2]["said"]) == (pytest.approx(0.025), 0.5, None)
-    assert rows[-1]["to"] == 1.0
-
-
-def test_nothing_known_has_no_score():
-    row = forecast_row({"method": "x"}, Believed(np.zeros(0), np.zeros(0, bool)))
-    assert (row["cells"], row["calibration_error"]) == (0, 0.0)
-    assert math.isnan(row["brier"])
-    assert math.isnan(row["log_score"])
-
-
-def test_only_known_cells_among_those_that_count_are_judged():
-    forecast = Forecast(np.array([[0, UNKNOWN], [2, 3]]), np.array([[0.9, 0.0], [0.6, 0.7]]))
-    judged = forecast.judged(np.array([[0, 1], [1, 3]]), np.array([[True, True], [True, False]]))
-    assert judged.confidence.tolist() == [0.9, 0.6]
-    assert judged.right.tolist() == [True, False]
-
-
 def test_the_last_value_is_as_likely_as_it_is_frequent():
     forecast = by_frequency(hits([0, 0, 0, 0], [0.04, 0.04, 0.06, 0.041]))
     assert forecast.kind.tolist() == [2, UNKNOWN]
@@ -86,10 +61,3 @@ def test_coverage_is_the_share_within_the_interval_of_what_is_known():
     assert coverage_pct(error, np.full(error.shape, 2.0)) == pytest.approx(95.0, abs=0.3)
     assert coverage_pct(np.array([0.0, 9.0, np.nan, 0.0]), np.array([1.0, 1.0, 1.0, np.nan])) == 50.0
     assert math.isnan(coverage_pct(np.array([np.nan]), np.array([1.0])))
-
-
-def test_the_servers_forecast_is_its_leading_class():
-    layers = {"resistance_class": np.array([3.0, np.nan]), "confidence": np.array([0.75, np.nan])}
-    forecast = layers_forecast(layers)
-    assert forecast.kind.tolist() == [3, UNKNOWN]
-    assert forecast.confidence.tolist() == [0.75, 0.0]

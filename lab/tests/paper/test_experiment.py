@@ -4,18 +4,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from lab import commands
 from lab.campaign.experiment import Runner
-from lab.campaign.goals import goals
 from lab.paper import experiment
 from lab.paper.drives import ALONE, FLEETS, QUICK, Plan
-from lab.paper.experiment import Outcomes, contradictions, map_row, position_row
+from lab.paper.experiment import Outcomes, contradictions, map_row
 from lab.paper.maps import OURS, PAPERS, SERVED
-from lab.positions.configurations import Configuration
-from lab.tests.positions.test_table import score
 from sitegrid.door import run
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
@@ -48,24 +44,6 @@ def test_estimates_are_compared_with_the_same_samples_corrected_by_the_truth():
     assert map_row(FLEETS[1], SERVED, seeds, [figures(9.0)] * 2)["above_true_pct"] == 0.0
     row = map_row(FLEETS[1], OURS, seeds, ())
     assert row["above_true_pct"] is row["paper"] is None
-
-
-def test_rows_of_both_tables_have_the_same_columns():
-    run = score(1.0)
-    position = position_row(QUICK, Configuration("ekf", 1, 1, "paper"), [run, run])
-    assert list(position) == list(map_row(ALONE[0], PAPERS, [figures(1.0)], ()))
-    assert (position["table"], position["net_m"], position["us_per_second"]) == ("positions", 1.0, 100)
-    assert position["paper"]["net_m"] == 3.7363
-    assert position["wrong_resistance_pct"] is None
-
-
-def test_goals_are_of_rows_that_a_full_plan_has():
-    plan = Plan((0,), 1200.0)
-    named = [
-        map_row(source, kind, [figures(1.0)], [figures(1.0)]) for source in plan.sources for kind in (OURS, SERVED)
-    ]
-    for goal in goals("paper"):
-        assert len([row for row in named if goal.row.items() <= row.items()]) == 1, goal
 
 
 def test_contradictions_of_the_paper_are_named():
@@ -108,14 +86,6 @@ def test_pictures_are_drawn(result, runner: Runner, tmp_path: Path):
     assert all(cv2.imread(str(path)).std() > 10 for path in paths)
 
 
-@pytest.mark.slow
-def test_the_papers_map_is_written_as_a_tensor(result, runner: Runner, tmp_path: Path):
-    experiment.write_map(result[1], runner, tmp_path / "map.npy")
-    made = np.load(tmp_path / "map.npy")
-    assert made.shape == (2, 200, 150, 3)
-    assert 100 < np.isfinite(made[0, ..., 2]).sum() < 1000
-
-
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
@@ -126,8 +96,3 @@ def test_options_reach_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
         assert run(["paper", "--json", "--out", str(tmp_path), *more], commands) == 0
     whole = Plan(range(12), 1200.0)
     assert asked == [whole, QUICK, replace(whole, sources=()), replace(whole, positions=())]
-
-
-def test_a_tensor_is_a_file_of_numpy(capsys: pytest.CaptureFixture[str]):
-    assert run(["paper", "--tensor", "map.csv"], commands) == 1
-    assert "map.npy" in capsys.readouterr().err

@@ -1,29 +1,23 @@
 """Maps of samples whose ground and errors are known: who has which places and values, and what is taken off."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from lab.calibration.drives import Agent, Scene
+from lab.calibration.drives import Scene
 from lab.campaign.true_maps import region_of, true_layers
 from lab.paper.maps import (
     AS_SENT,
     AS_TRUE,
-    KINDS,
-    LAYERS,
     OURS,
     PAPERS,
     PLOTTED_ESTIMATES,
     SERVED,
-    Fleet,
     MadeMaps,
     MapKind,
     make_maps,
     plotted,
     with_true_values,
 )
-from lab.positions.configurations import Configuration
 from lab.tests.calibration.scenes import made_scene
 from protocol.arrays import Table
 from sitegrid.proof.map_score import score
@@ -61,13 +55,6 @@ def test_true_values_are_those_of_the_true_place_wherever_a_sample_is_put(scene)
     np.testing.assert_allclose(there["x_m"] - here["x_m"], 30.0)
 
 
-def test_samples_of_no_known_place_have_no_true_value(scene):
-    rows, true = scene
-    late = rows["a"].copy()
-    late["stamp_ns"][-5:] += 10**13
-    assert len(with_true_values(late, true, "a")) == len(late) - 5
-
-
 @pytest.mark.slow
 def test_a_plotter_has_the_places_of_at_once_and_a_server_those_of_later(made: MadeMaps, scene):
     _, true = scene
@@ -84,22 +71,6 @@ def test_the_server_takes_errors_off_about_as_well_as_the_truth(made: MadeMaps, 
     assert served < best + 1.0
 
 
-@pytest.mark.slow
-def test_every_map_has_its_layers_and_every_method_its_forecast(made: MadeMaps, scene):
-    rows, true = scene
-    assert made.samples == sum(map(len, rows.values()))
-    assert made.layers.shape == (len(KINDS), len(LAYERS), *true.truth.c_rr.shape)
-    for kind in KINDS:
-        known = {name for name, values in made.layers_of(kind).items() if np.isfinite(values).any()}
-        assert known == (set(LAYERS) if kind.merge == "soft_votes" else {"resistance", "grade_east", "grade_north"})
-    for method in ("last_write", "mean"):
-        forecast = made.forecast(method)
-        there = forecast.kind >= 0
-        assert 100 < there.sum() < there.size
-        assert (forecast.confidence[there] > 0.2).all()
-        assert not forecast.confidence[~there].any()
-
-
 def test_the_newest_of_all_machines_is_written_last(scene):
     rows, true = scene
     first, second = rows["a"][:50].copy(), rows["a"][:50].copy()
@@ -108,9 +79,3 @@ def test_the_newest_of_all_machines_is_written_last(scene):
     for named in ({"a": first, "b": second}, {"a": second, "b": first}):
         values = plotted(named, true.truth)["resistance"]
         assert np.unique(values[np.isfinite(values)]) == pytest.approx([0.25])
-
-
-def test_names_of_files_tell_agents_apart():
-    plain = Agent(0, closed_tours=True)
-    with_sensors = replace(plain, configuration=Configuration("ukf", 2, 1, "paper"))
-    assert len({Fleet(agents).name for agents in ((plain,), (with_sensors,), (plain, replace(plain, index=1)))}) == 3

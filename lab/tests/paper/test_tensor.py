@@ -1,10 +1,8 @@
 """The paper's tensor: places and values where they belong."""
 
-from pathlib import Path
-
 import numpy as np
 
-from lab.paper.tensor import tensor, write_tensor
+from lab.paper.tensor import tensor
 from sim.truth import TruthMap
 
 ROWS, COLUMNS = 2, 3
@@ -30,8 +28,3 @@ def test_a_cell_that_was_never_passed_is_nan_and_has_a_place():
     assert np.isnan(made[..., 2]).sum() == 2
     np.testing.assert_allclose(made[0, 1, 0, :2], [11.5, 20.5])
     assert np.isfinite(made[..., :2]).all()
-
-
-def test_it_is_written_as_numpy_reads_it(tmp_path: Path):
-    write_tensor(tmp_path / "map.npy", LAYERS, TRUTH)
-    np.testing.assert_array_equal(np.load(tmp_path / "map.npy"), tensor(LAYERS, TRUTH))

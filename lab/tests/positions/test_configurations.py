@@ -1,12 +1,10 @@
 """The paper's table: its rows, its figures, and how a row becomes a machine and options."""
 
-import pytest
-
 from lab.campaign.recordings import PlannedDrive
 from lab.positions import configurations as table
 from lab.positions import published
 from lab.positions.configurations import Configuration
-from sitegrid.logs.sensors import UnsupportedError, select
+from sitegrid.logs.sensors import select
 
 
 def used(machine):
@@ -22,22 +20,9 @@ def test_the_table_has_every_configuration_of_the_paper_in_both_profiles_and_one
     assert Configuration("ukf", 3, 1, "paper").published_net_m is None
 
 
-def test_shares_repeat_the_rows_that_have_receivers_the_first_share_first():
-    rows = table.configurations(shares=(0.0, 0.5))
-    assert len(rows) == len(set(rows)) == len({row.name for row in rows}) == 36 + 32
-    assert [row.machine_share for row in rows] == [0.0] * 36 + [0.5] * 32
-    assert {row.gps for row in rows[36:]} == {1, 2, 3}
-    assert {row.machine_share for row in table.configurations()} == {None}
-
-
 def test_sensors_of_a_row_are_in_use_and_no_others():
     machine = PlannedDrive(0, 1.0).machine
     rest = {"torque", "wheels", "articulation"}
     assert set(used(select(machine, 2, 1))) == rest | {"imu-3", "attitude-3", "gps-1", "gps-2"}
     assert set(used(select(machine, 0, 3))) == rest | {f"{k}-{i}" for k in ("imu", "attitude") for i in (1, 3, 4)}
     assert used(select(machine)) == used(machine)
-
-
-def test_more_receivers_than_there_are_is_refused():
-    with pytest.raises(UnsupportedError, match="3 GPS receivers, not 4"):
-        select(PlannedDrive(0, 1.0).machine, gps=4)

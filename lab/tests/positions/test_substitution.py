@@ -8,7 +8,6 @@ import pytest
 
 from lab.campaign.recordings import PAPER, PlannedDrive, RecordedDrive, load, make
 from lab.positions.substitution import (
-    GpsErrors,
     TrueMotion,
     gps_errors,
     true_motion,
@@ -85,12 +84,3 @@ def test_slow_errors_correlate_by_the_shares_and_white_ones_never(machine_share:
         for axis in range(3):
             assert np.corrcoef(a.slow_m[:, axis], b.slow_m[:, axis])[0, 1] == pytest.approx(expected, abs=tolerance)
             assert np.corrcoef(a.white_m[:, axis], b.white_m[:, axis])[0, 1] == pytest.approx(0, abs=tolerance)
-
-
-def test_a_stamp_at_which_no_receiver_reads_is_an_error():
-    errors = gps_errors(DRIVE.machine, NOISE, 5, START_NS + 2_000_000_000)["gps-1"]
-    assert errors.rows(errors.stamp_ns[[3, 1]]).tolist() == [3, 1]
-    for off in (1, -200_000_000, 10**12):
-        with pytest.raises(ValueError, match="between its instants"):
-            errors.rows(errors.stamp_ns[:1] + off)
-    assert isinstance(errors, GpsErrors)

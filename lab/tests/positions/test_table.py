@@ -4,14 +4,12 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from lab.campaign.recordings import PAPER, PlannedDrive, load, make
 from lab.positions import table
 from lab.positions.configurations import Configuration
-from lab.positions.table import paired_ratio, ratios, summarise
-from protocol.machine.machine_config import MachineConfig
+from lab.positions.table import ratios, summarise
 from sitegrid.logs.replay import Score
 
 FAST = replace(PAPER, world="fast")
@@ -36,13 +34,6 @@ def test_row_has_means_over_seeds_and_stands_beside_the_paper():
     assert row["ci95_m"] == pytest.approx(12.7062 * math.sqrt(0.5) / math.sqrt(2), abs=1e-3)
 
 
-def test_pairing_takes_out_what_recordings_have_in_common():
-    hard = np.random.default_rng(6).uniform(1, 4, 12)
-    ratio, half = paired_ratio(0.7 * hard, hard)
-    assert ratio == pytest.approx(0.7)
-    assert half == pytest.approx(0.0, abs=1e-12)
-
-
 def test_ratios_are_of_profiles_and_of_filters_that_were_both_run():
     rows = {(f, p): Configuration(f, 1, 1, p) for f, p in (("ukf", "paper"), ("ukf", "default"), ("ekf", "default"))}
     net = {("ukf", "paper"): 2.0, ("ukf", "default"): 1.0, ("ekf", "default"): 1.1}
@@ -64,14 +55,6 @@ def test_one_more_receiver_is_compared_on_the_same_fixes():
     ]
 
 
-def test_smoothed_poses_stand_beside_the_live_ones_of_the_same_drives():
-    runs = [score(2.0, smoothed=(1.5, 1.8, 0.96)), score(4.0, smoothed=(3.3, 2.2, 0.94))]
-    row = summarise(ONE, runs)
-    assert (row["smoothed_net_m"], row["smoothed_nees"], row["smoothed_coverage95"]) == (2.4, 2.0, 0.95)
-    (ratio,) = ratios({ONE: runs})
-    assert (ratio["ratio"], ratio["net"]) == ("smoothed/live", 0.8)
-
-
 # --- on recordings ---------------------------------------------------------------------------------------------------
 
 
@@ -91,17 +74,3 @@ def test_the_share_that_was_recorded_is_the_recording_itself(cache: Path):
     pairs = list(zip(recording.readings, shared.readings, strict=True))
     assert all(a.stamp_ns == b.stamp_ns and a.sensor == b.sensor for a, b in pairs)
     assert {a.sensor for a, b in pairs if a != b} == {"gps-1", "gps-2", "gps-3"}
-
-
-@pytest.mark.slow
-def test_a_configuration_that_never_had_a_pose_still_has_a_row(cache: Path, monkeypatch: pytest.MonkeyPatch):
-    """Without a single GPS fix the machine cannot know where it is."""
-    monkeypatch.setattr(table, "select", _deaf)
-    run = table._replay(table.replay_task(ONE, DRIVE), cache)
-    row = table.summarise(ONE, [run])
-    assert row["covered"] == 0.0
-    assert math.isnan(row["net_m"])  # the command prints null
-
-
-def _deaf(machine: MachineConfig, *_: int) -> MachineConfig:
-    return replace(machine, sensors=tuple(replace(s, use=s.use and s.kind != "gps") for s in machine.sensors))

@@ -71,15 +71,6 @@ def test_a_change_that_nothing_shows_is_found_nowhere():
     assert pooled([each[SEGMENTS]])["recall_1_pct"] is None
 
 
-@pytest.mark.slow
-def test_what_is_said_of_ground_that_did_not_change_is_wrong_and_an_alarm():
-    recorded, nothing = drive(7), ChangedGround(WINDOW, np.zeros((WINDOW.rows, WINDOW.columns), np.bool_))
-    whole = roads(recorded.rows)
-    for part in changes(recorded, whole, SegmentRepairs.of_recording(recorded, whole), nothing)[1:]:
-        assert part.said > 200
-        assert (part.right, part.false_alarms, part.passes) == (0, 1, [])
-
-
 def track(*points: tuple[float, float, float]) -> TrueTrack:
     """A machine that is at places x, y after seconds, with a straight line between."""
     second, x, y = np.array(points).T

@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import kendalltau
 
-from lab.campaign.figures import judge
 from lab.campaign.goals import goals
-from lab.campaign.summary import chosen
 from lab.roads import experiment
 from lab.roads.drives import BAD, planned
 from lab.roads.score import Recorded, kendall, kept_after, roads
-from protocol.errors import ConfigError
 from sim.scenario.file import load_scenario
 from tests.unit.mapserver.roads.drives import along, passes
 
@@ -29,11 +26,6 @@ def test_tau_with_ties_on_both_sides():
     assert kendall(np.zeros(3), np.arange(3.0), 0.5, 0.5) == 0.0
 
 
-def test_an_order_without_ties_is_never_all_in_order_with_one_that_has_them():
-    right = np.array([10.0, 9.9, 5.0, 5.1, 0.0, 0.1])  # 3 of 15 pairs are ties
-    assert kendall(right, right, 0.0, 0.5) == pytest.approx(np.sqrt(12 / 15))
-
-
 @pytest.mark.parametrize("scenario", ["haul_road", "paper_site"])
 def test_patches_are_drawn_from_the_seed(tmp_path, scenario):
     drives = [planned(scenario, seed, 90.0, repairs=True) for seed in (3, 3, 4)]
@@ -48,36 +40,6 @@ def test_patches_are_drawn_from_the_seed(tmp_path, scenario):
     assert made.change
     assert all(change.at_s == 45.0 and change.outline in bad for change in made.change)
     assert "change" not in planned(scenario, 3, 90.0).scenario_toml
-
-
-def test_rows_sum_repairs_and_take_medians_of_the_rest():
-    seed = {
-        "repairs": 4,
-        "seen_2": 3,
-        "seen_3": 4,
-        "looks": 100,
-        "cells": 40.0,
-        "cells_changed": 10.0,
-        "cells_since": 30.0,
-        "false_alarms": 0,
-        "saved_j": 9.0,
-        "true_saved_j": 10.0,
-    }
-    row = experiment.row_of(experiment.CASES[3], [seed, {**seed, "seen_2": 1, "false_alarms": 1}])
-    assert (row["repairs"], row["seen_2_pct"], row["seen_3_pct"]) == (8, 50.0, 100.0)
-    assert (row["false_per_1000"], row["saved_pct"]) == (5.0, -10.0)
-    assert (row["cells_changed_pct"], row["cells_since_pct"]) == (25.0, 75.0)
-    plain = experiment.row_of(experiment.CASES[0], [{"c_pct": 3.0}, {"c_pct": 9.0}, {"c_pct": 4.0}])
-    assert plain["c_pct"] == 4.0
-    assert len(plain["by_seed"]) == 3
-    assert judge(goals("roads")[:1], [plain])[0]["met"]
-
-
-def test_cases_are_chosen_by_name_and_others_refused():
-    assert [case.name for case in chosen(experiment.CASES, ["repairs", "haul_road"])] == ["haul_road", "repairs"]
-    assert chosen(experiment.CASES, []) == experiment.CASES
-    with pytest.raises(ConfigError, match="`haul` is not known; known: haul_road"):
-        chosen(experiment.CASES, ["haul"])
 
 
 def test_names_are_those_of_the_day_before_where_the_same_roads_are_driven():

@@ -44,19 +44,6 @@ def test_a_tour_without_stops_is_cut_into_whole_turns():
     assert list(_laps(straight, 0, len(speed))) == []
 
 
-def test_a_line_that_is_crossed_is_no_turn():
-    """A figure of eight comes by its begin once at a right angle, which does not close it."""
-    angle = np.linspace(0, 2 * np.pi, 4000)
-    place = 100 * np.stack([np.sin(angle), np.sin(2 * angle)], axis=1)
-    along = np.diff(place, axis=0)
-    twice = np.concatenate([along, along, along])
-    speed = np.hypot(*twice.T) * HZ
-    _, course = track(speed, np.arctan2(twice[:, 1], twice[:, 0]))
-    laps = list(_laps(course, 0, len(speed)))
-    whole = np.hypot(*along.T).sum()
-    assert [course.driven_m[end] - course.driven_m[begin] for begin, end in laps] == pytest.approx([whole] * 2, abs=2.0)
-
-
 def test_legs_over_one_line_with_one_load_are_one_drive():
     x = np.arange(400.0)
     there = np.stack([x, 0 * x], axis=1)

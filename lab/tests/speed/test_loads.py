@@ -10,20 +10,15 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from agents.pipeline import Pipeline
-from agents.positioning import PipelineConfig
-from lab.speed import agent, fleet, ingest, merge, query, restart, scaling, sim, site
 from lab.speed import filter as filters
+from lab.speed import fleet, ingest, merge, query, restart, scaling, sim, site
 from lab.speed.__main__ import LOADS, OPTIONS, load_of, main
-from lab.speed.measure import in_turn, judged, rows_of, scattered, track
-from mapserver.evidence.grid import Grid
-from mapserver.ingest.store import Store
-from mapserver.journal.location import JournalLocation
+from lab.speed.measure import in_turn, scattered, track
 from protocol.errors import Refusal
 from protocol.wire.codec import decode_batch
 from protocol.wire.messages import Ack, Refused
 from tests.paths import ROOT
-from tests.site_work import START_NS, batches, samples_of, seconds_of, write_store
+from tests.site_work import batches, samples_of, seconds_of, write_store
 
 # The smallest size of each load, and cases that it must have.
 SMALLEST = {
@@ -76,15 +71,6 @@ def test_every_load_prints_figures_in_the_same_columns(name, small, capsys):
         assert judgements == dict(load_of(name).GOALS)
 
 
-def test_a_table_has_the_columns_of_the_json(monkeypatch, capsys):
-    monkeypatch.setattr(sim, "run", lambda **_: rows_of("pybullet, 1", {sim.PACE: 26.0, "none": None}))
-    main(["sim"])
-    head, first, second = capsys.readouterr().out.splitlines()
-    assert head.split() == COLUMNS
-    assert first.split() == ["pybullet,", "1", sim.PACE, "26.0", ">=", "25", "True"]
-    assert second.split()[-4:] == ["none", "-", "-", "-"]
-
-
 @pytest.mark.parametrize("name", LOADS)
 def test_an_option_that_does_nothing_for_a_load_or_is_not_positive_is_refused(name, capsys):
     own = load_of(name).OPTIONS
@@ -112,12 +98,6 @@ def test_variants_take_turns_and_medians_count():
     assert order == ["a", "b"] * 3
 
 
-def test_a_goal_that_is_missed_or_not_measured_is_not_met():
-    goals = {("a", "x"): "<= 2", ("a", "y"): ">= 2", ("b", "x"): "<= 2"}
-    rows = [*rows_of("a", {"x": 2.0, "y": 1.9, "z": 1.0}), *rows_of("b", {"x": None})]
-    assert [row["met"] for row in judged(rows, goals)] == [True, False, None, False]
-
-
 @pytest.mark.parametrize("draw", [track, scattered])
 def test_both_plain_sums_are_those_of_bincount(draw):
     rows = draw(3000)
@@ -131,29 +111,6 @@ def test_both_plain_sums_are_those_of_bincount(draw):
         for part in (rows[:1000], rows[1000:]):
             add(total, part)
         np.testing.assert_allclose(total, np.stack(expected, axis=1), rtol=1e-9, atol=1e-15)
-
-
-def test_a_second_of_site_time_is_read_at_once():
-    rows = track(250)  # 10 ms apart, the first one at the beginning of a second
-    parts = list(merge.spans(rows, merge.SECOND_NS))
-    assert [len(part) for part in parts] == [100, 100, 50]
-    assert np.concatenate(parts).tobytes() == rows.tobytes()
-
-
-def test_own_and_stock_filters_move_alike():
-    start = filters._start()
-    moves = filters.motion(filters.MODEL, start, 0.3)
-    np.testing.assert_allclose(filters._stock_motion(start.x, 0.3), moves.f(start.x[None])[0], atol=1e-14)
-
-
-def test_the_agents_readings_come_at_their_rates_and_give_a_pose():
-    pipeline = Pipeline(agent.SITE, agent.machine(), PipelineConfig())
-    for readings in agent.bundles(20):
-        counts = {s.name: sum(r.sensor == s.name for r in readings) for s in agent.machine().sensors}
-        assert counts == {"imu": 100, "wheels": 50, "gps-1": 5, "gps-2": 5}
-        pipeline.step(readings)
-    assert pipeline.pose is not None
-    assert math.dist((pipeline.pose.x_m, pipeline.pose.y_m), agent.place(agent.progress(20)[0])[:2]) < 1.0
 
 
 def test_a_fold_that_lacks_samples_is_no_measurement(tmp_path, monkeypatch):
@@ -217,21 +174,7 @@ def test_a_machine_that_was_refused_sends_the_same_again(monkeypatch):
     assert len(result.ms) * site.SAMPLES == result.samples
 
 
-def test_a_refusal_that_stays_ends_the_measurement():
-    (one,) = site.fleet([Link()], 1)
-    with pytest.raises(RuntimeError, match="refused a batch"):
-        site._take(one, Refused(Refusal.WRONG_FRAME, ""), 0.0, 1.0, site.Sent())
-
-
 # --- a site's work ---------------------------------------------------------------------------------------------------
-
-
-def test_work_drives_a_tenth_of_a_square_kilometre():
-    rows = np.concatenate([rows for _, rows in islice(batches(), samples_of(2.0) // 100)])
-    driven = {(x, y) for x, y in zip((rows["x_m"] // 10).tolist(), (rows["y_m"] // 10).tolist(), strict=True)}
-    roads = sum(min(x % 25, 24 - x % 25) == 0 or min(y % 25, 24 - y % 25) == 0 for x, y in driven)
-    assert 0.95 * len(driven) < roads <= len(driven)  # along roads every 250 m, errors of position aside
-    assert rows["distance_m"].sum() == pytest.approx(10 * 3.0 * 2 * 3600, rel=0.01)
 
 
 def test_work_is_a_function_of_its_seed_and_a_second_has_what_ten_machines_drive_in_it():
@@ -241,20 +184,6 @@ def test_work_is_a_function_of_its_seed_and_a_second_has_what_ten_machines_drive
     assert len({name for name, _ in first}) == len(first) == 10
     assert {len(rows) for _, rows in first} == {6}
     assert samples_of(10.0) == 2_160_000
-
-
-def test_a_store_with_a_snapshot_and_a_tail_holds_the_same_grid_as_folding_all_of_it(tmp_path):
-    write_store(tmp_path, site.SITE, 20, tail_rows=7)
-    store, grid = (
-        Store(JournalLocation(tmp_path), site.SITE, restart.CONFIG, lambda: START_NS),
-        Grid(1.0, restart.CONFIG.fold),
-    )
-    for name, rows in islice(batches(), 20):
-        grid.fold(rows, name)
-    one, other = store.grid.state(), grid.state()
-    store.close()
-    assert one.folded == other.folded == 2000
-    assert [at.page.votes.tobytes() for at in one.pages] == [at.page.votes.tobytes() for at in other.pages]
 
 
 def test_the_page_of_many_sites_has_the_tables_that_follow_from_what_was_measured():

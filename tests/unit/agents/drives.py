@@ -15,6 +15,7 @@ import numpy as np
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.balance import front_share, squat_rad
 from agents.localisation.filters.belief import Belief, PoseBelief
+from agents.localisation.filters.state import YAW
 from agents.localisation.localiser import STEP_S, LocalisationConfig, Localiser
 from agents.stream_order import by_stamp
 from protocol.arrays import Floats, Table
@@ -93,6 +94,16 @@ class Drive:
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
         i = round((stamp_ns - START_NS) * 1e-9 / TRUE_STEP_S) - 1
         return float(self.x_m[i]), float(self.y_m[i]), float(self.heading_rad[i])
+
+    def off_m(self, located: PoseBelief | Belief) -> float:
+        """How far off a pose lies."""
+        x, y = located.x[:2] if isinstance(located, Belief) else (located.x_m, located.y_m)
+        return math.dist((x, y), self.at(located.stamp_ns)[:2])
+
+    def turned_rad(self, located: PoseBelief | Belief) -> float:
+        """How far off its heading is."""
+        heading = float(located.x[YAW]) if isinstance(located, Belief) else located.heading_rad
+        return abs(math.remainder(heading - self.at(located.stamp_ns)[2], math.tau))
 
 
 def drive(
@@ -254,8 +265,13 @@ def simulated(seed: int, seconds: float, **options: Any) -> tuple[SiteConfig, Ma
     return simulator.site, simulator.machines[0], readings, simulator.tracks()["loader-1"]
 
 
-def after(reading: Reading, seconds: float) -> bool:
-    return reading.stamp_ns > START_NS + seconds * 1e9
+def seconds(made: Reading | PoseBelief | Belief) -> float:
+    """Since the start."""
+    return (made.stamp_ns - START_NS) * 1e-9
+
+
+def after(reading: Reading, at_s: float) -> bool:
+    return reading.stamp_ns > START_NS + at_s * 1e9
 
 
 def with_ahrs(made: Drive, off_rad: float = 0.0, from_s: float = 0.0, variance: float = 1e-4) -> list[Reading]:

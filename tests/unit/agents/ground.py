@@ -72,7 +72,6 @@ class EstimatorRun:
         machine: MachineConfig,
         config: EstimationConfig | None = None,
         *,
-        lag_s: float = 1.5,
         calibration: Calibration | None = None,
         known_c_rr: float | None = None,
         knows_place: bool = False,
@@ -81,7 +80,7 @@ class EstimatorRun:
         self.estimator = GroundEstimator(machine, config or EstimationConfig(), calibration)
         self.dead_reckoning = DeadReckoning(machine, 0.0)
         self.estimates: list[tuple[int, GroundEstimate]] = []
-        self._machine, self._lag_ns, self._known_c_rr = machine, round(lag_s * 1e9), known_c_rr
+        self._machine, self._known_c_rr = machine, known_c_rr
         self._asked_ns = 0
         self._knows_place = knows_place
 
@@ -92,16 +91,15 @@ class EstimatorRun:
             self.estimator.update(reading, sensor, self.dead_reckoning, self._known_c_rr, self._pose())
             if reading.stamp_ns - self._asked_ns >= 100_000_000:
                 self._asked_ns = reading.stamp_ns
-                stamp_ns = reading.stamp_ns - self._lag_ns
+                stamp_ns = reading.stamp_ns - 1_500_000_000
                 self.estimates.append((stamp_ns, self.estimator.at(stamp_ns)))
         return self
 
     def _pose(self) -> PoseBelief | None:
         at = self.dead_reckoning.pose
         speed_mps = self.dead_reckoning.wheels.speed_mps
-        return (
-            PoseBelief(at.stamp_ns, at.x_m, at.y_m, at.angle_rad, speed_mps, np.eye(2)) if self._knows_place else None
-        )
+        pose = PoseBelief(at.stamp_ns, at.x_m, at.y_m, at.angle_rad, speed_mps, np.eye(2))
+        return pose if self._knows_place else None
 
     @property
     def last(self) -> GroundEstimate:

@@ -45,7 +45,7 @@ from tests.unit.agents.drives import (
     with_ahrs,
 )
 from tests.unit.agents.localisation import test_foreign_logs as carts
-from tests.unit.agents.localisation import test_gps_velocity as doppler
+from tests.unit.agents.localisation import test_gps as doppler
 from tests.unit.agents.localisation import test_turns as trucks
 
 FIGURES = Path(__file__).with_name("golden_drives.json")

@@ -1,4 +1,3 @@
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -8,13 +7,10 @@ from agents.holdout import Holdout, HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
-from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity, Reading
-from tests.paths import ROOT
 from tests.unit.agents.drives import S_BEND, SITE, Drive, changed_sensor, drive, fix, machine
 
-HUSKY = ROOT.parent / "shared" / "data" / "rl_test1_husky"
 CONFIG, SETTLE_S = HoldoutConfig(period_s=5.0, off_s=1.0), 10.0
 CHEAP = PipelineConfig(LocalisationConfig(filter="ekf"))
 
@@ -51,8 +47,6 @@ def test_withheld_fixes_never_reach_the_pipeline(vehicle: MachineConfig, made: D
     moved = [replace(r, lat_deg=r.lat_deg + 0.001) if r in withheld else r for r in made.readings]
     pipelines = [run(vehicle, readings)[0] for readings in (made.readings, moved)]
     assert pipelines[0].health() == pipelines[1].health()
-    assert pipelines[0].pose
-    assert pipelines[1].pose
     assert pipelines[0].pose.x_m == pipelines[1].pose.x_m
     assert not any("gated" in name for name in pipelines[1].health()["counters"])
 
@@ -71,8 +65,8 @@ def test_errors_are_right_on_a_made_up_case(vehicle: MachineConfig, made: Drive)
     assert report["fixes"] == 20  # 5 Hz for 1 s in 5, from 10 to 30 s
     assert report["rms_m"] == pytest.approx(off_m, abs=0.5)
     assert report["median_m"] == pytest.approx(off_m, abs=0.5)
-    assert report["median_m"] <= report["max_m"]
-    assert report["rms_m"] <= report["max_m"]
+    none = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None, "end_m": None}
+    assert run(vehicle, made.readings[:100])[1] == none
 
 
 @pytest.mark.slow
@@ -101,47 +95,7 @@ def test_velocities_are_withheld_with_the_fixes_and_judged_by_nobody(made: Drive
     assert holdout.report()["fixes"] == 0
 
 
-@pytest.mark.slow
-def test_report_without_a_judged_fix_says_so(vehicle: MachineConfig, made: Drive) -> None:
-    none = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None, "end_m": None}
-    assert run(vehicle, made.readings[:100])[1] == none
-    assert run(vehicle, made.readings, settle_s=1000.0)[1] == none
-
-
-@pytest.mark.parametrize(
-    ("config", "withheld"), [(CONFIG, 30), (HoldoutConfig(10.0, 1.0), 15), (HoldoutConfig(5.0, 2.0), 60)]
-)
-def test_options_say_how_many_fixes_are_withheld(
-    vehicle: MachineConfig, made: Drive, config: HoldoutConfig, withheld: int
-) -> None:
-    """30 s of fixes at 5 Hz."""
-    readings = [r for r in made.readings if r.stamp_ns < made.readings[0].stamp_ns + 30 * 10**9]
-    assert len(readings) - len(Holdout(SITE, vehicle, config).split(readings)) == pytest.approx(withheld, abs=1)
-
-
 @pytest.mark.parametrize(("name", "value"), [("period_s", 1.0), ("off_s", 0.0)])
 def test_bad_holdout_option_is_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         HoldoutConfig(**{name: value})
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not HUSKY.is_dir(), reason=f"no recording in {HUSKY}")
-@pytest.mark.nightly
-def test_real_log_gives_samples_without_resistance_and_a_small_error_where_gps_was_withheld() -> None:
-    log = open_log(ROOT / "lab" / "logs" / "rl_test1_husky", HUSKY)
-    pipeline, holdout = (
-        Pipeline(log.site, log.machine, PipelineConfig()),
-        Holdout(log.site, log.machine, HoldoutConfig()),
-    )
-    readings = list(log.readings())
-    made = []
-    for i in range(0, len(readings), 10):
-        made.append(pipeline.step(holdout.split(readings[i : i + 10])).pending)
-        holdout.compare(pipeline)
-    assert sum(map(len, made)) >= 500
-    assert all(math.isnan(c) for rows in made for c in rows["c_rr"])
-    report = holdout.report()
-    assert (report["fixes"] or 0) > 50
-    assert report["rms_m"] is not None
-    assert report["rms_m"] < 2.0

@@ -1,12 +1,11 @@
 """Receivers that are off, hang or repeat themselves: positions recover, and nothing wrong reaches the map.
 
-Each drive is made up, with a slow and a white error of the receiver; each fault is judged beside the drive without it.
+The drive is made up, with a slow and a white error of the receiver; each fault is judged beside the drive without it.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import Enum
 from functools import cache
 from itertools import groupby
 
@@ -18,60 +17,54 @@ from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import joined
 from protocol.arrays import Floats
-from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, Reading
-from tests.unit.agents.drives import PROJECTION, SITE, START_NS, VEHICLE, Drive, Leg, drive, noisy, thinned
+from tests.unit.agents.drives import (
+    PROJECTION,
+    SITE,
+    VEHICLE,
+    Leg,
+    changed_sensor,
+    drive,
+    noisy,
+    seconds,
+    thinned,
+)
 
 STD_M, SLOW_SHARE, SLOW_S = 1.2, 0.75, 45.0  # of the receiver, as it states and as a machine's description has it
-LEGS = (Leg(3), Leg(4, 1.0), Leg(6), *[Leg(5, 0.0, 0.25), Leg(7), Leg(4, 0.0, -0.3), Leg(6)] * 4)
-SETTLED_S = 30.0  # of good input
+RECEIVER = changed_sensor(VEHICLE, "gps-1", drift_share=SLOW_SHARE, drift_time_s=SLOW_S)
+LEGS = (Leg(3), Leg(4, 1.0), Leg(6), *[Leg(5, 0.0, 0.25), Leg(7), Leg(4, 0.0, -0.3), Leg(6)] * 3)  # 79 s
+SETTLED_S = 25.0  # of good input
 SEED = 1
-Change = Callable[[Gps, float], Gps]  # a fix, and seconds since the begin
+Fault = Callable[[list[Reading]], list[Reading]]
 
 
-def shifted(fix: Gps, off_m: float, std_m: float = STD_M) -> Gps:
-    """The fix so far to the north-east."""
+def shifted(fix: Gps, east_m: float, north_m: float, std_m: float = STD_M) -> Gps:
     x, y, z = PROJECTION.to_map(fix.lat_deg, fix.lon_deg, fix.height_m)
-    lat, lon, _ = PROJECTION.to_geodetic(x + 0.6 * off_m, y + 0.8 * off_m, z)
+    lat, lon, _ = PROJECTION.to_geodetic(x + east_m, y + north_m, z)
     return replace(fix, lat_deg=lat, lon_deg=lon, var_e_m2=std_m**2, var_n_m2=std_m**2)
 
 
-def off(metres: float, seconds: float, *, states: bool) -> Change:
-    """A receiver that has just started."""
-    return lambda fix, s: shifted(fix, metres, metres if states else STD_M) if s < seconds else fix
+def off(metres: Callable[[float], float], *, states: bool) -> Fault:
+    """A receiver that has just started is so far off after some seconds."""
 
+    def changed(fix: Gps) -> Gps:
+        off_m = metres(seconds(fix))
+        return shifted(fix, 0.6 * off_m, 0.8 * off_m, math.hypot(STD_M, off_m) if states else STD_M)
 
-def converging(metres: float, tau_s: float) -> Change:
-    def changed(fix: Gps, s: float) -> Gps:
-        left_m = metres * math.exp(-s / tau_s)
-        return shifted(fix, left_m, math.hypot(STD_M, left_m))
-
-    return changed
-
-
-@dataclass(frozen=True)
-class Fault:
-    """What a receiver does, and from when on its fixes are good again [s]."""
-
-    changed: Callable[[list[Reading]], list[Reading]]
-    good_s: float
-
-
-def each(change: Change, good_s: float) -> Fault:
-    return Fault(lambda rs: [change(r, since(r)) if isinstance(r, Gps) else r for r in rs], good_s)
+    return lambda readings: [changed(r) if isinstance(r, Gps) else r for r in readings]
 
 
 def frozen(begin_s: float, end_s: float) -> Fault:
     """A receiver that hangs: it repeats its last fix bit for bit."""
 
     def changed(readings: list[Reading]) -> list[Reading]:
-        last = next(r for r in reversed(readings) if isinstance(r, Gps) and since(r) < begin_s)
+        last = next(r for r in reversed(readings) if isinstance(r, Gps) and seconds(r) < begin_s)
         return [
-            replace(last, stamp_ns=r.stamp_ns) if isinstance(r, Gps) and begin_s <= since(r) < end_s else r
+            replace(last, stamp_ns=r.stamp_ns) if isinstance(r, Gps) and begin_s <= seconds(r) < end_s else r
             for r in readings
         ]
 
-    return Fault(changed, end_s)
+    return changed
 
 
 def held(readings: list[Reading]) -> list[Reading]:
@@ -88,47 +81,26 @@ def held(readings: list[Reading]) -> list[Reading]:
     return table
 
 
-class Faults(Enum):
-    """Scenarios, of public reports by users of receivers."""
-
-    OFF_AND_SAYS_SO = each(off(30.0, 6.0, states=True), 6.0)
-    OFF_FOR_LONG_AND_SAYS_SO = each(off(60.0, 20.0, states=True), 20.0)
-    OFF_AND_SURE = each(off(40.0, 6.0, states=False), 6.0)
-    OFF_FOR_LONG_AND_SURE = each(off(25.0, 20.0, states=False), 20.0)
-    CONVERGING = each(converging(40.0, 4.0), 16.0)
-    FROZEN = frozen(30.0, 70.0)
-    FROZEN_FROM_THE_START = frozen(2.0, 25.0)
-    HELD = Fault(held, 0.0)
-
-
-def since(reading: Reading) -> float:
-    return (reading.stamp_ns - START_NS) * 1e-9
+FAULTS: dict[str, tuple[Fault, float]] = {  # of public reports by users of receivers, and when fixes are good again [s]
+    "off, and says so": (off(lambda s: 30.0 * (s < 6), states=True), 6.0),
+    "off, and sure": (off(lambda s: 25.0 * (s < 20), states=False), 20.0),
+    "converging": (off(lambda s: 40.0 * math.exp(-s / 4), states=True), 16.0),
+    "frozen": (frozen(20.0, 40.0), 40.0),
+    "frozen from the start": (frozen(2.0, 25.0), 25.0),
+    "held": (held, 0.0),
+}
 
 
 @cache
-def truth() -> Drive:
-    return drive(LEGS, machine())
-
-
-def machine() -> MachineConfig:
-    receiver = {"drift_share": SLOW_SHARE, "drift_time_s": SLOW_S}
-    sensors = (replace(s, **receiver) if s.kind == "gps" else s for s in VEHICLE.sensors)
-    return replace(VEHICLE, sensors=tuple(sensors))
-
-
-@cache
-def measured(seed: int) -> list[Reading]:
+def measured() -> list[Reading]:
     """The drive with the errors of a receiver; a quarter of the fast readings are enough here, and save time."""
-    rng, slow_m = np.random.default_rng(seed), math.sqrt(SLOW_SHARE) * STD_M
+    rng, slow_m = np.random.default_rng(SEED), math.sqrt(SLOW_SHARE) * STD_M
     readings, error = [], slow_m * rng.standard_normal(2)
     kept = math.exp(-0.2 / SLOW_S)
-    for r in noisy(thinned(truth().readings, 40), seed):
+    for r in noisy(thinned(drive(LEGS, RECEIVER).readings, 40), SEED):
         if isinstance(r, Gps):
             error = kept * error + slow_m * math.sqrt(1 - kept**2) * rng.standard_normal(2)
-            e, n = error + math.sqrt(1 - SLOW_SHARE) * STD_M * rng.standard_normal(2)
-            x, y, z = PROJECTION.to_map(r.lat_deg, r.lon_deg, r.height_m)
-            lat, lon, _ = PROJECTION.to_geodetic(x + e, y + n, z)
-            r = replace(r, lat_deg=lat, lon_deg=lon, var_e_m2=STD_M**2, var_n_m2=STD_M**2)
+            r = shifted(r, *(error + math.sqrt(1 - SLOW_SHARE) * STD_M * rng.standard_normal(2)).tolist())
         readings.append(r)
     return readings
 
@@ -145,51 +117,39 @@ class Outcome:
     repeating: set[str]
 
 
-def replayed(readings: Iterable[Reading]) -> Outcome:
-    config = PipelineConfig(LocalisationConfig("ekf", slip=0.0, slip_soft=0.0))
-    pipeline, poses, made, repeating = Pipeline(SITE, machine(), config), [], [], set()
+@cache
+def replayed(fault: str = "") -> Outcome:
+    readings = FAULTS[fault][0](measured()) if fault else measured()
+    config, made_up = PipelineConfig(LocalisationConfig("ekf", slip=0.0, slip_soft=0.0)), drive(LEGS, RECEIVER)
+    pipeline, poses, made, repeating = Pipeline(SITE, RECEIVER, config), [], [], set()
     for stamp_ns, group in groupby(readings, key=lambda r: r.stamp_ns - r.stamp_ns % 200_000_000):
         made.append(pipeline.step(list(group)))
         poses += [pipeline.pose] if pipeline.pose else []
         if stamp_ns % 1_000_000_000 == 0:
             repeating |= set(pipeline.health()["repeating"])
     made.append(pipeline.finish())
-    errors = np.array([(p.x_m, p.y_m) for p in poses]) - [truth().at(p.stamp_ns)[:2] for p in poses]
+    errors = np.array([(p.x_m, p.y_m) for p in poses]) - [made_up.at(p.stamp_ns)[:2] for p in poses]
     nees = np.array([e @ np.linalg.solve(p.covariance_m2, e) for e, p in zip(errors, poses, strict=True)])
-    seconds = (np.array([p.stamp_ns for p in poses]) - START_NS) * 1e-9
-    final, counters = joined(made).final, pipeline.health()["counters"]
-    off_m = np.array([sample_off_m(row) for row in final])
-    return Outcome(seconds, np.hypot(*errors.T), nees, off_m, counters, repeating)
-
-
-def sample_off_m(row: np.void) -> float:
-    """How far a sample lies from where the load centre was."""
-    x, y, heading = truth().at(int(row["stamp_ns"]))
-    ahead = VEHICLE.load_centre_m
-    return math.dist((row["x_m"], row["y_m"]), (x + ahead * math.cos(heading), y + ahead * math.sin(heading)))
-
-
-@cache
-def passing(seed: int) -> Outcome:
-    return replayed(measured(seed))
-
-
-@cache
-def faulty(fault: Faults) -> Outcome:
-    return replayed(fault.value.changed(measured(SEED)))
+    times_s = np.array([seconds(p) for p in poses])
+    final, ahead_m = joined(made).final, VEHICLE.load_centre_m
+    true = np.array([made_up.at(stamp_ns) for stamp_ns in final["stamp_ns"].tolist()])
+    east_m = final["x_m"] - true[:, 0] - ahead_m * np.cos(true[:, 2])
+    north_m = final["y_m"] - true[:, 1] - ahead_m * np.sin(true[:, 2])
+    counters = pipeline.health()["counters"]
+    return Outcome(times_s, np.hypot(*errors.T), nees, np.hypot(east_m, north_m), counters, repeating)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", Faults, ids=lambda fault: fault.name.lower())
-def test_positions_recover_and_no_sample_is_far_off(fault: Faults) -> None:
-    outcome, without = faulty(fault), passing(SEED)
-    later = outcome.seconds > fault.value.good_s + SETTLED_S
-    off_m, nees = outcome.off_m[later], outcome.nees[later]
-    beside = without.off_m[without.seconds > fault.value.good_s + SETTLED_S]
-    figures = f"seed={SEED} rms {rms(off_m):.2f} of {rms(beside):.2f} nees {nees.mean():.2f}"
+@pytest.mark.parametrize("fault", FAULTS)
+def test_positions_recover_and_no_sample_is_far_off(fault: str) -> None:
+    outcome, without, good_s = replayed(fault), replayed(), FAULTS[fault][1]
+    later = outcome.seconds > good_s + SETTLED_S
+    nees, rms_m = outcome.nees[later], rms(outcome.off_m[later])
+    beside_m = rms(without.off_m[without.seconds > good_s + SETTLED_S])
+    figures = f"seed={SEED} rms {rms_m:.2f} of {beside_m:.2f} nees {nees.mean():.2f}"
     assert (nees < 9.0).mean() >= 0.99, figures
     assert nees.mean() <= max(4.0, 1.2 * without.nees.mean()), figures
-    assert rms(off_m) <= 1.3 * rms(beside) + 0.3, figures
+    assert rms_m <= 1.3 * beside_m + 0.3, figures
     assert len(outcome.samples_off_m) > 0.6 * len(without.samples_off_m), figures
     assert (outcome.samples_off_m > 5.0).sum() <= (without.samples_off_m > 5.0).sum(), figures
     assert outcome.samples_off_m.max() < 9.0, figures
@@ -201,18 +161,17 @@ def rms(values: Floats) -> float:
 
 @pytest.mark.slow
 def test_a_receiver_that_hangs_is_named_and_one_that_does_not_is_not() -> None:
-    outcome = faulty(Faults.FROZEN)
+    outcome = replayed("frozen")
     assert outcome.repeating == {"gps-1"}
-    assert outcome.counters["gps-1_repeated"] == pytest.approx(40 * 5, abs=2)
-    assert passing(SEED).repeating == set()
-    assert "gps-1_repeated" not in passing(SEED).counters
+    assert outcome.counters["gps-1_repeated"] == pytest.approx(20 * 5, abs=2)
+    assert replayed().repeating == set()
+    assert "gps-1_repeated" not in replayed().counters
 
 
 def test_a_parked_machine_s_receiver_has_no_fault() -> None:
     """It pins its fix: that is one value, and no fault as long as no wheel turns."""
-    made = drive([Leg(20)], VEHICLE)
     pipeline = Pipeline(SITE, VEHICLE, PipelineConfig())
-    pipeline.step(made.readings)
+    pipeline.step(thinned(drive([Leg(20)], VEHICLE).readings))
     health = pipeline.health()
     assert health["repeating"] == []
     assert "gps-1_repeated" not in health["counters"]

@@ -9,7 +9,7 @@ from agents.estimation.ground import NOTHING_KNOWN, GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
 from agents.sampling import EVERY_M, HISTORY_S, LAG_S, Odometer, PoseHistory, Sampler
 from protocol.arrays import Table
-from protocol.machine.readings import Encoder, Imu, Odometry, Reading
+from protocol.machine.readings import Encoder, Imu, Reading
 from protocol.machine.samples import GRADE, RESISTANCE, check_samples
 
 S = 10**9
@@ -65,36 +65,19 @@ def test_one_sample_per_stretch_that_says_how_long_it_is() -> None:
     check_samples(rows, 1e4)
 
 
-def test_distance_of_a_stretch_is_at_most_twice_that_of_a_sample() -> None:
-    sampler = Sampler(0.0)
-    sampler.poses.append(pose(0))
-    sampler.mark(ns(0), 30.0)
-    assert sampled(sampler)["distance_m"].tolist() == [2 * EVERY_M]
-
-
-def test_load_centre_lies_ahead() -> None:
-    for heading, place in ((0.0, (1.5, 5.0)), (math.pi / 2, (0.0, 6.5)), (math.pi, (-1.5, 5.0))):
-        sampler = Sampler(1.5)
-        sampler.poses.append(pose(0, heading_rad=heading))
-        sampler.mark(ns(0), 0.5)
-        (row,) = sampled(sampler)
-        assert (row["x_m"], row["y_m"]) == pytest.approx(place)
-
-
-@pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])
-def test_gradient_is_turned_into_the_map(heading: float) -> None:
+@pytest.mark.parametrize("heading", [0.7, -2.0])
+def test_load_centre_lies_ahead_and_the_gradient_is_turned_into_the_map(heading: float) -> None:
     sampler = Sampler(1.5)
     sampler.poses.append(pose(0, heading_rad=heading))
-    sampler.mark(ns(0), 0.5)
+    sampler.mark(ns(0), 30.0)
     (row,) = sampled(sampler)
+    assert row["distance_m"] == 2 * EVERY_M, "at most"
+    assert (row["x_m"], row["y_m"]) == pytest.approx((1.5 * math.cos(heading), 5.0 + 1.5 * math.sin(heading)))
     ahead, left = complex(math.cos(heading), math.sin(heading)), complex(-math.sin(heading), math.cos(heading))
     expected = 0.2 * ahead + 0.1 * left
     assert complex(row["grade_e"], row["grade_n"]) == pytest.approx(expected, abs=1e-6)
     assert (row["c_rr"], row["c_rr_var"], row["grade_var"]) == pytest.approx((0.05, 1e-4, 1e-3))
     assert (row["cov_xx_m2"], row["cov_xy_m2"], row["cov_yy_m2"]) == (1.0, 0.0, 2.0)
-
-
-# --- later than the machine was there --------------------------------------------------------------------------------
 
 
 def test_estimator_is_asked_for_the_stamp_of_the_mark_once_the_lag_has_passed() -> None:
@@ -106,45 +89,6 @@ def test_estimator_is_asked_for_the_stamp_of_the_mark_once_the_lag_has_passed() 
         rows = sampler.due_samples(ns(t), asked)
         assert (len(rows), sampler.waiting) == ((1, 0) if t == LAG_S else (0, int(t < LAG_S)))
     assert asked.stamps_ns == [ns(0)]
-
-
-def test_an_estimate_is_asked_in_time_even_if_no_pose_is_known_yet() -> None:
-    """An estimator remembers seconds, a late alignment takes minutes."""
-    sampler, asked = Sampler(0.0), Asked(ESTIMATE)
-    for i in range(1, 400):
-        sampler.mark(ns(i * 0.25), i * 0.5)
-        assert not len(sampler.due_samples(ns(i * 0.25), asked))
-    assert asked.stamps_ns == [ns(i * 0.25) for i in range(1, 392)]
-
-
-def test_what_still_waits_is_sampled_without_waiting_and_all_in_the_order_of_stamps() -> None:
-    sampler, rows = Sampler(0.0), []
-    for i in range(101):
-        sampler.poses.append(pose(i * 0.05, 0.1 * i))
-        sampler.mark(ns(i * 0.05), 0.1 * i)
-        rows.append(sampler.due_samples(ns(i * 0.05), Asked(ESTIMATE)))
-    in_time = np.concatenate(rows)
-    rest = sampler.due_samples(ns(5.0), Asked(ESTIMATE), waits=False)
-    assert (len(in_time), len(rest)) == (12, 8)  # the lag of 2 s is 4 m
-    assert (np.diff(np.concatenate([in_time, rest])["stamp_ns"]) > 0).all()
-    assert sampler.waiting == 0
-    assert not sampler.withheld
-
-
-def test_nothing_is_lost_while_no_pose_is_known() -> None:
-    """The heading is found late: the poses then come all at once, from the beginning of the drive on."""
-    sampler = Sampler(0.0)
-    for i in range(1, 21):
-        sampler.mark(ns(i * 0.25), i * 0.5)
-        assert not len(sampled(sampler, now_s=i * 0.25))
-    for i in range(201):
-        sampler.poses.append(pose(i * 0.05, i * 0.1))
-    rows = sampled(sampler, now_s=10.0)
-    assert rows["x_m"] == pytest.approx(np.arange(1, 21) * 0.5)
-    assert not sampler.withheld
-
-
-# --- pending and final -----------------------------------------------------------------------------------------------
 
 
 def moved(by_m: float, turn_rad: float, variance_m2: float) -> Callable[[PoseBelief], PoseBelief]:
@@ -169,18 +113,6 @@ def test_final_sample_is_that_of_the_corrected_pose() -> None:
     assert [final[name] for name in same] == [pending[name] for name in same]
 
 
-def test_samples_become_final_once_each_and_in_their_order() -> None:
-    sampler = Sampler(0.0)
-    pending = drive(sampler)
-    assert sampler.pending == len(pending) == 20
-    first = sampler.final_samples(lambda p: p if p.stamp_ns <= pending["stamp_ns"][6] else None)
-    assert first.tobytes() == pending[:7].tobytes()
-    assert sampler.pending == 13
-    assert sampler.final_samples(lambda p: p).tobytes() == pending[7:].tobytes()
-    assert not len(sampler.final_samples(lambda p: p))
-    assert sampler.pending == 0
-
-
 # --- what is withheld ------------------------------------------------------------------------------------------------
 
 
@@ -194,30 +126,23 @@ def test_marks_before_the_first_pose_are_counted() -> None:
     assert sampler.withheld == {"no_pose": 2}
 
 
-@pytest.mark.parametrize("reason", ["pitch_transient", "no_imu"])
-def test_where_the_slope_is_blurred_place_distance_and_mass_are_sampled_and_counted(reason: str) -> None:
+@pytest.mark.parametrize(
+    ("estimate", "unknown"),
+    [
+        (replace(NOTHING_KNOWN, reason="pitch_transient", mass_kg=22_000.0), (*RESISTANCE, *GRADE)),
+        (replace(ESTIMATE, c_rr=math.nan, c_rr_var=math.nan, reason="braking"), RESISTANCE),
+    ],
+)
+def test_what_is_not_known_of_the_ground_is_counted_and_the_rest_is_sampled(
+    estimate: GroundEstimate, unknown: tuple[str, ...]
+) -> None:
     sampler = Sampler(0.0)
-    rows = drive(sampler, replace(NOTHING_KNOWN, reason=reason, mass_kg=22_000.0))
+    rows = drive(sampler, estimate)
     assert len(rows) == 20
-    for name in (*RESISTANCE, *GRADE):
-        assert np.isnan(rows[name]).all()
+    assert {name for name in (*RESISTANCE, *GRADE) if np.isnan(rows[name]).all()} == set(unknown)
     assert rows["mass_kg"] == pytest.approx(22_000.0)
     assert rows["distance_m"] == pytest.approx(drive(Sampler(0.0))["distance_m"])
-    assert sampler.without_resistance == {reason: 20}
-    assert not sampler.withheld
-    check_samples(rows, 1e4)
-
-
-@pytest.mark.parametrize("reason", ["braking", "no_torque"])
-def test_position_and_slope_are_sampled_without_resistance_and_counted(reason: str) -> None:
-    sampler = Sampler(0.0)
-    rows = drive(sampler, replace(ESTIMATE, c_rr=math.nan, c_rr_var=math.nan, reason=reason))
-    assert len(rows) == 20
-    assert np.isnan(rows["c_rr"]).all()
-    assert np.isnan(rows["c_rr_var"]).all()
-    assert rows["grade_e"] == pytest.approx(0.2)
-    assert sampler.without_resistance == {reason: 20}
-    assert not sampler.withheld
+    assert (sampler.without_resistance, sampler.withheld) == ({estimate.reason: 20}, {})
     check_samples(rows, 1e4)
 
 
@@ -236,13 +161,6 @@ def imu(seconds: float) -> Reading:
 
 def wheels(seconds: float) -> Reading:
     return Encoder("wheels", ns(seconds), 0.0, 0.0)
-
-
-def test_distance_is_that_of_the_wheels_while_they_are_read() -> None:
-    odometer = Odometer()
-    for i in range(100):
-        reading = wheels(i * 0.05) if i % 2 else Odometry("wheels", ns(i * 0.05), 0.0, 0.0, 0.0)
-        assert odometer.update(reading, 0.1 * i, 7.0) == pytest.approx(0.1 * i)  # the filter's speed is not asked
 
 
 @pytest.mark.parametrize("speed_mps", [2.0, -2.0], ids=["forwards", "reverse"])
@@ -267,12 +185,6 @@ def test_wheels_that_are_read_again_count_on_and_nothing_twice() -> None:
     assert after == pytest.approx(before + 0.02 * 98, abs=0.05)
 
 
-def test_a_machine_without_wheels_has_a_distance() -> None:
-    odometer = Odometer()
-    distances = [odometer.update(imu(i * 0.01), 0.0, 2.0) for i in range(101)]
-    assert distances[-1] - distances[0] == pytest.approx(2.0)
-
-
 def test_noise_of_the_filter_s_speed_at_a_standstill_is_no_distance() -> None:
     odometer = Odometer()
     start = odometer.update(imu(0.0), 0.0, 0.0)
@@ -282,34 +194,18 @@ def test_noise_of_the_filter_s_speed_at_a_standstill_is_no_distance() -> None:
 # --- where the machine was -------------------------------------------------------------------------------------------
 
 
-def test_interpolation_takes_the_short_way_across_the_back_heading() -> None:
+def test_history_interpolates_between_its_ends_and_takes_the_short_way_across_the_back_heading() -> None:
     history = PoseHistory()
-    history.append(pose(0, 0.0, math.pi - 0.1))
+    assert history.at(100 * S) is None
+    history.append(pose(0, 1.0))
+    history.append(pose(0, 0.0, math.pi - 0.1))  # of the same stamp: it replaces the last
     history.append(pose(1, 4.0, -math.pi + 0.3, variance_m2=3.0))
     middle = history.at(100 * S + S // 2)
     assert math.remainder(middle.heading_rad - (math.pi + 0.1), math.tau) == pytest.approx(0, abs=1e-12)
     assert -math.pi <= middle.heading_rad <= math.pi
     assert (middle.x_m, middle.speed_mps, middle.covariance_m2[0, 0]) == pytest.approx((2.0, 2.0, 2.0))
-
-
-def test_history_knows_its_ends_and_nothing_beyond() -> None:
-    history = PoseHistory()
-    assert history.newest is None
-    assert history.at(100 * S) is None
-    history.append(pose(0, 1.0))
-    history.append(pose(1, 2.0))
-    for seconds, x in ((0, 1.0), (1, 2.0)):
-        at = history.at((100 + seconds) * S)
-        assert at.x_m == x
-    assert history.at(100 * S - 1) is None
-    assert history.at(101 * S + 1) is None
-
-
-def test_pose_of_the_same_stamp_replaces_the_last() -> None:
-    history = PoseHistory()
-    history.append(pose(0, 1.0))
-    history.append(pose(0, 2.0))
-    assert history.newest.x_m == 2.0
+    assert [history.at((100 + seconds) * S).x_m for seconds in (0, 1)] == [0.0, 4.0]
+    assert history.at(100 * S - 1) is history.at(101 * S + 1) is None
 
 
 def test_history_forgets_but_never_what_it_has_to_keep() -> None:

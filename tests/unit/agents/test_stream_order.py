@@ -18,50 +18,23 @@ def order() -> StreamOrder:
     return order
 
 
-def test_readings_in_order_are_accepted_and_not_counted(order: StreamOrder) -> None:
-    assert all(order.decide(at(ms)) is Decision.ACCEPT for ms in (1, 20, 5000, 9999))
-    assert not order.counters
+ACCEPT, REFUSE, RESTART = Decision.ACCEPT, Decision.REFUSE, Decision.RESTART
 
 
-def test_duplicate_is_refused_and_counted(order: StreamOrder) -> None:
-    assert order.decide(at(0)) is Decision.REFUSE
-    assert order.counters == {"reading_duplicate": 1}
-
-
-def test_two_sensors_may_share_a_stamp(order: StreamOrder) -> None:
-    assert order.decide(at(0, "b")) is Decision.ACCEPT
-
-
-def test_sensor_s_own_readings_never_go_back(order: StreamOrder) -> None:
-    order.decide(at(100))
-    assert order.decide(at(99)) is Decision.REFUSE
-    assert order.counters == {"reading_late": 1}
-
-
-def test_other_sensor_may_be_late_by_half_a_second_but_no_more(order: StreamOrder) -> None:
-    order.decide(at(1000))
-    assert order.decide(at(499, "b")) is Decision.REFUSE
-    assert order.decide(at(500, "b")) is Decision.ACCEPT
-    assert order.counters == {"reading_late": 1}
-
-
-def test_late_reading_does_not_turn_the_clock_back(order: StreamOrder) -> None:
-    order.decide(at(1000))
-    order.decide(at(600, "b"))
-    assert order.decide(at(400, "c")) is Decision.REFUSE
-
-
-def test_pause_longer_than_five_seconds_restarts(order: StreamOrder) -> None:
-    assert order.decide(at(5000)) is Decision.ACCEPT
-    assert order.decide(at(10_001)) is Decision.RESTART
-    assert order.decide(at(10_002)) is Decision.ACCEPT
-    assert order.counters == {"gap_restarts": 1}
-
-
-def test_pause_is_one_of_all_sensors_together(order: StreamOrder) -> None:
-    for ms in range(100, 9000, 100):
-        order.decide(at(ms, "b"))
-    assert order.decide(at(9000)) is Decision.ACCEPT
+@pytest.mark.parametrize(
+    ("rows", "counters"),
+    [
+        ([(1, "a", ACCEPT), (20, "a", ACCEPT), (5000, "a", ACCEPT), (9999, "a", ACCEPT)], {}),
+        ([(0, "a", REFUSE), (0, "b", ACCEPT)], {"reading_duplicate": 1}),
+        ([(100, "a", ACCEPT), (99, "a", REFUSE)], {"reading_late": 1}),  # a sensor's own never go back
+        ([(1000, "a", ACCEPT), (499, "b", REFUSE), (500, "b", ACCEPT), (400, "c", REFUSE)], {"reading_late": 2}),
+        ([(5000, "a", ACCEPT), (10_001, "a", RESTART), (10_002, "a", ACCEPT)], {"gap_restarts": 1}),
+        ([*((ms, "b", ACCEPT) for ms in range(100, 9000, 100)), (9000, "a", ACCEPT)], {}),  # a pause is one of all
+    ],
+)
+def test_what_is_accepted(order: StreamOrder, rows: list[tuple[int, str, Decision]], counters: dict[str, int]) -> None:
+    assert [order.decide(at(ms, sensor)) for ms, sensor, _ in rows] == [decision for *_, decision in rows]
+    assert order.counters == counters
 
 
 def test_clock_that_was_set_back_restarts_after_a_while(order: StreamOrder) -> None:

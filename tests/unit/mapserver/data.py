@@ -195,6 +195,10 @@ def open_store(folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = S
     return Store(JournalLocation(folder), site, config, now_ns)
 
 
+def store_at(location: JournalLocation) -> Store:
+    return Store(location, SITE, CONFIG, now_ns)
+
+
 def open_writer(
     folder: Path, config: ServerConfig = CONFIG, site: SiteConfig = SITE, clock: Callable[[], float] = time.monotonic
 ) -> Writer:

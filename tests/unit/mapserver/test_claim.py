@@ -17,8 +17,6 @@ FIRST, SECOND = "a" * 16, "b" * 16
 
 
 class Network:
-    """A router that can be started again, and clients of it."""
-
     def __init__(self) -> None:
         self.endpoint = free_endpoint()
         self.router = open_session(SessionConfig(self.endpoint, mode="router"))
@@ -52,21 +50,6 @@ def test_a_second_server_is_refused_in_one_line_and_the_first_goes_on(network: N
         assert str(caught.value).startswith("site pit: a map server runs already, pid ")
         assert f"with store {FIRST}; stop it, or start this one with --take-over" in str(caught.value)
         assert (first.held, first.ended, second.held) == (True, "", False)
-
-
-def test_a_server_of_another_site_is_no_rival(network: Network):
-    with network.writer(FIRST), closing(WriterClaim(network.session(), "hill", SECOND)) as other:
-        other.acquire()
-        assert other.held
-
-
-def test_a_server_that_was_killed_keeps_nobody_waiting(network: Network):
-    killed = network.claim(FIRST)
-    killed.acquire()
-    killed._ending = True
-    killed._session.close()
-    with network.writer(FIRST) as again:
-        assert again.held
 
 
 def test_a_server_that_takes_over_waits_until_the_other_one_has_ended(network: Network):

@@ -1,33 +1,21 @@
 """Samples that say no more than where a machine was: they count as driven, and do no harm anywhere."""
 
 import numpy as np
-import pytest
 
-from mapserver.change.detection import ChangeConfig
-from mapserver.change.validity import valid_pages
 from mapserver.fleet.calibration import calibrate
 from mapserver.fleet.ledger import Ledger
 from mapserver.trust.auditor import Auditor
-from protocol.machine.samples import GRADE, RESISTANCE, check_samples
-from tests.unit.mapserver.roads.drives import EVERYWHERE, along, grid_of, passes
+from protocol.machine.samples import GRADE, RESISTANCE
+from tests.unit.mapserver.roads.drives import along, passes
 
 LINE = along([(10, 10), (110, 10)])
 
 
 def nothing_measured(rows):
-    """The same drives, of which nothing is known but the place."""
     rows = rows.copy()
     for name in (*RESISTANCE, *GRADE):
         rows[name] = np.nan
     return rows
-
-
-def test_they_change_no_ground():
-    true, blind = passes(LINE, 30), nothing_measured(passes(LINE, 30, seed=1, after_s=3600.0))
-    grid = grid_of(true, blind)
-    blocks = grid.blocks_in(EVERYWHERE)
-    first = valid_pages(dict(zip(blocks, grid.pages(blocks), strict=True)), 1.0, ChangeConfig())
-    assert not any(index.any() for index in first.values())
 
 
 def test_a_machine_that_sends_nothing_else_is_not_judged_and_accuses_nobody():
@@ -52,11 +40,3 @@ def test_calibration_learns_nothing_from_them():
     assert [each for each in with_blind.corrections if each.machine == "a"] == list(
         calibrate({"a": true.stays()}).corrections
     )
-
-
-@pytest.mark.parametrize("mass_kg", [0.5, 2e6, -1.0, np.inf])
-def test_an_absurd_mass_is_refused_by_name(mass_kg):
-    rows = passes(LINE, 1)
-    rows["mass_kg"][3] = mass_kg
-    with pytest.raises(Exception, match="mass_kg"):
-        check_samples(rows, 20_000.0)

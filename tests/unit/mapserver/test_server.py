@@ -1,5 +1,6 @@
 import threading
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import zenoh
 
 from mapserver import server as server_module
 from mapserver.journal.location import JournalLocation
-from mapserver.query import queryable, region_pieces
+from mapserver.query import queryable
 from mapserver.query.answering import SMALL_BYTES
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
@@ -16,13 +17,11 @@ from protocol.queries import answer_codec as codec
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import TrustCommand, encode_command
 from protocol.queries.parameters import selector_of
-from protocol.queries.pieces import joined
 from protocol.queries.requests import (
     AliveQuery,
     Freshness,
     HistoryQuery,
     InfoQuery,
-    PieceQuery,
     PointQuery,
     RegionQuery,
     encode_query,
@@ -31,18 +30,7 @@ from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    WAIT_S,
-    batch,
-    held,
-    now_ns,
-    routed,
-    samples,
-    wait_for,
-)
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, WAIT_S, batch, held, now_ns, routed, samples, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +48,6 @@ def served(sessions, tmp_path):
 
 
 def get(client: zenoh.Session, key: str, parameters: dict[str, str] | None = None, payload: bytes | None = None):
-    """The one reply to a query."""
     selector = f"{key}?{selector_of(parameters)}" if parameters else key
     (reply,) = client.get(selector, payload=payload, timeout=WAIT_S)
     return reply
@@ -119,24 +106,20 @@ def test_a_refused_batch_gets_its_reason(served):
     assert counted == {"refused_gap": 1, "refused_wrong_machine": 1, "refused_not_msgpack": 1}
 
 
-def test_a_wildcard_names_no_machine(served):
-    _, client = served
-    reply = get(client, keys.ingest_all("pit"), payload=encode_batch(batch(samples(1))))
-    assert decode_reply(reply.ok.payload.to_bytes()).reason == Refusal.WRONG_MACHINE
-
-
 @pytest.mark.parametrize(
-    ("name", "parameters", "reason"),
+    ("key", "parameters", "reason"),
     [
-        ("region", {"bounds": "0,0,1,1", "colour": "red"}, Refusal.UNKNOWN_PARAMETER),
-        ("elevation", {}, Refusal.UNKNOWN_QUERY),
-        ("info", {"after": "9", "wait": "0.01"}, Refusal.AFTER_TIMEOUT),
+        (keys.map_query("pit", "region"), {"bounds": "0,0,1,1", "colour": "red"}, Refusal.UNKNOWN_PARAMETER),
+        (keys.map_query("pit", "elevation"), {}, Refusal.UNKNOWN_QUERY),
+        (keys.map_query("pit", "info"), {"after": "9", "wait": "0.01"}, Refusal.AFTER_TIMEOUT),
+        (keys.admin("pit", "trust"), {"machine": "c", "trusted": "yes"}, Refusal.UNKNOWN_MACHINE),
+        (keys.admin("pit", "trust"), {"machine": "c"}, Refusal.MISSING_FIELD),
+        (keys.admin("pit", "shutdown"), {}, Refusal.UNKNOWN_QUERY),
     ],
 )
-def test_a_refused_query_gets_its_reason_and_is_counted(served, name, parameters, reason):
+def test_a_refused_query_or_command_gets_its_reason_and_is_counted(served, key, parameters, reason):
     _, client = served
-    error = refusal(client, name, parameters)
-    assert error.reason == reason
+    assert codec.decode_error(get(client, key, parameters).err.payload.to_bytes()).reason == reason
     assert counters(client) == {f"refused_query_{reason}": 1}
 
 
@@ -151,29 +134,20 @@ def test_a_bug_in_a_query_is_answered(served, monkeypatch):
 @pytest.mark.parametrize(("query_threads", "together"), [(1, False), (2, True)])
 def test_so_many_queries_are_answered_at_once(sessions, tmp_path, monkeypatch, query_threads, together):
     router, client = sessions
-    server = Server(
-        router, router, JournalLocation(tmp_path), SITE, replace(CONFIG, query_threads=query_threads), now_ns
-    )
-    both = threading.Barrier(2)
-    met = []
+    config = replace(CONFIG, query_threads=query_threads)
+    both, met = threading.Barrier(2), []
 
-    def meet(_) -> dict[str, object]:
-        try:
+    def meet() -> dict[str, object]:
+        with suppress(threading.BrokenBarrierError):
             both.wait(WAIT_S if together else 0.2)
-        except threading.BrokenBarrierError:
-            met.append(False)
-        else:
             met.append(True)
         return {}
 
-    monkeypatch.setattr(server.answers, "info", lambda: meet(None))
-    askers = [threading.Thread(target=ask, args=(client, InfoQuery())) for _ in range(2)]
-    for asker in askers:
-        asker.start()
-    for asker in askers:
-        asker.join()
-    server.close()
-    assert met == [together] * 2
+    with closing(Server(router, router, JournalLocation(tmp_path), SITE, config, now_ns)) as server:
+        monkeypatch.setattr(server.answers, "info", meet)
+        with ThreadPoolExecutor() as threads:
+            list(threads.map(ask, [client] * 2, [InfoQuery()] * 2))
+    assert len(met) == 2 * together
 
 
 def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
@@ -190,11 +164,7 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     server.close()
 
 
-# --- readers that ask for much ----------------------------------------------------------------------------------------
-
-
 def begun(client: zenoh.Session, key: str, parameters: dict[str, str], n: int) -> list[zenoh.Handler]:
-    """Queries whose answers nobody waits for yet."""
     return [client.get(f"{key}?{selector_of(parameters)}", timeout=WAIT_S) for _ in range(n)]
 
 
@@ -245,40 +215,6 @@ def test_a_query_that_would_fill_memory_while_it_waits_is_refused(served, asked)
     assert codec.decode_error(reply.err.payload.to_bytes()).reason == Refusal.TOO_LARGE
 
 
-def test_a_large_region_comes_in_pieces_and_is_forgotten_after_a_while(served, monkeypatch):
-    _, client = served
-    deliver(client, batch(samples(5, c_rr=0.25)))
-    first = codec.decode_region(ask(client, RegionQuery(Bounds(0, 0, 600, 400), ("resistance",))))
-    count = first.piece.count
-    parts = [codec.decode_region(ask(client, PieceQuery(first.piece.cursor, n))) for n in range(count)]
-    region = joined(parts)
-    assert count > 1
-    assert region["resistance"].shape == (400, 600)
-    assert region["resistance"][8, 8] == pytest.approx(0.25, rel=1e-3)
-    assert np.isfinite(region["resistance"]).sum() == 1
-    monkeypatch.setattr(region_pieces, "IDLE_S", -1.0)
-    piece = {"cursor": str(first.piece.cursor), "number": "0"}
-    assert refusal(client, "piece", piece).reason == Refusal.EXPIRED
-
-
-# --- changes, commands, the past --------------------------------------------------------------------------------------
-
-
-def test_events_and_queries_below_the_map_do_not_meet(served):
-    server, client = served
-    received, here = [], threading.Event()
-    subscriber = client.declare_subscriber(
-        keys.changed("pit"), lambda s: (received.append(s.payload.to_bytes()), here.set())
-    )
-    error = codec.decode_error(get(client, keys.changed("pit")).err.payload.to_bytes())
-    assert error.reason == Refusal.UNKNOWN_QUERY
-    ask(client, InfoQuery())  # the subscription has reached the server with this answer
-    server._publish({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})
-    assert here.wait(WAIT_S)
-    assert received == [codec.encode_change({"id": 1, "bounds": [0.0, 0.0, 1.0, 1.0]})]
-    subscriber.undeclare()
-
-
 def test_no_batch_is_taken_while_another_server_may_be_the_writer(served):
     server, client = served
     server._claim.held = False
@@ -305,20 +241,6 @@ def test_a_command_reaches_the_upkeep_with_its_reason(served):
     assert machine.name == "a"
     assert not machine.trusted
     assert answer.version == MapVersion(row.store, 1, 1)
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "reason"),
-    [
-        ("trust", {"machine": "c", "trusted": "yes"}, Refusal.UNKNOWN_MACHINE),
-        ("trust", {"machine": "c"}, Refusal.MISSING_FIELD),
-        ("shutdown", {}, Refusal.UNKNOWN_QUERY),
-    ],
-)
-def test_a_refused_command_gets_its_reason_and_is_counted(served, name, parameters, reason):
-    _, client = served
-    assert codec.decode_error(get(client, keys.admin("pit", name), parameters).err.payload.to_bytes()).reason == reason
-    assert counters(client) == {f"refused_query_{reason}": 1}
 
 
 @pytest.mark.parametrize("slow", ["past", "command"])

@@ -5,7 +5,6 @@ import pytest
 
 from protocol.config import from_table, section
 from protocol.errors import ConfigError
-from protocol.files import load_toml
 
 
 @dataclass(frozen=True)
@@ -51,20 +50,13 @@ def test_values_and_defaults():
         ({}, ["x.toml", "`name` is missing"]),
         ({"name": "a", "nmae": 1}, ["unknown key `nmae`", "name, count"]),
         ({"name": 1}, ["x.toml name", "str is expected, not int"]),
-        ({"name": "a", "count": 1.0}, ["count", "int is expected, not float"]),
         ({"name": "a", "count": True}, ["count", "int is expected, not bool"]),
-        ({"name": "a", "on": 1}, ["on", "bool is expected"]),
         ({"name": "a", "ratio": "1"}, ["ratio", "float is expected, not str"]),
         ({"name": "a", "ratio": float("nan")}, ["ratio", "finite"]),
-        ({"name": "a", "ratio": float("inf")}, ["ratio", "finite"]),
-        ({"name": "a", "maybe": "x"}, ["maybe", "float is expected"]),
         ({"name": "a", "triple": [1, 2]}, ["triple", "3 values are expected, not 2"]),
-        ({"name": "a", "triple": 1}, ["triple", "a list is expected"]),
         ({"name": "a", "triple": [1, "b", 3]}, ["triple[1]", "float is expected"]),
-        ({"name": "a", "many": [1, 2.5]}, ["many[1]", "int is expected"]),
         ({"name": "a", "inner": 1}, ["inner", "a table is expected"]),
         ({"name": "a", "inner": {"deep": 1}}, ["x.toml inner", "unknown key `deep`"]),
-        ({"name": "a", "inners": [{}, {"deep": 1}]}, ["inners[1]", "unknown key `deep`"]),
         ({"name": "a", "named": [1]}, ["x.toml named", "a table is expected, not list"]),
         ({"name": "a", "named": {"b": "c"}}, ["x.toml named.b", "float is expected, not str"]),
         ({"name": "a", "count": -1}, ["x.toml", "count: -1 is negative"]),
@@ -84,17 +76,3 @@ def test_section_is_taken_out():
     assert table == {"b": 2}
     with pytest.raises(ConfigError, match="a table is expected"):
         section(table, "b", "x.toml")
-
-
-def test_file_errors_name_the_file(tmp_path):
-    with pytest.raises(ConfigError, match="no such file"):
-        load_toml(tmp_path / "none.toml")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_toml(tmp_path)
-    broken = tmp_path / "broken.toml"
-    broken.write_text("a = 1\nb = = 2\n")
-    with pytest.raises(ConfigError, match=r"broken\.toml: not valid TOML.*line 2"):
-        load_toml(broken)
-    broken.write_bytes(b"a = '\xff'")
-    with pytest.raises(ConfigError, match="not valid TOML"):
-        load_toml(broken)

@@ -2,14 +2,12 @@
 
 import itertools
 import re
-import tomllib
 from collections.abc import Iterable
 from dataclasses import fields
 
 import pytest
 
 from agents.holdout import FIGURES
-from protocol.config import from_table
 from protocol.errors import Refusal
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MODES, QUANTITIES
@@ -19,7 +17,6 @@ from protocol.queries import calibration as cal
 from protocol.queries import commands, parameters, requests
 from protocol.queries.answers import GroundChange, MachineState, MapInfo, SampleCounts
 from protocol.site.geometry import MAX_CELLS
-from protocol.site.site_config import KnownGround
 from protocol.units import _NS, _UNITS
 from protocol.wire import codec
 from protocol.wire.messages import Pose
@@ -100,10 +97,6 @@ def test_example_of_a_query_is_read_and_written(root, name, selector):
         assert requests.parse_query(name, requests.encode_query(parsed)) == parsed
 
 
-def test_every_kind_of_query_has_an_example():
-    assert {name for _, name, _ in EXAMPLES} == {"point", "region", "history", "changes", "trust"}
-
-
 @pytest.mark.parametrize(
     ("title", "record"), [("Info", MapInfo), ("Machines", MachineState), ("Changes", GroundChange)]
 )
@@ -163,9 +156,3 @@ def test_examples_of_known_ground_are_read(tmp_path):
 def test_every_figure_of_a_replay_is_documented():
     figures = [*FIGURES, *GROUND, *(f"truth_{name}" for name in TRUTH_FIGURES)]
     assert undocumented(figures, LOGS) == []
-
-
-def test_example_of_known_ground_is_read():
-    example = re.search(r"`known_ground` \|.*?`(\{.*?\})`", LOGS)[1]
-    area = from_table(KnownGround, tomllib.loads(f"area = {example}")["area"], "example")
-    assert area.inside_m(15.0, 5.0) > 0

@@ -73,8 +73,3 @@ def test_writers_of_one_file_do_not_meet(tmp_path: Path):
 def test_permissions_are_those_asked_for(tmp_path: Path):
     write_whole(tmp_path / "key", b"secret", permissions=0o600)
     assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
-
-
-def test_a_folder_that_is_not_there_is_an_os_error(tmp_path: Path):
-    with pytest.raises(FileNotFoundError):
-        write_whole(tmp_path / "missing" / "a.bin", b"")

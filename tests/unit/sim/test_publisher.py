@@ -106,14 +106,6 @@ def test_machine_without_an_agent_is_named() -> None:
             result.result(timeout=20)
 
 
-def test_progress_is_reported() -> None:
-    seen: list[float] = []
-    published(CONFIG, on_progress=seen.append)
-    assert seen
-    assert seen == sorted(seen)
-    assert 0 < seen[0] <= 0.5
-
-
 class FakeStop(threading.Event):
     """Waiting moves the clock on instead."""
 

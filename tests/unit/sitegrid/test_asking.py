@@ -17,7 +17,7 @@ from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import pack
 from protocol.wire.messages import VERSION
 from sitegrid import asking
-from sitegrid.asking import Asker, Followers, preferred
+from sitegrid.asking import Asker, preferred
 from sitegrid.client import REGION_ATTEMPTS, Client
 from tests.unit.records import STORE, map_info, version
 
@@ -203,23 +203,6 @@ def piece(number: int, merged: int = 7) -> bytes:
     return codec.encode_region(
         Region(np.array([0.5]), np.array([0.5 + number]), 1.0, layers, version(merged, 0), 5, place)
     )
-
-
-def test_tokens_of_others_name_no_follower():
-    session = SimpleNamespace(
-        liveliness=lambda: SimpleNamespace(
-            get=lambda _, timeout: [SimpleNamespace(ok=SimpleNamespace(key_expr="sitegrid/pit/follower/A*/alive"))]
-        )
-    )
-    assert Followers(session, "pit").in_order() == []  # type: ignore[arg-type]
-
-
-def test_a_region_that_nobody_reads_to_its_end_is_asked_of_others():
-    query = RegionQuery(Bounds(0, 0, 1, 1))
-    site = Site(a=SILENT)
-    with pytest.raises(QueryError, match="does not answer any more") as refused:
-        asker(site).ask(query, at=Origin("a"))
-    assert refused.value.reason == Refusal.EXPIRED
 
 
 # --- a server alone ---------------------------------------------------------------------------------------------------

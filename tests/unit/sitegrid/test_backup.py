@@ -105,10 +105,8 @@ def test_a_backup_of_an_open_store_is_restored_with_all_that_it_had(store: Path,
     [
         (lambda store: min((store / FOLDER).glob("*.parquet")).unlink(), "the file with row 1 is missing"),
         (lambda store: flip(max((store / FOLDER).glob("*.parquet"))), "is damaged"),
-        (lambda store: flip(store / JOURNAL_FILE), "is damaged"),
         (lambda store: (store / JOURNAL_FILE).unlink(), "holds no journal.db"),
         (lambda store: change(store, "UPDATE meta SET value = 'qit' WHERE key = 'site'"), "the site of the journal is"),
-        (lambda store: change(store, "UPDATE meta SET value = '9' WHERE key = 'epoch'"), "the epoch of the journal is"),
         (lambda store: decided(store) or change(store, "DELETE FROM events"), "what follows number 0 is damaged"),
     ],
 )
@@ -226,16 +224,8 @@ def test_backups_that_are_killed_leave_no_backup_and_the_one_that_ends_has_all_t
         live = ending.enter_context(subprocess.Popen([sys.executable, "-c", SERVE, str(store), str(noted)]))
         ending.callback(live.kill)
         wait_until(lambda: noted.exists() and noted.read_text() != "", WAIT_S, "the first batch")
-        command = [
-            sys.executable,
-            "-m",
-            "sitegrid.cli",
-            "backup",
-            str(store),
-            "--out",
-            str(tmp_path / "copy"),
-            "--json",
-        ]
+        words = ("backup", str(store), "--out", str(tmp_path / "copy"), "--json")
+        command = [sys.executable, "-m", "sitegrid.cli", *words]
         killed = 0
         for _ in range(KILLS):
             with subprocess.Popen(command, stdout=subprocess.DEVNULL) as copier:

@@ -1,4 +1,5 @@
 import contextlib
+import random
 import signal
 import sqlite3
 import subprocess
@@ -10,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.delivery.audit import AuditLog, read_audit
+from agents.delivery.audit import AuditLog, Contents, read_audit
 from agents.delivery.spool import KEPT_RUNS, Spool, SpoolConfig
 from agents.delivery.spool_file import connect
+from agents.delivery.write_buffer import WriteBuffer
 from protocol.errors import StoreError
-from protocol.machine.samples import content_hash
+from protocol.machine.samples import content_hash, empty
 from tests.paths import ROOT
 from tests.unit.agents.drives import made_up_samples
 
@@ -55,16 +57,6 @@ def hashes(rows: np.ndarray) -> list[str]:
     return [content_hash(row) for row in rows]
 
 
-def test_samples_are_numbered_from_one_and_come_out_in_order(spool: Spool) -> None:
-    assert spool.head(10) is None
-    assert spool.record(ROWS[:4]) == 1
-    assert spool.record(ROWS[4:9]) == 5
-    head = spool.head(7)
-    assert (head.spool_id, head.first_seq, head.lost_before) == (spool.spool_id, 1, 0)
-    assert hashes(head.rows) == hashes(ROWS[:7])
-    assert spool.newest == 9
-
-
 def test_commits_are_full_and_logged_ahead(spool: Spool) -> None:
     assert spool._db.execute("PRAGMA synchronous").fetchone()[0] == 2
     assert spool._db.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
@@ -82,42 +74,6 @@ def test_acknowledged_samples_are_deleted_and_stay_so(tmp_path: Path) -> None:
     assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 7, 4, 0)
     assert again.counters()["depth"] == 4
     again.close()
-
-
-def test_every_opening_has_an_identity_of_its_own(tmp_path: Path) -> None:
-    ids = set()
-    for name in ("a", "a", "a", "b"):
-        spool = opened(tmp_path / name)
-        assert spool.record(ROWS[:1]) == 1
-        ids.add(spool.spool_id)
-        spool.close()
-    assert len(ids) == 4
-    assert 0 < min(ids) <= max(ids) < 2**64
-
-
-def test_openings_that_record_nothing_leave_nothing(tmp_path: Path) -> None:
-    for _ in range(5):
-        spool = opened(tmp_path)
-        assert spool.head(9) is None
-        assert spool.is_settled()
-        spool.close()
-
-
-def test_runs_come_out_one_after_the_other_and_are_closed(tmp_path: Path) -> None:
-    ids = []
-    for i in range(3):
-        spool = opened(tmp_path)
-        spool.record(ROWS[4 * i : 4 * i + 4])
-        ids.append(spool.spool_id)
-        if i < 2:
-            kill(spool)
-    heads = []
-    while head := spool.head(3):
-        heads.append((ids.index(head.spool_id), head.first_seq, len(head.rows), head.lost_before))
-        spool.acknowledge(head.spool_id, head.first_seq + len(head.rows) - 1)
-    assert heads == [(i, *part) for i in range(3) for part in ((1, 3, 0), (4, 1, 0))]
-    assert spool.is_settled()
-    spool.close()
 
 
 def test_runs_that_are_closed_are_declared_again_at_each_opening_and_forgotten_in_the_end(tmp_path: Path) -> None:
@@ -200,17 +156,6 @@ def test_spool_survives_kill_in_the_middle_of_writing(tmp_path: Path) -> None:
     assert list(read_audit(tmp_path / "audit.txt").values()) == [(content,) for content in hashes(head.rows)]
 
 
-def test_kill_while_the_file_is_made_leaves_no_broken_spool(tmp_path: Path) -> None:
-    def killed() -> int:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        Spool(tmp_path / "spool.db", SpoolConfig(), draw_id=killed)
-    spool = opened(tmp_path)
-    assert spool.record(ROWS[:2]) == 1
-    spool.close()
-
-
 # --- pending and final -----------------------------------------------------------------------------------------------
 
 
@@ -259,19 +204,6 @@ def test_pending_samples_are_final_after_a_crash(tmp_path: Path) -> None:
     again.close()
 
 
-def test_pending_samples_keep_their_place_under_a_new_identity(spool: Spool) -> None:
-    spool.record(ROWS[:2])
-    spool.record(ROWS[2:6], pending=4)
-    old = spool.spool_id
-    spool.acknowledge(old, 1)
-    spool.start_new_run()
-    spool.record(ROWS[:0], finals=better(ROWS[2:4]))
-    closing = spool.head(99)
-    head = closing if closing.spool_id == spool.spool_id else spool.head(99)
-    assert head.spool_id != old
-    assert (head.first_seq, hashes(head.rows)) == (1, hashes(np.concatenate([ROWS[1:2], better(ROWS[2:4])])))
-
-
 def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(tmp_path: Path) -> None:
     """Whoever opens a copy takes them as they are, and sends them under the numbers that they have here."""
     spool = opened(tmp_path, 2, AuditLog(tmp_path / "audit"))
@@ -289,15 +221,6 @@ def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(t
     assert list(read_audit(tmp_path / "audit").values()) == [(content,) for content in hashes(rows)]
 
 
-def test_damage_of_a_pending_sample_is_mended_by_its_final_value(spool: Spool) -> None:
-    spool.record(ROWS[:2], pending=2)
-    spool._db.execute("UPDATE sample SET row = zeroblob(80) WHERE number = 1")
-    assert spool.head(99) is None
-    spool.record(ROWS[:0], finals=better(ROWS[:2]))
-    assert hashes(spool.head(99).rows) == hashes(better(ROWS[:2]))
-    assert spool.counters()["put_aside"] == 0
-
-
 @pytest.mark.parametrize("limit", [1, 3])
 def test_full_spool_drops_no_pending_sample(tmp_path: Path, limit: int) -> None:
     """They do not count: else a spool that holds less than the lag would drop each sample before it may be sent."""
@@ -312,38 +235,7 @@ def test_full_spool_drops_no_pending_sample(tmp_path: Path, limit: int) -> None:
     spool.close()
 
 
-def test_a_write_that_fails_leaves_what_is_pending_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spool = SpoolOnFullDisk(tmp_path / "spool.db", SpoolConfig())
-    spool.record(ROWS[:3], pending=3)
-    for statement in ("UPDATE sample", "INSERT INTO sample", "REPLACE INTO meta", "COMMIT"):
-        with monkeypatch.context() as patch:
-            patch.setattr(FullDisk, "full_at", statement)
-            with pytest.raises(StoreError):
-                spool.record(ROWS[3:5], pending=1, finals=better(ROWS[:3]))
-        assert spool.head(99) is None
-        assert spool.counters() == {**EMPTY, "depth": 3, "pending": 3, "recorded": 3}
-    spool.record(ROWS[3:5], pending=1, finals=better(ROWS[:3]))
-    assert hashes(spool.head(99).rows) == hashes(np.concatenate([better(ROWS[:3]), ROWS[3:4]]))
-    spool.close()
-
-
 # --- holes, bounds, and samples that the server refuses --------------------------------------------------------------
-
-
-def test_head_ends_before_a_hole(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
-    spool.record(ROWS[:10])
-    bad = spool.head(99)
-    spool.acknowledge(spool.spool_id, 3)
-    spool.quarantine(type(bad)(bad.spool_id, 6, ROWS[5:6], 0), "too bad")
-    first = spool.head(99)
-    assert (first.first_seq, len(first.rows), first.lost_before) == (4, 2, 0)
-    spool.acknowledge(spool.spool_id, 5)
-    rest = spool.head(99)
-    assert (rest.first_seq, len(rest.rows), rest.lost_before) == (7, 4, 1)
-    assert spool.counters()["put_aside"] == 1
-    spool.close()
-    assert quarantined(tmp_path) == [(6, ROWS[5].tobytes(), "too bad")]
 
 
 @pytest.mark.parametrize("limit", [1, 10])
@@ -366,7 +258,9 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
     spool.close()
-    spool = opened(changed(tmp_path, "UPDATE sample SET row = zeroblob(80) WHERE number IN (1, 2, 3, 6)"))
+    for numbers, row in (("1, 2", "zeroblob(80)"), ("3", "x'0102'"), ("6", "5")):
+        changed(tmp_path, f"UPDATE sample SET row = {row} WHERE number IN ({numbers})")
+    spool = opened(tmp_path)
     first = spool.head(2)
     assert (first.first_seq, first.lost_before) == (4, 3)
     assert hashes(first.rows) == hashes(ROWS[3:5])
@@ -378,40 +272,6 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool.close()
     problem = "damaged on the machine's disk"
     assert [(seq, why) for seq, _, why in quarantined(tmp_path)] == [(seq, problem) for seq in (1, 2, 3, 6)]
-
-
-# --- servers and files that are set back ------------------------------------------------------------------------------
-
-
-def test_server_that_knows_less_than_it_acknowledged_is_told_what_is_lost(spool: Spool) -> None:
-    spool.record(ROWS[:10])
-    spool.acknowledge(spool.spool_id, 8)
-    spool.lower_watermark(spool.spool_id, 5)
-    head = spool.head(99)
-    assert (head.first_seq, head.lost_before) == (9, 3)
-
-
-def test_earlier_runs_are_declared_again_to_a_server_that_was_set_back(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
-    earlier = spool.spool_id
-    spool.record(ROWS[:3])
-    spool.acknowledge(earlier, 3)
-    spool.close()
-    spool = opened(tmp_path)
-    spool.acknowledge(earlier, 3)
-    spool.record(ROWS[3:5])
-    spool.acknowledge(spool.spool_id, 1)
-    spool.lower_watermark(spool.spool_id, 0)
-    head = spool.head(9)
-    assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 4, 0, 3)
-    spool.close()
-
-
-def test_ack_never_goes_back_nor_beyond_the_end(spool: Spool) -> None:
-    spool.record(ROWS[:6])
-    for watermark, expected in ((4, 4), (2, 4), (99, 6)):
-        spool.acknowledge(spool.spool_id, watermark)
-        assert spool.acknowledged == expected
 
 
 # --- errors ----------------------------------------------------------------------------------------------------------
@@ -499,21 +359,6 @@ def test_failed_commit_leaves_no_transaction_open(
     spool.close()
 
 
-# --- damage that SQLite does not see ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("row", ["x'0102'", "5", "'text'"])
-def test_a_sample_that_is_none_is_quarantined_and_the_others_are_sent(tmp_path: Path, row: str) -> None:
-    spool = opened(tmp_path)
-    spool.record(ROWS[:3])
-    spool.close()
-    spool = opened(changed(tmp_path, f"UPDATE sample SET row = {row} WHERE number = 1"))
-    head = spool.head(10)
-    assert (head.first_seq, len(head.rows), head.lost_before) == (2, 2, 1)
-    assert spool.counters()["put_aside"] == 1
-    spool.close()
-
-
 def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:3])
@@ -525,3 +370,141 @@ def test_a_damaged_sample_that_cannot_be_removed_is_an_error_and_no_endless_loop
         spool.head(10)
     assert spool.counters()["put_aside"] == 0
     spool.close()
+
+
+# --- the audit --------------------------------------------------------------------------------------------------------
+
+HASHES = [content_hash(row) for row in ROWS]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "logs" / "audit.txt"
+
+
+def numbered(spool_id: int, first: int, hashes: list[str]) -> dict[tuple[int, int], Contents]:
+    return {(spool_id, first + i): (h,) for i, h in enumerate(hashes)}
+
+
+def test_what_a_crash_kept_from_being_noted_is_added(path: Path) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.close()
+    again = AuditLog(path)
+    again.complete([(7, 3, ROWS[2]), (7, 4, ROWS[3]), (8, 1, ROWS[4])])
+    again.close()
+    assert read_audit(path) == numbered(7, 1, HASHES[:4]) | numbered(8, 1, HASHES[4:5])
+    assert path.read_text().count("\n") == 5, "what is known is not repeated"
+
+
+def test_sample_that_is_on_disk_with_another_content_is_noted_so(path: Path) -> None:
+    """Its final value was not noted, or is gone with a damaged log; who knows which of the two has been delivered?"""
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    for _ in range(2):
+        audit.complete([(7, 2, ROWS[12])])
+    assert read_audit(path) == numbered(7, 1, HASHES[:3]) | {(7, 2): (HASHES[1], HASHES[12])}
+    assert path.read_text().count("\n") == 4
+    audit.recorded(7, 2, ROWS[13:14])
+    audit.close()
+    assert read_audit(path) == numbered(7, 1, [HASHES[0], HASHES[13], HASHES[2]])
+
+
+@pytest.mark.parametrize("cut", [1, 18])
+def test_line_that_a_crash_cut_off_counts_for_nothing(path: Path, cut: int) -> None:
+    audit = AuditLog(path)
+    audit.recorded(7, 1, ROWS[:3])
+    audit.close()
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert read_audit(path) == numbered(7, 1, HASHES[:2])
+    again = AuditLog(path)
+    again.complete([(7, 3, ROWS[2])])
+    again.recorded(7, 4, ROWS[3:4])
+    again.close()
+    assert read_audit(path) == numbered(7, 1, HASHES[:4])
+
+
+def test_spool_notes_what_it_records_finalises_and_numbers_anew(tmp_path: Path, path: Path) -> None:
+    spool = Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([5, 6]).__next__)
+    spool.record(ROWS[:2])
+    spool.record(ROWS[2:5], pending=3)
+    assert read_audit(path) == numbered(5, 1, HASHES[:5])
+    spool.record(ROWS[:0], finals=ROWS[12:14])
+    assert read_audit(path) == numbered(5, 1, [*HASHES[:2], *HASHES[12:14], HASHES[4]])
+    spool.acknowledge(5, 1)
+    spool.start_new_run()
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:14], HASHES[4]])
+    spool.record(ROWS[:0], finals=ROWS[14:15])
+    assert read_audit(path) == numbered(5, 1, HASHES[:1]) | numbered(6, 1, [HASHES[1], *HASHES[12:15]])
+    spool.close()
+
+
+def test_audit_on_a_full_disk_keeps_no_sample_from_the_spool(tmp_path: Path, path: Path) -> None:
+    audit = AuditLog(path)
+    audit._file.close()
+    with Path("/dev/full").open("w", encoding="ascii", buffering=1) as full:
+        audit._file = full
+        spool = Spool(tmp_path / "spool.db", SpoolConfig(), None, iter([5, 6]).__next__)
+        spool._audit = audit
+        assert spool.record(ROWS[:2]) == 1
+        spool._db.close()
+        with contextlib.suppress(OSError):
+            full.close()
+    Spool(tmp_path / "spool.db", SpoolConfig(), AuditLog(path), iter([6]).__next__).close()
+    assert read_audit(path) == numbered(5, 1, HASHES[:2])
+
+
+# --- what waits for the disk ------------------------------------------------------------------------------------------
+
+MANY = made_up_samples(400)
+BETTER = better(MANY)
+
+
+def sendable(spool: Spool) -> bytes:
+    head = spool.head(1000)
+    return head.rows.tobytes() if head else b""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_the_disk_does_each_sample_gets_its_own_final_value(tmp_path: Path, seed: int) -> None:
+    """New samples, final values, writes and full disks in any order, against a list."""
+    rng, buffer = random.Random(seed), WriteBuffer()
+    spool = Spool(tmp_path / "spool.db", SpoolConfig())
+    made = final = 0
+    for _ in range(60):
+        n = rng.randint(0, min(6, len(MANY) - made))
+        k = rng.choice((0, rng.randint(0, made + n - final)))
+        buffer.add(MANY[made : made + n], BETTER[final : final + k])
+        made, final = made + n, final + k
+        if rng.random() < 0.5 and not buffer.is_clean:
+            spool._db.execute(f"PRAGMA query_only = {rng.choice(('ON', 'OFF'))}")
+            try:
+                buffer.write(spool)
+            except StoreError:
+                assert not buffer.is_clean
+                continue
+            assert buffer.is_clean
+            assert sendable(spool) == BETTER[:final].tobytes(), f"seed={seed}"
+            assert spool.counters()["pending"] == made - final
+    spool._db.execute("PRAGMA query_only = OFF")
+    buffer.add(empty(), BETTER[final:made])
+    buffer.write(spool)
+    assert sendable(spool) == BETTER[:made].tobytes()
+    assert (spool.counters()["recorded"], buffer.given_up) == (made, 0)
+    spool.close()
+
+
+def test_memory_gives_up_the_oldest_that_are_final_and_counts_them(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("agents.delivery.write_buffer.MOST_UNSAVED", 8)
+    buffer, final = WriteBuffer(), empty()
+    for i in range(20):
+        final = BETTER[i - 3 : i - 2] if i >= 3 else empty()
+        buffer.add(MANY[i : i + 1], final)
+    assert (len(buffer), buffer.given_up) == (8, 12)
+    buffer.write(spool)
+    assert sendable(spool) == BETTER[12:17].tobytes()
+    buffer.add(empty(), BETTER[17:20])
+    buffer.write(spool)
+    assert sendable(spool) == BETTER[12:20].tobytes()

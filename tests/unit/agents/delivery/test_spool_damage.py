@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from agents.delivery.spool import Spool, SpoolConfig
-from agents.delivery.spool_file import RunEnd, runs_cut_short
 from protocol.disk.high_water_mark import mark_path
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
@@ -137,17 +136,6 @@ def test_what_was_acknowledged_is_not_gone(tmp_path):
         assert spool.counters()["gone"] == 3
 
 
-def test_samples_with_a_new_identity_are_not_gone(tmp_path):
-    def use(spool: Spool) -> None:
-        spool.record(ROWS[:50])
-        spool.acknowledge(spool.spool_id, 20)
-        spool.start_new_run()
-
-    left = left_by_kill(tmp_path / "work", tmp_path / "left", use)
-    with closing(opened(left)) as spool:
-        assert (spool.counters()["gone"], len(deliver(spool)[0])) == (0, 30)
-
-
 @pytest.mark.parametrize("kept", [0.0, 0.9])
 def test_a_mark_that_is_torn_or_behind_is_no_alarm(folder, kept):
     mark = mark_path(folder / "spool.db")
@@ -178,11 +166,3 @@ def test_a_copy_in_place_of_the_file_is_named_and_declares_nothing(tmp_path):
         assert deliver(spool)[1:] == (0, 20)
     with closing(opened(tmp_path)) as spool:
         assert (spool.damage, spool.counters()["gone"]) == ("", 70)
-
-
-def test_only_the_last_run_can_be_cut_short():
-    there = [RunEnd(1, 10, 10), RunEnd(2, 5, 0)]
-    mark = {k: v for run in (RunEnd(1, 12, 3), RunEnd(2, 9, 2), RunEnd(3, 4, 1)) for k, v in run.values().items()}
-    assert runs_cut_short(there, mark) == [(RunEnd(2, 9, 2), 4), (RunEnd(3, 4, 1), 3)]
-    assert runs_cut_short(there, {}) == []
-    assert runs_cut_short([], mark)[0] == (RunEnd(1, 12, 3), 9)

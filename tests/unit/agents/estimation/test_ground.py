@@ -10,12 +10,12 @@ import pytest
 
 from agents.estimation import ground
 from agents.estimation.calibration import SCALE_STD, ZERO_STD, Calibration
-from agents.estimation.ground import ESTIMATORS, NOTHING_KNOWN, EstimationConfig, GroundEstimate, GroundEstimator
+from agents.estimation.ground import ESTIMATORS, NOTHING_KNOWN, EstimationConfig, GroundEstimate
 from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder, Imu, Reading, Torque
+from protocol.machine.readings import Imu, Reading, Torque
 from protocol.units import GRAVITY_MPS2
-from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, drive, machine, noisy
-from tests.unit.agents.ground import STEADY, EstimatorRun
+from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, drive, machine, noisy, thinned
+from tests.unit.agents.ground import EstimatorRun
 
 SLOPE_RAD = math.radians(15)
 STAND, START = Leg(2), Leg(4, 0.5)
@@ -35,12 +35,8 @@ def weighing(**options: Any) -> MachineConfig:
     return replace(vehicle, sensors=(*vehicle.sensors, SensorConfig("scale", "payload")))
 
 
-# --- physics ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("legs", [FORWARDS, REVERSE], ids=["forwards", "reverse"])
 @pytest.mark.slow
-@pytest.mark.parametrize(("c_rr", "ahead_rad"), [(0.008, 0.0), (0.25, SLOPE_RAD), (0.05, -SLOPE_RAD)])
+@pytest.mark.parametrize(("legs", "c_rr", "ahead_rad"), [(FORWARDS, 0.25, SLOPE_RAD), (REVERSE, 0.05, -SLOPE_RAD)])
 def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad: float) -> None:
     """Positive slope is uphill ahead, also when the machine drives down it backwards."""
     made = drive(legs, VEHICLE, ground=Ground(c_rr, ahead_rad))
@@ -50,48 +46,6 @@ def test_resistance_and_slope_are_right(legs: list[Leg], c_rr: float, ahead_rad:
         assert estimate.slope_x == pytest.approx(math.tan(ahead_rad), abs=0.005), estimator
         assert estimate.slope_y == pytest.approx(0.0, abs=0.002), estimator
         assert estimate.reason == "", estimator
-
-
-@pytest.mark.parametrize(("estimator", "turn_radps"), [("kalman", 0.2), ("rls", 0.0)])
-def test_slope_across_the_driving_direction(estimator: str, turn_radps: float) -> None:
-    """A machine that turns on a plane takes its slope from another side; the bend's own acceleration is no slope."""
-    ground = Ground(0.04, left_rad=SLOPE_RAD)
-    made = drive([STAND, START, Leg(10, 0.0, turn_radps)], VEHICLE, ground=ground)
-    run = EstimatorRun(VEHICLE, EstimationConfig(estimator=estimator)).feed(made.readings)
-    here = ground.turned(turn_radps * (10 - 1.5))
-    assert run.last.slope_y == pytest.approx(math.tan(here.left_rad), abs=0.01)
-    assert run.last.slope_x == pytest.approx(math.tan(here.ahead_rad), abs=0.01 if estimator == "kalman" else 0.1)
-    assert run.last.c_rr == pytest.approx(0.04, abs=0.003)
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_accelerating_does_not_change_the_resistance(estimator: str) -> None:
-    legs = [STAND, START, Leg(2), Leg(2, 0.6), Leg(2, -0.6), Leg(2, 0.6), Leg(2)]
-    run = EstimatorRun(VEHICLE, EstimationConfig(estimator=estimator)).feed(
-        drive(legs, VEHICLE, ground=Ground(0.05)).readings
-    )
-    values = [e.c_rr for e in run.between(7, 14) if not e.reason]
-    assert len(values) > 60
-    assert np.abs(np.array(values) - 0.05).max() < 0.004
-
-
-def test_border_between_two_grounds_is_found_where_it_is() -> None:
-    """Within half a metre, asked 1.5 s later."""
-    border_ns = START_NS + 10 * 10**9
-    run = EstimatorRun(VEHICLE).feed(two_grounds(VEHICLE, 0.02, 0.25, border_ns, ahead_rad=0.15))
-    for stamp_ns, estimate in run.estimates:
-        off_s = (stamp_ns - border_ns) * 1e-9
-        if abs(off_s) > 0.25 and stamp_ns > START_NS + 8 * 10**9 and not estimate.reason:
-            assert estimate.c_rr == pytest.approx(0.02 if off_s < 0 else 0.25, abs=0.01), off_s
-
-
-def two_grounds(vehicle: MachineConfig, a: float, b: float, border_ns: int, **options: Any) -> list[Reading]:
-    first, second = (drive(FORWARDS, vehicle, ground=Ground(c, **options)) for c in (a, b))
-    pairs = zip(first.readings, second.readings, strict=True)
-    return [x if x.stamp_ns < border_ns else y for x, y in pairs]
-
-
-# --- the mass --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("mass", "stated_kg"), [("message", 22_500.0), ("known", 17_500.0), ("estimated", math.nan)])
@@ -129,8 +83,8 @@ def test_normalised_errors_are_about_one(estimator: str) -> None:
     """Machines with sensors as bad as they are taken to be, on a slope and without anything learnt of them."""
     vehicle, errors = machine(), []
     legs = [STAND, START, Leg(6), Leg(3, 0.2), Leg(3, -0.2), Leg(4)]
-    made = {ahead: drive(legs, vehicle, ground=Ground(0.05, ahead)).readings for ahead in (0.0, 0.1)}
-    for seed in range(10):
+    made = {ahead: thinned(drive(legs, vehicle, ground=Ground(0.05, ahead)).readings, 20) for ahead in (0.0, 0.1)}
+    for seed in range(6):
         rng = np.random.default_rng(100 + seed)
         zero, scale = ZERO_STD * GRAVITY_MPS2 * rng.standard_normal(), 1 + SCALE_STD * rng.standard_normal()
         readings = noisy(made[0.1 * (seed % 2)], seed, torque=scale, force_mps2=zero)
@@ -143,72 +97,7 @@ def test_normalised_errors_are_about_one(estimator: str) -> None:
     assert 0.5 < rms < 1.5, rms
 
 
-@pytest.mark.slow
-def test_slope_s_normalised_errors_are_about_one() -> None:
-    vehicle, errors = machine(), []
-    made = drive(FORWARDS, vehicle, ground=Ground(0.05, 0.1, -0.05)).readings
-    for seed in range(10):
-        rng = np.random.default_rng(200 + seed)
-        zero = ZERO_STD * GRAVITY_MPS2 * rng.standard_normal()
-        for estimate in EstimatorRun(vehicle).feed(noisy(made, seed, force_mps2=zero)).between(8, 15)[::20]:
-            error = estimate.slope_x - math.tan(0.1)
-            errors += [error / math.sqrt(estimate.slope_var)]
-    rms = float(np.sqrt(np.mean(np.square(errors))))
-    assert 0.5 < rms < 1.5, rms
-
-
 # --- what is not known -----------------------------------------------------------------------------------------------
-
-
-def test_nothing_is_known_before_the_imu_speaks() -> None:
-    assert GroundEstimator(VEHICLE, EstimationConfig()).at(START_NS) == PLACE_ALONE
-    run = EstimatorRun(VEHICLE).feed(drive(FORWARDS, VEHICLE, without=("imu",)).readings)
-    assert run.last == PLACE_ALONE
-    assert run.estimator.newest_ns == 0
-
-
-@pytest.mark.parametrize(("kind", "reason"), [(Torque, "no_torque"), (Encoder, "no_wheels")])
-def test_sensor_that_falls_silent_is_missed_and_welcomed_back(kind: type[Reading], reason: str) -> None:
-    made = drive([*FORWARDS, Leg(10)], VEHICLE)
-    silent = (made.stamps_ns[1200], made.stamps_ns[1600])
-    run = EstimatorRun(VEHICLE).feed(
-        [r for r in made.readings if not (isinstance(r, kind) and silent[0] < r.stamp_ns < silent[1])]
-    )
-    assert {e.reason for e in run.between(8, 12.3)} == {""}
-    assert {e.reason for e in run.between(12.8, 15.9)} == {reason}
-    assert {e.reason for e in run.between(17.5, 30)} == {""}
-    assert all(math.isnan(e.c_rr) and math.isfinite(e.slope_x) for e in run.between(12.8, 15.9))
-    assert run.last.c_rr == pytest.approx(0.04, abs=0.003)
-    assert run.estimator.fault == ""
-
-
-def test_accelerometer_in_g_is_no_accelerometer() -> None:
-    made = drive(FORWARDS, VEHICLE).readings
-    in_g = [
-        replace(r, force_x_mps2=r.force_x_mps2 / 9.81, force_z_mps2=r.force_z_mps2 / 9.81) if isinstance(r, Imu) else r
-        for r in made
-    ]
-    run = EstimatorRun(VEHICLE).feed(in_g)
-    assert run.last.reason == "accelerometer"
-    assert math.isnan(run.last.slope_x)
-    assert run.estimator.health()["fault"] == "accelerometer"
-
-
-def test_torque_in_a_wrong_unit_is_noticed() -> None:
-    legs = [STAND, START, *[Leg(3, 0.6), Leg(3, -0.6)] * 5]
-    made = [
-        replace(r, torque_nm=r.torque_nm * 0.001) if isinstance(r, Torque) else r for r in drive(legs, VEHICLE).readings
-    ]
-    run = EstimatorRun(VEHICLE).feed(made)
-    assert run.last.reason == "torque_implausible"
-    assert run.estimator.fault == "torque_implausible"
-
-
-def test_fault_of_the_moment_is_none() -> None:
-    """A machine that stands or brakes is not broken."""
-    run = EstimatorRun(VEHICLE).feed(drive([*FORWARDS, Leg(4, -0.5), Leg(3)], VEHICLE).readings)
-    assert run.last.reason == "standstill"
-    assert run.estimator.fault == ""
 
 
 def test_standing_machine_learns_nothing_and_keeps_what_it_knew() -> None:
@@ -244,16 +133,6 @@ def test_change_of_slope_blurs_slope_and_resistance() -> None:
         assert e.mass_kg == VEHICLE.mass_kg
 
 
-@pytest.mark.parametrize(("speed_mps", "axles"), [(2.0, (0.4, 3.3, 2.1)), (-2.0, (0.6, 3.3, 1.2))])
-def test_step_states_which_axle_leads(speed_mps: float, axles: tuple[float, float, float]) -> None:
-    """Its share of the load, how far the other one is behind, and the load centre."""
-    estimator = GroundEstimator(machine(wheelbase_m=3.3, load_centre_m=1.2), EstimationConfig())
-    step = estimator._balance_step(replace(STEADY, speed_mps=speed_mps, on_front=0.4), 0.1, 0.04, 1.0)
-    assert (step.lead_share, step.wheelbase_m, step.lead_m) == pytest.approx(axles)
-    bare = GroundEstimator(machine(), EstimationConfig())._balance_step(STEADY, 0.1, 0.04, 1.0)
-    assert (bare.lead_share, bare.wheelbase_m) == (1.0, 0.0)
-
-
 # --- calibration -----------------------------------------------------------------------------------------------------
 
 CYCLE = [Leg(4, 0.5), Leg(6), Leg(4, -0.5), Leg(4), Leg(4, -0.5), Leg(6), Leg(4, 0.5), Leg(4)]  # there and back
@@ -261,7 +140,7 @@ CYCLE = [Leg(4, 0.5), Leg(6), Leg(4, -0.5), Leg(4), Leg(4, -0.5), Leg(6), Leg(4,
 
 @cache
 def cycles(vehicle: MachineConfig, n: int, **ground: Any) -> list[Reading]:
-    return drive([STAND, *CYCLE * n], vehicle, ground=Ground(0.04, **ground)).readings
+    return thinned(drive([STAND, *CYCLE * n], vehicle, ground=Ground(0.04, **ground)).readings)
 
 
 def off(readings: list[Reading], zero_mps2: float, torque: float = 1.0) -> list[Reading]:
@@ -279,9 +158,9 @@ def off(readings: list[Reading], zero_mps2: float, torque: float = 1.0) -> list[
 @pytest.mark.slow
 def test_zero_is_found_by_the_work_cycle() -> None:
     """0.06 m/s2 are 0.006 of c_rr, each direction the other way; slope ahead is put right too."""
-    readings = off(cycles(VEHICLE, 5), 0.06)
+    readings = off(cycles(VEHICLE, 3), 0.06)
     run, without = (EstimatorRun(VEHICLE, EstimationConfig(calibrate=c)).feed(readings) for c in (True, False))
-    for direction in ((151.5, 155.5), (169.5, 173.5)):  # of the last cycle
+    for direction in ((79.5, 83.5), (97.5, 101.5)):  # of the last cycle
         calibrated, uncalibrated = ([e.c_rr for e in r.between(*direction) if not e.reason] for r in (run, without))
         assert len(calibrated) > 20
         assert np.mean(calibrated) == pytest.approx(0.04, abs=0.0015)
@@ -289,7 +168,7 @@ def test_zero_is_found_by_the_work_cycle() -> None:
     health = run.estimator.health()["calibration"]
     assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.001)
     assert 0 < health["zero_std"] < 0.0015
-    assert health["pairs"] > 100
+    assert health["pairs"] > 60
     assert health["passages"] >= health["pairs"]
     assert 0 <= health["age_s"] < 40
     assert run.last.slope_x == pytest.approx(0.0, abs=0.003)
@@ -299,15 +178,15 @@ def test_zero_is_found_by_the_work_cycle() -> None:
 
 @pytest.mark.slow
 def test_new_calibration_takes_effect_at_a_standstill_only() -> None:
-    made = drive([STAND, START, Leg(40), Leg(4, -0.5), Leg(3), START, Leg(6)], VEHICLE).readings
+    made = drive([STAND, START, Leg(24), Leg(4, -0.5), Leg(3), START, Leg(6)], VEHICLE).readings
     run = EstimatorRun(VEHICLE, known_c_rr=0.04).feed(off(made, 0.06))
-    first = [e.c_rr for e in run.between(8, 45) if not e.reason]
+    first = [e.c_rr for e in run.between(8, 29) if not e.reason]
     assert np.mean(first) == pytest.approx(0.04 - 0.06 / GRAVITY_MPS2, abs=1e-3)
     assert np.ptp(first) < 2e-3
-    assert run.estimator.calibration.passages > 100
+    assert run.estimator.calibration.passages > 60
     health = run.estimator.health()["calibration"]
     assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)
-    assert health["known_ground"] > 100
+    assert health["known_ground"] > 60
 
 
 @pytest.mark.slow
@@ -328,31 +207,9 @@ def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("estimator", ["kalman", pytest.param("rls", marks=pytest.mark.nightly)])
-@pytest.mark.nightly
-def test_a_machine_that_drives_round_and_round_finds_its_zero_and_applies_it_as_it_drives(estimator: str) -> None:
-    """At 2 m/s round a circle of 20 m; it never stands again. Where the calibration changes the ground does not."""
-    readings = off(drive([STAND, START, Leg(150, turn_radps=0.1)], VEHICLE).readings, 0.06)
-    zero = -0.06 / GRAVITY_MPS2
-    run = EstimatorRun(VEHICLE, EstimationConfig(estimator), knows_place=True).feed(readings)
-    health = run.estimator.health()["calibration"]
-    assert health["zero"] == pytest.approx(zero, abs=0.001)
-    assert (health["tours"], health["torn"]) == (2, 0)
-    assert np.mean([e.c_rr for e in run.between(20, 60) if not e.reason]) == pytest.approx(0.04 + zero, abs=1e-3)
-    last = [e for e in run.between(75, 150) if not e.reason]
-    assert np.mean([e.c_rr for e in last]) == pytest.approx(0.04, abs=1.5e-3)
-    assert {e.zero for e in last} <= {e.zero for e in run.between(0, 150)}
-    settled = [e.c_rr + e.zero for e in run.between(20, 150)]  # as measured
-    assert np.ptp(settled) < 1e-3
-    plain = EstimatorRun(VEHICLE, EstimationConfig(estimator, closed_tours=False), knows_place=True).feed(readings)
-    assert plain.estimator.health()["calibration"]["zero"] == 0.0
-    assert EstimatorRun(VEHICLE, EstimationConfig(estimator)).feed(readings).estimator.calibration.zero == 0.0
-
-
-@pytest.mark.slow
 def test_a_jolt_on_the_way_does_not_hide_the_zero() -> None:
     """Three steps of the balance at the end of what is plausible, as at the foot of a ramp."""
-    made = off(drive([STAND, START, Leg(80, turn_radps=0.1)], VEHICLE).readings, 0.06)
+    made = off(thinned(drive([STAND, START, Leg(80, turn_radps=0.1)], VEHICLE).readings), 0.06)
     jolt_ns = range(START_NS + 40_000_000_000, START_NS + 40_150_000_000)
     readings = [replace(r, force_z_mps2=17.0) if isinstance(r, Imu) and r.stamp_ns in jolt_ns else r for r in made]
     run = EstimatorRun(VEHICLE, EstimationConfig(), knows_place=True).feed(readings)
@@ -360,44 +217,5 @@ def test_a_jolt_on_the_way_does_not_hide_the_zero() -> None:
     assert "accelerometer" in [e.reason for e in run.between(39, 42)]
     assert (health["tours"], health["torn"]) == (1, 0)
     assert health["zero"] == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.0015)  # one tour, and the data sheet
-
-
-def test_calibration_from_before_is_used_at_once() -> None:
-    zero = -0.06 / GRAVITY_MPS2
-    known = Calibration(zero, 0.0, ((1e-7, 0.0), (0.0, 1e-4)), START_NS - 10**10, 400)
-    readings = off(drive(FORWARDS, VEHICLE).readings, 0.06)
-    estimates = [e for e in EstimatorRun(VEHICLE, calibration=known).feed(readings).between(6, 14) if not e.reason]
-    assert np.mean([e.c_rr for e in estimates]) == pytest.approx(0.04, abs=0.0015)
-    unknown = [e for e in EstimatorRun(VEHICLE).feed(readings).between(6, 14) if not e.reason]
-    assert np.mean([e.c_rr_var for e in estimates]) < 0.5 * np.mean([e.c_rr_var for e in unknown])
-    health = EstimatorRun(VEHICLE, calibration=known).feed(readings).estimator.health()["calibration"]
-    assert health["age_s"] == pytest.approx(10 + 16, abs=0.5)
-
-
-@pytest.mark.slow
-def test_what_is_found_is_handed_on() -> None:
-    run = EstimatorRun(VEHICLE).feed(off(cycles(VEHICLE, 2), 0.06))
-    calibration = run.estimator.calibration
-    assert calibration.zero == pytest.approx(-0.06 / GRAVITY_MPS2, abs=0.001)
-    again = EstimatorRun(VEHICLE, calibration=calibration).feed(drive([STAND], VEHICLE).readings).estimator
-    assert again.calibration.zero == calibration.zero
-    assert again.health()["calibration"]["zero"] == calibration.zero
-    assert again.health()["calibration"]["passages"] == calibration.passages
-
-
-# --- options ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("mass", ground.MASSES)
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_every_combination_runs(estimator: str, mass: str) -> None:
-    vehicle = weighing()
-    estimate = last_estimate(vehicle, drive(FORWARDS, vehicle), estimator=estimator, mass=mass)
-    assert estimate.c_rr == pytest.approx(0.04, abs=0.01)
-    assert 0 < estimate.c_rr_var < 1e-2
-
-
-@pytest.mark.parametrize(("name", "value"), [("estimator", "ukf"), ("mass", "guessed")])
-def test_bad_estimation_option_is_refused_by_name(name: str, value: object) -> None:
-    with pytest.raises(ValueError, match=name):
-        EstimationConfig(**{name: value})  # type: ignore[arg-type]
+    plain = EstimatorRun(VEHICLE, EstimationConfig(closed_tours=False), knows_place=True).feed(readings)
+    assert plain.estimator.health()["calibration"]["zero"] == 0.0

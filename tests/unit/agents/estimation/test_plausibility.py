@@ -4,11 +4,10 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from agents.estimation.balance import Balance
-from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility
+from agents.estimation.plausibility import Plausibility
 from tests.unit.agents.ground import STEADY, after
 
 
@@ -32,44 +31,22 @@ def at_work(seconds: float, gain: float = 1.0, offset: float = 0.0, c_rr: float 
     return judged
 
 
-# --- nothing is wrong ------------------------------------------------------------------------------------------------
-
-
-def test_a_machine_that_drives_steadily_is_believed() -> None:
-    assert set(reasons(after(i, share=0.04 + 1e-5 * (i % 2)) for i in range(2000))) == {""}
-
-
 def test_a_loader_at_work_is_believed() -> None:
     assert set(reasons(at_work(300))) == {""}
 
 
-def test_which_reasons_are_faults_and_which_leave_no_slope() -> None:
-    assert {"pitch_transient", "accelerometer"} == SLOPE_TOO
-    assert {"accelerometer", "no_torque", "no_wheels", "torque_frozen", "torque_implausible"} == FAULTS
-
-
-# --- one balance is enough -------------------------------------------------------------------------------------------
-
 CASES = [  # a change of the steady balance, and why it is withheld
     ({"norm_mps2": 1.0}, "accelerometer"),  # in g
     ({"norm_mps2": 9810.0}, "accelerometer"),  # in mm/s2
-    ({"norm_mps2": 0.0}, "accelerometer"),
     ({"wheels_s": 0.6}, "no_wheels"),
-    ({"wheels_s": math.inf}, "no_wheels"),
-    ({"torque_s": 0.6}, "no_torque"),
     ({"torque_s": math.inf}, "no_torque"),
     ({"share": 1.3}, "torque_implausible"),
-    ({"share": -1.3}, "torque_implausible"),
     ({"speed_mps": 0.39}, "standstill"),
-    ({"speed_mps": -0.39}, "standstill"),
     ({"pitch_radps": 0.03}, "pitch_transient"),
-    ({"pitch_radps": -0.03}, "pitch_transient"),
     ({"pitch_radps": -0.03, "speed_mps": 0.5}, "pitch_transient"),
     ({"pitch_radps": 0.11, "speed_mps": 8.0}, "pitch_transient"),
-    ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.0}, "braking"),
     ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.019}, "braking"),  # coasts, by a torque sensor with a zero
     ({"accel_mps2": 1.6, "body_mps2": 1.6, "speed_mps": -2.0, "unbalanced": -0.04}, "braking"),
-    ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": -0.1}, "braking"),
     ({"unbalanced": 0.46}, "digging"),
     ({"unbalanced": -0.46, "speed_mps": -2.0}, "digging"),
     ({"accel_mps2": 8.0}, "slip"),  # low-passed: a sixth of it counts at once
@@ -79,11 +56,8 @@ CASES = [  # a change of the steady balance, and why it is withheld
     ({"speed_mps": 0.1, "accel_mps2": -3.0, "pitch_radps": 0.1}, "standstill"),
     # below the thresholds
     ({"speed_mps": 0.41}, ""),
-    ({"speed_mps": -0.41, "unbalanced": -0.04}, ""),
     ({"pitch_radps": 0.025}, ""),
-    ({"pitch_radps": 0.025, "speed_mps": 0.5}, ""),
     ({"pitch_radps": 0.1, "speed_mps": 8.0}, ""),  # the same crown as at 2 m/s, passed four times as fast
-    ({"pitch_radps": 0.1, "speed_mps": -8.0, "unbalanced": -0.04}, ""),
     ({"accel_mps2": 1.6, "body_mps2": 1.6}, ""),  # accelerates
     ({"accel_mps2": -1.6, "body_mps2": -1.6, "share": 0.03, "unbalanced": 0.25}, ""),  # pulls: sand slows it down
     ({"accel_mps2": 1.6, "body_mps2": 1.6, "speed_mps": -2.0, "share": -0.03, "unbalanced": -0.25}, ""),  # in reverse
@@ -91,8 +65,6 @@ CASES = [  # a change of the steady balance, and why it is withheld
     ({"unbalanced": 0.44}, ""),
     ({"unbalanced": -0.44}, ""),  # forwards: nothing that digs
     ({"wheels_s": 0.4, "torque_s": 0.4}, ""),
-    ({"norm_mps2": 8.0}, ""),
-    ({"norm_mps2": 12.0}, ""),
     ({"share": 1.19}, ""),
     ({"accel_mps2": 1.0, "body_mps2": 1.9}, ""),
 ]
@@ -136,28 +108,11 @@ def frozen(seconds: float, swing: float, share: float = 0.1, every_s: float = 4.
 
 def test_torque_that_stays_the_same_while_motion_changes_is_frozen() -> None:
     judged = reasons(frozen(10, 0.08))
+    assert set(reasons(frozen(10, 0.02))) == {""}, "a small change of the motion is no proof"
     begins = judged.index("torque_frozen") * 0.05
     assert 2.0 <= begins < 4.0
     assert set(judged[:40]) == {""}
     assert set(judged[100:]) == {"torque_frozen"}
-
-
-def test_a_small_change_of_the_motion_is_no_proof_of_frozen_torque() -> None:
-    assert set(reasons(frozen(10, 0.02))) == {""}
-    assert "torque_frozen" in reasons(frozen(10, 0.045))
-
-
-def test_torque_at_the_end_of_its_range_is_frozen() -> None:
-    """A sensor that ends at a third of the weight, on a machine that pushes harder now and then for seconds."""
-    steps = []
-    for i in range(1200):
-        taken = 0.25 + 0.2 * math.sin(2 * math.pi * i * 0.05 / 20)
-        share = min(taken + 0.04, 0.33)
-        steps.append(after(i, share=share, unbalanced=share - taken))
-    judged = reasons(steps)
-    assert "torque_frozen" in judged
-    saturated = [b.share == 0.33 for b in steps]
-    assert not any(reason == "torque_frozen" and not s for reason, s in zip(judged, saturated, strict=True))
 
 
 def test_frozen_torque_that_moves_again_is_believed_at_once() -> None:
@@ -172,32 +127,6 @@ def test_torque_that_stays_the_same_at_a_standstill_or_steadily_is_not_frozen() 
     assert set(reasons(frozen(60, 0.0))) == {""}
 
 
-@pytest.mark.parametrize(
-    "gain", [1000.0, 1 / 1000, 0.3, 3.0, -1.0], ids=["Nm in mNm", "Nm in kNm", "a third", "three times", "sign"]
-)
-def test_torque_in_a_wrong_unit_is_implausible(gain: float) -> None:
-    judged = reasons(at_work(120, gain))
-    assert judged[-1] == "torque_implausible"
-    assert judged.index("torque_implausible") * 0.05 < 25
-
-
-@pytest.mark.parametrize(("gain", "offset"), [(0.8, -0.03), (1.25, 0.03)])
-def test_scales_and_zeros_as_sensors_have_them_are_believed(gain: float, offset: float) -> None:
-    assert set(reasons(at_work(120, gain, offset))) == {""}
-
-
-def test_forces_of_a_machine_that_stands_prove_nothing() -> None:
-    standing = [replace(b, speed_mps=0.0) for b in at_work(60, 5.0)]
-    judged = reasons([*standing, *(replace(b, stamp_ns=b.stamp_ns + 60 * 10**9) for b in at_work(60))])
-    assert set(judged) <= {"", "standstill"}
-
-
-def test_resistance_alone_does_not_look_like_a_wrong_unit() -> None:
-    """Sand and asphalt in turn: the drive force changes, and what the motion takes does not."""
-    steps = [after(i, share=c, unbalanced=c) for i in range(4000) for c in [0.25 if i // 200 % 2 else 0.01]]
-    assert set(reasons(steps)) == {""}
-
-
 def test_sand_that_slows_a_machine_down_does_not_look_like_a_wrong_unit() -> None:
     """It takes more force while it slows the machine down, and less as that speeds up again behind it."""
     steps = []
@@ -208,23 +137,12 @@ def test_sand_that_slows_a_machine_down_does_not_look_like_a_wrong_unit() -> Non
     assert set(reasons(steps)) == {""}
 
 
-@pytest.mark.parametrize("gain", [1 / 1000, 0.3, 3.0, -1.0])
-def test_torque_in_a_wrong_unit_is_implausible_on_changing_ground_too(gain: float) -> None:
-    steps = [
-        replace(b, share=gain * (b.share + extra), unbalanced=gain * (b.share + extra) - (b.share - b.unbalanced))
-        for i, b in enumerate(at_work(120))
-        for extra in [0.2 if i % 400 < 80 else 0.0]
-    ]
-    assert reasons(steps).count("torque_implausible") > 0.6 * len(steps)
-
-
-def test_a_machine_that_never_varies_proves_nothing() -> None:
-    steps = [after(i, share=0.00004, unbalanced=0.00004) for i in range(4000)]
-    assert set(reasons(steps)) == {""}
-
-
-@pytest.mark.parametrize(("gain", "is_plausible"), [(0.36, False), (0.5, True), (2.0, True), (2.8, False)])
-def test_gain_within_its_limits_is_believed(gain: float, is_plausible: bool) -> None:
+@pytest.mark.parametrize(
+    ("gain", "is_plausible"), [(0.36, False), (0.5, True), (2.0, True), (2.8, False), (1e3, False), (-1, False)]
+)
+def test_torque_in_a_wrong_unit_is_implausible_and_a_gain_within_its_limits_is_believed(
+    gain: float, is_plausible: bool
+) -> None:
     assert ("torque_implausible" not in reasons(at_work(60, gain))) is is_plausible
 
 
@@ -234,13 +152,3 @@ def test_a_unit_that_is_put_right_is_believed_again_after_a_while() -> None:
     judged = reasons([*wrong, *right])[len(wrong) :]
     assert judged[0] == "torque_implausible"
     assert judged[-1] == ""
-
-
-def test_noise_of_the_torque_does_not_look_like_a_wrong_unit() -> None:
-    seed = 4
-    rng = np.random.default_rng(seed)
-    noise = 0.03 * rng.standard_normal(6000)
-    steps = [
-        replace(b, share=b.share + e, unbalanced=b.unbalanced + e) for b, e in zip(at_work(300), noise, strict=True)
-    ]
-    assert set(reasons(steps)) == {""}, f"{seed=}"

@@ -10,7 +10,7 @@ from agents.estimation.balance import BalanceStep
 from agents.estimation.resistance_rls import MultipleForgetting, RecursiveGrade, RecursiveResistance
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
-from tests.unit.agents.ground import STEP_S, feed, level_steps, white_noise
+from tests.unit.agents.ground import STEP_S, feed, level_steps
 
 
 def by_the_paper(
@@ -47,60 +47,31 @@ def test_it_is_the_algorithm_of_the_paper() -> None:
         assert squares.variance == pytest.approx(p, rel=1e-9), f"{seed=}"
 
 
-def test_factors_mean_the_same_at_any_rate() -> None:
-    estimates = []
-    for dt_s in (0.02, 0.1):
-        squares = MultipleForgetting(np.zeros(1), np.ones(1), np.array([0.5]), np.full(1, 1e9))
-        for i in range(round(8 / dt_s)):
-            squares.update(dt_s, 0.0 if i * dt_s < 7 else 1.0, np.ones(1))
-        estimates.append(float(squares.parameters[0]))
-    assert estimates == pytest.approx([0.5, 0.5], abs=0.03)  # half of the past is forgotten in the last second
-
-
-def test_variance_stays_below_its_bound_without_excitation() -> None:
-    squares = MultipleForgetting(np.zeros(2), np.ones(2), np.full(2, 0.1), np.array([3.0, 5.0]))
-    for _ in range(1000):
-        squares.update(STEP_S, 0.0, np.zeros(2))
-    assert squares.variance.tolist() == [3.0, 5.0]
-
-
-def test_wrong_mass_is_found_where_forces_vary_faster_than_the_ground() -> None:
-    n = round(600 / STEP_S)
-    share = 0.05 + 0.2 * np.sin(0.3 * np.arange(n))
-    rls = RecursiveResistance(estimates_mass=True)
-    feed(rls, level_steps(0.05 + 0.1 * share, share=share))
-    assert 0.05 < rls._squares.parameters[0] < 0.11  # slowly: ten minutes
-    estimate = rls.at(START_NS + (n - 1) * 50_000_000)
-    assert estimate[0] == pytest.approx(0.05, abs=0.01)
-
-
-def test_ground_that_jumps_is_followed_within_seconds() -> None:
-    rls = RecursiveResistance()
-    raw = np.where(np.arange(400) < 200, 0.02, 0.06)
-    for i, step in enumerate(level_steps(raw)):
-        rls.update(step)
-        if i == 199 + round(1.36 / STEP_S):  # ln 2 / -ln 0.6 s: half of it
-            half = rls.at(step.stamp_ns)
-    assert half[0] == pytest.approx(0.04, abs=2e-3)
-    last = rls.at(START_NS + 399 * 50_000_000)
-    assert last[0] == pytest.approx(0.06, abs=1e-3)
-
-
-def test_variance_is_that_of_white_noise() -> None:
-    seed, errors = 5, []
+def test_grade_is_the_slope_of_the_mean_sine() -> None:
+    seed, slope_rad, grade = 6, -0.3, RecursiveGrade()
     rng = np.random.default_rng(seed)
-    for _ in range(60):
-        rls = RecursiveResistance()
-        feed(rls, level_steps(0.05 + white_noise(0.004, 300, rng)))
-        estimate = rls.at(START_NS + 299 * 50_000_000)
-        errors.append((estimate[0] - 0.05) / math.sqrt(estimate[1]))
-    rms = float(np.sqrt(np.mean(np.square(errors))))
-    assert 0.8 < rms < 1.25, f"{seed=} {rms=}"
+    estimates = [grade.update(STEP_S, math.sin(slope_rad) + 0.02 * rng.standard_normal()) for _ in range(400)]
+    assert np.mean(estimates[200:]) == pytest.approx(slope_rad, abs=3e-3), f"{seed=}"
+    assert np.std(estimates[200:]) < 0.02
+    later = [grade.update(STEP_S, 0.0) for _ in range(round(2 / STEP_S))]
+    assert later[-1] == pytest.approx(0.2**2 * slope_rad, abs=0.01)
+
+
+def test_recalibrated_goes_on_from_what_it_would_have_been() -> None:
+    regressor = -1.0
+
+    def steps(raw: float) -> list[BalanceStep]:
+        return [replace(step, regressor=regressor, raw=regressor * raw) for step in level_steps(np.full(400, raw))]
+
+    estimator = RecursiveResistance()
+    feed(estimator, steps(0.04))
+    estimator.recalibrate(0.005, 0.1)
+    c_rr, _ = estimator.at(START_NS + 399 * round(STEP_S * 1e9))
+    assert c_rr == pytest.approx(0.04 - regressor * (0.005 + 0.1 * 0.04), abs=1e-4)
 
 
 def test_a_load_that_changes_at_a_stop_is_found_again_sooner() -> None:
-    n = round(600 / STEP_S)
-    share = 0.05 + 0.2 * np.sin(0.3 * np.arange(n))
+    share = 0.05 + 0.2 * np.sin(0.3 * np.arange(3000))
     estimates = []
     for loads in (True, False):
         rls = RecursiveResistance(estimates_mass=True)
@@ -111,48 +82,17 @@ def test_a_load_that_changes_at_a_stop_is_found_again_sooner() -> None:
     assert estimates[0] < estimates[1] - 1e-3
 
 
-def test_mass_that_is_known_stays_known() -> None:
-    rls = RecursiveResistance()
-    share = 0.1 + 0.15 * np.sin(0.05 * np.arange(400))
-    feed(rls, level_steps(0.05 + 0.2 * share, share=share))
-    rls.stand(changes_load=True)
-    feed(rls, level_steps(0.05 + 0.2 * share, share=share))
-    assert rls._squares.parameters[0] == 0.0
-    assert rls._squares.variance[0] == 0.0
-
-
 def test_only_the_recent_past_has_an_estimate() -> None:
     rls = RecursiveResistance()
     assert rls.at(START_NS) is None
     feed(rls, level_steps(np.full(20, 0.05)))
     end = START_NS + 19 * 50_000_000
-    assert rls.at(end - 10**9)
     assert rls.at(end + 490_000_000)
     assert rls.at(end + 510_000_000) is None
 
 
-@pytest.mark.parametrize("slope_rad", [0.2, -0.3])
-def test_grade_is_the_slope_of_the_mean_sine(slope_rad: float) -> None:
-    seed, grade = 6, RecursiveGrade()
-    rng = np.random.default_rng(seed)
-    estimates = [grade.update(STEP_S, math.sin(slope_rad) + 0.02 * rng.standard_normal()) for _ in range(400)]
-    assert np.mean(estimates[200:]) == pytest.approx(slope_rad, abs=3e-3), f"{seed=}"
-    assert np.std(estimates[200:]) < 0.02
-    later = [grade.update(STEP_S, 0.0) for _ in range(round(2 / STEP_S))]
-    assert later[-1] == pytest.approx(0.2**2 * slope_rad, abs=0.01)
-
-
-def test_grade_survives_nonsense() -> None:
-    assert math.isfinite(RecursiveGrade().update(STEP_S, 40.0))
-
-
-@pytest.mark.parametrize("regressor", [1.0, -1.0])
-def test_recalibrated_goes_on_from_what_it_would_have_been(regressor: float) -> None:
-    def steps(raw: float) -> list[BalanceStep]:
-        return [replace(step, regressor=regressor, raw=regressor * raw) for step in level_steps(np.full(400, raw))]
-
-    estimator = RecursiveResistance()
-    feed(estimator, steps(0.04))
-    estimator.recalibrate(0.005, 0.1)
-    c_rr, _ = estimator.at(START_NS + 399 * round(STEP_S * 1e9))
-    assert c_rr == pytest.approx(0.04 - regressor * (0.005 + 0.1 * 0.04), abs=1e-4)
+def test_variance_stays_below_its_bound_without_excitation() -> None:
+    squares = MultipleForgetting(np.zeros(2), np.ones(2), np.full(2, 0.1), np.array([3.0, 5.0]))
+    for _ in range(200):
+        squares.update(STEP_S, 0.0, np.zeros(2))
+    assert squares.variance.tolist() == [3.0, 5.0]

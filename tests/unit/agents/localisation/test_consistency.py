@@ -22,7 +22,6 @@ def white(seed: int = 3, n: int = 150) -> np.ndarray:
 
 def test_white_innovations_of_the_right_size_are_good() -> None:
     consistency = monitored(white()).consistency()
-    assert consistency is not None
     assert consistency.verdict == CANNOT_TELL
     assert consistency.nis == pytest.approx(1.0, abs=0.25)
     assert abs(consistency.correlation) < 0.25
@@ -41,8 +40,6 @@ def test_white_innovations_of_the_right_size_are_good() -> None:
 def test_what_a_consistent_filter_does_not_see_is_monitored(monitor: InnovationMonitor, name: str) -> None:
     consistency = monitor.consistency()
     good = monitored(white()).consistency()
-    assert consistency is not None
-    assert good is not None
     assert consistency.verdict == INCONSISTENT
     assert abs(getattr(consistency, name) - getattr(good, name)) > 0.4
 
@@ -52,9 +49,7 @@ def test_too_few_say_nothing_and_old_ones_are_forgotten() -> None:
     monitor = monitored(10 * white())
     for innovation in white():
         monitor.note(Conditioned(BELIEF, innovation, np.eye(2), float(innovation @ innovation), accepted=True))
-    consistency = monitor.consistency()
-    assert consistency is not None
-    assert consistency.verdict == CANNOT_TELL
+    assert monitor.consistency().verdict == CANNOT_TELL
 
 
 def test_measurements_that_are_no_numbers_say_nothing_of_the_filter() -> None:
@@ -87,12 +82,9 @@ def test_a_slow_error_is_seen_by_its_size_and_denied_by_another_receiver_alone(
     slow_error: float, is_checked: bool, verdict: str
 ) -> None:
     consistency = noted(slow_error, 600.0).consistency(is_checked=is_checked)
-    assert consistency is not None
     assert consistency.verdict == verdict
     assert consistency.slow_error == pytest.approx(slow_error, abs=0.35)
 
 
 def test_a_slow_error_is_no_verdict_before_it_has_lasted() -> None:
-    consistency = noted(2 * MAX_LEVEL, 30.0).consistency()
-    assert consistency is not None
-    assert consistency.verdict == CANNOT_TELL
+    assert noted(2 * MAX_LEVEL, 30.0).consistency().verdict == CANNOT_TELL

@@ -5,15 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby
-from operator import attrgetter
 
 import numpy as np
 import pytest
 
-from agents.localisation.consistency import CANNOT_TELL, CONSISTENT, INCONSISTENT
 from agents.localisation.filters.belief import Belief, PoseBelief
-from agents.localisation.filters.state import PITCH, ROLL
 from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.positioning import PipelineConfig, Positioning
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
@@ -80,12 +76,6 @@ def located(
     return positioning, poses, beliefs
 
 
-def net_m(made: Drive, poses: Sequence[PoseBelief]) -> float:
-    """Root mean square of the distance from the true place."""
-    off = [math.dist((p.x_m, p.y_m), made.at(p.stamp_ns)[:2]) for p in poses]
-    return float(np.sqrt(np.mean(np.square(off))))
-
-
 def scale_of(positioning: Positioning, belief: Belief) -> tuple[float, float]:
     """The wheels' scale and its standard deviation."""
     state = positioning.localiser._tracker._model.layout.wheel_scales.start
@@ -125,53 +115,6 @@ def test_wheels_that_pause_while_the_machine_brakes_come_back_with_their_new_spe
     assert positioning.counters["standstill_used"] == 0
 
 
-# --- any order -------------------------------------------------------------------------------------------------------
-
-MANY = (
-    replace(GPS, delay_s=0.1),
-    SensorConfig("gps-2", "gps", delay_s=0.1),
-    SensorConfig("imu", "imu"),
-    SensorConfig("gyro", "imu", measures=("rate",)),
-    SensorConfig("wheels", "odometry", measures=("speed",)),
-    SensorConfig("left", "encoder", Mount((0.0, 0.7, 0.0))),
-)
-
-
-def shuffled_stamps(readings: Sequence[Reading], rng: np.random.Generator) -> list[Reading]:
-    """Readings of each stamp in another order."""
-    groups = [list(group) for _, group in groupby(readings, key=attrgetter("stamp_ns"))]
-    return [group[i] for group in groups for i in rng.permutation(len(group))]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("engine", "rate_hz"), [("ekf", 20), ("ukf", 5)])
-@pytest.mark.nightly
-def test_no_order_of_sensor_tables_and_of_readings_of_a_stamp_changes_a_bit(engine: str, rate_hz: float) -> None:
-    vehicle = cart(*MANY)
-    readings = readings_of(vehicle, drive(TOUR, vehicle), rate_hz, seed=4)[: 25 * rate_hz * len(MANY)]
-    _, poses, _ = located(vehicle, readings, engine)
-    assert len(poses) > 50
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        swapped = replace(vehicle, sensors=tuple(MANY[i] for i in rng.permutation(len(MANY))))
-        _, others, _ = located(swapped, shuffled_stamps(readings, rng), engine)
-        assert [repr(p) for p in others] == [repr(p) for p in poses], f"seed={seed}"
-
-
-def test_a_reading_counts_in_the_step_of_its_stamp() -> None:
-    """At 5 Hz, where a machine starts to turn and to drive at once, both show at once in whatever order they come."""
-    vehicle = cart(GYRO, ODOMETRY, GPS)
-    made = drive(TOUR, vehicle)
-    readings = readings_of(vehicle, made, 5, seed=2)
-    readings.sort(key=lambda r: (r.stamp_ns, r.sensor == "gyro"))
-    net = net_m(made, located(vehicle, readings)[1])
-    readings.sort(key=lambda r: (r.stamp_ns, r.sensor != "gyro"))
-    assert net_m(made, located(vehicle, readings)[1]) == net
-
-
-# --- what a sensor provides decides what is estimated ----------------------------------------------------------------
-
-
 AHRS, JOINT = SensorConfig("ahrs", "attitude"), SensorConfig("joint", "articulation")
 IMU, FORCE = SensorConfig("imu", "imu"), SensorConfig("force", "imu", measures=("force",))
 
@@ -181,13 +124,10 @@ IMU, FORCE = SensorConfig("imu", "imu"), SensorConfig("force", "imu", measures=(
     [
         ((IMU,), "default", True),
         ((GYRO,), "default", False),
-        ((FORCE,), "default", False),
         ((GYRO, FORCE), "default", True),
-        ((replace(IMU, use=False),), "default", False),
         ((replace(IMU, frame=FRONT),), "default", False),  # nobody knows how it lies against the rear frame
         ((replace(IMU, frame=FRONT), JOINT), "default", True),
         ((AHRS,), "paper", True),
-        ((AHRS,), "default", False),
         ((replace(AHRS, mode="relative"), GYRO), "default", True),
         ((replace(AHRS, mode="differential"), GYRO), "default", False),
         ((replace(AHRS, mode="differential"), FORCE), "default", True),
@@ -200,70 +140,3 @@ def test_tilt_is_estimated_where_something_shows_it_and_holds_it(
 ) -> None:
     config = LocalisationConfig(profile=profile)
     assert Localiser(cart(*sensors, ODOMETRY, GPS), PROJECTION, config)._tracker._model.on_plane is not in_space
-
-
-def test_a_gyro_without_accelerometer_does_not_make_the_tilt_wander() -> None:
-    vehicle = cart(GYRO, ODOMETRY, GPS)
-    made = drive(TOUR, vehicle)
-    positioning, _, beliefs = located(vehicle, readings_of(vehicle, made, 10, seed=3), "ukf")
-    assert max(abs(float(b.x[state])) for b in beliefs for state in (ROLL, PITCH)) < 1e-3
-    assert abs(scale_of(positioning, beliefs[-1])[0]) < 0.02
-    assert positioning.counters["gyro_gated"] == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("sensors", "rate_hz"),
-    [((GYRO, ODOMETRY), 20), ((SensorConfig("odometry", "odometry"),), 5), ((IMU, ENCODER), 5)],
-)
-def test_both_filters_agree_where_the_model_is_the_same(sensors: tuple[SensorConfig, ...], rate_hz: float) -> None:
-    """Where nothing but the start's wide heading is far from linear; a log that begins in motion."""
-    vehicle = cart(*sensors, GPS)
-    made = drive(TOUR, vehicle)
-    readings = readings_of(vehicle, made, rate_hz, seed=1, from_s=9.0)
-    (_, ekf, _), (_, ukf, _) = (located(vehicle, readings, engine) for engine in ("ekf", "ukf"))
-    apart = [math.dist((a.x_m, a.y_m), (b.x_m, b.y_m)) for a, b in zip(ekf, ukf, strict=True)]
-    assert max(apart) < 0.1
-    assert net_m(made, ukf) == pytest.approx(net_m(made, ekf), rel=0.05)
-
-
-# --- what nobody can know --------------------------------------------------------------------------------------------
-
-
-def judged(slow_m: float, time_s: float, receivers: int, seed: int) -> tuple[float, set[str], float]:
-    """Share of time in the 95 % ellipse, verdicts on the receivers, and the largest NIS.
-
-    The slow error has this standard deviation and correlation time; stated are 1 m and 45 s.
-    """
-    names = [f"gps-{i + 1}" for i in range(receivers)]
-    vehicle = cart(IMU, ODOMETRY, *(SensorConfig(name, "gps", drift_time_s=time_s) for name in names))
-    legs = (Leg(6, 1.0), Leg(6), *[Leg(12, 0, 0.2), Leg(5), Leg(12, 0, -0.2), Leg(5)] * 10)
-    made = drive(legs, vehicle)
-    stated = replace(vehicle, sensors=tuple(replace(s, drift_time_s=45.0, drift_share=0.8) for s in vehicle.sensors))
-    positioning, poses, _ = located(stated, readings_of(vehicle, made, 5, seed, slow_m=slow_m))
-    off = np.array([(p.x_m, p.y_m) for p in poses]) - [made.at(p.stamp_ns)[:2] for p in poses]
-    nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv([p.covariance_m2 for p in poses]), off)
-    consistency = positioning.localiser.consistency.values()
-    return float((nees < 5.99).mean()), {c.verdict for c in consistency}, max(c.nis for c in consistency)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("receivers", "slow_m", "time_s", "covers", "verdict"),
-    [
-        (1, 1.0, 45.0, True, CANNOT_TELL),
-        (1, 3.0, 405.0, False, CANNOT_TELL),  # innovations are as white and small as before
-        (2, 1.0, 45.0, True, CONSISTENT),
-        (2, 3.0, 405.0, False, INCONSISTENT),  # the receivers disagree by more than they state
-    ],
-)
-def test_an_ellipse_that_misses_the_truth_for_long_is_not_said_to_hold(
-    receivers: int, slow_m: float, time_s: float, *, covers: bool, verdict: str
-) -> None:
-    seed = 5
-    coverage, verdicts, nis = judged(slow_m, time_s, receivers, seed)
-    assert (coverage > 0.8) is covers, f"seed={seed} {coverage}"
-    assert verdict in verdicts, f"seed={seed} {verdicts}"
-    assert (CONSISTENT in verdicts) is (verdict == CONSISTENT), f"seed={seed} {verdicts}"
-    assert nis < 1.3, f"seed={seed}"

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from agents.localisation.shared_errors import PRIOR, SPAN_NS, SharedFix, ShareEstimator
+from agents.localisation.shared_errors import SPAN_NS, SharedFix, ShareEstimator
 from protocol.arrays import Floats
 
 SLOW_M2, TIME_S, WHITE_M2, RATE_HZ = 2.7, 45.0, 0.3, 5
@@ -26,15 +26,13 @@ def slow_errors(seed: int, seconds: float, receivers: int, share: float, slow_m2
     return np.sqrt(slow_m2) * (np.sqrt(share) * parts[:, :1] + np.sqrt(1 - share) * parts[:, 1:])
 
 
-def fixes_of(
-    errors_m: Floats, seed: int = SEED, *, staggered: bool = False, white_m2: float = WHITE_M2
-) -> list[SharedFix]:
-    """Fixes of receivers on a machine that drives circles with 2 m/s; staggered: each at instants of its own."""
+def fixes_of(errors_m: Floats, seed: int = SEED) -> list[SharedFix]:
+    """Fixes of receivers on a machine that drives circles with 2 m/s, each at instants of its own."""
     rng, made = np.random.default_rng(seed + 10_000), []
-    white = np.sqrt(white_m2) * rng.standard_normal(errors_m.shape)
+    white = np.sqrt(WHITE_M2) * rng.standard_normal(errors_m.shape)
     c, s = np.cos(ROTATION_RAD), np.sin(ROTATION_RAD)
     for i, j in np.ndindex(errors_m.shape[:2]):
-        t = (i + (0.3 * j if staggered else 0.0)) / RATE_HZ
+        t = (i + 0.3 * j) / RATE_HZ
         heading = 0.2 * t
         lever = LEVERS_M[j, 0] + 1j * LEVERS_M[j, 1]
         reckoned = 500 + 10 * np.sin(heading) - 10j * np.cos(heading) + lever * np.exp(1j * heading)
@@ -45,27 +43,18 @@ def fixes_of(
     return made
 
 
-def estimate(fixes: Sequence[SharedFix], receivers: int, rotation_rad: float = ROTATION_RAD) -> ShareEstimator:
+def estimate(fixes: Sequence[SharedFix], receivers: int) -> ShareEstimator:
     estimator = ShareEstimator(receivers)
     for fix in fixes:
-        estimator.add(fix, rotation_rad)
+        estimator.add(fix, ROTATION_RAD)
     return estimator
-
-
-def share_of(share: float, seed: int = SEED, receivers: int = 2, seconds: float = 300.0, **options: bool) -> float:
-    return estimate(fixes_of(slow_errors(seed, seconds, receivers, share), seed, **options), receivers).share
-
-
-def test_before_any_fix_the_share_is_what_is_likely_of_receivers() -> None:
-    assert PRIOR.sum() == 1.0
-    assert ShareEstimator(2).share == pytest.approx(0.25)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("receivers", [2, pytest.param(3, marks=pytest.mark.nightly)])
 def test_over_all_shares_the_mean_is_right_and_better_with_time(receivers: int) -> None:
     """Of shares drawn as the estimator expects them, the mean of what is left is zero: a law of every posterior."""
-    true = np.concatenate([np.zeros(20), (np.arange(20) + 0.5) / 20])
+    true = np.concatenate([np.zeros(10), (np.arange(10) + 0.5) / 10])
     early, late = [], []
     for seed, share in enumerate(true):
         estimator = ShareEstimator(receivers)
@@ -82,23 +71,9 @@ def test_over_all_shares_the_mean_is_right_and_better_with_time(receivers: int) 
     assert np.abs(np.array(late) - true).mean() < np.abs(np.array(early) - true).mean() < 0.25
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("staggered", [False, True])
-def test_antennas_and_motion_are_no_errors(staggered: bool) -> None:
-    """Levers, turns, and receivers that read at different instants: what is left is white noise alone."""
-    assert share_of(1.0, staggered=staggered) > 0.95
-    assert share_of(0.0, staggered=staggered) < 0.3
-
-
-def test_a_heading_that_is_a_little_off_does_no_harm() -> None:
-    fixes = fixes_of(slow_errors(SEED, 120, 2, 0.9))
-    assert estimate(fixes, 2, ROTATION_RAD + 0.1).share == pytest.approx(estimate(fixes, 2).share, abs=0.05)
-
-
-@pytest.mark.parametrize("share", [0.1, 0.95])
-def test_outliers_say_nothing(share: float) -> None:
+def test_outliers_say_nothing() -> None:
     """A receiver that is far off for a second in eight, or for half a minute; single fixes the filter refuses."""
-    errors = slow_errors(SEED, 180, 2, share)
+    errors = slow_errors(SEED, 180, 2, 0.95)
     plain = estimate(fixes_of(errors), 2).share
     wild = errors.copy()
     wild.reshape(-1, RATE_HZ, 2, 2)[::8, :, 1] += 30.0
@@ -108,35 +83,9 @@ def test_outliers_say_nothing(share: float) -> None:
     assert estimate(fixes_of(wild), 2).share == pytest.approx(plain, abs=0.15)
 
 
-def test_one_of_three_that_is_silent_or_alone_is_no_trouble() -> None:
-    fixes = fixes_of(slow_errors(SEED, 120, 3, 0.95))
-    two = estimate([f for f in fixes if f.receiver != 1], 3).share
-    assert two > 0.8
-    alone = estimate([f for f in fixes if f.receiver == 1], 3).share
-    assert alone == ShareEstimator(3).share
-
-
-def test_fixes_that_come_late_or_after_a_long_gap_are_no_trouble() -> None:
-    fixes = fixes_of(slow_errors(SEED, 120, 2, 0.95))
-    share = estimate(fixes, 2).share
-    assert estimate([*fixes[:600], *fixes[:50], *fixes[600:]], 2).share == share
-    gap = [f for f in fixes if not 20 < f.stamp_ns / SPAN_NS < 90]
-    assert 0.5 < estimate(gap, 2).share < 1
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_a_share_that_changes_is_followed_within_an_hour() -> None:
-    errors = np.concatenate([slow_errors(1, 900, 2, 0.95), slow_errors(2, 3600, 2, 0.0)])
-    fixes = fixes_of(errors)
-    before = 900 * RATE_HZ * 2
-    assert estimate(fixes[:before], 2).share > 0.9
-    assert estimate(fixes, 2).share < 0.3
-
-
 def test_receivers_that_err_less_than_they_state_share_it_for_all_one_knows() -> None:
     """The safe side: then several are taken for no better than one."""
     errors = slow_errors(SEED, 120, 2, 0.0, slow_m2=0.1 * SLOW_M2)
     assert estimate(fixes_of(errors), 2).share > 0.7
-    wider = slow_errors(SEED, 240, 2, 0.0, slow_m2=4 * SLOW_M2)
+    wider = slow_errors(SEED, 180, 2, 0.0, slow_m2=4 * SLOW_M2)
     assert estimate(fixes_of(wider), 2).share < 0.2

@@ -7,17 +7,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.dead_reckoning import DeadReckonedPose, WheelSpeed, turn_source
+from agents.dead_reckoning import turn_source
 from agents.localisation.filters.belief import Belief
 from agents.localisation.filters.motion import motion
-from agents.localisation.filters.state import YAW, YAW_RATE, Layout
-from agents.localisation.imu_steps import FilterStep, StepGatherer, Turn
-from agents.localisation.measurements import RATE_RADPS
-from agents.localisation.motion_sensors import STEERED_S, MotionSensors
+from agents.localisation.filters.state import YAW_RATE, Layout
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Odometry, Reading, Steering
-from tests.unit.agents.drives import LEVER_M, START_NS, Drive, Leg, RunLocaliser, drive, localiser, reckoned
-from tests.unit.agents.localisation.test_imu_steps import gather
+from tests.unit.agents.drives import (
+    LEVER_M,
+    START_NS,
+    Drive,
+    Leg,
+    RunLocaliser,
+    drive,
+    localiser,
+    reckoned,
+    seconds,
+    thinned,
+)
 
 WHEELBASE_M = 2.5
 EIGHT = [Leg(6, 0.5), Leg(4), *[Leg(25, 0, 0.25), Leg(25, 0, -0.25)] * 2]  # at 3 m/s, circles of 12 m
@@ -26,6 +33,7 @@ DARK_S = 80.0, 90.0
 ERROR = Layout(imus=1).gyro_bias(0)
 GPS, ENCODER = SensorConfig("gps-1", "gps", Mount(LEVER_M)), SensorConfig("wheels", "encoder")
 STEERING, ODOMETRY = SensorConfig("steer", "steering"), SensorConfig("odom", "odometry")
+SURE = SensorConfig("b", "odometry", std={"rate": 0.01})
 
 
 def truck(*sensors: SensorConfig) -> MachineConfig:
@@ -69,17 +77,12 @@ def run(vehicle: MachineConfig, readings: list[Reading], **options: Any) -> tupl
     return located, located.beliefs(readings)
 
 
-def seconds(stamp_ns: int) -> float:
-    return (stamp_ns - START_NS) * 1e-9
-
-
 def without_fixes(readings: list[Reading]) -> list[Reading]:
-    return [r for r in readings if not isinstance(r, Gps) or not DARK_S[0] < seconds(r.stamp_ns) < DARK_S[1]]
+    return [r for r in readings if not isinstance(r, Gps) or not DARK_S[0] < seconds(r) < DARK_S[1]]
 
 
 def errors(made: Drive, beliefs: list[Belief], from_s: float = 0.0, to_s: float = 1e9) -> list[float]:
-    chosen = [b for b in beliefs if from_s <= seconds(b.stamp_ns) <= to_s]
-    return [math.dist(b.x[:2], made.at(b.stamp_ns)[:2]) for b in chosen]
+    return [made.off_m(b) for b in beliefs if from_s <= seconds(b) <= to_s]
 
 
 # --- who tells the turn ----------------------------------------------------------------------------------------------
@@ -93,6 +96,9 @@ def errors(made: Drive, beliefs: list[Belief], from_s: float = 0.0, to_s: float 
         ((STEERING, ODOMETRY, SensorConfig("gyro", "imu", use=False)), "odom"),
         ((STEERING, replace(ODOMETRY, measures=("speed",))), "steer"),
         ((ENCODER, replace(STEERING, use=False)), None),
+        # of several the one that states the least error
+        ((ODOMETRY, SURE, replace(SURE, name="a", std={"rate": 0.2})), "b"),
+        ((replace(SURE, name="a", std={"rate": 0.2}), ODOMETRY), "a"),
     ],
 )
 def test_an_imu_is_asked_first_then_odometry_then_steering(
@@ -116,13 +122,6 @@ def test_dead_reckoning_turns_without_an_imu(sensors: tuple[SensorConfig, ...]) 
     assert (reckoning.pose.x_m, reckoning.pose.y_m) == pytest.approx((moved.real, moved.imag), abs=0.3)
 
 
-def test_odometry_without_speed_does_not_show_a_standstill() -> None:
-    vehicle = truck(replace(ODOMETRY, measures=("rate",)))
-    steps = steps_of(vehicle, [Odometry("odom", START_NS + i * 50_000_000, 3.0, 0.0, 0.1) for i in range(9)])
-    assert [step.rolled for step in steps] == [False] * 4
-    assert all(step.turn for step in steps)
-
-
 def test_old_steering_angle_turns_nothing() -> None:
     vehicle = truck(ENCODER, STEERING)
     readings: list[Reading] = [Steering("steer", START_NS, 0.2)]
@@ -130,67 +129,6 @@ def test_old_steering_angle_turns_nothing() -> None:
     reckoning = reckoned(vehicle, readings)
     turned_m = 2.0 * 39 / 100 * 2 * math.pi * 0.4  # in 2 s
     assert reckoning.angle_rad == pytest.approx(turned_m * math.tan(0.2) / WHEELBASE_M, rel=0.03)
-
-
-def steps_of(vehicle: MachineConfig, readings: list[Reading]) -> list[FilterStep]:
-    return gather(StepGatherer(vehicle, 0.1), vehicle, readings)
-
-
-def test_a_step_tells_the_turn_of_a_bicycle_whose_error_grows_with_speed() -> None:
-    vehicle = truck(ENCODER, STEERING)
-    made = driven(vehicle, Wrong(), [Leg(6, 0.5), Leg(4, 0, 0.25)])
-    turn = steps_of(vehicle, [r for r in made.readings if not isinstance(r, Gps)])[-1].turn
-    assert (turn.rate_radps, turn.per_error) == pytest.approx((0.25, 3.0), rel=0.01)
-
-
-def test_a_step_tells_the_mean_rate_of_odometry() -> None:
-    vehicle = truck(ODOMETRY)
-    readings: list[Reading] = [Odometry("odom", START_NS + i * 50_000_000, 1.0, 0.0, 0.1 * i) for i in range(5)]
-    turns = [step.turn for step in steps_of(vehicle, readings)]
-    assert [(t.rate_radps, t.per_error) for t in turns if t] == [(pytest.approx(0.1), 1.0), (pytest.approx(0.35), 1.0)]
-
-
-def test_steering_without_wheels_tells_no_turn() -> None:
-    vehicle = truck(ENCODER, STEERING)
-    steps = steps_of(vehicle, [Steering("steer", START_NS + i * 50_000_000, 0.2) for i in range(10)])
-    assert [step.turn for step in steps] == [None] * len(steps)
-
-
-def test_of_several_sensors_the_one_that_states_the_least_error_shows_the_turn_in_any_order() -> None:
-    sure, sketchy, silent = (
-        SensorConfig(n, "odometry", std=std) for n, std in (("b", {"rate": 0.01}), ("a", {"rate": 0.2}), ("c", {}))
-    )
-    for sensors in ((sure, sketchy, silent), (silent, sketchy, sure)):
-        assert turn_source(truck(*sensors)) == sure
-        assert turn_source(truck(*(s for s in sensors if s is not sure))) == sketchy
-
-
-@pytest.mark.parametrize(
-    ("speed", "angle", "dt_ms"), [(3.0, 0.0, 50), (-3.0, 0.4, 50), (6.0, 0.2, 200), (0.0, 0.3, 50)]
-)
-def test_the_noise_of_a_steered_turn_is_that_of_its_angle(speed: float, angle: float, dt_ms: int) -> None:
-    """As strong in the long run as an angle that is wrong by the same for a second: e v / (L cos^2 angle)."""
-    vehicle = truck(ENCODER, replace(STEERING, std={"angle": 0.02}))
-    body = MotionSensors(vehicle, Layout(imus=1, wheel_scale=True), 0.05, (0.0, 0.0), on_plane=True)
-    curvature = math.tan(angle) / WHEELBASE_M
-    steps = [
-        FilterStep(
-            START_NS + i * dt_ms * 1_000_000,
-            DeadReckonedPose(0, 0.0, 0.0, 0.0, 0.0),
-            {},
-            {},
-            WheelSpeed(speed, is_known=True),
-            True,
-            0.0,
-            0.0,
-            Turn(speed * curvature, speed),
-        )
-        for i in range(2)
-    ]
-    (measurement,) = [body.turn(step) for step in steps][-1]
-    of_angle = 0.02 * speed / (WHEELBASE_M * math.cos(angle) ** 2)
-    expected = RATE_RADPS**2 + of_angle**2 * 2 * STEERED_S / (dt_ms * 1e-3)
-    assert float(measurement.R[0, 0]) == pytest.approx(expected)
 
 
 # --- what comes of it ------------------------------------------------------------------------------------------------
@@ -214,7 +152,7 @@ def test_a_machine_without_imu_is_located_and_holds_through_ten_seconds_without_
     shown = f"seed={seed} {located.counters}"
     assert max(errors(made, beliefs, 30.0)) < 4.5, shown
     assert max(errors(made, beliefs, *DARK_S)) < 4.0, shown
-    assert abs(math.remainder(beliefs[-1].x[YAW] - made.heading_rad[-1], math.tau)) < 0.15, shown
+    assert made.turned_rad(beliefs[-1]) < 0.15, shown
     assert located.counters["gps-1_gated"] == 0, shown
 
 
@@ -226,7 +164,6 @@ def test_the_error_of_a_turn_is_unsure_at_first_and_that_of_odometry_changes(
     vehicle = truck(*sensors)
     located, beliefs = run(vehicle, driven(vehicle, Wrong(), [Leg(1)]).readings, start=(10.0, 20.0, 0.7))
     assert beliefs[0].P[ERROR, ERROR] == pytest.approx(0.02**2, rel=0.01)
-    assert located._tracker.fusion
     assert motion(located._tracker.fusion.model, beliefs[0], 2.0).Q[ERROR, ERROR] == pytest.approx(
         2 * (per_s + 5e-5**2)
     )
@@ -235,40 +172,17 @@ def test_the_error_of_a_turn_is_unsure_at_first_and_that_of_odometry_changes(
 def test_nothing_that_tells_the_turn_is_counted_and_no_crash() -> None:
     vehicle = truck(ENCODER, SensorConfig("ahrs", "attitude"))
     made = driven(vehicle, Wrong(fixes=False), BEND)
-    located, beliefs = run(vehicle, made.readings)
+    located, beliefs = run(vehicle, thinned(made.readings))
     assert located.counters["turn_unknown"] > 500
     assert located.counters["turn_used"] == 0
     assert float(np.median(errors(made, beliefs, 20.0))) < 2.0
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["ekf", "ukf"])
-def test_the_heading_by_a_coarse_steering_angle_is_as_sure_as_it_is_right(engine: str) -> None:
-    """Steps of 3 degrees, bends of 5 s, GPS lost for 30 s of each 90 s."""
-    resolution, rng = math.radians(3), np.random.default_rng(5)
-    vehicle = truck(ENCODER, replace(STEERING, std={"angle": resolution / math.sqrt(12)}))
-    bends = [Leg(5, 0, float(rate)) for rate in rng.uniform(-0.25, 0.25, 50)]
-    made = driven(vehicle, Wrong(), [Leg(6, 1.0), Leg(4), *bends], seed=1)
-    readings: list[Reading] = [
-        replace(r, angle_rad=resolution * round(r.angle_rad / resolution)) if isinstance(r, Steering) else r
-        for r in made.readings
-        if not isinstance(r, Gps) or seconds(r.stamp_ns) % 90 < 60
-    ]
-    _, beliefs = run(vehicle, readings, filter=engine)
-    off = [math.remainder(b.x[YAW] - made.at(b.stamp_ns)[2], math.tau) for b in beliefs]
-    nees = np.square(off) / [b.P[YAW, YAW] for b in beliefs]
-    assert 0.3 < float(nees.mean()) < 3.0
-
-
-# --- options ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_step_without_a_turn_leaves_the_rate_to_what_is_known() -> None:
     """Odometry falls silent in a bend: the rate is soon unknown, not zero."""
     vehicle = truck(ENCODER, replace(ODOMETRY, measures=("rate",)))
     made = driven(vehicle, Wrong(fixes=False), [Leg(6, 0.5), Leg(6), Leg(20, 0, 0.25)])
-    readings = [r for r in made.readings if not isinstance(r, Odometry) or seconds(r.stamp_ns) < 20]
+    readings = [r for r in made.readings if not isinstance(r, Odometry) or seconds(r) < 20]
     last = run(vehicle, readings)[1][-1]
     assert last.P[YAW_RATE, YAW_RATE] > 0.01
     assert last.x[YAW_RATE] == pytest.approx(0.25, abs=0.2)

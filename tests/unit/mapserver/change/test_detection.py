@@ -16,6 +16,7 @@ from mapserver.change.detection import (
     known,
     reach_blocks,
 )
+from mapserver.change.kernels import differ, likeliest_cuts, medians, sums
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
@@ -45,29 +46,10 @@ def firsts(pages: list[TimedPage], config: ChangeConfig = CONFIG) -> Ints:
     return np.unique(cuts(pages, config).first)
 
 
-# --- one block -------------------------------------------------------------------------------------------------------
-
-
-def test_ground_that_stays_as_it_is_keeps_all_its_evidence():
-    assert firsts(passes(0.04, 0.04, 0.04)) == [0]
-    assert firsts(passes(*[0.04] * 6, noise=0.05)) == [0]
-
-
-@pytest.mark.parametrize("old", [1, 3, 6])
-def test_ground_that_changed_is_seen_after_one_pass(old):
-    assert firsts(passes(*[0.04] * old, 0.2)) == [old]
-
-
 @pytest.mark.parametrize("column", ["c_rr", "grade_e", "grade_n"])
 def test_every_kind_of_vote_tells_a_change(column):
     old, new = (0.04, 0.2) if column == "c_rr" else (0.1, -0.2)
     assert firsts(passes(old, old, new, new, column=column)) == [2]
-
-
-def test_of_two_changes_the_last_counts():
-    assert firsts(passes(0.04, 0.04, 0.2, 0.2, 0.01, 0.01)) == [4]
-    assert firsts(passes(0.04, 0.04, 0.2, 0.2, 0.04)) == [4]
-    assert firsts(passes(0.04, 0.2, 0.01)) == [2]
 
 
 def test_the_later_of_a_change_of_resistance_and_one_of_grade_counts():
@@ -82,25 +64,7 @@ def test_the_later_of_a_change_of_resistance_and_one_of_grade_counts():
         assert firsts(grid.pages([(0, 0)])[0]) == [4]
 
 
-def test_one_page_or_none_has_no_change():
-    assert cuts([], CONFIG).first.tolist() == [0] * 256
-    assert firsts(passes(0.2)) == [0]
-
-
-def test_cells_change_each_on_their_own():
-    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
-    grid = Grid(1.0, FoldConfig())
-    for hour in range(3):
-        c_rr = np.where((x > 8) & (hour == 2), 0.2, 0.04)
-        rows = samples(256, x_m=x, y_m=y, stamp_ns=NOW_NS + hour * HOUR_NS, cov_xx_m2=0, cov_yy_m2=0, c_rr=c_rr)
-        grid.fold(rows, "a")
-    first = cuts(grid.pages([(0, 0)])[0], CONFIG).first.reshape(16, 16)
-    assert (first[:, 8:] == 2).all()
-    assert (first[:, :8] == 0).all()
-
-
 def bin_of(c_rr: float) -> float:
-    """Place of a coefficient on the axis of bins."""
     return float(np.log(c_rr / ev.RESISTANCE_CENTRES[0])) / BIN
 
 
@@ -109,12 +73,6 @@ def test_the_kind_of_a_change_is_the_ground_after_it():
     assert np.allclose(cuts(pages, CONFIG).kind, bin_of(0.01), atol=0.6)
     assert np.isnan(cuts(passes(0.04, 0.04), CONFIG).kind).all()
     assert np.isnan(cuts(passes(0.1, -0.2, column="grade_e"), CONFIG).kind).all()
-
-
-def test_the_kind_of_a_cell_is_the_median_of_all_its_votes():
-    assert np.allclose(known(passes(0.04, 0.04, 0.2)).kind, bin_of(0.04), atol=0.6)
-    assert np.isnan(known([]).kind).all()
-    assert np.isnan(known(passes(0.1, column="grade_e")[:0]).kind).all()
 
 
 def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for_a_cut():
@@ -131,16 +89,6 @@ def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for
         for value, index in ((cells.from_ns, first), (cells.until_ns, last)):
             assert np.array_equal(value, np.full(256, begins[index] if index == index else np.nan), equal_nan=True)
     assert np.isnan(known([]).from_ns).all()
-
-
-def test_a_cut_lies_between_the_pages_that_knew_the_ground_before_and_after():
-    pages = passes(0.04, 0.04, 0.2)
-    one_cut, nothing = cuts(pages, CONFIG), cuts(passes(0.04, 0.04), CONFIG)
-    assert (set(one_cut.old_ns), set(one_cut.new_ns)) == ({pages[1].first_ns}, {pages[2].first_ns})
-    assert np.isnan([nothing.old_ns, nothing.new_ns]).all()
-
-
-# --- limits ----------------------------------------------------------------------------------------------------------
 
 
 def test_medians_nearer_than_bins_are_no_change():
@@ -182,8 +130,6 @@ def test_less_evidence_than_weight_on_either_side_is_no_change(old_is_less):
         old, new = (metres, 2.0) if old_is_less else (2.0, metres)
         assert firsts(two_passes({0.04: old}, {0.2: new})) == [change]
 
-
-# --- areas -----------------------------------------------------------------------------------------------------------
 
 # Ground of bin 10 in 80 x 80 cells, of which some are changed to bin 15 from a time on.
 OLD, NEW, NEW_NS = 10.0, 15.0, 300e9
@@ -259,7 +205,6 @@ def test_an_area_at_the_images_border_is_kept_and_what_is_cut_by_it_is_not_guess
 
 
 def lane(changed: Bools, known: Bools | None = None):
-    """What is credible of cells that changed where nothing else is known, but for some ground as it always was."""
     now: Floats = np.full(changed.shape, np.nan)
     now[changed] = NEW
     now[np.zeros_like(changed) if known is None else known & ~changed] = OLD
@@ -291,7 +236,7 @@ def crop(images: Cuts | Known, part: slice):
 
 
 @pytest.mark.parametrize("size_m", [1.0, 5.0, 6.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_what_a_cell_shows_depends_on_the_blocks_near_it_alone(seed, size_m):
     """Queries of a point and of the whole map see other images, and have to say the same."""
     rng, n = np.random.default_rng(seed), 9 * BLOCK_CELLS
@@ -312,13 +257,7 @@ def test_what_a_cell_shows_depends_on_the_blocks_near_it_alone(seed, size_m):
     assert np.array_equal(alone, whole[4 * BLOCK_CELLS : 5 * BLOCK_CELLS, 4 * BLOCK_CELLS : 5 * BLOCK_CELLS])
 
 
-def test_nothing_changed_and_nothing_known_is_nothing():
-    nothing, unknown = square(0), np.full((80, 80), np.nan)
-    assert not believed(nothing, unknown, unknown).any()
-
-
 def fringed(wide: int, *, is_fresh: bool) -> tuple[Bools, Bools]:
-    """A lane of 5 cells that changed, beside some cells of its new kind that did not; and what is credible of it."""
     strip, beside = square(5, 40, 32, 20), square(wide, 40, 37, 20)
     now = np.full(strip.shape, np.nan)
     now[strip | beside] = NEW
@@ -366,3 +305,79 @@ def test_the_rest_of_a_change_that_is_believed_is_believed_with_it_but_not_besid
     assert not seen[30:].any()
     other = np.where(tail, NEW + 4, np.where(area, NEW, np.nan))
     assert not believed(both, other, now)[30:].any(), "another kind of ground is another change"
+
+
+PARTS = [ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH]
+
+
+def made_up(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Votes of four pages packed, where each page's end, and the same as counts (pages, COUNTS, 256)."""
+    rng = np.random.default_rng(seed)
+    counts = rng.integers(0, 5000, (4, ev.COUNTS, ev.CELLS)) * (rng.random((4, ev.COUNTS, ev.CELLS)) < 0.01)
+    flat = counts.reshape(4, -1)
+    packed = flat.astype(np.uint64) << np.uint64(16) | np.arange(flat.shape[1], dtype=np.uint64)
+    return packed[flat > 0], np.cumsum((flat > 0).sum(axis=1)), counts
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_pages_differ_by_the_mean_or_the_spread_of_their_votes(part):
+    votes, ends, counts = made_up(0)
+    part_counts = counts[:, part].astype(float)
+    bins = np.arange(part_counts.shape[1])[:, None]
+    weight, first, second = (np.maximum((part_counts * bins**power).sum(axis=1), 0.0) for power in range(3))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean, spread = first / weight, np.sqrt(np.maximum(second / weight - (first / weight) ** 2, 0))
+    for least, most in ((0.0, 3.0), (4000.0, 6.0)):
+        seen = weight > least
+        low, high = (np.where(seen, (mean, spread), none) for none in (np.inf, -np.inf))
+        expected = (high.max(axis=1) - low.min(axis=1)).max(axis=0) > most
+        assert np.array_equal(differ(votes, ends, part.start, part.stop, least, most), expected)
+        assert expected.any()
+        assert not expected.all()
+
+
+def entropy(votes: np.ndarray) -> np.ndarray:
+    weight = votes.sum(axis=-2)
+    logs = votes * np.log(np.maximum(votes, 1e-12))
+    return weight * np.log(np.maximum(weight, 1e-12)) - logs.sum(axis=-2)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_best_cut_is_the_likeliest(seed):
+    rng = np.random.default_rng(seed)
+    votes = rng.exponential(1.0, (7, 24, 30)) * (rng.random((7, 24, 30)) < 0.2)
+    votes[4:, :, ::2] = np.roll(votes[4:, :, ::2], 6, axis=1)
+    first = rng.integers(0, 3, 30)
+    kept = np.where(np.arange(7)[:, None, None] >= first, votes, 0)
+    until = kept.cumsum(axis=0)
+    old, new = until[:-1], until[-1] - until[:-1]
+    likelihood = entropy(until[-1])[None] - entropy(old) - entropy(new)
+    likelihood[np.minimum(old.sum(axis=1), new.sum(axis=1)) < 1.0] = -np.inf
+    best, variation, medians_before, medians_after = likeliest_cuts(votes, first, 1.0)
+    known = np.isfinite(likelihood).any(axis=0)
+    assert np.array_equal(best[known], likelihood.argmax(axis=0)[known] + 1)
+    assert not best[~known].any()
+    cells = np.flatnonzero(known)
+    before, after = (part[best[cells] - 1, :, cells].T for part in (old, new))
+    shares = [part / part.sum(axis=0) for part in (before, after)]
+    np.testing.assert_allclose(variation[cells], np.abs(shares[0] - shares[1]).sum(axis=0) / 2, atol=1e-9)
+    np.testing.assert_allclose(medians_before[cells], median(before), atol=1e-9)
+    np.testing.assert_allclose(medians_after[cells], median(after), atol=1e-9)
+
+
+def median(votes: np.ndarray) -> np.ndarray:
+    """Where half of the votes (bins, cells) lie below, each bin's spread evenly around it."""
+    until = np.vstack([np.zeros(votes.shape[1]), (votes / votes.sum(axis=0)).cumsum(axis=0)])
+    return np.array([np.interp(0.5, column, np.arange(len(column)) - 0.5) for column in until.T])
+
+
+def test_all_pages_together_have_their_sums_and_medians():
+    votes, _, counts = made_up(3)
+    part = ev.RESISTANCE
+    together = sums(votes, part.start, part.stop)
+    assert np.array_equal(together, counts[:, part].sum(axis=0))
+    known = together.any(axis=0)
+    of_all = medians(together)
+    np.testing.assert_allclose(of_all[known], median(together[:, known]), atol=1e-9)
+    assert np.isnan(medians(np.zeros((24, 2)))).all()
+    assert known.any()

@@ -1,19 +1,20 @@
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
-from mapserver.change import validity
-from mapserver.change.detection import ChangeConfig, cuts
-from mapserver.change.validity import around, clusters, valid_pages
+from mapserver.change.change_log import ChangeLog
+from mapserver.change.detection import ChangeConfig
+from mapserver.change.validity import around, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import evidence
 from mapserver.layers import cell_layers
 from mapserver.layers.cell_layers import ReadConfig
-from protocol.site.geometry import CellWindow
-from tests.unit.mapserver.data import NOW_NS, folded, random_samples, samples
+from protocol.queries.answers import GroundChange
+from tests.unit.mapserver.data import NOW_NS, samples
 
 HOUR_NS = 3600 * 10**9
 CONFIG = ChangeConfig()
@@ -42,7 +43,6 @@ def repaved(west: float, south: float, size: int, **options: int) -> Grid:
 
 
 def read(grid: Grid, config: ChangeConfig = CONFIG) -> ev.Evidence:
-    """Evidence of the site, as one image: arrays (64, 64, ...)."""
     blocks = [(x, y) for y in range(-2, 2) for x in range(-2, 2)]
     pages = dict(zip(blocks, grid.pages(blocks), strict=True))
     first = valid_pages(pages, grid.cell_m, config)
@@ -60,7 +60,6 @@ def resistance(now: ev.Evidence) -> np.ndarray:
 
 
 def area(west: int, south: int, size: int, margin: int = 0) -> np.ndarray:
-    """Cells (64, 64) of an area, grown by a margin."""
     image = np.zeros((64, 64), np.bool_)
     image[
         south + 32 - margin : south + size + 32 + margin,
@@ -79,11 +78,6 @@ def test_a_repaved_area_is_seen_after_one_pass_and_the_rest_stays(place):
     assert not now.changed_ns[outside].any()
     assert now.weight[inside].max() < 2 * ev.WEIGHT_UNITS_PER_M  # of one pass
     assert now.weight[outside].min() > (PASSES - 2) * ev.WEIGHT_UNITS_PER_M  # of all
-
-
-def test_after_a_pause_a_change_is_dated_where_the_first_new_bucket_begins():
-    now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
-    assert (now.changed_ns[inside] == NOW_NS + (PASSES - 1) * HOUR_NS).all()
 
 
 @pytest.mark.parametrize("keep_buckets", [1, 2, 3])
@@ -111,26 +105,10 @@ def test_a_change_is_dated_after_the_last_old_sample_of_the_same_span():
     assert (changed <= stamps[2]).all()
 
 
-@pytest.mark.parametrize("size", [2, 3])
-def test_a_contradiction_narrower_than_the_least_size_leaves_everything(size):
-    grid = repaved(3, 3, size)
-    now = read(grid)
-    assert not now.changed_ns.any()
-    everything = grid.evidence([(0, 0)])
-    assert np.array_equal(now.counts[32:48, 32:48].reshape(256, -1), everything.counts[0])
-
-
 @pytest.mark.parametrize(("size_m", "seen"), [(7.0, True), (13.0, False)])
 def test_the_least_size_is_obeyed(size_m, seen):
     now = read(repaved(3, 3, 10), replace(CONFIG, size_m=size_m))
     assert now.changed_ns.any() == seen
-
-
-def test_detection_off_leaves_everything():
-    now = read(repaved(-5, 4, 10), replace(CONFIG, detect=False))
-    assert not now.changed_ns.any()
-    everything = repaved(-5, 4, 10).evidence([(x, y) for x in range(-2, 2) for y in range(-2, 2)])
-    assert now.counts.sum() == everything.counts.sum()
 
 
 def test_of_two_changes_the_last_counts_and_dates():
@@ -155,13 +133,6 @@ def test_a_change_stays_found_where_the_rest_of_its_block_is_driven_on(days):
     assert np.allclose(resistance(read(grid))[area(1, 1, 8)], NEW, rtol=0.05)
 
 
-def test_late_samples_of_the_time_before_the_change_do_not_count_either():
-    grid = repaved(-5, 4, 10)
-    late = lane(0, -32, -32, 64, 64, c_rr=OLD)
-    grid.fold(late, "b")
-    assert np.allclose(resistance(read(grid))[area(-5, 4, 10, -1)], NEW, rtol=0.05)
-
-
 def test_bits_and_newest_stamp_are_those_of_the_evidence_that_holds():
     now, inside = read(repaved(-5, 4, 10)), area(-5, 4, 10, -1)
     outside = ~area(-5, 4, 10, 1)
@@ -170,51 +141,7 @@ def test_bits_and_newest_stamp_are_those_of_the_evidence_that_holds():
     assert (now.newest_ns >= NOW_NS + (PASSES - 1) * HOUR_NS).all()
 
 
-def test_no_blocks_and_blocks_without_pages_are_read():
-    assert valid_pages({}, 1.0, CONFIG) == {}
-    nothing = valid_pages({(0, 0): [], (5, -3): []}, 1.0, CONFIG)
-    assert {block: first.any() for block, first in nothing.items()} == {(0, 0): False, (5, -3): False}
-
-
-def test_blocks_far_apart_are_read_in_one_image():
-    grid = repaved(3, 3, 10)
-    pages = {block: grid.pages([block])[0] for block in [(0, 0), (40, -40)]}
-    first = valid_pages(pages, 1.0, CONFIG)
-    assert first[0, 0].any()
-    assert not first[40, -40].any()
-
-
-@pytest.mark.parametrize("reach", [0, 1, 3])
-def test_around_a_block_are_all_blocks_so_far(reach):
-    blocks = around((0, -1), reach)
-    assert len(blocks) == len(set(blocks)) == (2 * reach + 1) ** 2
-    assert {max(abs(x), abs(y + 1)) for x, y in blocks} == set(range(reach + 1))
-
-
-def test_pages_are_cut_once_as_long_as_nothing_is_folded_into_them(monkeypatch):
-    grid = folded(random_samples(200, 3, half_m=20.0))
-    calls = []
-    monkeypatch.setattr(validity, "cuts", lambda pages, config: calls.append(pages) or cuts(pages, config))
-
-    def look() -> int:
-        calls.clear()
-        blocks = grid.blocks_in(CellWindow(-64, -64, 128, 128))
-        valid_pages(dict(zip(blocks, grid.pages(blocks), strict=True)), 1.0, CONFIG)
-        return len(calls)
-
-    assert look() == len(grid.blocks_in(CellWindow(-64, -64, 128, 128))) > 1
-    assert look() == 0
-    grid.fold(samples(1, x_m=8.5, y_m=8.5, cov_xx_m2=0, cov_yy_m2=0), "b")
-    assert look() == 1
-
-
-def test_blocks_near_each_other_are_in_one_cluster():
-    parts = clusters([(0, 0), (40, 0), (2, 2), (4, 4), (40, 3)], 1)
-    assert sorted(map(sorted, parts)) == [[(0, 0), (2, 2), (4, 4)], [(40, 0)], [(40, 3)]]
-
-
 def ages_of(begin_ns: int, cells: slice) -> dict[tuple[int, int], np.ndarray]:
-    """An age of some cells of block (0, 0)."""
     begins = np.zeros(ev.CELLS, np.int64)
     begins[cells] = begin_ns
     return {(0, 0): begins, (90, 90): begins}  # the last one has no evidence
@@ -249,3 +176,87 @@ def test_an_age_before_a_change_of_the_cells_takes_nothing_back():
     first, _ = firsts(grid, NOW_NS + 1)
     np.testing.assert_array_equal(np.maximum(first, plain), first)
     assert (first[128:] == plain[128:]).all()
+
+
+def sweep(west: int, south: int, east: int, north: int, c_rr: float, hour: float, grade: float = 0.0):
+    x, y = (v.ravel() + 0.5 for v in np.meshgrid(np.arange(west, east), np.arange(south, north)))
+    stamps = NOW_NS + int(hour * HOUR_NS) + np.arange(len(x)) * 10**8
+    return samples(len(x), x_m=x, y_m=y, c_rr=c_rr, grade_e=grade, grade_n=0.0, stamp_ns=stamps, cov_xx_m2=0.25)
+
+
+def look(log: ChangeLog, grid: Grid, most: int = 1000) -> list[GroundChange]:
+    changes, blocks = [], grid.take_touched(most)
+    while blocks:
+        wide = sorted({near for block in blocks for near in around(block, 1)})
+        pages = {block: p for block, p in zip(wide, grid.pages(wide), strict=True) if p}
+        changes += log.look(blocks, pages)
+        blocks = grid.take_touched(most)
+    return changes
+
+
+def change_log(kept=(), **options) -> ChangeLog:
+    return ChangeLog(1.0, ChangeConfig(**options), ReadConfig(), kept)
+
+
+@pytest.fixture
+def repaved_grid() -> Grid:
+    """40 x 40 m of wet dirt, driven twice; a part of it is gravel an hour later."""
+    grid = Grid(1.0, FoldConfig())
+    for hour in (0, 1):
+        grid.fold(sweep(0, 0, 40, 40, 0.06, hour), "a")
+    grid.fold(sweep(10, 10, 30, 25, 0.02, 2), "b")
+    return grid
+
+
+def test_a_change_says_where_when_and_from_what_to_what(repaved_grid):
+    (change,) = look(change_log(), repaved_grid)
+    west, south, east, north = change.bounds
+    assert abs(np.array([west - 10, south - 10, east - 30, north - 25])).max() <= 2
+    assert 200 < change.cells < 400
+    assert NOW_NS + HOUR_NS < change.first_ns <= change.last_ns < NOW_NS + 2 * HOUR_NS + 300 * 10**9
+    assert change.resistance_before == pytest.approx(0.06, rel=0.05)
+    assert change.resistance_after == pytest.approx(0.02, rel=0.05)
+
+
+def test_a_change_is_logged_once(repaved_grid):
+    log = change_log()
+    assert len(look(log, repaved_grid)) == 1
+    repaved_grid.touch_all()
+    assert look(log, repaved_grid) == []
+    repaved_grid.fold(sweep(10, 10, 30, 25, 0.02, 3), "b")
+    assert [c.id for c in look(log, repaved_grid)] in ([], [1])  # a few cells at its edge may be new
+
+
+def test_a_change_grows_while_machines_pass():
+    grid, log = Grid(1.0, FoldConfig()), change_log()
+    for hour in (0, 1):
+        grid.fold(sweep(0, 0, 60, 20, 0.06, hour), "a")
+    look(log, grid)
+    grid.fold(sweep(0, 0, 20, 20, 0.02, 2), "b")
+    (first,) = look(log, grid)
+    grid.fold(sweep(20, 0, 40, 20, 0.02, 2.5), "b")
+    changes = look(log, grid)
+    assert {change.id for change in changes} == {first.id}
+    assert changes[-1].cells > 1.5 * first.cells
+    assert changes[-1].bounds[2] > 35
+    assert [c.id for c in log.changes()] == [first.id]
+
+
+def test_a_second_change_of_the_same_ground_much_later_is_another(repaved_grid):
+    log = change_log()
+    look(log, repaved_grid)
+    for hour in (30, 31):
+        repaved_grid.fold(sweep(10, 10, 30, 25, 0.25, hour), "b")
+    changes = look(log, repaved_grid)
+    assert {change.id for change in changes} == {2}
+    assert changes[-1].resistance_before == pytest.approx(0.02, rel=0.3)
+    assert changes[-1].resistance_after == pytest.approx(0.25, rel=0.1)
+
+
+def test_after_a_restart_nothing_is_logged_again(repaved_grid):
+    log = change_log()
+    look(log, repaved_grid)
+    again = change_log([json.loads(json.dumps(asdict(change))) for change in log.changes()])
+    repaved_grid.touch_all()
+    assert look(again, repaved_grid) == []
+    assert again.changes() == log.changes()

@@ -1,41 +1,23 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
+from mapserver.evidence import grid as grid_module
 from mapserver.evidence.fold_config import TABLE, TABLE_LAST, FoldConfig
-from mapserver.evidence.grid import Grid
-from protocol.errors import MessageError
-from protocol.machine.samples import check_samples
-from protocol.site.ground_classes import ZONES
-from tests.reference.votes import prepare, split_grade, split_resistance
-from tests.unit.mapserver.data import APART, NOW_NS, filled_to, folded, is_by_definition, same, samples, total
+from mapserver.evidence.grid import LIVE_ROWS, Grid
+from mapserver.journal.history import lent
+from protocol.arrays import Table
+from protocol.machine.samples import check_samples, empty
+from tests.unit.mapserver.data import APART, NOW_NS, folded, is_by_definition, same, samples, total
 
 UNITS = ev.WEIGHT_UNITS_PER_M
 HOUR_NS = 3600 * 10**9
-
-
-def weight_of(grid: Grid, block: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """Weight of a block's cells (rows, columns)."""
-    return grid.evidence([block]).weight[0].reshape(16, 16)
-
-
-# --- weights ---------------------------------------------------------------------------------------------------------
-
-metres = st.floats(-20_000, 20_000)
-deviation = st.floats(0, 2.1)  # at most 3 m along any direction
-
-
-@settings(max_examples=60)
-@given(metres, metres, deviation, deviation, st.floats(-1, 1), st.floats(0, 100), st.sampled_from([0.25, 1.0, 100.0]))
-def test_weights_of_a_sample_sum_exactly_to_its_weight(x, y, std_x, std_y, correlation, distance, cell_m):
-    covariance = {"cov_xx_m2": std_x**2, "cov_yy_m2": std_y**2, "cov_xy_m2": 0.999 * correlation * std_x * std_y}
-    rows = samples(x_m=x, y_m=y, distance_m=distance, **covariance)
-    weight = round(float(rows["distance_m"][0]) * UNITS)
-    counts = total(folded(rows, cell_m=cell_m))
-    for votes in (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH, ev.HEADING):
-        assert counts[votes].sum() == weight
 
 
 # Rows of every kind that the door admits: what is unknown, what stands still, what is nowhere, what is at a border.
@@ -94,29 +76,6 @@ def test_a_stencil_of_many_blocks_is_what_the_definition_says(monkeypatch):
     assert same(folded(rows, cell_m=0.2), grid)
 
 
-def test_weight_falls_off_with_the_covariance():
-    rows = samples(cov_xx_m2=1.0, cov_yy_m2=0.04, distance_m=100.0)
-    weight = weight_of(folded(rows)).astype(float)
-    middle = weight[8, 8]
-    assert weight[8, 9] / middle == pytest.approx(np.exp(-0.5 / 1.09), rel=0.01)  # one metre off, variance 1 + 0.3**2
-    assert weight[9, 8] / middle == pytest.approx(np.exp(-0.5 / 0.13), rel=0.02)
-    assert weight[8, 7] == weight[8, 9]
-    assert weight[7, 8] == weight[9, 8]
-
-
-# --- order and batching ----------------------------------------------------------------------------------------------
-
-
-def test_only_full_counts_saturate():
-    rows = samples(50, distance_m=100.0, cov_xx_m2=0.5, cov_yy_m2=0.5)
-    near_full = filled_to(folded(rows).state(), ev.COUNT_MAX - 5_000_000)
-    grid = Grid.from_state(1.0, FoldConfig(), near_full)
-    grid.fold(rows, "a")
-    counts = np.concatenate([at.page.votes["count"] for at in grid.state().pages])
-    assert (counts == ev.COUNT_MAX).any()
-    assert (counts < ev.COUNT_MAX).any()
-
-
 @pytest.mark.parametrize("batch", [1500, 12_000])
 def test_no_count_wraps_before_it_is_packed(batch):
     """Two headings of 6000 samples fit into 32 bits, what they share does not."""
@@ -132,36 +91,6 @@ def test_no_count_wraps_before_it_is_packed(batch):
     assert counts[ev.GRADE_EAST][20] == counts[ev.GRADE_EAST].sum() == ev.COUNT_MAX
 
 
-# --- what votes for what ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("c_rr", "bin_"), [(-0.5, 0), (0.0, 0), (0.004, 0), (0.4, 23), (5.0, 23)])
-def test_resistance_beyond_the_bins_votes_for_the_end(c_rr, bin_):
-    counts = total(folded(samples(c_rr=c_rr, cov_xx_m2=0, cov_yy_m2=0, distance_m=4.0)))[ev.RESISTANCE]
-    assert counts.argmax() == bin_
-    assert counts[bin_] == counts.sum()
-
-
-@pytest.mark.parametrize(("grade", "bin_"), [(-5.0, 0), (-0.5, 0), (0.0, 16), (0.5, 32), (5.0, 32)])
-def test_grade_votes_lie_on_their_centres(grade, bin_):
-    counts = total(folded(samples(grade_e=grade, grade_n=-grade)))
-    assert counts[ev.GRADE_EAST].argmax() == bin_
-    assert counts[ev.GRADE_NORTH].argmax() == 32 - bin_
-
-
-def test_a_vote_is_split_linearly_between_two_bins():
-    lower, share = split_grade(np.array([0.25 / 32]))
-    assert (lower[0], share[0]) == (16, 64)
-    lower, share = split_resistance(np.sqrt(ev.RESISTANCE_CENTRES[3:4] * ev.RESISTANCE_CENTRES[4:5]))
-    assert (lower[0], share[0]) == (3, 128)
-    assert [int(part[0]) for part in split_grade(np.array([np.nan]))] == [-1, 0]
-
-
-def test_neighbouring_zones_are_at_least_two_bins_apart():
-    lower, share = split_resistance(np.array([zone.c_rr for zone in ZONES]))
-    assert np.diff(lower + share / ev.SHARE_ONE).min() > 1.9
-
-
 @pytest.mark.parametrize(
     ("heading", "sector"), [(0.0, 0), (0.19, 0), (0.2, 1), (-0.19, 0), (-0.2, 15), (np.pi, 8), (-np.pi, 8), (6.9, 2)]
 )
@@ -175,9 +104,6 @@ def test_a_sample_too_uncertain_is_the_newest_too():
     assert grid.evidence([(0, 0)]).newest_ns.max() == NOW_NS
 
 
-# --- options ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cap", [3.0, 1.0])
 def test_a_sample_too_uncertain_is_counted_not_folded(cap):
     rows = samples(4, cov_xx_m2=[cap**2, cap**2 * 1.01, 0.0, 0.0], cov_yy_m2=[0.0, 0.0, cap**2 * 1.01, 0.0])
@@ -187,45 +113,11 @@ def test_a_sample_too_uncertain_is_counted_not_folded(cap):
     assert folded(oblique, std_cap_m=cap).skipped == 1  # sure east and north, but not along the diagonal
 
 
-def test_the_floor_spreads_a_sample_that_claims_to_be_exact():
-    rows = samples(cov_xx_m2=0.0, cov_yy_m2=0.0, distance_m=100.0)
-    cells = [folded(rows, cell_m=cell_m).known_cells() for cell_m in (1.0, 0.5, 0.25)]
-    assert cells[0] == 1
-    assert cells == sorted(set(cells)), cells
-
-
 def test_bucket_length_decides_the_buckets():
     rows = samples(10, stamp_ns=NOW_NS + np.arange(10) * 60 * 10**9)
     pages = [folded(rows, bucket_s=s, **APART).state().pages for s in (60.0, 300.0, 600.0)]
     assert [*map(len, pages)] == [10, 2, 1]
     assert [at.index * 300 * 10**9 for at in pages[1]] == [NOW_NS, NOW_NS + 300 * 10**9]
-
-
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("bucket_s", (59.0, 3601.0, 7200.0, 700.0, 3600 / 7, float("nan"))),
-        *((name, (0, 1001)) for name in ("keep_buckets", "keep_hours", "keep_days")),
-        ("std_cap_m", (0.3, 31.0)),
-    ],
-)
-def test_bad_option_is_refused_by_name(name, values):
-    for value in values:
-        with pytest.raises(ValueError, match=name):
-            FoldConfig(**{name: value})
-
-
-def test_every_admitted_covariance_is_invertible():
-    std = np.linspace(0.0, 3.0, 40)
-    xx, yy = (axis.ravel() for axis in np.meshgrid(std**2, std**2))
-    diagonal = np.linspace(1.0, 449.9, 50)  # along it, twice as much
-    xx, yy = np.append(xx, diagonal), np.append(yy, diagonal)
-    xy = np.sqrt(xx * yy) * (1 + 4e-7)  # what rounding lets pass
-    rows = samples(len(xx), cov_xx_m2=xx, cov_yy_m2=yy, cov_xy_m2=xy)
-    check_samples(rows[1600:], 20_000.0)
-    a, b, c = prepare(rows, "a", 1.0, FoldConfig(std_cap_m=30.0)).inverse.T
-    assert (a > 0).all()
-    assert (a * c > b * b / 4).all()
 
 
 def test_covariances_that_only_rounding_lets_pass_vote_as_the_definition_says():
@@ -236,20 +128,102 @@ def test_covariances_that_only_rounding_lets_pass_vote_as_the_definition_says():
     assert is_by_definition(grid, rows)
 
 
-@pytest.mark.parametrize("column", ["cov_xx_m2", "cov_xy_m2", "cov_yy_m2"])
-def test_a_covariance_that_is_no_number_has_no_vote(column):
-    """The door refuses it; should one come by another way, it must not reach the table."""
-    rows = samples(3)
-    rows[column][1] = np.nan
-    with pytest.raises(MessageError):
-        check_samples(rows, 20_000.0)
-    grid = folded(rows)
-    assert (grid.folded, grid.skipped) == (2, 1)
-
-
 def test_table_falls_to_three_sigma_and_is_nothing_beyond():
     assert len(TABLE) == TABLE_LAST + 1
     assert TABLE[0] == 65536
     assert (np.diff(TABLE) <= 0).all()
     assert TABLE[-2] == round(65536 * np.exp(-4.5))
     assert TABLE[-1] == 0
+
+
+CONFIG = FoldConfig()
+DAY_NS = 86_400 * 10**9
+START_NS = 1_767_225_600 * 10**9
+Batches = list[tuple[str, Table]]
+
+
+def batches(seed: int, *, n: int = 150, days: float = 1.0, spread_m: float = 8.0, machines: int = 3) -> Batches:
+    """Samples with everything that is hard: unknown values, unsure and tilted positions, no way driven, any order."""
+    rng = np.random.default_rng(seed)
+    rows = empty(n)
+    rows["stamp_ns"] = START_NS + (rng.random(n) * days * DAY_NS).astype(np.int64)
+    rows["x_m"], rows["y_m"] = rng.normal(0.0, spread_m, (2, n))
+    std_x, std_y, rho = rng.uniform(0.0, 3.2, n), rng.uniform(0.0, 3.2, n), rng.uniform(-0.99, 0.99, n)
+    rows["cov_xx_m2"], rows["cov_yy_m2"], rows["cov_xy_m2"] = std_x**2, std_y**2, rho * std_x * std_y
+    rows["heading_rad"] = rng.uniform(-7.0, 7.0, n)
+    rows["distance_m"] = rng.choice([0.0, 0.5, 1.0, 90.0], n)
+    rows["c_rr"] = np.where(rng.random(n) < 0.3, np.nan, rng.uniform(-0.5, 1.0, n))
+    unknown = rng.random(n) < 0.3
+    rows["grade_e"], rows["grade_n"] = (np.where(unknown, np.nan, rng.normal(0.0, 0.3, n)) for _ in range(2))
+    cuts = sorted({0, n, *rng.integers(0, n, 6).tolist()})
+    return [(f"loader-{rng.integers(machines)}", rows[first:end]) for first, end in pairwise(cuts)]
+
+
+def grid_of(parts: Batches, waiting_rows: int = LIVE_ROWS, cell_m: float = 1.0) -> Grid:
+    grid = Grid(cell_m, CONFIG, waiting_rows)
+    for machine, rows in parts:
+        grid.fold(rows, machine)
+    return grid
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0]), st.sampled_from([1, 7, 100, 8192]))
+def test_how_many_samples_wait_and_in_which_order_they_come_does_not_matter(seed: int, days: float, rows: int) -> None:
+    parts = batches(seed, days=days)
+    shuffled = [parts[i] for i in np.random.default_rng(seed).permutation(len(parts))]
+    assert same(grid_of(parts), grid_of(shuffled, rows))
+
+
+@settings(max_examples=12)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([0.01, 1.0, 60.0, 400.0]),
+    st.sampled_from([1, 2, 3]),
+    st.sampled_from([1, 9, 131_072]),
+)
+def test_how_many_threads_fold_does_not_matter(seed: int, days: float, count: int, rows: int) -> None:
+    parts = batches(seed, days=days, spread_m=30.0)
+    grid = grid_of(parts[:2])
+    with pytest.MonkeyPatch.context() as patch, lent(count) as workers:
+        patch.setattr(grid_module, "REFOLD_ROWS", rows)
+        with grid.bulk(workers):
+            for machine, part in parts[2:]:
+                grid.fold(part, machine)
+    assert same(grid, grid_of(parts))
+    more = batches(seed + 1, days=days)
+    for machine, part in more:
+        grid.fold(part, machine)
+    assert same(grid, grid_of(parts + more)), "it is an ordinary grid again"
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 60.0, 400.0]), st.integers(1, 4))
+def test_a_merge_of_folds_is_the_fold_of_all(seed: int, days: float, more: int) -> None:
+    parts = batches(seed, days=days)
+    rng = np.random.default_rng(seed)
+    owner = rng.integers(more + 1, size=len(parts))
+    grids = [grid_of([part for part, at in zip(parts, owner, strict=True) if at == n]) for n in range(more + 1)]
+    while len(grids) > 1:  # any tree
+        one, other = (grids.pop(int(rng.integers(len(grids)))) for _ in range(2))
+        one.merge(other)
+        grids.append(one)
+    assert same(grids[0], grid_of(parts))
+
+
+def test_counts_saturate_in_a_merge_and_become_wide() -> None:
+    rows = empty(200)
+    rows["stamp_ns"], rows["distance_m"], rows["c_rr"] = START_NS, 100.0, 0.05
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.01
+    one, other, both = (Grid(1.0, CONFIG) for _ in range(3))
+    for _ in range(120):
+        for grid in (one, other, both, both):
+            grid.fold(rows, "loader-1")
+    one.merge(other)
+    assert same(one, both)
+    assert max(int(at.page.votes["count"].max()) for at in both.state().pages) == 2**32 - 1
+
+
+@pytest.mark.parametrize("other", [Grid(2.0, CONFIG), Grid(1.0, FoldConfig(bucket_s=60.0))])
+def test_folds_of_another_kind_are_refused(other: Grid) -> None:
+    with pytest.raises(ValueError, match="folded otherwise"):
+        Grid(1.0, CONFIG).merge(other)

@@ -3,34 +3,10 @@ import pytest
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
-from mapserver.evidence.grid import READ_BLOCKS, Grid, chunks
+from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridCounts
 from protocol.site.geometry import CellWindow
 from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
-
-EVERYTHING = CellWindow(-(2**20), -(2**20), 2**21, 2**21)
-
-
-def test_an_empty_grid_knows_nothing():
-    grid = Grid(1.0, FoldConfig())
-    assert grid.bounds() is None
-    assert grid.known_cells() == 0
-    assert grid.blocks_in(EVERYTHING) == []
-    assert grid.evidence([(0, 0)]).counts.sum() == 0
-    grid.fold(samples(0), "a")
-    assert len(grid.state().pages) == 0
-
-
-def test_blocks_exist_only_where_somebody_drove():
-    grid = folded(samples(3, x_m=[8.0, 1000.0, -900.0], y_m=[8.0, 8.0, -5000.0]))
-    assert grid.blocks_in(EVERYTHING) == [(-57, -313), (0, 0), (62, 0)]
-
-
-def test_a_sample_at_a_corner_touches_four_blocks():
-    grid = folded(samples(x_m=0.0, y_m=0.0, cov_xx_m2=0.25, cov_yy_m2=0.25))
-    assert grid.blocks_in(EVERYTHING) == [(-1, -1), (-1, 0), (0, -1), (0, 0)]
-    weights = grid.evidence(grid.blocks_in(EVERYTHING)).weight.sum(axis=1)
-    assert weights.max() - weights.min() < 0.01 * weights.sum()
 
 
 @pytest.mark.parametrize(
@@ -46,11 +22,6 @@ def test_a_sample_at_a_corner_touches_four_blocks():
 def test_window_finds_the_blocks_that_it_touches(window, expected):
     grid = folded(samples(2, x_m=[8.0, -24.0], y_m=[8.0, 8.0]))
     assert grid.blocks_in(window) == expected
-
-
-def test_bounds_are_those_of_the_blocks():
-    grid = folded(samples(2, x_m=[8.0, -24.0], y_m=[8.0, 40.0]))
-    assert grid.bounds() == (-32, 0, 16, 48)
 
 
 def test_counts_are_kept_while_folding_and_fold_nothing(monkeypatch):
@@ -74,13 +45,6 @@ def test_counts_are_kept_while_folding_and_fold_nothing(monkeypatch):
         cells = sum(timeline.known_cells for timeline in timelines.values())
         sure = sum(int(is_foldable(part, grid.config).sum()) for part in rows)
         assert each.counts() == GridCounts(sure, 90 * len(rows) - sure, cells, bounds)
-
-
-def test_known_cells_are_counted_once_over_all_buckets():
-    once = folded(samples(1))
-    again = folded(samples(2, stamp_ns=[NOW_NS, NOW_NS + 3600 * 10**9]))
-    assert len(again.state().pages) == 2
-    assert once.known_cells() == again.known_cells() > 0
 
 
 def test_evidence_is_summed_over_buckets():
@@ -112,16 +76,6 @@ def test_summing_buckets_does_not_wrap():
     assert grid.evidence([(0, 0)]).counts.max() == 4 * int(ev.COUNT_MAX)
 
 
-def test_a_grid_from_its_state_folds_on_as_if_nothing_happened():
-    rows = random_samples(400, 1)
-    whole = folded(rows)
-    first = folded(rows[:200])
-    again = Grid.from_state(1.0, FoldConfig(), first.state())
-    assert same(first, again)
-    again.fold(rows[200:], "a")
-    assert same(again, whole)
-
-
 def test_state_is_a_copy():
     grid = folded(samples(1))
     state = grid.state()
@@ -147,26 +101,12 @@ def test_the_ends_of_the_site_and_of_time_have_blocks_of_their_own(cell_m, stamp
     assert {(at.tier, at.index) for at in grid.state().pages} == {(0, stamp_ns // (60 * 10**9))}
 
 
-def test_rows_are_folded_once_however_many_wait(monkeypatch):
-    monkeypatch.setattr("mapserver.evidence.grid.PIECE", 64)
-    rows = random_samples(200, 4)
-    grid = folded(rows, waiting_rows=3)
-    assert (grid.folded, grid.skipped) == (200, 0)
-    assert same(grid, folded(rows))
-
-
 @pytest.mark.parametrize(("limit", "most"), [("MOST_PAGES", 3), ("MOST_VOTES", 1)])
 def test_pages_are_packed_a_few_at_a_time_where_space_is_short(limit, most, monkeypatch):
     rows = random_samples(200, 4)
     whole = folded(rows)
     monkeypatch.setattr(f"mapserver.evidence.fold.{limit}", most)
     assert same(folded(rows), whole)
-
-
-def test_rows_that_are_all_too_uncertain_leave_no_page():
-    grid = folded(samples(5000, cov_xx_m2=100.0))
-    assert (grid.folded, grid.skipped) == (0, 5000)
-    assert grid.state().pages == []
 
 
 def test_pages_of_a_block_come_in_the_order_of_time():
@@ -178,6 +118,18 @@ def test_pages_of_a_block_come_in_the_order_of_time():
     assert newest == sorted(newest)
     assert not len(nothing)
     assert all(timed.first_ns <= stamp < timed.end_ns for timed, stamp in zip(pages, newest, strict=True))
+
+
+def test_blocks_are_touched_once_until_they_are_folded_into_again():
+    grid = folded(samples(2, x_m=[8.0, 40.0]))
+    assert sorted(grid.take_touched(9)) == [(0, 0), (2, 0)]
+    assert grid.take_touched(9) == []
+    grid.fold(samples(1), "b")
+    grid.fold(samples(1), "a")
+    assert grid.take_touched(9) == [(0, 0)]
+    grid.touch_all()
+    assert len(grid.take_touched(1)) == len(grid.take_touched(1)) == 1
+    assert grid.take_touched(1) == []
 
 
 def test_a_cell_and_bucket_that_machines_drive_take_few_bytes():
@@ -199,27 +151,3 @@ def test_a_cell_and_bucket_that_machines_drive_take_few_bytes():
     )
     blocks = [pages for _, _, pages in folded(rows, keep_buckets=1000).state().blocks]
     assert sum(pages.nbytes for pages in blocks) / sum(len(pages.marks) for pages in blocks) <= 55
-
-
-def test_blocks_are_touched_once_until_they_are_folded_into_again():
-    grid = folded(samples(2, x_m=[8.0, 40.0]))
-    assert sorted(grid.take_touched(9)) == [(0, 0), (2, 0)]
-    assert grid.take_touched(9) == []
-    grid.fold(samples(1), "b")
-    grid.fold(samples(1), "a")
-    assert grid.take_touched(9) == [(0, 0)]
-    grid.touch_all()
-    assert len(grid.take_touched(1)) == len(grid.take_touched(1)) == 1
-    assert grid.take_touched(1) == []
-
-
-def test_a_sample_that_adds_nothing_touches_nothing():
-    grid = folded(samples(2, x_m=[8.0, 40.0], distance_m=[0.0, 1.0], cov_xx_m2=[0.0, 100.0]))
-    assert grid.take_touched(9) == []
-
-
-def test_chunks_hold_every_block_once():
-    blocks = [(i, -i) for i in range(2 * READ_BLOCKS + 3)]
-    pieces = list(chunks(blocks))
-    assert [len(piece) for piece in pieces] == [READ_BLOCKS, READ_BLOCKS, 3]
-    assert [block for piece in pieces for block in piece] == blocks

@@ -1,5 +1,4 @@
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.pages import CompactPages
-from tests.unit.mapserver.data import CONFIG, folded, incoming, open_store, random_samples, same, samples
+from tests.unit.mapserver.data import folded, random_samples, same, samples
 
 FOLD = FoldConfig()
 Change = Callable[[dict[str, Any]], object]
@@ -93,12 +92,6 @@ def test_a_snapshot_of_other_facts_is_passed_over(tmp_path):
     assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD, facts)[0] == 1
 
 
-def test_an_empty_grid_is_kept_too(tmp_path):
-    row, grid = snapshot.load(save(tmp_path, 3, Grid(1.0, FOLD)), 1.0, FOLD) or (0, None)
-    assert row == 3
-    assert same(grid, Grid(1.0, FOLD))
-
-
 # What is not caught makes a grid whose reads fail later, or a map with less in it; a checksum catches all that happens
 # to a file by itself.
 PARTS = CompactPages.__slots__
@@ -151,25 +144,18 @@ CHANGES = {
 
 @pytest.fixture(scope="module")
 def two_blocks(tmp_path_factory):
-    """A snapshot of two blocks, as arrays."""
     with np.load(save(tmp_path_factory.mktemp("whole"), 1, folded(samples(2, x_m=[8.0, 24.0])))) as file:
         return dict(file)
 
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_cannot_be_is_passed_over(tmp_path, two_blocks, change):
-    """Something was changed in a way that no checksum sees."""
     arrays = {name: array.copy() for name, array in two_blocks.items()}
     np.savez(tmp_path / "snapshot-1.npz", **arrays)
     assert snapshot.load(tmp_path / "snapshot-1.npz", 1.0, FOLD)
     CHANGES[change](arrays)
     np.savez(tmp_path / "snapshot-1.npz", **arrays)
     assert snapshot.load(tmp_path / "snapshot-1.npz", 1.0, FOLD) is None
-
-
-def test_a_snapshot_under_the_name_of_an_earlier_row_is_passed_over(tmp_path):
-    save(tmp_path, 8).rename(tmp_path / "snapshot-2.npz")
-    assert snapshot.load_newest(tmp_path, 5, 1.0, FOLD)[0] <= 5
 
 
 def test_a_snapshot_beyond_the_journal_is_passed_over(tmp_path):
@@ -183,64 +169,3 @@ def test_only_the_newest_two_are_kept_and_nothing_else_is_left(tmp_path):
         save(tmp_path, row)
     assert snapshot.rows_on_disk(tmp_path) == [100, 10]
     assert names(tmp_path) == ["snapshot-10.npz", "snapshot-100.npz"]
-
-
-def test_a_full_disk_leaves_the_old_snapshot_and_nothing_beside_it(tmp_path, monkeypatch):
-    save(tmp_path, 1)
-
-    def full(file, **arrays):
-        file.write(b"half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(OSError, match="space"):
-        save(tmp_path, 2)
-    assert names(tmp_path) == ["snapshot-1.npz"]
-
-
-def test_what_a_kill_left_half_written_is_replaced(tmp_path):
-    (tmp_path / ".snapshot-1.npz.1.0.part").write_bytes(b"half")
-    save(tmp_path, 2)
-    assert names(tmp_path) == ["snapshot-2.npz"]
-
-
-def test_other_files_are_no_snapshots(tmp_path):
-    for name in ("snapshot-x.npz", "snapshot-1.npz.old", "my-snapshot-3.npz"):
-        (tmp_path / name).touch()
-    assert snapshot.rows_on_disk(tmp_path) == []
-
-
-def test_snapshots_that_a_restored_journal_does_not_reach_never_come_back(tmp_path):
-    """A backup of the journal is put back; later it grows past the snapshots of the history that is gone."""
-    store, backup = open_store(tmp_path / "store"), tmp_path / "backup.db"
-    parts = np.split(random_samples(120, 8), 6)
-    store.commit([incoming(parts[0], 1)])
-    store.close()
-    shutil.copy(tmp_path / "store" / "journal.db", backup)
-    store = open_store(tmp_path / "store")
-    for i in (1, 2):
-        store.commit([incoming(parts[i], 1 + 20 * i)])
-    store.save_snapshot()  # of row 3
-    store.close()
-    shutil.copy(backup, tmp_path / "store" / "journal.db")
-    store = open_store(tmp_path / "store")
-    for i in (3, 4, 5):
-        store.commit([incoming(parts[i], 21 + 20 * (i - 3))])
-    assert store.journalled == 4
-    store.close()  # without a snapshot, as a kill would
-    store = open_store(tmp_path / "store")
-    assert same(store.grid, folded(np.concatenate([parts[i] for i in (0, 3, 4, 5)])))
-    store.close()
-
-
-def test_parameters_of_a_store_reach_its_snapshot(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(5))])
-    store.save_snapshot()
-    store.close()
-    changed = replace(CONFIG, fold=replace(CONFIG.fold, std_cap_m=0.35))
-    store = open_store(tmp_path, changed)
-    assert store.snapshot_row == 0  # folded again
-    assert store.grid.config.std_cap_m == 0.35
-    assert store.merged == 1
-    store.close()

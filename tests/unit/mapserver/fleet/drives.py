@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -122,8 +122,3 @@ def ledgers(rows: Mapping[str, Table]) -> dict[str, Table]:
         ledger.add(table)
         out[name] = ledger.stays()
     return out
-
-
-def shifted(errors: Errors, zero: float) -> Errors:
-    """The same with another zero."""
-    return replace(errors, zero=errors.zero + zero)

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import SCALE_FLOOR, ZERO_FLOOR, Calibration, calibrate
-from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, corrected
+from mapserver.fleet.calibration import (
+    MOST_EPOCHS,
+    MOST_MACHINES,
+    Calibration,
+    calibrate,
+    epochs_of_each,
+    groups,
+    joined,
+)
+from mapserver.fleet.correction import ANY_SHARE, LAST_NS, Correction, corrected
 from mapserver.fleet.hysteresis import differs
-from mapserver.fleet.ledger import EPOCH_NS
-from mapserver.fleet.observability import FAULT_SIGMAS, MachineState, moved, state_of
-from mapserver.fleet.passages import Epochs, passages
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Prior, known_cells
+from mapserver.fleet.ledger import EPOCH_NS, EPOCHS, newest
+from mapserver.fleet.observability import FAULT_SIGMAS, MachineState, state_of
+from mapserver.fleet.passages import passages
+from mapserver.fleet.solver import SCALE_STD, ZERO_STD, known_cells
 from protocol.arrays import Floats, Table
 from protocol.site.site_config import KnownGround
 from tests.unit.mapserver.fleet.drives import (
@@ -31,7 +41,6 @@ from tests.unit.mapserver.fleet.drives import (
     drive,
     height_slope,
     ledgers,
-    shifted,
     soils,
 )
 
@@ -40,15 +49,13 @@ FLEET = {
     "ramp": (RAMP, Errors(-0.006, 0.04, -0.003)),
     "again": (RAMP_AGAIN, Errors(0.008, 0.03, 0.0)),
 }
-ELSEWHERE = ((20.0, 60.0), (110.0, 60.0), (110.0, 90.0), (20.0, 90.0))  # over the same ramp in lanes of its own
-SEEDS = (0, 1)
 
 
-def fleet(site: Site = soils, seed: int = 0, errors: Mapping[str, Errors] | None = None) -> dict[str, Table]:
+def fleet(site: Site = soils, errors: Mapping[str, Errors] | None = None) -> dict[str, Table]:
     """Samples of three machines that never reverse."""
     known = errors or {}
     return {
-        name: drive(route, known.get(name, own), site=site, seed=10 * seed + i)
+        name: drive(route, known.get(name, own), site=site, seed=i)
         for i, (name, (route, own)) in enumerate(FLEET.items())
     }
 
@@ -58,9 +65,9 @@ def solve(rows: Mapping[str, Table], excluded: tuple[str, ...] = (), **more: obj
 
 
 @cache
-def usual(seed: int = 0) -> Calibration:
+def usual() -> Calibration:
     """Of the fleet as it is."""
-    return solve(fleet(seed=seed))
+    return solve(fleet())
 
 
 def check(state: MachineState, errors: Errors, zero: float = 0.0016, scale: float = 0.02) -> None:
@@ -77,9 +84,8 @@ def on_ramp(x_m: Floats) -> Floats:
     return (height_slope(x_m) > 0).astype(np.float64)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_fleet_that_never_reverses_knows_zeros_and_scales(seed: int) -> None:
-    result = usual(seed)
+def test_a_fleet_that_never_reverses_knows_zeros_and_scales() -> None:
+    result = usual()
     for name in ("ramp", "again"):
         check(result.machines[name], FLEET[name][1])
         assert result.machines[name].scale_by == ("edges",)
@@ -87,17 +93,12 @@ def test_a_fleet_that_never_reverses_knows_zeros_and_scales(seed: int) -> None:
         assert result.machines[name].across == pytest.approx(FLEET[name][1].across, abs=0.0025)
     check(result.machines["low"], FLEET["low"][1], scale=0.04)
     assert result.common.observed
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_what_is_stated_is_what_is_off(seed: int) -> None:
-    result = usual(seed)
     off = [(s.zero - FLEET[n][1].zero) / s.zero_std for n, s in result.machines.items()]
     off += [(s.scale - FLEET[n][1].scale) / s.scale_std for n, s in result.machines.items()]
-    assert np.mean(np.square(off)) < 2.5
+    assert np.mean(np.square(off)) < 2.5, "what is stated is what is off"
 
 
-@pytest.mark.parametrize(("direction", "zero"), [(1.0, 0.006), (-1.0, 0.006), (-1.0, -0.006)])
+@pytest.mark.parametrize(("direction", "zero"), [(1.0, 0.006), (-1.0, -0.006)])
 def test_the_zero_has_its_sign_ahead_and_in_reverse(direction: float, zero: float) -> None:
     rows = drive(LOW, Errors(zero), direction=direction)
     result = solve({"low": rows})
@@ -107,28 +108,17 @@ def test_the_zero_has_its_sign_ahead_and_in_reverse(direction: float, zero: floa
     true = drive(LOW, Errors(), direction=direction)
     usual = true["c_rr"] < 0.1  # on sand the scale counts too
     assert abs(np.mean((right["c_rr"] - true["c_rr"])[usual])) < 0.0015
-    assert abs(np.mean((rows["c_rr"] - true["c_rr"])[usual])) > 0.005
-
-
-def reversing(errors: Errors, site: Site) -> Table:
-    """Round, and then back in reverse."""
-    there = drive(RAMP, errors, seconds=300.0, site=site)
-    back = drive(tuple(reversed(RAMP)), errors, seconds=300.0, site=site, seed=1, direction=-1, start_s=300.0)
-    return np.concatenate([there, back])
-
-
-@pytest.mark.parametrize("errors", [Errors(0.006), Errors(-0.006)])
-def test_reversing_shows_the_zero_by_the_same_ground(errors: Errors) -> None:
-    state = solve({"a": reversing(errors, concrete)}).machines["a"]
-    assert state.zero_by == ("same_ground",)
-    assert state.zero == pytest.approx(errors.zero, abs=0.001)
 
 
 @pytest.mark.parametrize("scale", [0.1, -0.1])
-def test_reversing_on_a_slope_shows_the_scale_by_the_same_ground(scale: float) -> None:
-    state = solve({"a": reversing(Errors(0.003, scale), soils)}).machines["a"]
+def test_reversing_shows_the_zero_and_on_a_slope_the_scale_by_the_same_ground(scale: float) -> None:
+    errors = Errors(0.003, scale)
+    there = drive(RAMP, errors, seconds=300.0)
+    back = drive(tuple(reversed(RAMP)), errors, seconds=300.0, seed=1, direction=-1, start_s=300.0)
+    state = solve({"a": np.concatenate([there, back])}).machines["a"]
     assert "same_ground" in state.scale_by
-    check(state, Errors(0.003, scale), zero=0.001, scale=0.015)
+    assert "same_ground" in state.zero_by
+    check(state, errors, zero=0.001, scale=0.015)
 
 
 def test_a_track_that_nobody_closes_stays_at_the_data_sheet() -> None:
@@ -141,12 +131,11 @@ def test_a_track_that_nobody_closes_stays_at_the_data_sheet() -> None:
     assert not result.common.observed
 
 
-@pytest.mark.parametrize("names", [("low", "ramp"), tuple(FLEET)])
-def test_a_majority_that_is_off_by_the_same_is_put_right(names: tuple[str, ...]) -> None:
-    errors = {name: shifted(FLEET[name][1], 0.015) for name in names}
+def test_a_fleet_that_is_off_by_the_same_is_put_right() -> None:
+    errors = {name: replace(own, zero=own.zero + 0.015) for name, (_, own) in FLEET.items()}
     result = solve(fleet(errors=errors))
     for name in FLEET:
-        check(result.machines[name], errors.get(name, FLEET[name][1]), zero=0.002, scale=0.05)
+        check(result.machines[name], errors[name], zero=0.002, scale=0.05)
 
 
 def test_without_slopes_nothing_pulls_on_the_scale() -> None:
@@ -170,10 +159,8 @@ def test_noise_of_a_machine_is_not_explained_by_its_scale() -> None:
         assert result.machines[name].scale == pytest.approx(FLEET[name][1].scale, abs=0.035)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_gain_far_beyond_the_data_sheet_is_seen_and_spoils_no_other(seed: int) -> None:
-    errors = {"again": Errors(0.002, 0.6)}
-    rows = fleet(errors=errors, seed=seed)
+def test_a_gain_far_beyond_the_data_sheet_is_seen_and_spoils_no_other() -> None:
+    rows = fleet(errors={"again": Errors(0.002, 0.6)})
     result = solve(rows)
     assert result.machines["again"].scale == pytest.approx(0.6, abs=0.04)
     assert result.machines["again"].beyond[1] > 10
@@ -181,15 +168,20 @@ def test_a_gain_far_beyond_the_data_sheet_is_seen_and_spoils_no_other(seed: int)
     own = [each for each in result.corrections if each.machine == "again"]
     assert own[0].scale == pytest.approx(0.6 / 1.6, abs=0.02)  # k / (1 + k): the measured share has the gain in it
     right = corrected(rows["again"], own)
-    true = drive(RAMP_AGAIN, Errors(), seed=10 * seed + 2)
+    true = drive(RAMP_AGAIN, Errors(), seed=2)
     assert abs(np.median(right["c_rr"] - true["c_rr"])) < 0.003
+    for name in ("again", "ramp"):
+        newest_of = [each for each in result.corrections if each.machine == name][-1]
+        said, known = state_of(newest_of), result.machines[name]
+        assert (said.zero, said.scale, said.across) == pytest.approx((known.zero, known.scale, known.across), abs=5e-5)
+        assert (said.zero_std, said.scale_std) == pytest.approx((known.zero_std, known.scale_std), rel=1e-3)
+        assert (said.beyond[1] > FAULT_SIGMAS[1]) == (name == "again"), "a correction says what the solve said"
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_edges_wait_until_the_estimate_has_followed(seed: int) -> None:
+def test_edges_wait_until_the_estimate_has_followed() -> None:
     """Nearer to a bend the estimate of c_rr is still on its way, and the scale would seem smaller than it is."""
     errors = {"ramp": Errors(scale=0.12), "again": Errors(scale=0.12)}
-    result = solve(fleet(errors=errors, seed=seed))
+    result = solve(fleet(errors=errors))
     mean = np.mean([result.machines[name].scale for name in errors])
     assert mean == pytest.approx(0.12, abs=0.012)
 
@@ -223,47 +215,6 @@ def test_an_epoch_in_which_the_zero_steps_states_a_large_deviation() -> None:
     )
     assert np.sqrt(stepped[1].covariance[0][0]) == pytest.approx(0.004, abs=0.001)
     assert max(np.sqrt(each.covariance[0][0]) for each in still) < 0.0015
-
-
-@pytest.mark.parametrize(
-    ("machines", "numbers", "expected"),
-    [
-        ([0, 0, 0], [7, 8, 9], [4e-6, 9e-6, 9e-6]),
-        ([0, 0, 1], [7, 8, 9], [4e-6, 4e-6, 0.0]),
-        ([0, 0, 0], [7, 8, 10], [4e-6, 4e-6, 0.0]),
-    ],
-)
-def test_zeros_that_differ_from_those_beside_them_are_less_sure(
-    machines: list[int], numbers: list[int], expected: list[float]
-) -> None:
-    epochs = Epochs(np.array(machines), np.array(numbers))
-    zeros, none = np.array([0.0, 0.004, 0.010]), np.zeros(3)
-    assert moved(epochs, zeros, none) == pytest.approx(expected)
-    assert moved(epochs, zeros, none + 0.01**2) == pytest.approx(0.0)  # by no more than what they are unsure of
-
-
-@pytest.mark.parametrize("step", [-0.02, 0.01])
-def test_ramps_of_other_ground_change_nothing_on_the_slope(step: float) -> None:
-    rows = fleet(lambda x, y, h: soils(x, y, h) + step * on_ramp(x))
-    result = solve(rows)
-    assert not result.common.observed
-    assert result.common.reason == "ground_changes_with_slope"
-    for name in ("ramp", "again"):
-        own = [each for each in result.corrections if each.machine == name]
-        assert {each.most_share for each in own} == {LEVEL_SHARE}
-        right = corrected(rows[name], own)
-        steep = np.hypot(rows[name]["grade_e"], rows[name]["grade_n"]) > 0.2
-        assert right["c_rr"][steep].tobytes() == rows[name]["c_rr"][steep].tobytes()
-        assert result.machines[name].zero == pytest.approx(FLEET[name][1].zero, abs=0.002)
-
-
-def test_lanes_that_disagree_leave_the_scale_at_the_data_sheet() -> None:
-    rows = fleet(lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x) * (y < 32.0))  # gravel up, none down
-    result = solve(rows)
-    assert not result.common.observed
-    for name in ("ramp", "again"):
-        assert result.machines[name].scale_by == ()
-        assert {each.scale for each in result.corrections if each.machine == name} == {0.0}
 
 
 def test_a_ramp_that_is_only_ever_climbed_shows_no_scale() -> None:
@@ -310,44 +261,11 @@ def test_a_machine_without_a_say_moves_nobody() -> None:
     assert of_others(solve(rows)) != without.corrections
 
 
-@pytest.mark.parametrize(("scale", "zero"), [(0.6, 0.01), (-0.45, 0.0), (0.1, 0.04)])
+@pytest.mark.parametrize(("scale", "zero"), [(-0.45, 0.0), (0.1, 0.04)])
 def test_a_machine_at_fault_has_no_say_though_nobody_said_so(scale: float, zero: float) -> None:
     result = solve(with_bad(scale, zero))
     assert of_others(result) == usual().corrections
     assert max(np.divide(result.machines["bad"].beyond, FAULT_SIGMAS)) > 1
-    assert all(max(np.divide(result.machines[name].beyond, FAULT_SIGMAS)) < 1 for name in FLEET)
-
-
-def test_a_machine_that_puts_the_slopes_in_doubt_is_the_one_that_is_far_off() -> None:
-    """Not as far as a fault in the common estimate, which has a say of its own; alone against the others it is."""
-    result = solve(with_bad(0.65, route=RAMP_AGAIN, off_m=6.0))
-    assert result.common.observed
-    assert of_others(result) == usual().corrections
-    assert result.machines["bad"].beyond[1] > FAULT_SIGMAS[1]
-
-
-@pytest.mark.parametrize(("scale", "at_fault"), [(0.65, True), (0.2, False)])
-def test_where_the_doubt_stays_only_a_fault_is_left_out(scale: float, at_fault: bool) -> None:
-    rows = with_bad(scale, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
-    result = solve(rows)
-    assert result.common.reason == "ground_changes_with_slope"
-    assert (result.machines["bad"].beyond[1] > FAULT_SIGMAS[1]) == at_fault
-    assert (of_others(result) == of_others(solve(rows, ("bad",)))) == at_fault
-
-
-def test_what_is_beyond_a_data_sheet_is_beyond_it_for_sure() -> None:
-    state = solve(fleet(errors={"again": Errors(0.002, 0.6)})).machines["again"]
-    own_std = np.sqrt(state.scale_std**2 - SCALE_FLOOR**2)
-    assert state.beyond[1] == pytest.approx((state.scale - 2 * own_std) / SCALE_STD, rel=0.01)
-
-
-def test_where_most_seem_at_fault_all_have_a_say() -> None:
-    errors = {"ramp": Errors(0.002, 0.5), "again": Errors(0.0, 0.5)}
-    rows = fleet(errors=errors)
-    result = solve(rows)
-    for name in errors:
-        check(result.machines[name], errors[name], zero=0.003, scale=0.05)
-        assert result.machines[name].beyond[1] > FAULT_SIGMAS[1]
 
 
 def test_of_slopes_that_contradict_each_other_nobody_is_at_fault() -> None:
@@ -362,7 +280,7 @@ def test_of_slopes_that_contradict_each_other_nobody_is_at_fault() -> None:
         assert state.scale_std == pytest.approx(SCALE_STD, rel=0.05), name
 
 
-@pytest.mark.parametrize("factor", [0.0, -1.0, 3.0])
+@pytest.mark.parametrize("factor", [0.0, 3.0])
 def test_of_a_sensor_that_measures_no_force_slopes_alone_are_corrected(factor: float) -> None:
     rows = fleet()
     share = rows["low"]["c_rr"].copy()
@@ -375,30 +293,6 @@ def test_of_a_sensor_that_measures_no_force_slopes_alone_are_corrected(factor: f
     assert differs(own[-1], earlier), "what was taken off before its sensor broke does not hold on"
     assert result.machines["low"].beyond[1] > FAULT_SIGMAS[1]
     check(result.machines["ramp"], FLEET["ramp"][1])
-
-
-def test_a_machine_without_a_say_that_shares_no_ground_shows_its_scale_by_its_own_edges() -> None:
-    state = solve(with_bad(0.6, route=ELSEWHERE, off_m=0.0), ("bad",)).machines["bad"]
-    assert state.scale == pytest.approx(0.6, abs=0.06)
-    assert state.scale_by == ("edges",)
-
-
-def test_edges_of_a_machine_without_a_say_do_not_count_where_those_of_the_others_do_not() -> None:
-    rows = with_bad(0.2, route=ELSEWHERE, off_m=0.0, site=lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x))
-    result = solve(rows, ("bad",))
-    assert result.common.reason == "ground_changes_with_slope"
-    assert result.machines["bad"].scale_by == ()
-    assert {each.scale for each in result.corrections if each.machine == "bad"} == {0.0}
-
-
-def test_a_fault_is_one_also_against_ground_that_may_itself_be_off_by_what_data_sheets_allow() -> None:
-    site: Site = lambda x, y, h: soils(x, y, h) + 0.02 * on_ramp(x)  # noqa: E731
-    for scale, fault in ((0.6, True), (0.36, False)):
-        result = solve(with_bad(scale, off_m=0.0, site=site), ("bad",))
-        assert not result.common.observed
-        state = result.machines["bad"]
-        assert state.scale == pytest.approx(scale, abs=0.1)
-        assert (state.beyond[1] > FAULT_SIGMAS[1]) == fault
 
 
 def test_on_level_ground_a_gain_unlike_all_others_is_a_fault_and_corrected() -> None:
@@ -441,30 +335,13 @@ def test_cells_at_the_edge_of_known_ground_are_not_known() -> None:
     known = np.isfinite(known_cells(cells, [area]))[p.cell]
     inside = ((p.place_m > 7.5) & (p.place_m < 32.5)).all(axis=1)
     outside = ((p.place_m < 4.5) | (p.place_m > 35.5)).any(axis=1)
-    assert known[inside].all()
-    assert inside.any()
-    assert not known[outside].any()
-    assert outside.any()
+    assert set(known[inside].tolist()) == {True}
+    assert set(known[outside].tolist()) == {False}
 
 
-def test_a_machine_that_is_known_pins_the_others() -> None:
-    rows = {"a": drive(OPEN, Errors(0.0), seconds=200.0, closed=False, site=concrete)}
-    rows |= {"b": drive(OPEN, Errors(0.007), seconds=200.0, closed=False, site=concrete, seed=1)}
-    pinned = Prior(0.0, 0.0, ((0.0005**2, 0.0), (0.0, 0.005**2)))
-    result = solve(rows, remembered={"a": pinned})
-    assert result.machines["a"].zero_by == ("remembered",)
-    sure = Prior(0.0, 0.0, ((1e-12, 0.0), (0.0, 1e-12)))  # no evidence makes a zero surer than the model
-    state = solve(rows, remembered={"a": sure}).machines["a"]
-    assert (state.zero_std, state.scale_std) == pytest.approx((ZERO_FLOOR, SCALE_FLOOR), rel=0.05)
-    assert (ZERO_FLOOR, SCALE_FLOOR) == (0.0004, 0.004)
-    assert result.machines["b"].zero == pytest.approx(0.007, abs=0.0015)
-    assert "same_ground" in result.machines["b"].zero_by
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_any_order_of_samples_and_machines_gives_the_same_facts(seed: int) -> None:
+def test_any_order_of_samples_and_machines_gives_the_same_facts() -> None:
     rows = fleet()
-    draw = np.random.default_rng(seed)
+    draw = np.random.default_rng(0)
     mixed = {name: draw.permutation(rows[name]) for name in draw.permutation(list(rows)).tolist()}
     assert solve(mixed) == usual()
 
@@ -476,8 +353,8 @@ def test_corrections_are_rounded_follow_each_other_and_the_newest_holds_on() -> 
         assert all(a.to_ns <= b.from_ns for a, b in pairwise(own))
         assert own[-1].to_ns > START_NS + 10**18
         assert all(value == round(value, 5) for each in own for value in (each.zero, each.scale, each.across))
-        assert all(each.covariance[0][0] >= ZERO_FLOOR**2 for each in own)
-        assert all(each.covariance[1][1] >= SCALE_FLOOR**2 for each in own)
+        assert min(each.covariance[0][0] for each in own) >= 0.0004**2
+        assert min(each.covariance[1][1] for each in own) >= 0.004**2
         assert all(np.linalg.eigvalsh(np.array(each.covariance)).min() > 0 for each in own)
 
 
@@ -487,25 +364,45 @@ def test_nothing_is_solved_of_nothing() -> None:
     assert solve({"a": drive(LOW, seconds=10.0)}, ("a",)).corrections == ()
     one = solve({"a": drive(LOW, seconds=10.0)[:1]})
     assert one.machines["a"].zero == 0.0
+    flood = {"flood": np.repeat(drive(LOW, seconds=10.0)[:1], 5000)}
+    assert solve(flood).machines == {}
+    assert solve(fleet() | flood).corrections == usual().corrections, "and it keeps nobody from being calibrated"
 
 
-@pytest.mark.parametrize("excluded", [(), ("flood",)])
-def test_a_machine_that_sends_nothing_but_nonsense_keeps_nobody_from_being_calibrated(
-    excluded: tuple[str, ...],
-) -> None:
-    rows = drive(LOW, seconds=10.0)[:1]
-    result = solve(fleet() | {"flood": np.repeat(rows, 5000)}, excluded)
-    assert result.corrections == usual().corrections
-    assert solve({"flood": np.repeat(rows, 5000)}).machines == {}
+@pytest.mark.nightly
+def test_a_hundred_machines_take_a_gigabyte_at_most() -> None:
+    """What they know of four hours each is bounded: of all together a solve takes so many epochs."""
+    of_each = ledgers(
+        {
+            str(i): drive(route, Errors(0.002 * i, 0.02 * i), seconds=4 * 3600.0, seed=i, late=False)
+            for i, (route, _) in enumerate(FLEET.values())
+        }
+    )
+    stays = {f"m{i:03d}": of_each[str(i % 3)] for i in range(MOST_MACHINES)}
+    tracemalloc.start()
+    result = calibrate(stays)
+    most_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most_bytes < 0.7e9  # beside what the program itself takes
+    assert len(result.corrections) == MOST_EPOCHS
+    assert result.common.observed
+    one = calibrate({name: newest(stays[name], epochs_of_each(3)) for name in ("m000", "m001", "m002")})
+    assert result.machines["m001"].zero == pytest.approx(one.machines["m001"].zero, abs=0.002)
 
 
-def test_a_correction_says_of_its_machine_what_the_solve_said() -> None:
-    result = solve(fleet(errors={"again": Errors(0.002, 0.6)}))
-    for name in ("again", "ramp"):
-        newest = [each for each in result.corrections if each.machine == name][-1]
-        state, known = state_of(newest), result.machines[name]
-        assert (state.zero, state.scale, state.across) == pytest.approx(
-            (known.zero, known.scale, known.across), abs=5e-5
-        )
-        assert (state.zero_std, state.scale_std) == pytest.approx((known.zero_std, known.scale_std), rel=1e-3)
-        assert (state.beyond[1] > FAULT_SIGMAS[1]) == (name == "again")
+def test_more_machines_are_solved_in_groups() -> None:
+    names = [f"m{i:03d}" for i in range(2 * MOST_MACHINES + 1)]
+    assert groups([]) == [()]
+    assert groups(names[:MOST_MACHINES]) == [tuple(names[:MOST_MACHINES])]
+    some = groups(reversed(names))
+    assert (len(some), sorted(name for group in some for name in group)) == (3, names)
+    assert [epochs_of_each(n) for n in (0, 1, 20, 21, 100, 5000)] == [EPOCHS, EPOCHS, EPOCHS, 47, 10, 10]
+
+
+def test_what_groups_say_is_joined_and_the_common_scale_is_the_least_known() -> None:
+    parts = [solve({name: drive(route, Errors(0.004, 0.03))}) for name, route in (("a", LOW), ("b", RAMP))]
+    whole = joined(parts)
+    assert {*whole.machines} == {*whole.stated} == {one.machine for one in whole.corrections} == {"a", "b"}
+    assert whole.machines["b"] == parts[1].machines["b"]
+    assert parts[1].common.observed
+    assert whole.common == parts[0].common

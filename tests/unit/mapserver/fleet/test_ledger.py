@@ -8,7 +8,7 @@ from mapserver.fleet.ledger import EPOCH_NS, EPOCH_SLOTS, EPOCHS, Ledger, epochs
 from mapserver.fleet.passages import links, passages
 from protocol.arrays import Table
 from tests.unit.mapserver.data import random_samples
-from tests.unit.mapserver.fleet.drives import LOW, RAMP, SLOPE, Errors, drive
+from tests.unit.mapserver.fleet.drives import LOW, drive
 
 
 def stays_of(parts: list[Table]) -> Table:
@@ -81,32 +81,6 @@ def test_far_places_and_floods_of_samples_do_no_harm() -> None:
     assert len(p) == len(passages({"a": stays_of([rows])})[0]) - 1  # the stay of the flood
 
 
-def test_passages_measure_what_samples_say() -> None:
-    rows = drive(RAMP, Errors(), seconds=60.0, withheld=False, late=False)
-    p, epochs, _ = passages({"a": stays_of([rows])})
-    assert len(epochs.number) == 1
-    on_ramp = (p.place_m[:, 0] > 54) & (p.place_m[:, 0] < 70) & (p.place_m[:, 1] < 20)
-    assert on_ramp.sum() >= 7
-    assert p.along[on_ramp] == pytest.approx(SLOPE, abs=0.02)
-    assert p.c_rr[on_ramp] == pytest.approx(0.04, abs=0.02)
-    assert p.speed_mps == pytest.approx(4.0, abs=1e-3)
-    assert (np.diff(p.time_s) > 0).all()
-
-
-def test_a_stay_that_the_clock_cuts_in_two_is_one_passage() -> None:
-    rows = drive(LOW, seconds=300.0)
-    p, _, _ = passages({"a": stays_of([rows])})
-    assert (p.cell[1:] != p.cell[:-1]).all()
-
-
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_links_rise_by_the_slope_and_sum_up_to_the_height_of_the_ramp(direction: float) -> None:
-    rows = drive(RAMP, Errors(), seconds=25.0, withheld=False, direction=direction)
-    p, _, _ = passages({"a": stays_of([rows])})
-    rise_m = links(p).rise_m.sum()
-    assert rise_m == pytest.approx(24 * SLOPE, abs=0.4)
-
-
 def test_nobody_drove_where_a_position_jumped() -> None:
     rows = drive(LOW, seconds=60.0)
     rows["x_m"][len(rows) // 2 :] += 30.0
@@ -115,13 +89,3 @@ def test_nobody_drove_where_a_position_jumped() -> None:
     apart = np.hypot(*np.diff(p.place_m, axis=0).T)
     assert len(link.rise_m) == len(p) - 2
     assert apart.max() > 20
-
-
-def test_distances_are_those_of_the_positions() -> None:
-    rows = drive(RAMP, Errors(), seconds=25.0)  # up the ramp, with gaps at foot and top
-    rows["speed_mps"] *= 1.2  # wheels that slip
-    p, _, _ = passages({"a": stays_of([rows])})
-    over = links(p)
-    assert (over.bend_m > 0.5).sum() == 2
-    assert (over.per_zero_m[over.bend_m > 0.5] > 4).all()
-    assert over.per_zero_m == pytest.approx(np.hypot(*np.diff(p.place_m, axis=0).T))

@@ -14,14 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapserver.change import change_log
+from mapserver.follower import follower as edge
 from mapserver.follower import following as module
+from mapserver.follower.follower import Follower
 from mapserver.follower.following import Following
-from mapserver.ingest.store import Store
+from mapserver.follower.replica import Replica
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import LAST
-from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.journal.table_writer import meta_line
 from mapserver.past.making import make
 from mapserver.past.past import Past
@@ -41,8 +42,10 @@ from tests.unit.mapserver.data import (
     past_of,
     random_samples,
     refused,
+    routed,
     same,
     send,
+    store_at,
     wait_for,
 )
 
@@ -60,7 +63,7 @@ def following(folder: Path, site=SITE, config=CONFIG) -> Iterator[Following]:
 @pytest.mark.parametrize("folder", ["store", "elsewhere"])
 def test_a_follower_of_a_journal_in_postgresql_is_told_of_rows(tmp_path, database, folder):
     location = JournalLocation(tmp_path / "store", database.url)
-    with closing(Writer(Store(location, SITE, CONFIG, now_ns))) as writer:
+    with closing(Writer(store_at(location))) as writer:
         deliver(writer, 1)
         writer.run(lambda store: store.save_snapshot())
         deliver(writer, 2)
@@ -84,7 +87,6 @@ def version(one: Following) -> MapVersion | None:
 
 
 def catches_up(one: Following, writer: Writer) -> None:
-    """Wait until both have the same version of the map, then compare all that there is of it."""
     wait_for(lambda: version(one) == writer.run(lambda store: store.version))
     ours, theirs = one.run(lambda replica: replica.grid), writer.run(lambda store: store.grid)
     assert one.run(lambda replica: writer.run(lambda store: same(replica.grid, store.grid)))
@@ -109,6 +111,11 @@ def test_a_follower_that_is_started_before_the_server_waits_for_it(tmp_path):
 
 def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_path, monkeypatch):
     may_go_on, folds, fold_anew = threading.Event(), list[int](), module.fold_anew
+    adopted, adopt = list[int](), Replica.adopt
+
+    def noted(replica, grid, merged, facts):
+        adopted.append(facts.number)
+        adopt(replica, grid, merged, facts)
 
     def held(past, reader, facts, stopped):
         folds.append(facts.number)
@@ -120,6 +127,7 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
         deliver(writer, 1, machine="b")
         catches_up(one, writer)
         monkeypatch.setattr(module, "fold_anew", held)
+        monkeypatch.setattr(Replica, "adopt", noted)
         for trusted in (False, True):
             writer.run(lambda store, t=trusted: store.decide(TrustDecision("b", t, PERSON, "drawn", NOW_NS)))
             wait_for(lambda n=1 + trusted: one.run(lambda replica: replica.event) == n)
@@ -127,13 +135,12 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
         assert version(one).fact == 2  # the map has what decisions come to
         may_go_on.set()
         wait_for(lambda: one._anew is None)
-        assert version(one).fact == 2
-        assert one.run(lambda replica: replica.facts.excluded) == frozenset()
+        deliver(writer, 2)
         catches_up(one, writer)
+        assert adopted == []
 
 
 def archive_all(folder: Path, writer: Writer) -> list[Path]:
-    """Have all rows in the archive; returns its new files."""
     location = JournalLocation(folder)
 
     def forget(until: int) -> int:
@@ -144,8 +151,6 @@ def archive_all(folder: Path, writer: Writer) -> list[Path]:
 
 
 class Served:
-    """A writer and its folds over a folder: rows come in, machines are decided about, it archives and starts again."""
-
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._open()
@@ -251,52 +256,6 @@ def test_an_epoch_that_is_lower_than_before_is_noticed(tmp_path, caplog):
         assert caplog.text.count("rows are gone") == 1
 
 
-def test_a_slow_follower_holds_nobody_up_says_how_far_behind_it_is_and_has_the_same_map_in_the_end(
-    tmp_path, monkeypatch
-):
-    may_read = threading.Event()
-    may_read.set()
-    read = module.read_history
-
-    def slowly(*words):
-        for rows in read(*words):
-            assert may_read.wait(WAIT_S)
-            yield rows
-
-    monkeypatch.setattr(module, "read_history", slowly)
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-        may_read.clear()
-        for seed in range(2, 10):
-            deliver(writer, seed, machine="b")  # each is acknowledged
-        wait_for(lambda: one.behind()[0] > 0)
-        before_s = one.behind()[1]
-        wait_for(lambda: one.behind()[1] > before_s + 0.2)
-        assert version(one).row == 1, "and it answers with the map that it has"
-        may_read.set()
-        catches_up(one, writer)
-        wait_for(lambda: one.behind()[0] == 0 and one.behind()[1] < 1.5)
-
-
-def test_it_begins_with_the_snapshot_of_the_server(tmp_path, monkeypatch):
-    with closing(open_writer(tmp_path)) as writer:
-        for seed in range(4):
-            deliver(writer, seed)
-        writer.run(lambda store: store.save_snapshot())
-        deliver(writer, 5)
-        folded, fold_history = list[int](), module.fold_history
-
-        def noted(grid, history, after, *more) -> bool:
-            folded.append(after)
-            return fold_history(grid, history, after, *more)
-
-        monkeypatch.setattr(module, "fold_history", noted)
-        with following(tmp_path) as one:
-            catches_up(one, writer)
-        assert folded == [4]
-
-
 @pytest.mark.parametrize(
     ("site", "problem"), [(replace(SITE, name="quarry"), "quarry"), (replace(SITE, origin_lat_deg=49.0), "frame")]
 )
@@ -344,35 +303,6 @@ def test_a_journal_damaged_beneath_a_follower_takes_no_map_away_and_gives_none_t
             catches_up(one, writer)
 
 
-def test_a_row_that_is_gone_from_a_database_is_named_and_gives_no_map(tmp_path, database, caplog):
-    location = JournalLocation(tmp_path / "store", database.url)
-    with closing(Writer(Store(location, SITE, CONFIG, now_ns))) as writer:
-        for seed in (1, 2, 3):
-            deliver(writer, seed)
-        (row,) = database.sql("SELECT record FROM sitegrid.journal WHERE row = 2")
-        database.sql("DELETE FROM sitegrid.journal WHERE row = 2")
-        one = Following(JournalLocation(tmp_path / "elsewhere", database.url), SITE, CONFIG)
-        one.start()
-        with closing(one):
-            wait_for(lambda: "what follows number 1 is damaged" in caplog.text)
-            assert version(one) is None
-            database.sql(f"INSERT INTO sitegrid.journal VALUES (2, '\\x{bytes(row[0]).hex()}')")
-            catches_up(one, writer)
-
-
-def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):
-    def lost(self, known, timeout_s):  # the notification; the time-out is not
-        wait_for(lambda: True)
-        return self.state()
-
-    monkeypatch.setattr(SqliteReader, "follow", lost)
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-        deliver(writer, 2)
-        catches_up(one, writer)
-
-
 def test_changes_of_the_ground_come_with_the_events(tmp_path):
     change = GroundChange(1, 1, 2, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, 0.5)
     with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
@@ -401,31 +331,9 @@ def test_a_fold_beside_that_fails_is_done_again(tmp_path, monkeypatch):
         assert folds == [1, 1]
 
 
-def test_a_damaged_row_behind_a_sound_one_takes_no_map_away(tmp_path, caplog):
-    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
-        deliver(writer, 1)
-        catches_up(one, writer)
-
-        def damage(store) -> None:
-            db = store.journal._db
-            record = bytearray(db.execute("SELECT record FROM journal WHERE row = 3").fetchone()[0])
-            record[60] ^= 1
-            db.execute("UPDATE journal SET record = ? WHERE row = 3", (bytes(record),))
-
-        with one._lock:  # it sees both rows at once
-            for seed in (2, 3):
-                deliver(writer, seed)
-            writer.run(damage)
-        wait_for(lambda: "journal row 3" in caplog.text)
-        wait_for(lambda: one.behind()[1] > 2.5)  # it has opened the journal again
-        assert version(one).row == 2
-        assert one.behind()[0] == 1
-        assert "rows are gone" not in caplog.text
-
-
 def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_path, database):
     location = JournalLocation(tmp_path / "store", database.url)
-    with closing(Store(location, SITE, CONFIG, now_ns)) as store:
+    with closing(store_at(location)) as store:
         for seed in (1, 2, 3):
             store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
         with location.reader() as reader:
@@ -435,7 +343,7 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
     database.sql(
         "UPDATE sitegrid.head SET last_row = 1; DELETE FROM sitegrid.watermark WHERE spool_id <> '\\x0000000000000001'"
     )
-    with closing(Store(JournalLocation(tmp_path / "other", database.url), SITE, CONFIG, now_ns)) as other:
+    with closing(store_at(JournalLocation(tmp_path / "other", database.url))) as other:
         for seed in (4, 5, 6):  # another host's server goes on
             other.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
         one = Following(location, SITE, CONFIG)
@@ -447,11 +355,42 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
                 assert same(one.past.grid_as_of(reader, LAST), other.grid)
 
 
+def test_a_follower_that_cannot_keep_up_is_hidden_until_it_has_caught_up(tmp_path, monkeypatch, caplog):
+    may_read, read = threading.Event(), module.read_history
+
+    def slowly(*words):
+        for rows in read(*words):
+            assert may_read.wait(WAIT_S)
+            yield rows
+
+    monkeypatch.setattr(edge, "SHOWN_S", 1.5)  # for ten seconds
+    monkeypatch.setattr(module, "read_history", slowly)
+    may_read.set()
+    with routed() as (_, session), closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(random_samples(20, 1), 1, "a")])
+        with closing(Follower(session, "slow", JournalLocation(tmp_path), SITE, CONFIG, now_ns)) as one:
+
+            def is_shown() -> bool:
+                one.tend()
+                return one.is_shown
+
+            wait_for(is_shown)
+            may_read.clear()
+            send(writer, [incoming(random_samples(20, 2), 21, "a")])
+            wait_for(lambda: not is_shown())
+            assert "clients ask others" in caplog.text
+            assert one.source.origin().behind_rows == 1
+            assert writer.run(lambda store: store.merged) == 2, "nobody waits for it"
+            may_read.set()
+            wait_for(is_shown)
+            assert one.source.origin().behind_rows == 0
+
+
 @pytest.mark.nightly
 def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_it_is(tmp_path, caplog):
     with server.cluster() as primary, server.replica(primary, "b") as replica:
         database = primary.new_database()
-        with closing(Store(JournalLocation(tmp_path / "store", database.url), SITE, CONFIG, now_ns)) as store:
+        with closing(store_at(JournalLocation(tmp_path / "store", database.url))) as store:
 
             def deliver(seed: int) -> None:
                 store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])

@@ -1,38 +1,48 @@
+from __future__ import annotations
+
 import os
-import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mapserver.evidence import snapshot
 from mapserver.fleet.correction import LAST_NS, NO_SHARE, Correction
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
+from mapserver.ingest import standby as standby_module
+from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
-from mapserver.journal.facts import NO_FACTS, Facts
-from mapserver.journal.journal import UnwrittenError
+from mapserver.journal.facts import Facts
+from mapserver.journal.journal import JournalQueries, UnwrittenError
 from mapserver.journal.location import JournalLocation
+from mapserver.journal.postgres import reader as postgres_reader
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import Refusal, StoreError
+from protocol.wire import keys
 from protocol.wire.messages import Ack, CalibrationOffer, Refused
 from protocol.wire.offer_codec import decode_offer
+from sitegrid.security.signing import Signer, Verifier, make_signing_key
+from tests.postgres_server import Database
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
     SITE,
     Incoming,
+    fold_of,
     folded,
     incoming,
+    now_ns,
     open_store,
     random_samples,
     same,
     samples,
+    store_at,
+    wait_for,
 )
 
 
@@ -66,9 +76,8 @@ def test_a_group_is_answered_in_order(store):
     assert (store.merged, store.journalled, store.grid.folded) == (3, 3, 10)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_sent_at_least_once_is_merged_exactly_once(store, seed):
-    rows, draw = random_samples(120, seed), np.random.default_rng(seed)
+def test_sent_at_least_once_is_merged_exactly_once(store):
+    rows, draw = random_samples(120, 1), np.random.default_rng(1)
     watermark = 0
     while watermark < len(rows):
         first = max(1, watermark + 1 - int(draw.integers(0, 15)))
@@ -99,22 +108,33 @@ def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
     assert store.info()["machines"]["b"] == counts(1, 4, 0, NOW_NS + 3 * 10**9)
 
 
+def test_what_is_refused_or_not_committed_is_neither_journalled_nor_paid_for(store, monkeypatch):
+    x_m, y_m = np.random.default_rng(6).uniform(-2e4, 2e4, (2, 400))
+    rows = samples(400, x_m=x_m, y_m=y_m, cov_xx_m2=8.9, cov_yy_m2=8.9, stamp_ns=NOW_NS)
+
+    def fails() -> None:
+        raise UnwrittenError("journal", "the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store.journal, "commit", fails)
+        lost = [store.commit([incoming(rows[first : first + 40])])[0] for first in range(50, 400, 40)]
+    assert {answer.reason for answer in lost} == {Refusal.STORE}
+    (refused,) = store.commit([incoming(rows)])
+    assert refused.reason == Refusal.SCATTERED
+    assert store.commit([incoming(rows)]) == [refused]
+    assert isinstance(store.commit([incoming(rows[:50])])[0], Ack)
+    (overlapping,) = store.commit([incoming(rows[:300])])
+    assert 50 <= int(overlapping.problem.removeprefix("x_m[").split("]")[0]) < 300, "rows count as they were sent"
+    assert (store.journal.samples, store.counters["refused_scattered"]) == (50, 3)
+
+
 def test_info_tells_the_state_in_plain_values(store):
-    store.commit([
-        incoming(samples(3)),
-        incoming(samples(2), spool_id=8),
-        incoming(samples(2, cov_xx_m2=10.0, x_m=900.0, stamp_ns=NOW_NS + 10**12), machine="b"),
-    ])  # fmt: skip
+    far = samples(2, cov_xx_m2=10.0, x_m=900.0, stamp_ns=NOW_NS + 10**12)
+    store.commit([incoming(samples(3)), incoming(samples(2), spool_id=8), incoming(far, machine="b")])
     store.grid.known_cells()  # folds what waits: cells and bounds follow then
     info = store.info()
-    assert info["site"]["name"] == SITE.name
-    assert info["site"]["frame"] == SITE.frame
-    assert info["site"]["crs"] == SITE.crs
-    assert info["site"]["cell_m"] == 1.0
-    assert (info["journalled"], info["merged"], info["snapshot"]) == (3, 3, 0)
     assert (info["samples_merged"], info["samples_too_unsure"], info["cells"]) == (5, 2, 1)
-    assert info["bounds"] == (0, 0, 16, 16)
-    assert info["stamp_ns"] == NOW_NS + 10**12
+    assert (info["bounds"], info["stamp_ns"]) == ((0, 0, 16, 16), NOW_NS + 10**12)
     assert info["machines"]["a"] == counts(2, 5, 0, NOW_NS + 2 * 10**9)
 
 
@@ -124,30 +144,6 @@ def test_a_store_that_cannot_be_opened_is_let_go(tmp_path):
         with pytest.raises(StoreError, match="site 'pit'"):
             open_store(tmp_path, site=replace(SITE, name="quarry"))
     open_store(tmp_path).close()
-
-
-def test_a_damaged_journal_is_named_at_the_start(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(3))])
-    store.close()
-    db = sqlite3.connect(tmp_path / "journal.db")
-    db.execute("UPDATE journal SET record = substr(record, 1, 100)")
-    db.commit()
-    db.close()
-    with pytest.raises(StoreError, match="row 1 is damaged; restore"):
-        open_store(tmp_path)
-
-
-def test_a_grid_adopted_while_a_snapshot_is_written_gets_one_of_its_own(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(3)), incoming(samples(3), machine="b")])
-    write = store.snapshot()
-    store.adopt(folded(samples(3)), store.merged, Facts(frozenset({"b"})))
-    write()
-    store.save_snapshot()
-    row, _ = snapshot.load_newest(tmp_path, store.merged, SITE.cell_m, store.config.fold, store.facts.of_evidence())
-    store.close()
-    assert row == 2
 
 
 @pytest.mark.parametrize("row", [0, 1])
@@ -162,8 +158,6 @@ def test_an_adopted_grid_gets_what_came_since_without_those_excluded(store, row)
     assert same(store.grid, expected)
     assert (store.merged, store.journalled) == (5, 5)
 
-
-# --- kill and replay -------------------------------------------------------------------------------------------------
 
 # Takes batches of 20 samples; in the fold of number `stuck`, half of its pages are in the grid, and nothing goes on.
 TAKES = """
@@ -210,7 +204,7 @@ def taking(folder, stuck: int, saved: int) -> Iterator[subprocess.Popen]:
         child.stdout.close()
 
 
-@pytest.mark.parametrize(("stuck", "saved"), [(1, 9), pytest.param(7, 9, marks=pytest.mark.slow), (7, 4)])
+@pytest.mark.parametrize(("stuck", "saved"), [(1, 9), (7, 4)])
 def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, saved):
     rows = random_samples(200, 12)
     np.save(tmp_path / "rows.npy", rows)
@@ -232,49 +226,7 @@ def test_a_kill_in_the_middle_of_a_fold_leaves_the_same_bits(tmp_path, stuck, sa
     store.close()
 
 
-@pytest.mark.parametrize("parts", [1, 5, 25])
-def test_a_replay_of_any_part_of_the_journal_after_a_snapshot_gives_the_same_bits(tmp_path, parts):
-    rows = random_samples(100, 13, half_m=20.0)
-    rows["stamp_ns"] += np.arange(100) % 9 * 10**9 * 9_000
-    store = open_store(tmp_path / "store")
-    for i, part in enumerate(np.split(rows, parts * 4)):
-        store.commit([incoming(part, 1 + i * len(part))])
-        if i == parts:
-            store.save_snapshot()
-    shutil.copytree(tmp_path / "store", tmp_path / "copy")  # as a kill leaves it
-    again = open_store(tmp_path / "copy")
-    assert again.snapshot_row == parts + 1 == max(snapshot.rows_on_disk(tmp_path / "copy"))
-    assert same(again.grid, store.grid)
-    assert same(again.grid, folded(rows))
-    store.close(), again.close()
-
-
-def test_samples_at_the_end_of_a_spool_are_declared_lost_without_a_row(tmp_path):
-    store = open_store(tmp_path)
-    store.commit([incoming(samples(3))])
-    (answer,) = store.commit([incoming(samples(0), 8, lost_before=4)])
-    assert (answer.watermark, answer.row) == (7, 1)
-    assert store.counters["samples_lost"] == 4
-    store.close()
-    store = open_store(tmp_path)
-    assert store.machines()["a"] == counts(1, 3, 4, NOW_NS + 2 * 10**9)
-    store.close()
-
-
-# --- which store it is -----------------------------------------------------------------------------------------------
-
 GONE = "0123456789abcdef"
-
-
-def test_a_store_keeps_its_id_and_so_does_a_copy_of_it(tmp_path):
-    with closing(open_store(tmp_path / "a")) as store, closing(open_store(tmp_path / "b")) as other:
-        identity = store.identity
-        assert identity.id != other.identity.id
-        assert identity.descends == ()
-    shutil.copytree(tmp_path / "a", tmp_path / "copy")
-    for name in ("a", "copy"):
-        with closing(open_store(tmp_path / name)) as again:
-            assert again.identity == identity
 
 
 def test_a_run_that_is_bound_to_another_store_is_refused_until_a_person_accepts_that_one(tmp_path):
@@ -295,22 +247,6 @@ def test_a_run_that_is_bound_to_another_store_is_refused_until_a_person_accepts_
         assert store.commit([incoming(samples(1), 6, store=store.identity.id)])[0].replaces == ""
 
 
-def test_the_version_of_the_map_names_the_last_decision_that_counts_in_it(tmp_path):
-    with closing(open_store(tmp_path)) as store:
-        store.commit([incoming(samples(2)), incoming(samples(2), machine="b")])
-        assert (store.version.row, store.version.fact) == (2, 0)
-        store.decide(TrustDecision("a", trusted=True, by="person", reason="", stamp_ns=1))
-        assert store.fact == 1  # it changes nothing in the map, so it counts at once
-        store.decide(TrustDecision("b", trusted=False, by="person", reason="moved", stamp_ns=1))
-        assert store.fact == 1
-        store.adopt(folded(samples(2)), 2, Facts(frozenset({"b"})))
-        assert store.fact == 2
-    with closing(open_store(tmp_path)) as store:
-        assert (store.version.row, store.version.fact) == (2, 2)
-
-
-# --- time ------------------------------------------------------------------------------------------------------------
-
 DAY = 86_400 * 10**9
 
 
@@ -325,16 +261,6 @@ def test_the_site_s_now_is_that_of_trusted_machines_and_is_taken_back(tmp_path):
         assert (store.newest_ns, store.machines()["b"]["newest_ns"]) == (NOW_NS, NOW_NS + DAY)
     with closing(open_store(tmp_path)) as store:
         assert store.newest_ns == NOW_NS
-
-
-def test_a_machine_from_the_future_bears_out_no_other_once_it_is_distrusted(tmp_path):
-    with closing(open_store(tmp_path)) as store:
-        store.commit([incoming(samples(1, stamp_ns=NOW_NS + DAY), machine="b")])
-        later = incoming(samples(1, stamp_ns=NOW_NS + 2 * DAY), machine="c")
-        store.adopt(folded(samples(0)), 1, Facts(frozenset({"b"})))
-        assert store.commit([later])[0].reason == Refusal.FAR_FUTURE
-        store.adopt(folded(samples(1, stamp_ns=NOW_NS + DAY)), 1, NO_FACTS)
-        assert isinstance(store.commit([later])[0], Ack)
 
 
 def test_a_server_whose_clock_went_back_says_so_until_it_is_right_again(tmp_path):
@@ -401,8 +327,6 @@ def test_samples_that_are_missing_are_counted_until_they_are_declared_lost(tmp_p
     store.close()
 
 
-# --- what is offered -------------------------------------------------------------------------------------------------
-
 COVARIANCE = ((4e-7, 1e-7, 0.0), (1e-7, 2e-5, 0.0), (0.0, 0.0, 1e-6))
 
 
@@ -429,21 +353,19 @@ def test_a_machine_is_offered_what_is_taken_off_its_newest_samples(store):
     assert (offered(store).zero, offered(store).stamp_ns) == (0.02, NOW_NS + 5)
 
 
-@pytest.mark.parametrize("span", [(0, NOW_NS, 0.004, COVARIANCE), (0, LAST_NS, 0.004, ())])
-def test_what_has_ended_or_is_of_unknown_quality_is_not_offered(store, span):
-    store.decide(calibrated("a", span))
-    assert offered(store) is None
-
-
-def test_a_machine_whose_sensor_measures_no_force_is_offered_nothing(store):
-    stuck = Correction("a", 0, LAST_NS, 0.004, 0.0, 0.0, COVARIANCE, NO_SHARE)
-    store.decide(CalibrationDecision("a", SOLVER, "", NOW_NS, (stuck,)))
-    assert offered(store) is None
-
-
-def test_a_machine_that_is_not_trusted_is_offered_nothing(store):
-    store.decide(calibrated("a", (0, LAST_NS, 0.004, COVARIANCE)))
-    store.decide(TrustDecision("a", trusted=False, by="person", reason="moved", stamp_ns=1))
+@pytest.mark.parametrize(
+    ("end_ns", "covariance", "most_share", "trusted"),
+    [
+        (NOW_NS, COVARIANCE, 1.0, True),  # it has ended
+        (LAST_NS, (), 1.0, True),  # of unknown quality
+        (LAST_NS, COVARIANCE, NO_SHARE, True),  # of a sensor that measures no force
+        (LAST_NS, COVARIANCE, 1.0, False),
+    ],
+)
+def test_what_no_machine_may_take_is_not_offered(store, end_ns, covariance, most_share, trusted):
+    correction = Correction("a", 0, end_ns, 0.004, 0.05, 0.0, covariance, most_share)
+    store.decide(CalibrationDecision("a", SOLVER, "", NOW_NS, (correction,)))
+    store.decide(TrustDecision("a", trusted=trusted, by="person", reason="moved", stamp_ns=1))
     assert offered(store) is None
 
 
@@ -455,3 +377,145 @@ def test_an_acknowledgement_without_new_samples_offers_nothing(store):
         Ack(2, 1, trimmed=2, store=store.identity.id),
         Ack(2, 1, store=store.identity.id),
     ]
+
+
+PRIVATE, PUBLIC = make_signing_key()
+OTHER, _ = make_signing_key()
+
+
+@pytest.fixture
+def signed_store(tmp_path):
+    with closing(Store(JournalLocation(tmp_path), SITE, CONFIG, now_ns, Verifier({"a": PUBLIC}).check)) as opened:
+        yield opened
+
+
+def signed(machine: str = "a", key: bytes = PRIVATE, under: str = "") -> Incoming:
+    batch = incoming(samples(3), machine=machine)
+    return Incoming(machine, batch.payload, Signer(key).sign(keys.ingest(SITE.name, under or machine), batch.payload))
+
+
+@pytest.mark.parametrize(
+    ("batch", "problem"),
+    [
+        (incoming(samples(3)), "is not signed"),
+        (signed(key=OTHER), "is not that of 'a'"),
+        (signed(under="b"), "is not that of 'a'"),
+        (Incoming("a", signed().payload + b"x", signed().signature), "is not that of 'a'"),
+        (signed(machine="stranger"), "no signing key of 'stranger'"),
+        (Incoming("", signed().payload, signed().signature), "names no machine"),
+    ],
+)
+def test_what_a_machine_did_not_sign_for_its_own_key_is_refused_and_leaves_no_trace(signed_store, batch, problem):
+    (answer,) = signed_store.commit([batch])
+    assert answer.reason == "wrong_machine"
+    assert problem in answer.problem
+    assert signed_store.counters["refused_wrong_machine"] == 1
+    assert (signed_store.journalled, signed_store.grid.state().folded) == (0, 0)
+    assert isinstance(signed_store.commit([signed()])[0], Ack)
+
+
+@pytest.fixture
+def location(tmp_path: Path, database: Database) -> JournalLocation:
+    return JournalLocation(tmp_path / "one", database.url)
+
+
+@pytest.fixture
+def standby(tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch) -> Iterator[Standby]:
+    """One that reads row by row, and tries again at once."""
+    for name in ("ROWS_AT_ONCE", "BYTES_AT_ONCE"):
+        monkeypatch.setattr(postgres_reader, name, 1)
+    monkeypatch.setattr(standby_module, "_MOST_PAUSE_S", 0.0)
+    monkeypatch.setattr(standby_module, "_PAUSE_S", 0.0)
+    with closing(Standby(JournalLocation(tmp_path / "two", database.url), SITE, CONFIG, bool)) as made:
+        yield made
+
+
+def send(store: Store, first: int, last: int, machine: str = "a") -> None:
+    for seq in range(first, last + 1):
+        store.commit([incoming(random_samples(1, seq), seq, machine)])
+
+
+def is_fold(standby: Standby, journal: JournalQueries, without: frozenset[str] = frozenset()) -> bool:
+    return same(standby._grid, fold_of(journal.read(until=standby.row), without))
+
+
+@pytest.mark.parametrize("warm_rows", [0, 2])
+def test_before_a_damaged_row_it_waits_and_folds_nothing_twice(location, standby, warm_rows, database):
+    with closing(store_at(location)) as store:
+        send(store, 1, warm_rows)
+        if warm_rows:
+            standby.follow(5.0)
+        send(store, warm_rows + 1, 6)
+        ((sound,),) = database.sql("SELECT record FROM sitegrid.journal WHERE row = 4")
+        database.sql("UPDATE sitegrid.journal SET record = '\\x00' WHERE row = 4")
+        for _ in range(5):
+            standby.follow(0.1)
+            assert standby.row == 3
+            assert is_fold(standby, store.journal)
+        assert "journal row 4 is damaged" in standby._problem
+        database.sql(f"UPDATE sitegrid.journal SET record = '\\x{sound.hex()}' WHERE row = 4")
+        standby.follow(0.1)
+        assert (standby.row, standby._problem) == (6, "")
+        assert is_fold(standby, store.journal)
+
+
+def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
+    with closing(store_at(location)) as store:
+        send(store, 1, 2)
+        standby.follow(5.0)
+        row, grid = standby.grid_for(store.journal, store.facts)
+        assert (row, same(grid, store.grid)) == (2, True)
+        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        assert standby.grid_for(store.journal, facts) is None, "the grid of other facts"
+        standby.follow(5.0)
+        assert standby.grid_for(store.journal, store.facts) is None
+        send(store, 1, 3, machine="b")
+        standby.follow(5.0)
+        assert standby.row == 5
+        assert is_fold(standby, store.journal, facts.excluded)
+        send(store, 3, 3)
+        standby.follow(5.0)
+        assert is_fold(standby, store.journal, facts.excluded)
+
+
+def restore(database: Database, row: int) -> None:
+    """As a backup of the same epoch would have it."""
+    database.sql(f"DELETE FROM sitegrid.journal WHERE row > {row}; DELETE FROM sitegrid.extent WHERE row > {row}")
+    database.sql(f"UPDATE sitegrid.head SET last_row = {row}")
+
+
+@pytest.mark.parametrize("rows_since", [0, 2, 4, 6])
+def test_a_database_that_is_restored_within_an_epoch_is_folded_again(location, standby, database, rows_since):
+    with closing(store_at(location)) as store:
+        send(store, 1, 4)
+        standby.follow(5.0)
+        assert standby.has_checked(store.journal)
+    restore(database, 1)
+    epoch = database.sql("SELECT epoch FROM sitegrid.head")[0][0]
+    with closing(store_at(location)) as store:
+        send(store, 1, rows_since, machine="b")
+        database.sql(f"UPDATE sitegrid.head SET epoch = {epoch}")
+        assert not standby.has_checked(store.journal)
+        assert standby.grid_for(store.journal, store.facts) is None
+        standby.follow(5.0)
+        assert standby.row == 1 + rows_since
+        assert is_fold(standby, store.journal)
+        standby.follow(0.1)
+        assert standby.has_checked(store.journal)
+
+
+def test_a_decision_of_another_course_is_not_kept(location, standby, database):
+    """A restored database may have another decision under the number of one that is gone."""
+    with closing(store_at(location)) as store:
+        send(store, 1, 4)
+        send(store, 1, 4, machine="b")
+        store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        standby.follow(5.0)
+        assert standby._facts.excluded == {"b"}
+    restore(database, 2)
+    database.sql("DELETE FROM sitegrid.events; UPDATE sitegrid.head SET last_event = 0")
+    with closing(store_at(location)) as store:
+        events = store.journal.state().event
+        store.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
+        assert events == 1, "what is missing is an event"
+    wait_for(lambda: standby.follow(0.1) or standby._facts.excluded == {"c"})

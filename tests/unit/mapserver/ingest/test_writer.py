@@ -1,7 +1,9 @@
 import math
 import threading
 import time
+from collections import Counter
 from concurrent.futures import Future
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +13,10 @@ import pytest
 
 from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
-from mapserver.ingest import backlog, snapshot_times
+from mapserver.ingest import backlog, merge_waits, snapshot_times
 from mapserver.ingest import writer as writer_module
-from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, MOST_RETRY_S
+from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, GROUP_BYTES, MOST_RETRY_S, Backlog, Pace
+from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
@@ -23,7 +26,6 @@ from protocol.queries.answers import ServerAlive
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
 from protocol.wire.messages import Ack
 from tests.unit.mapserver.data import (
-    CONFIG,
     NOW_NS,
     SITE,
     WAIT_S,
@@ -41,7 +43,6 @@ from tests.unit.mapserver.data import (
     send,
     wait_for,
 )
-from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
 
 
 @pytest.fixture
@@ -70,9 +71,6 @@ def spied(monkeypatch, method: str) -> list[str]:
 
     monkeypatch.setattr(SqliteJournal, method, spy)
     return events
-
-
-# --- batches ---------------------------------------------------------------------------------------------------------
 
 
 def test_batches_are_acknowledged_in_order_and_merged(start):
@@ -142,24 +140,6 @@ def test_where_too_much_waits_a_batch_is_refused_at_once_and_told_when_to_come_a
     assert isinstance(send(writer, [batches[10]])[0], Ack)  # room again
 
 
-def test_the_backlog_of_one_machine_keeps_no_other_out(start, monkeypatch):
-    large = [incoming(samples(100), 1 + 100 * i) for i in range(8)]
-    small = [incoming(samples(1), machine=f"m-{i}") for i in range(20)]
-    monkeypatch.setattr(backlog.Backlog.__init__, "__defaults__", (8 * (len(large[0].payload) + BATCH_BYTES),))
-    writer, late, live = start(), Replies(), Replies()
-    with held(writer):
-        for i, each in enumerate(large):
-            writer.submit(each, late[i])
-        for i, each in enumerate(small):
-            writer.submit(each, live[i])
-        gone = [(key, answer.reason) for key, answer in late.all]
-        assert gone == [(key, Refusal.OVERLOADED) for key in range(7, 7 - len(gone), -1)]  # the newest first
-        assert 1 < len(gone) < 8
-    assert all(isinstance(answer, Ack) for answer in live.wait(20))
-    answers = dict(late.all) if late.wait(8) else {}
-    assert [answers[key].watermark for key in range(8 - len(gone))] == [100 * (i + 1) for i in range(8 - len(gone))]
-
-
 def test_closing_finishes_what_is_waiting(start, tmp_path):
     writer, replies = start(), Replies()
     with held(writer):
@@ -174,20 +154,6 @@ def test_closing_finishes_what_is_waiting(start, tmp_path):
     assert again.info()["snapshot"] == again.info()["merged"] == 7
 
 
-# --- work of other threads -------------------------------------------------------------------------------------------
-
-
-def test_a_thread_gets_the_error_that_its_work_raised(start):
-    writer = start()
-    with pytest.raises(ZeroDivisionError):
-        writer.run(lambda _: 1 // 0)
-    assert not writer.failed
-
-
-def test_work_runs_on_the_owners_thread(start):
-    assert start().run(lambda _: threading.current_thread().name) == "writer"
-
-
 def test_a_look_is_taken_by_whoever_asks_while_the_owner_waits(start):
     writer = start()
     send(writer, [incoming(samples(3))])
@@ -197,19 +163,6 @@ def test_a_look_is_taken_by_whoever_asks_while_the_owner_waits(start):
     assert here == (threading.get_ident(), 1)
     with pytest.raises(ZeroDivisionError):
         writer.look(lambda _: 1 / 0)
-
-
-def test_a_look_takes_its_turn_while_the_owner_works(start):
-    writer, seen = start(), []
-    with held(writer):
-        writer.submit(incoming(samples(3)), lambda _: None)
-        asker = threading.Thread(target=lambda: seen.append(writer.look(lambda s: (threading.get_ident(), s.merged))))
-        asker.start()
-        wait_for(lambda: writer._works)
-        assert not seen
-    asker.join(WAIT_S)
-    assert len(seen) == 1
-    assert seen[0][1] == 1, "it saw the batch that waited before it"
 
 
 def test_nobody_looks_while_the_owner_commits(start, monkeypatch):
@@ -232,31 +185,7 @@ def test_nobody_looks_while_the_owner_commits(start, monkeypatch):
     assert all(folded == 2 * merged for merged, folded in both)
 
 
-def test_nobody_looks_at_a_store_that_is_closed_or_failed(start, monkeypatch):
-    writer = start()
-    writer.close()
-    with pytest.raises(QueryError):
-        writer.look(lambda store: store.merged)
-
-
-def test_waiting_for_a_row_that_does_not_come_times_out(start):
-    writer = start()
-    send(writer, [incoming(samples(1))])
-    called: Future[QueryError] = Future()
-    writer.waits.add(2, 0.01, called.set_result)
-    error = called.result(WAIT_S)
-    assert (error.reason, str(error)) == (
-        Refusal.AFTER_TIMEOUT,
-        "journal row 2 is not merged after 0.01 s; merged is 1",
-    )
-
-
-# --- snapshots -------------------------------------------------------------------------------------------------------
-
-
 class Clock:
-    """Seconds that pass when a test says so."""
-
     def __init__(self) -> None:
         self.now_s = 1000.0
 
@@ -265,7 +194,6 @@ class Clock:
 
 
 def turn(writer: Writer) -> None:
-    """Have the owner look what is due, to the end."""
     for _ in range(2):
         writer.run(lambda _: None)
 
@@ -281,16 +209,6 @@ def test_a_snapshot_is_made_once_a_restart_would_take_long(start, tmp_path):
         send(writer, [incoming(samples(1), row)])
         turn(writer)
         wait_for(lambda row=row: snapshot.rows_on_disk(tmp_path) == expected[row // 3 * 3] and is_written(writer))
-
-
-def test_what_a_start_has_folded_counts_for_the_next_snapshot(start, tmp_path):
-    writer = start(clock=Clock())
-    send(writer, [incoming(samples(2)), incoming(samples(2), machine="b")])
-    writer.close()
-    next(tmp_path.glob("snapshot-*")).unlink()
-    again = start(restart_samples=4, clock=Clock())
-    turn(again)
-    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [2])
 
 
 def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start, tmp_path, monkeypatch):
@@ -322,26 +240,6 @@ def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start
     assert start().info()["snapshot"] == 6
 
 
-def test_a_snapshot_is_of_the_moment_at_which_it_was_taken(start, tmp_path, monkeypatch):
-    """What is folded while it is written is not in it."""
-    release, real = threading.Event(), snapshot.save
-
-    def slow(*args):
-        assert release.wait(WAIT_S)
-        return real(*args)
-
-    monkeypatch.setattr(snapshot, "save", slow)
-    writer = start(restart_samples=1)
-    parts = np.split(random_samples(60, 14), 3)
-    for i, part in enumerate(parts):
-        send(writer, [incoming(part, 1 + 20 * i)])
-    release.set()
-    wait_for(lambda: is_written(writer))
-    row, grid = snapshot.load_newest(tmp_path, 3, 1.0, CONFIG.fold)
-    assert row == 1
-    assert same(grid, folded(parts[0]))
-
-
 def test_a_snapshot_is_made_when_its_time_has_come_even_if_nothing_comes(start, tmp_path):
     clock = Clock()
     writer = start(snapshot_s=60.0, clock=clock)
@@ -358,12 +256,6 @@ def test_a_snapshot_is_made_when_its_time_has_come_even_if_nothing_comes(start, 
     send(writer, [incoming(samples(1), 2)])
     turn(writer)
     assert snapshot.rows_on_disk(tmp_path) == [1]  # and it was looked at a moment ago
-
-
-def test_the_owner_wakes_up_for_a_snapshot(start, tmp_path):
-    writer = start(snapshot_s=0.02)
-    send(writer, [incoming(samples(1))])
-    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [1])
 
 
 def test_a_snapshot_that_fails_is_tried_again_only_after_a_while(start, tmp_path, monkeypatch):
@@ -387,19 +279,6 @@ def test_a_snapshot_that_fails_is_tried_again_only_after_a_while(start, tmp_path
     assert tries == [3, 6, 7]
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_bug_in_the_snapshot_is_logged(start, monkeypatch, caplog):
-    monkeypatch.setattr(snapshot, "save", lambda *_: 1 // 0)
-    writer = start(restart_samples=1)
-    send(writer, [incoming(samples(1))])
-    writer.info()
-    wait_for(lambda: is_written(writer))
-    assert writer.failed or "snapshot failed" in caplog.text
-
-
-# --- probes ----------------------------------------------------------------------------------------------------------
-
-
 def test_a_probe_waits_for_nobody_and_hears_of_a_writer_that_hangs(start):
     clock = Clock()
     writer = start(clock=clock)
@@ -421,11 +300,9 @@ def test_what_comes_after_the_end_is_refused_at_once(start):
     writer = start()
     writer.close()
     assert [answer.reason for answer in send(writer, [incoming(samples(1))])] == [Refusal.STORE]
-    with pytest.raises(QueryError, match="the server is ending"):
-        writer.run(lambda _: None)
-
-
-# --- the end of the thread -------------------------------------------------------------------------------------------
+    for ask in (writer.run, writer.look):
+        with pytest.raises(QueryError, match="the server is ending"):
+            ask(lambda _: None)
 
 
 def test_a_bug_in_the_writer_shows_and_leaves_nobody_waiting(start, monkeypatch):
@@ -442,32 +319,6 @@ def test_a_bug_in_the_writer_shows_and_leaves_nobody_waiting(start, monkeypatch)
     writer.close()
 
 
-def test_a_bug_between_two_groups_leaves_nobody_waiting_either(start, monkeypatch):
-    clock = Clock()
-    writer, replies = start(clock=clock), Replies()
-    monkeypatch.setattr(Store, "snapshot", lambda _: 1 // 0)
-    with held(writer):
-        clock.now_s += 60.0  # a snapshot is due after this turn
-        for i in range(3):
-            writer.submit(incoming(samples(1), machine=f"m-{i}"), replies[i])
-    wait_for(lambda: writer.failed)
-    assert [answer.reason for answer in replies.wait(3)] == [Refusal.STORE] * 3
-    writer.close()
-
-
-def test_closing_after_a_bug_in_the_last_group_ends(start, monkeypatch):
-    writer = start()
-    monkeypatch.setattr(Store, "_fold", lambda *_: 1 // 0)
-    with held(writer):
-        writer.submit(incoming(samples(1)), lambda _: None)
-        closing = threading.Thread(target=writer.close)
-        closing.start()
-        wait_for(lambda: writer._is_closing)
-    closing.join(WAIT_S)
-    assert not closing.is_alive()
-    assert writer.failed
-
-
 def test_after_a_bug_a_restart_folds_what_was_committed(start, monkeypatch, tmp_path):
     writer = start()
     with monkeypatch.context() as patched:
@@ -479,9 +330,6 @@ def test_after_a_bug_a_restart_folds_what_was_committed(start, monkeypatch, tmp_
     again = start()
     assert send(again, [incoming(samples(4))]) == [Ack(4, 1, trimmed=4, store=writer.store_id)]
     assert again.info()["samples_merged"] == 4
-
-
-# --- every refusal has its counter -----------------------------------------------------------------------------------
 
 
 def table(**fields: Any) -> bytes:
@@ -497,27 +345,20 @@ def one(**columns: Any) -> bytes:
 WALL = replace(SITE, clock="wall")
 BATCHES = [
     (Refusal.TOO_LARGE, b"\0" * (MAX_BATCH_BYTES + 1)),
-    (Refusal.TOO_LARGE, table(n=10**6)),
     (Refusal.NOT_MSGPACK, b"\xc1"),
-    (Refusal.NOT_MSGPACK, b""),
-    (Refusal.NOT_MSGPACK, msgpack.packb([1, 2])),
     (Refusal.VERSION, table(v=2)),
     (Refusal.MISSING_FIELD, table(spool_id=None)),
     (Refusal.WRONG_TYPE, table(n="2")),
     (Refusal.COLUMN_LENGTH, table(n=3)),
     (Refusal.NOT_FINITE, one(x_m=np.nan)),
-    (Refusal.NOT_FINITE, one(c_rr=np.nan, c_rr_var=1.0)),
     (Refusal.OUT_OF_RANGE, one(speed_mps=1e4)),
-    (Refusal.OUT_OF_RANGE, table(machine="../etc")),
     (Refusal.COVARIANCE, one(cov_xy_m2=1.0)),
-    (Refusal.COVARIANCE, one(cov_xx_m2=-1.0)),
     (Refusal.OUTSIDE_SITE, one(y_m=-20_001.0)),
     (Refusal.FIRST_SEQ, table(first_seq=0)),
     (Refusal.GAP, table(first_seq=2)),
     (Refusal.WRONG_FRAME, table(frame="00000000")),
     (Refusal.WRONG_MACHINE, table(machine="b")),
     (Refusal.OTHER_STORE, table(store="0123456789abcdef")),
-    (Refusal.OUT_OF_RANGE, table(store="0123")),
     (Refusal.WALL_CLOCK, one(stamp_ns=NOW_NS + 10**13)),
     (Refusal.FAR_FUTURE, one(stamp_ns=NOW_NS + 10**15)),
     (Refusal.SCATTERED, encode_batch(batch(samples(400, stamp_ns=NOW_NS, x_m=40.0 * np.arange(400))))),
@@ -534,33 +375,82 @@ def test_a_refused_batch_is_counted_by_its_reason(start, reason, payload):
     assert info["journalled"] == 0
 
 
-QUERIES = [
-    (Refusal.UNKNOWN_QUERY, "weather", {}),
-    (Refusal.UNKNOWN_QUERY, "*", {}),
-    (Refusal.UNKNOWN_PARAMETER, "point", {"x": "1", "y": "1", "z": "1"}),
-    (Refusal.UNKNOWN_LAYER, "point", {"x": "1", "y": "1", "layers": "grade,colour"}),
-    (Refusal.AFTER_TIMEOUT, "info", {"after": "5", "wait": "0.01"}),
-    (Refusal.TOO_LARGE, "region", {"bounds": "0,0,5000,5000"}),
-    (Refusal.MISSING_FIELD, "point", {"x": "1"}),
-    (Refusal.MISSING_FIELD, "region", {"bounds": "1,2,3"}),
-    (Refusal.WRONG_TYPE, "point", {"x": "one", "y": "1"}),
-    (Refusal.NOT_FINITE, "point", {"x": "nan", "y": "1"}),
-    (Refusal.OUT_OF_RANGE, "region", {"bounds": "5,0,4,1"}),
-    (Refusal.OUT_OF_RANGE, "info", {"after": "1", "wait": "61"}),
-]
+def filled(batches: str, size: int = 10, limit: int = 10**9) -> Backlog[str]:
+    backlog, sent = Backlog(limit), Counter()
+    for machine in batches:
+        sent[machine] += 1
+        backlog.add(machine, size, f"{machine}{sent[machine]}")
+    return backlog
 
 
-@pytest.mark.parametrize(("reason", "name", "parameters"), QUERIES)
-def test_a_refused_query_says_why(start, reason, name, parameters):
-    writer = start()
-    with refused(reason):
-        answered(answers_of(writer), name, parameters)
+def test_who_has_had_a_turn_comes_after_those_who_wait():
+    backlog = filled("a" * 2 * GROUP_BATCHES + "b")
+    first = backlog.take()
+    assert (len(first), first[:3]) == (GROUP_BATCHES, ["a1", "b1", "a2"])
+    backlog.add("c", 10, "c1")
+    assert backlog.take()[:2] == [f"a{GROUP_BATCHES}", "c1"]
 
 
-def test_every_reason_to_refuse_is_provoked_here():
-    elsewhere = {Refusal.OVERLOADED, Refusal.STORE}  # a full queue and a failed commit, above
-    elsewhere |= {Refusal.SERVER_CLOCK, Refusal.NOT_WRITER}  # in the tests of admission, and of the claim
-    elsewhere |= {Refusal.UNSIGNED}  # which a sender says, and no server
-    elsewhere |= {Refusal.NOT_HERE}  # which followers say
-    elsewhere |= {Refusal.UNKNOWN_MACHINE, Refusal.EXPIRED}  # commands and tiles, in the tests of the answers
-    assert {reason for reason, _ in BATCHES} | {reason for reason, _, _ in QUERIES} | elsewhere == set(Refusal)
+def test_a_group_is_bounded_in_bytes_and_never_empty():
+    backlog = filled("abc", GROUP_BYTES // 2)
+    assert backlog.take() == ["a1", "b1"]
+    assert filled("ab", 2 * GROUP_BYTES).take() == ["a1"]
+
+
+def test_the_newest_of_the_machine_with_most_bytes_gives_way():
+    backlog = filled("aaab", limit=40)
+    assert backlog.add("c", 10, "c1") == ["a3"]
+    assert backlog.add("c", 10, "c2") == ["c2"]  # as much as anybody has
+    assert backlog.add("d", 10, "d1") == ["a2"]
+    assert backlog.add("e", 10, "e1") == ["e1"]  # all have one
+    assert backlog.take() == ["a1", "b1", "c1", "d1"]
+
+
+def test_a_batch_larger_than_all_room_is_not_taken_and_takes_nobodys_place():
+    backlog = filled("ab", limit=40)
+    assert backlog.add("c", 41, "c1") == ["c1"]
+    assert backlog.take() == ["a1", "b1"]
+
+
+def test_the_time_until_there_is_room_follows_the_pace():
+    pace = Pace()
+    for _ in range(100):
+        pace.worked(2_000_000, 0.5)
+    assert 0.9 < pace.retry_after_s(4_000_000) < 1.1
+    pace.worked(1, 0.0)  # a clock that stood still
+    assert pace.retry_after_s(10**12) == MOST_RETRY_S
+
+
+@pytest.fixture
+def waits():
+    with closing(MergeWaits(5)) as made:
+        yield made
+
+
+def added(waits: MergeWaits, row: int, wait_s: float = WAIT_S) -> Future:
+    called: Future[QueryError | None] = Future()
+    waits.add(row, wait_s, called.set_result)
+    return called
+
+
+def test_rows_call_back_as_they_are_merged_in_any_order(waits):
+    later, sooner = added(waits, 9), added(waits, 7)
+    waits.advance(6)
+    waits.advance(7)
+    assert sooner.result(WAIT_S) is None
+    assert not later.done()
+    waits.advance(12)
+    assert later.result(WAIT_S) is None
+
+
+def test_waits_are_bounded_and_room_comes_back(waits, monkeypatch):
+    monkeypatch.setattr(merge_waits, "MOST_WAITING", 2)
+    first = [added(waits, 6), added(waits, 6)]
+    with pytest.raises(QueryError, match="too many queries wait") as caught:
+        added(waits, 6)
+    assert caught.value.reason == Refusal.OVERLOADED
+    assert caught.value.retry_after_s > 0
+    assert added(waits, 5).done(), "which waits for nothing"
+    waits.advance(6)
+    assert [one.result(WAIT_S) for one in first] == [None, None]
+    assert not added(waits, 7).done()

@@ -1,4 +1,9 @@
+from __future__ import annotations
+
+import random
+import shutil
 import sqlite3
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -6,20 +11,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mapserver.evidence.fold_config import name_hash
+from mapserver.journal import stamp_index
 from mapserver.journal.journal import UnwrittenError
-from mapserver.journal.rows import Admission, Selection, Watermark
+from mapserver.journal.rows import LAST, Admission, MachineTotals, Progress, Selection, Watermark
+from mapserver.journal.shortfall import KIND, Shortfall, SpoolShortfall, missing
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteQueries, SqliteReader
+from mapserver.journal.stamp_index import StampIndex
 from mapserver.journal.table_writer import meta_line
+from protocol.disk.high_water_mark import mark_path
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, put, random_samples, samples
 
 
 def newest_ns(journal: SqliteJournal | SqliteReader) -> int:
-    """The newest stamp of all samples, archived or not."""
     return max((mark.newest_ns for mark in journal.watermarks().values()), default=0)
 
 
@@ -36,7 +46,6 @@ def journal(tmp_path) -> Iterator[SqliteJournal]:
 
 
 def sql(journal: SqliteQueries, statement: str) -> list[tuple]:
-    """What a statement gives on a connection of its own."""
     with closing(sqlite3.connect(journal.path, isolation_level=None)) as db:
         return db.execute(statement).fetchall()
 
@@ -50,12 +59,6 @@ def write(journal: SqliteJournal, *admissions: Admission) -> None:
 
 def admission(n: int = 3, first_seq: int = 1, lost: int = 0, **more) -> Admission:
     return Admission(batch(random_samples(n, first_seq), first_seq, **more), trimmed=0, lost=lost)
-
-
-def test_commits_are_synced_to_disk(journal):
-    assert journal._query("PRAGMA journal_mode") == [("wal",)]
-    assert journal._number("PRAGMA synchronous") == 2  # FULL
-    assert journal._number("PRAGMA journal_size_limit") == 64 * 2**20
 
 
 @pytest.mark.parametrize(
@@ -81,34 +84,6 @@ def test_a_file_that_is_no_database_is_refused(tmp_path):
         open_journal(tmp_path)
 
 
-def test_tables_and_their_names_are_made_in_one_transaction(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.journal.sqlite.journal.TABLES", "CREATE TABLE meta (key, value, crc32, more); ")
-    with pytest.raises(StoreError):
-        open_journal(tmp_path)
-    monkeypatch.undo()
-    open_journal(tmp_path).close()  # nothing half-made was left behind
-
-
-def test_newest_stamp_is_that_of_all_rows(journal):
-    for first, stamps in ((1, [50, 90, 10]), (4, [60, 20, 30])):
-        write(journal, Admission(batch(samples(3, stamp_ns=stamps), first), trimmed=0, lost=0))
-    assert newest_ns(journal) == 90
-    assert sql(journal, "SELECT first_stamp_ns, last_stamp_ns FROM extent ORDER BY row") == [(10, 90), (20, 60)]
-
-
-def test_closing_folds_the_log_into_the_file(tmp_path):
-    journal = open_journal(tmp_path)
-    write(journal, admission(1000))
-    assert (tmp_path / "journal.db-wal").stat().st_size > 0
-    journal.close()
-    assert not (tmp_path / "journal.db-wal").exists()
-    copy = np.frombuffer((tmp_path / "journal.db").read_bytes(), np.uint8)
-    assert len(copy) > 1000 * 64
-
-
-# --- reading by row, time, place and machine -------------------------------------------------------------------------
-
-
 def numbers(rows) -> list[int]:
     return [r.row for r in rows]
 
@@ -132,9 +107,7 @@ def placed(journal):
         (Selection(to_ns=200), [1, 2]),
         (Selection(from_ns=302), [3, 4]),
         (Selection(from_ns=303), [4]),
-        (Selection(from_ns=103, to_ns=199), []),
         (Selection(without=frozenset({"a"})), [2, 4]),
-        (Selection(without=frozenset({"a", "b"})), []),
         (Selection(without=frozenset({"a' OR TRUE --"})), [1, 2, 3, 4]),
         (Selection(bounds=Bounds(15, -24, 19, -20)), []),
         (Selection(bounds=Bounds(15, -24, 20, -20)), [2]),
@@ -148,15 +121,6 @@ def placed(journal):
 )
 def test_reads_by_time_place_and_machine(placed, selection, expected):
     assert numbers(placed.read(selection=selection)) == expected
-
-
-def test_opening_and_the_newest_stamp_read_no_journal_row(placed):
-    tables = set()
-    placed._db.set_authorizer(lambda action, table, *_: tables.add((action, table)) or sqlite3.SQLITE_OK)
-    placed._return_to_disk()
-    assert newest_ns(placed) == 402
-    assert (sqlite3.SQLITE_READ, "watermark") in tables
-    assert not tables & {(sqlite3.SQLITE_READ, name) for name in ("journal", "extent")}
 
 
 def test_many_rows_are_one_table(journal, monkeypatch):
@@ -187,17 +151,6 @@ def test_samples_are_selected_from_many_rows(placed):
     assert names.tolist() == [name_hash("a")] * 2
 
 
-# --- readers ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_reader_cannot_write(tmp_path):
-    open_journal(tmp_path).close()
-    reader = SqliteReader(tmp_path / "journal.db")
-    with pytest.raises(sqlite3.OperationalError, match="readonly"):
-        reader._db.execute("DELETE FROM journal")
-    reader.close()
-
-
 def test_a_reader_in_the_middle_holds_no_lock_on_the_log(journal, monkeypatch):
     monkeypatch.setattr("mapserver.journal.sqlite.reader.BYTES_AT_ONCE", 1)  # the fewest rows at a time
     write(journal, *(admission(1, first_seq=i + 1) for i in range(300)))
@@ -208,14 +161,6 @@ def test_a_reader_in_the_middle_holds_no_lock_on_the_log(journal, monkeypatch):
     assert sql(journal, "PRAGMA wal_checkpoint(TRUNCATE)")[0][0] == 0  # 1 would be: busy
     assert len(list(rows)) == 300
     reader.close()
-
-
-def test_a_reader_of_nothing_is_refused(tmp_path):
-    with pytest.raises(StoreError, match="no usable journal"):
-        SqliteReader(tmp_path / "journal.db")
-
-
-# --- rows that are archived ------------------------------------------------------------------------------------------
 
 
 def test_numbers_marks_and_now_outlive_the_rows(placed):
@@ -244,9 +189,6 @@ def test_a_journal_with_much_free_space_shrinks_in_steps(journal):
     assert len(list(journal.read(190))) == 10
 
 
-# --- events ----------------------------------------------------------------------------------------------------------
-
-
 def test_an_event_is_never_part_of_a_group_commit(journal):
     journal.begin()
     journal.append(admission(), NOW_NS)
@@ -256,67 +198,11 @@ def test_an_event_is_never_part_of_a_group_commit(journal):
     assert (numbers(journal.read()), journal.events()) == ([1], [])
 
 
-def test_an_event_that_cannot_be_numbered_leaves_no_transaction_open(journal, monkeypatch):
-
-    def broken(query: str) -> int:
-        raise StoreError(journal.path, "cannot be read: disk I/O error")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(journal, "_number", broken)
-        patch.setattr(journal, "_return_to_disk", lambda: None)
-        with pytest.raises(StoreError, match="disk I/O error"):
-            journal.append_event("t", 1, {})
-    write(journal, admission(1))
-    assert numbers(journal.read()) == [1]
-
-
-# --- damage ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "change", ["machine = 'b'", "seq = 2", "lost = 1", "newest_ns = 7", "crc32 = 1", "crc32 = '1x'"]
-)
-def test_a_watermark_that_is_not_what_was_written_is_named(tmp_path, change):
-    journal = open_journal(tmp_path)
-    write(journal, admission(3))
-    sql(journal, f"UPDATE watermark SET {change}")
-    journal.close()
-    with pytest.raises(StoreError, match=r"the watermark of . is damaged"):
-        open_journal(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        ("UPDATE extent SET first_stamp_ns = 1 WHERE row = 2", "the extent of journal row 2"),
-        ("UPDATE extent SET west_m = 'x' WHERE row = 2", "the extent of journal row 2"),
-        ("UPDATE extent SET crc32 = 1 WHERE row = 2", "the extent of journal row 2"),
-        ("DELETE FROM extent WHERE row = 2", "what follows number 1"),
-        ("DELETE FROM extent WHERE row = 4", "what follows number 3"),
-        ("UPDATE extent SET row = 9 WHERE row = 4", "the extent of journal row 9"),
-        ("UPDATE events SET body = '{}' WHERE id = 1", "event 1"),
-        ("UPDATE events SET kind = 'u' WHERE id = 2", "event 2"),
-        ("DELETE FROM events WHERE id = 1", "what follows number 0"),
-        ("DELETE FROM events WHERE id = 2", "what follows number 1"),
-        (f"INSERT INTO meta VALUES {meta_line('archived_row', '2')}", "what follows number 2"),
-        (f"INSERT INTO meta VALUES {meta_line('archived_row', '2x')}", "the value '2x'"),
-        ("INSERT INTO meta VALUES ('archived_row', '2', 0)", "the archived_row of the journal"),
-        ("UPDATE meta SET value = '7' WHERE key = 'epoch'", "the epoch of the journal"),
-        ("UPDATE meta SET value = 'hill' WHERE key = 'site'", "the site of the journal"),
-        ("DELETE FROM meta WHERE key = 'frame'", "the frame of the journal"),
-    ],
-)
-def test_what_stands_beside_the_rows_is_checked_on_opening(placed, monkeypatch, change, problem):
-    monkeypatch.setattr("mapserver.journal.table_queries._EXTENTS_AT_ONCE", 3)  # read in two pieces
-    for i in range(2):
-        placed.append_event("t", i, {"machine": "a"})
-    placed.check()
-    sql(placed, change)
-    for _ in range(2):  # nothing is left open by the first
-        with pytest.raises(StoreError, match=rf"journal\.db: {problem} is damaged; restore"):
-            placed.check()
-    with pytest.raises(StoreError, match="is damaged"):
-        open_journal(placed.path.parent)
+@pytest.mark.parametrize(("archived", "problem"), [("2", "what follows number 2"), ("2x", "the value '2x'")])
+def test_an_archived_row_that_the_rows_do_not_follow_is_named(placed, archived, problem):
+    sql(placed, f"INSERT INTO meta VALUES {meta_line('archived_row', archived)}")
+    with pytest.raises(StoreError, match=rf"journal\.db: {problem} is damaged; restore"):
+        placed.check()
 
 
 @pytest.mark.parametrize("row", [1, 3, 4])
@@ -329,12 +215,6 @@ def test_a_row_that_is_gone_is_missed(placed, row):
     assert numbers(placed.read(until=row - 1)) == list(range(1, row))
 
 
-def test_machines_that_are_excluded_are_not_missed(journal):
-    write(journal, *(admission(1, first_seq=1 + i // 2, machine="ab"[i % 2]) for i in range(500)))
-    assert numbers(journal.read(selection=Selection(without=frozenset("a")))) == list(range(2, 501, 2))
-    assert numbers(journal.read(selection=Selection(without=frozenset("ab")))) == []
-
-
 def test_a_new_journal_goes_on_after_an_archive(tmp_path):
     marks = {("a", 7): Watermark(50, 3, 40), ("b", 2**64 - 1): Watermark(9, 0, 60)}
     with closing(SqliteJournal(tmp_path / "journal.db", "pit", SITE.frame)) as journal:
@@ -345,3 +225,206 @@ def test_a_new_journal_goes_on_after_an_archive(tmp_path):
         journal.check()
     with closing(SqliteJournal(tmp_path / "journal.db", "pit", SITE.frame)) as again:
         assert (again.last_row, again.archived_row, again.samples, again.shortfall) == (21, 20, 59, None)
+
+
+def test_totals_begin_with_what_is_on_disk():
+    marks = {("a", 1): Watermark(10, 2, 5), ("a", 2): Watermark(7, 0, 3), ("b", 1): Watermark(1, 1, 0)}
+    assert Progress(marks).machines() == {"a": MachineTotals(2, 15, 2, 5), "b": MachineTotals(1, 0, 1, 0)}
+    assert (Progress(marks).watermark("a", 2), Progress(marks).watermark("c", 2)) == (Watermark(7, 0, 3), Watermark())
+
+
+S = 10**9
+
+
+def append(journal: SqliteJournal, first_s: int, last_s: int) -> None:
+    stamps = NOW_NS + np.array([first_s, last_s]) * S
+    put(journal, batch(samples(2, stamp_ns=stamps), 1 + 2 * journal.last_row))
+
+
+def inside(stretches, last: int) -> list[int]:
+    return [row for first, end in stretches for row in range(first + 1, min(end, last) + 1)]
+
+
+ROWS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 6)), min_size=1, max_size=25)
+
+
+@pytest.mark.slow
+@settings(max_examples=20, deadline=None)
+@given(
+    rows=ROWS, cut=st.integers(0, 25), archived=st.integers(0, 25), begin=st.integers(-1, 50), length=st.integers(0, 20)
+)
+def test_no_selected_row_is_passed_over(rows, cut, archived, begin, length):
+    selection = Selection(NOW_NS + begin * S, NOW_NS + (begin + length) * S)
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stamp_index, "CHUNK", 4)
+        journal = SqliteJournal(Path(folder) / "journal.db", SITE.name, SITE.frame)
+        with closing(journal), SqliteReader(journal.path) as reader:
+            index = StampIndex()
+            for number, (first, more) in enumerate(rows, start=1):
+                append(journal, first, first + more)
+                if number == cut:
+                    list(index.stretches(reader, 0, LAST, selection))
+                    journal.forget(archived)
+            archived_row = journal.archived_row
+            for after, until in ((0, LAST), (3, 9), (8, 8), (archived_row, len(rows))):
+                got = inside(index.stretches(reader, after, until, selection), len(rows))
+                assert got == sorted(set(got))
+                for number, (first, more) in enumerate(rows, start=1):
+                    wanted = after < number <= until
+                    if number <= archived_row or (first <= begin + length and first + more >= begin):
+                        assert (number in got) == wanted
+                    assert wanted or number not in got
+            left = [(first, first + more) for first, more in rows[archived_row:]]
+            next_s = min((max(first, begin) for first, last in left if last >= begin), default=None)
+            expected = None if next_s is None else NOW_NS + next_s * S
+            assert index.next_stamp(reader, NOW_NS + begin * S) == expected
+
+
+MACHINES = ("loader-1", "loader-2")
+BATCHES, SAMPLES = 10, 100  # of each machine, of each batch
+
+
+def send(journal: SqliteJournal, machine: str, first_seq: int, n: int = SAMPLES, lost: int = 0) -> None:
+    put(journal, batch(random_samples(n, first_seq), first_seq, machine=machine), lost=lost)
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a journal as kill -9 leaves it: 2000 acknowledged samples, and a decision in between."""
+    work, left = tmp_path_factory.mktemp("work"), tmp_path_factory.mktemp("left")
+    with closing(open_journal(work)) as journal:
+        for i in range(BATCHES):
+            for machine in MACHINES:
+                send(journal, machine, 1 + i * SAMPLES)
+            if i == BATCHES // 2:
+                journal.append_event("trust", NOW_NS, {"machine": "loader-2"})
+        shutil.copytree(work, left, dirs_exist_ok=True)
+    return left
+
+
+@pytest.fixture
+def folder(killed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(killed, tmp_path / "store"))
+
+
+def flip(path: Path, at: int, bit: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1 << bit
+    path.write_bytes(content)
+
+
+def gone_of(journal: SqliteJournal) -> dict[str, int]:
+    return dict(missing([Shortfall.from_event(event) for event in journal.events(KIND)], journal.watermarks()))
+
+
+def test_each_flip_in_the_log_is_named_and_counted_by_machine(killed, tmp_path):
+    rng, log, counted, refusals = random.Random(1), "journal.db-wal", 0, []
+    size = (killed / log).stat().st_size
+    for i in range(20):
+        folder = Path(shutil.copytree(killed, tmp_path / str(i)))
+        flip(folder / log, rng.randrange(size), rng.randrange(8))
+        try:
+            journal = open_journal(folder)
+        except StoreError as error:  # pages of different times are in the file
+            refusals.append(str(error))
+            continue
+        with closing(journal):
+            present = {name: journal.watermark(name, 7).seq for name in MACHINES}
+            assert journal.shortfall is not None
+            assert gone_of(journal) == {n: BATCHES * SAMPLES - seq for n, seq in present.items() if seq < 1000}
+            assert sum(gone_of(journal).values()) == 2000 - sum(len(row.rows) for row in journal.read())
+            for name, n in gone_of(journal).items():
+                assert f"{n} acknowledged samples of {name} are gone" in str(journal.shortfall)
+            counted += 1
+    assert counted > 10
+    assert all("journal.db" in refusal for refusal in refusals)
+
+
+def test_without_a_mark_damage_before_the_last_commit_is_named(folder):
+    mark_path(folder / "journal.db").unlink()
+    flip(folder / "journal.db-wal", 20_000, 3)
+    with closing(open_journal(folder)) as journal:
+        assert "journal.db-wal is damaged at byte" in str(journal.shortfall)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.77, 1.0])
+def test_a_mark_that_is_torn_or_behind_is_no_alarm(folder, kept):
+    mark = mark_path(folder / "journal.db")
+    whole = mark.read_bytes()
+    mark.write_bytes(whole[: int(len(whole) * kept)] + b"\x55" * 7)
+    with closing(open_journal(folder)) as journal:
+        assert journal.shortfall is None
+
+
+def cut_short(folder: Path, share: float = 0.5) -> None:
+    """The log loses its end, as by a flip in its middle."""
+    log = folder / "journal.db-wal"
+    log.write_bytes(log.read_bytes()[: int(log.stat().st_size * share)])
+
+
+def test_what_is_gone_is_remembered_until_it_is_sent_again_or_declared_lost(folder):
+    cut_short(folder)
+    with closing(open_journal(folder)) as journal:
+        assert journal.shortfall is not None
+        before = gone_of(journal)
+        reached = {name: journal.watermark(name, 7).seq for name in MACHINES}
+        assert min(before.values()) > 2 * SAMPLES
+    with closing(open_journal(folder)) as journal:
+        assert journal.shortfall is None, "it is named once"
+        assert gone_of(journal) == before, "and counted for ever"
+        send(journal, "loader-1", reached["loader-1"] + 1)  # it still has some
+        assert gone_of(journal) == {**before, "loader-1": before["loader-1"] - SAMPLES}
+        send(journal, "loader-1", 1001, lost=1000 - reached["loader-1"] - SAMPLES)  # and declares the others
+        assert gone_of(journal) == {"loader-2": before["loader-2"]}
+        assert journal.watermark("loader-1", 7).lost == before["loader-1"] - SAMPLES
+
+
+def test_decisions_that_are_gone_are_named(folder):
+    cut_short(folder, 0.3)
+    with closing(open_journal(folder)) as journal:
+        assert journal.shortfall is not None
+        assert (journal.shortfall.event, journal.shortfall.expected_event) == (0, 1)
+        assert "1 events are gone" in str(journal.shortfall)
+
+
+def test_a_log_with_damage_is_kept_for_a_person(folder):
+    flip(folder / "journal.db-wal", 20_000, 3)
+    damaged = (folder / "journal.db-wal").read_bytes()
+    with closing(open_journal(folder)) as journal:
+        (kept,) = folder.glob("journal.db-wal.damaged-*")
+        assert kept.name.endswith(f"-{journal.shortfall.row}")
+        assert kept.read_bytes() == damaged
+        assert kept.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_journal_from_a_backup_beside_a_newer_mark_is_named(folder, tmp_path):
+    with closing(open_journal(folder)) as journal:
+        send(journal, "loader-1", 1001)
+    shutil.copy(folder / "journal.db", tmp_path / "backup.db")
+    with closing(open_journal(folder)) as journal:
+        send(journal, "loader-1", 1101, n=40)
+    shutil.copy(tmp_path / "backup.db", folder / "journal.db")
+    with closing(open_journal(folder)) as journal:
+        assert journal.shortfall == Shortfall(21, 22, 1, 1, (SpoolShortfall("loader-1", 7, 1100, 1140),))
+
+
+def test_a_journal_that_is_not_there_any_more_is_named(folder):
+    for name in ("journal.db", "journal.db-wal", "journal.db-shm"):
+        (folder / name).unlink(missing_ok=True)
+    with closing(open_journal(folder)) as journal:
+        assert gone_of(journal) == dict.fromkeys(MACHINES, 1000)
+
+
+def test_a_watermark_behind_its_rows_ends_the_start(folder):
+    """As pages of different times would leave it: a batch that is sent again would be taken twice."""
+    with closing(open_journal(folder)) as journal:
+        journal.begin()
+        journal.put_watermark("loader-1", 7, Watermark(900, 0, NOW_NS))
+        journal.commit()
+    mark = mark_path(folder / "journal.db")
+    with closing(open_journal(folder)) as journal:
+        assert journal.shortfall is None
+        journal._mark.write({"loader-2 " + f"{7:016x}": 1001})
+    assert mark.exists()
+    with pytest.raises(StoreError, match="what its write-ahead log left is damaged; restore the file from a backup"):
+        open_journal(folder)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import socket
+import os
+import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -21,11 +22,10 @@ from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.history import history_rows
-from mapserver.journal.journal import FencedError, UnwrittenError
+from mapserver.journal.journal import FencedError
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.postgres import session
 from mapserver.journal.postgres.connection import shown
-from mapserver.journal.postgres.journal import PostgresJournal
 from mapserver.journal.postgres.session import WriterSession
 from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
@@ -34,28 +34,20 @@ from protocol.wire.messages import Ack, Refused
 from tests import postgres_server as server
 from tests.postgres_server import Cluster, Database
 from tests.tcp_proxy import Proxy, Weather
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    fold_of,
-    incoming,
-    now_ns,
-    past_of,
-    random_samples,
-    same,
-    wait_for,
-)
-
-YEAR_NS = 365 * 86400 * 10**9
+from tests.unit.mapserver.data import CONFIG, SITE, fold_of, incoming, now_ns, past_of, random_samples, same, wait_for
 
 
 def place(folder: Path, database: Database) -> JournalLocation:
     return JournalLocation(folder, database.url)
 
 
-def open_store(folder: Path, database: Database, standby: Standby | None = None, clock_ns: int = NOW_NS) -> Store:
-    return Store(place(folder, database), SITE, CONFIG, lambda: clock_ns, standby=standby)
+def open_store(folder: Path, database: Database, standby: Standby | None = None) -> Store:
+    return Store(place(folder, database), SITE, CONFIG, now_ns, standby=standby)
+
+
+def after_waiting(folder: Path, database: Database) -> Store:
+    with closing(Standby(place(folder, database), SITE, CONFIG, bool)) as standby:
+        return open_store(folder, database, standby)
 
 
 def send(store: Store, first: int, count: int = 5, machine: str = "a") -> Ack | Refused:
@@ -65,9 +57,6 @@ def send(store: Store, first: int, count: int = 5, machine: str = "a") -> Ack | 
 def hang(store: Store) -> None:
     """Have the holder of the lock say nothing any more, as a process does that is stopped."""
     store.journal._session._ending.set()
-
-
-# --- what is refused, in one line -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -88,29 +77,6 @@ def test_a_url_that_leads_nowhere_is_one_line(tmp_path, postgres_cluster, url, p
 def test_a_password_is_never_shown():
     url = "postgresql://me:secret@one,two:5433/map?target_session_attrs=any"
     assert shown(url) == "postgresql://me@one,two:5433/map"
-
-
-@pytest.mark.slow
-def test_a_wrong_password_is_one_line(tmp_path):
-    with server.cluster() as cluster:
-        cluster.sql("ALTER USER postgres PASSWORD 'right'")
-        hba = cluster.data / "pg_hba.conf"
-        hba.write_text("host all all 127.0.0.1/32 scram-sha-256\n")
-        with psycopg.connect(cluster.url()) as db:
-            db.execute("SELECT pg_reload_conf()")
-        wait_for(lambda: refuses(cluster.url()))
-        wrong = cluster.url().replace("postgres@", "postgres:wrong@")
-        with pytest.raises(StoreError, match="password authentication failed") as caught:
-            JournalLocation(tmp_path, wrong).exists()
-        assert "wrong" not in str(caught.value)
-
-
-def refuses(url: str) -> bool:
-    try:
-        psycopg.connect(url).close()
-    except psycopg.OperationalError:
-        return True
-    return False
 
 
 def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
@@ -163,24 +129,16 @@ def test_a_folder_is_of_one_journal(tmp_path, database, postgres_cluster):
 def test_limits_that_a_database_has_for_others_are_not_for_a_server(tmp_path, database):
     for name in ("idle_session_timeout", "statement_timeout", "lock_timeout"):
         database.sql(f"ALTER DATABASE {database.name} SET {name} = '500ms'")
-    with closing(open_store(tmp_path, database)) as store, place(tmp_path, database).reader() as reader:
-        session_ends_s = time.monotonic() + 1.0
-        wait_for(lambda: time.monotonic() > session_ends_s)
-        assert reader.last_row == store.journal.last_row == 0
+    with closing(open_store(tmp_path, database)), place(tmp_path, database).reader() as reader:
         for name in ("idle_session_timeout", "statement_timeout", "lock_timeout"):
             assert reader._query(f"SHOW {name}") == [("0",)]
-
-
-# --- the lock ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_holder_that_says_nothing_loses_the_lock_by_itself(tmp_path, database):
     with closing(open_store(tmp_path / "one", database)) as first:
         assert send(first, 1).epoch == 1
         hang(first)
-        with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
-            second = open_store(tmp_path / "two", database, standby)
-        with closing(second):
+        with closing(after_waiting(tmp_path / "two", database)) as second:
             assert isinstance(send(first, 6), Refused), "its session is gone, and it does not know yet"
             with pytest.raises(FencedError, match="another server has taken over the journal, with epoch 2 after 1"):
                 send(first, 6)
@@ -193,20 +151,6 @@ def folded_by(store: Store) -> Grid:
     return fold_of(history_rows(store.history))
 
 
-def test_a_holder_that_stops_in_the_middle_of_a_message_loses_the_lock(tmp_path, database):
-    open_store(tmp_path, database).close()
-    holder = WriterSession(database.url, "here")
-    assert holder.take_lock()
-    holder._ending.set()
-    message = b"Q" + (1000).to_bytes(4, "big") + b"SELECT 1, "  # of which the rest never comes
-    with socket.socket(fileno=holder._db.fileno()) as link:
-        link.sendall(message)
-        with closing(WriterSession(database.url, "there")) as other:
-            wait_for(other.take_lock)
-        link.detach()
-    holder.close()
-
-
 def test_a_holder_whose_network_swallows_all_bytes_notices_it(tmp_path, database):
     """Something between acknowledges them, so that the kernel waits for ever."""
     with Proxy(database.cluster.port) as proxy:
@@ -214,9 +158,7 @@ def test_a_holder_whose_network_swallows_all_bytes_notices_it(tmp_path, database
         store = Store(JournalLocation(tmp_path / "one", url), SITE, CONFIG, now_ns)
         assert send(store, 1).epoch == 1
         proxy.set(Weather(hold_there=True, hold_back=True))
-        with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
-            second = open_store(tmp_path / "two", database, standby)
-        with closing(second):
+        with closing(after_waiting(tmp_path / "two", database)) as second:
             wait_for(lambda: store.journal._session.lost)
             assert isinstance(send(store, 6), Refused), "and no thread waits for ever"
             assert send(second, 6).epoch == 2
@@ -240,13 +182,11 @@ def test_a_commit_whose_answer_never_comes_ends_once_another_server_has_taken_ov
 
             committing = threading.Thread(target=commit)
             committing.start()
-            with closing(Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)) as standby:
-                second = open_store(tmp_path / "two", database, standby)
-            with closing(second):
+            with closing(after_waiting(tmp_path / "two", database)) as second:
                 committing.join(20.0)
                 assert len(answers) == 1
                 assert not isinstance(answers[0], Ack)
-                assert "taken over the journal, with epoch 2 after 1" in store.journal.fenced
+                wait_for(lambda: "taken over the journal, with epoch 2 after 1" in store.journal.fenced)
                 assert send(second, 6).trimmed == 5, "it was committed, and nobody was told so"
 
 
@@ -297,21 +237,15 @@ def test_a_decision_whose_answer_is_lost_is_not_called_refused(tmp_path, databas
     with closing(writer), closing(Refolding(writer, past_of(writer))) as refolding:
         LostAnswer(writer._store.journal._session, "INSERT INTO events")
         with pytest.raises(QueryError, match=r"not known whether the decision is kept.*ask for") as caught:
-            refolding.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+            refolding.decide(TrustDecision("b", False, PERSON, "it lies", 1))
         assert caught.value.reason == Refusal.AFTER_TIMEOUT
         with pytest.raises(
             QueryError, match="is not written: a decision was committed whose answer was lost"
         ) as caught:
-            refolding.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
+            refolding.decide(TrustDecision("c", False, PERSON, "it lies", 1))
         assert caught.value.reason == Refusal.NOT_WRITER
     with closing(open_store(tmp_path, database)) as store:
         assert store.facts.excluded == {"b"}
-
-
-def test_a_session_that_is_cut_while_it_is_made_is_no_reason_to_end(database, monkeypatch):
-    monkeypatch.setattr(WriterSession, "_look_for_replicas", lambda self: self._db.close() or self._db.execute(""))
-    with pytest.raises(UnwrittenError):
-        WriterSession(database.url, "here")
 
 
 def test_an_epoch_whose_answer_is_lost_is_not_taken_for_another_server(tmp_path, database, monkeypatch):
@@ -327,27 +261,6 @@ def test_an_epoch_whose_answer_is_lost_is_not_taken_for_another_server(tmp_path,
         answer = send(store, 6)
         assert (answer.watermark, answer.epoch) == (10, 3)
         assert same(store.grid, folded_by(store))
-
-
-def test_another_server_with_the_epoch_that_was_asked_for_is_known_as_such(tmp_path, database, monkeypatch):
-    with closing(open_store(tmp_path / "one", database)) as store:
-        real = WriterSession.run
-
-        def run(self: WriterSession, query: Any) -> Any:
-            if "SET epoch" in str(query):
-                with self._turn:  # its own thread may be asking just now
-                    self._lose("it was cut before it was sent")
-            return real(self, query)
-
-        monkeypatch.setattr(WriterSession, "run", run)
-        database.end_writer()
-        wait_for(lambda: store.journal._session.lost)
-        assert isinstance(send(store, 1), Refused)
-        monkeypatch.undo()
-        with closing(open_store(tmp_path / "two", database)) as other:
-            with pytest.raises(FencedError, match="with epoch 2 after 1"):
-                send(store, 1)
-            assert send(other, 1).epoch == 2
 
 
 @pytest.mark.parametrize("end", [Database.end_writer, Database.end_all])
@@ -376,151 +289,6 @@ def test_servers_that_start_at_once_on_an_empty_database_have_one_journal(tmp_pa
 def test_a_second_server_is_refused_where_it_may_not_wait(tmp_path, database):
     with closing(open_store(tmp_path / "one", database)), pytest.raises(StoreError, match="another server is writing"):
         open_store(tmp_path / "two", database)
-
-
-# --- who stands by ----------------------------------------------------------------------------------------------------
-
-
-class StandsBy:
-    """A server that waits for the journal on a thread. store: once it has it; error: why it does not wait any more."""
-
-    def __init__(self, folder: Path, database: Database) -> None:
-        self.store: Store | None = None
-        self.error: BaseException | None = None
-        self.on_turn: Callable[[], object] = lambda: None
-        self.standby = Standby(place(folder, database), SITE, CONFIG, lambda _: self.on_turn())
-        self._words = (folder, database, self.standby)
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self.store = open_store(*self._words)
-        except BaseException as error:
-            self.error = error
-
-    def join(self) -> None:
-        self._thread.join(20.0)
-        assert not self._thread.is_alive()
-
-    def close(self) -> None:
-        self.standby.close()
-        if self.store:
-            self.store.close()
-
-
-def test_a_session_that_is_lost_while_it_waits_is_closed_and_fences_nobody(tmp_path, database, monkeypatch):
-    looked = threading.Semaphore(0)
-    real = PostgresJournal._on_loss
-    monkeypatch.setattr(PostgresJournal, "_on_loss", lambda self: (real(self), looked.release()))
-    first = open_store(tmp_path / "one", database)
-    send(first, 1)
-    mine = f"application_name = 'sitegrid writer' AND pid <> {first.journal._session._db.info.backend_pid}"
-    with closing(StandsBy(tmp_path / "two", database)) as second:
-        wait_for(lambda: second.standby.row == 1)
-        waiting = database.sql(f"SELECT pid FROM pg_stat_activity WHERE {mine}")
-
-        def lose() -> None:
-            second.on_turn = lambda: None
-            database.sql(f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE {mine}")
-            assert looked.acquire(timeout=20.0), "it is lost while rows are folded, which takes time"
-
-        second.on_turn = lose
-        wait_for(lambda: database.sql(f"SELECT pid FROM pg_stat_activity WHERE {mine}") not in (waiting, []))
-        first.close()
-        second.join()
-        assert second.store.journal.fenced == ""
-        assert send(second.store, 6).epoch == 2
-        wait_for(lambda: sum(thread.name == "journal" for thread in threading.enumerate()) == 1)
-
-
-def test_a_standby_whose_take_over_is_cut_waits_again(tmp_path, database, monkeypatch):
-    first = open_store(tmp_path / "one", database)
-    send(first, 1)
-    with closing(StandsBy(tmp_path / "two", database)) as second:
-        wait_for(lambda: second.standby.row == 1)
-        real, cut = WriterSession.run, []
-
-        def run(self: WriterSession, query: Any) -> Any:
-            if "SET epoch" in str(query) and not cut:
-                cut.append(LostAnswer(self, "SET epoch"))
-            return real(self, query)
-
-        monkeypatch.setattr(WriterSession, "run", run)
-        first.close()
-        second.join()
-        assert second.error is None
-        assert cut
-        assert send(second.store, 6).epoch == 3
-
-
-def test_a_standby_of_a_database_that_is_made_anew_ends_and_leaves_it_empty(tmp_path, database):
-    """What it made there would be in the way of the backup that is put back."""
-    cluster, name = database.cluster, database.name
-    with closing(open_store(tmp_path / "one", database)) as store:
-        send(store, 1)
-    cluster.sql(f"CREATE DATABASE backup_{name} TEMPLATE {name}")
-    first = open_store(tmp_path / "one", database)
-    with closing(StandsBy(tmp_path / "two", database)) as second:
-        wait_for(lambda: second.standby.row == 1)
-        first.close()
-        cluster.sql(f"DROP DATABASE {name} WITH (FORCE)")
-        cluster.sql(f"CREATE DATABASE {name}")
-        second.join()
-        assert second.error or second.store, "it may have been faster than the database was gone"
-    for folder in ("one", "two"):  # as supervisors start them again
-        with pytest.raises(StoreError, match=r"holds no journal, and .* restore the database from a backup") as caught:
-            place(tmp_path / folder, database).prepared_id(SITE.name, SITE.frame)
-        assert "\n" not in str(caught.value)
-        with pytest.raises(StoreError, match=r"holds no journal, and .* restore the database from a backup"):
-            open_store(tmp_path / folder, database)
-    assert database.sql("SELECT to_regnamespace('sitegrid')") == [(None,)]
-    cluster.sql(f"DROP DATABASE {name} WITH (FORCE)")
-    cluster.sql(f"ALTER DATABASE backup_{name} RENAME TO {name}")
-    with closing(open_store(tmp_path / "two", database)) as store:
-        assert store.journalled == 1
-
-
-def test_a_standby_with_the_folder_of_another_journal_does_not_wait(tmp_path, database, postgres_cluster):
-    open_store(tmp_path / "other", postgres_cluster.new_database()).close()
-    with closing(open_store(tmp_path / "one", database)), closing(StandsBy(tmp_path / "other", database)) as second:
-        second.join()
-        assert "belongs to journal" in str(second.error)
-        assert database.sql("SELECT epoch FROM sitegrid.head") == [(1,)]
-
-
-def test_what_a_start_refuses_is_refused_by_a_take_over(tmp_path, database):
-    with closing(open_store(tmp_path / "one", database)) as first:
-        send(first, 1)
-        database.sql("UPDATE sitegrid.extent SET west_m = west_m + 1000")
-        second = StandsBy(tmp_path / "two", database)
-        wait_for(lambda: second.standby._problem)
-    with closing(second):
-        second.join()
-        assert "the extent of journal row 1 is damaged" in str(second.error)
-
-
-def test_a_warm_grid_counts_as_what_no_snapshot_has(tmp_path, database):
-    standby = Standby(place(tmp_path / "two", database), SITE, CONFIG, bool)
-    with closing(open_store(tmp_path / "one", database)) as first:
-        send(first, 1)
-        standby.follow(5.0)
-    with closing(standby), closing(open_store(tmp_path / "two", database, standby)) as second:
-        assert (second.samples_behind, second.snapshot_row, snapshot.rows_on_disk(tmp_path / "two")) == (5, 0, [])
-        second.save_snapshot()
-        assert second.samples_behind == 0
-
-
-def test_a_standby_whose_clock_is_a_year_behind_says_so_and_takes_nothing_until_it_is_right(tmp_path, database):
-    with closing(open_store(tmp_path / "one", database)) as store:
-        send(store, 1)
-    with closing(open_store(tmp_path / "two", database, clock_ns=NOW_NS - YEAR_NS)) as other:
-        assert send(other, 6).reason == Refusal.SERVER_CLOCK
-    with closing(open_store(tmp_path / "two", database, clock_ns=NOW_NS + YEAR_NS)) as other:
-        assert (send(other, 6).watermark, other.journal.epoch) == (10, 3), "a year ahead, it takes over"
-
-
-# --- what a backup leaves ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -570,6 +338,15 @@ def test_a_server_that_runs_while_its_database_is_restored_ends(tmp_path, databa
             send(store, 6)
 
 
+@contextmanager
+def synchronous_pair() -> Iterator[tuple[Cluster, Cluster]]:
+    with server.cluster() as primary, server.replica(primary, "b") as replica:
+        primary.sql("ALTER SYSTEM SET synchronous_standby_names = 'b'")
+        primary.sql("SELECT pg_reload_conf()")
+        wait_for(lambda: primary.sql("SELECT sync_state FROM pg_stat_replication") == [("sync",)])
+        yield primary, replica
+
+
 def test_a_long_dump_holds_nobody_up(tmp_path, database):
     with closing(open_store(tmp_path, database)) as store, place(tmp_path, database).reader() as reader:
         send(store, 1)
@@ -583,57 +360,37 @@ def test_a_long_dump_holds_nobody_up(tmp_path, database):
             assert dump.execute("SELECT count(*) FROM sitegrid.journal").fetchone() == (1,), "its own time"
 
 
-# --- replicas ---------------------------------------------------------------------------------------------------------
+@pytest.mark.nightly
+def test_a_commit_that_an_operator_stops_from_waiting_for_its_replica_is_not_acknowledged(tmp_path):
+    with synchronous_pair() as (primary, replica):
+        database = primary.new_database()
+        with closing(open_store(tmp_path, database)) as store:
+            assert isinstance(send(store, 1), Ack)
+            with stopped(replica), ThreadPoolExecutor() as threads:
+                waiting = threads.submit(send, store, 6)
+                waits = "application_name = 'sitegrid writer' AND wait_event = 'SyncRep'"
+                wait_for(lambda: bool(primary.sql(f"SELECT 1 FROM pg_stat_activity WHERE {waits}")))
+                primary.sql(f"SELECT pg_cancel_backend(pid) FROM pg_stat_activity WHERE {waits}")
+                assert waiting.result(20.0).reason == Refusal.STORE
+                assert database.sql("SELECT count(*) FROM sitegrid.journal") == [(2,)], "it is on this host alone"
+            wait_for(lambda: isinstance(send(store, 6), Ack))
+            wait_for(lambda: replica.shows_all_of(primary))
+            assert Database(replica, database.name).sql("SELECT count(*) FROM sitegrid.journal") == [(2,)]
+            assert same(store.grid, folded_by(store))
 
 
 @contextmanager
-def synchronous_pair() -> Iterator[tuple[Cluster, Cluster]]:
-    """A primary and its synchronous replica."""
-    with server.cluster() as primary, server.replica(primary, "b") as replica:
-        primary.sql("ALTER SYSTEM SET synchronous_standby_names = 'b'")
-        primary.sql("SELECT pg_reload_conf()")
-        wait_for(lambda: primary.sql("SELECT sync_state FROM pg_stat_replication") == [("sync",)])
-        yield primary, replica
+def stopped(cluster: Cluster) -> Iterator[None]:
+    pids = processes_of(cluster)
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for pid in pids:
+            os.kill(pid, signal.SIGCONT)
 
 
-@pytest.fixture
-def pair() -> Iterator[tuple[Cluster, Cluster]]:
-    with synchronous_pair() as both:
-        yield both
-
-
-@pytest.mark.nightly  # make test has the lock, the epoch and what a restore leaves
-def test_a_promoted_replica_has_all_that_was_acknowledged_and_the_old_primary_acknowledges_nothing(tmp_path, pair):
-    primary, replica = pair
-    database = primary.new_database()
-    both = f"postgresql://postgres@127.0.0.1:{primary.port},127.0.0.1:{replica.port}/{database.name}"
-    first = Store(JournalLocation(tmp_path / "one", database.url), SITE, CONFIG, now_ns)
-    assert first.info()["replica"] == "synchronous"
-    acknowledged = [send(first, k).watermark for k in (1, 6, 11)]
-    wait_for(lambda: replica.shows_all_of(primary))
-    with JournalLocation(tmp_path / "two", replica.url(database.name)).reader() as follower:
-        wait_for(lambda: follower.last_row == 3)
-        assert follower.follow(follower.state(), 0.1).row == 3, "a replica has no notifications"
-
-    replica.promote()  # while the old primary lives, and a server writes to it
-    answers: list[Ack | Refused] = []
-    writing = threading.Thread(target=lambda: answers.append(send(first, 16)), daemon=True)
-    writing.start()
-    replica.sql("ALTER SYSTEM RESET synchronous_standby_names")  # it is alone now, which a person decides
-    replica.sql("SELECT pg_reload_conf()")
-    wait_for(lambda: replica.sql("SHOW synchronous_standby_names") == [("",)])
-    second = Store(JournalLocation(tmp_path / "two", replica.url(database.name)), SITE, CONFIG, now_ns)
-    with closing(second):
-        assert second.journal.replica == "none"
-        assert [row.first_seq for row in second.journal.read()] == [1, 6, 11]
-        assert second.journal.watermark("a", 7).seq == acknowledged[-1]
-        answer = send(second, 16)
-        assert (answer.watermark, answer.epoch) == (20, 2)
-    assert not answers, "the old primary waits for a replica that does not come"
-    primary.stop()
-    writing.join(20.0)
-    assert [type(answer) for answer in answers] == [Refused]
-    first.journal._url = both  # as its operator gave it, where there are two
-    with pytest.raises((FencedError, UnwrittenError)):
-        first.journal.begin()
-    first.close()
+def processes_of(cluster: Cluster) -> list[int]:
+    main = (cluster.data / "postmaster.pid").read_text().split()[0]
+    return [int(pid) for pid in (main, *Path(f"/proc/{main}/task/{main}/children").read_text().split())]

@@ -14,22 +14,15 @@ from mapserver.layers.cell_layers import (
     UNEVEN_STD,
     ZERO_STD,
     ReadConfig,
-    derive_area,
-    margin_cells,
     read,
-    required,
     select,
 )
-from mapserver.layers.gap_filling import AREA_LAYERS
-from protocol.config import from_table
-from protocol.errors import ConfigError, Refusal
-from protocol.site.ground_classes import BOUNDARIES, SLOPE_LIMIT, ZONES
+from protocol.errors import Refusal
+from protocol.site.ground_classes import SLOPE_LIMIT, ZONES
 from tests.unit.mapserver.data import NOW_NS, folded, refused, samples
 
 CELL = 8 * 16 + 8  # of the usual sample in its block
-RESISTANCE_LAYERS = ("resistance", "resistance_std", "resistance_class", "confidence")
 LOG_STEP = np.log(100) / 23  # between resistance bins
-THIRD = 1 / 3 / (32 * np.sqrt(2))  # of a bin of the gradient, root mean square of two components of which one is zero
 EXACT = {"cov_xx_m2": 0.0, "cov_yy_m2": 0.0}
 
 
@@ -37,15 +30,10 @@ def value(grid: Grid, layer: str, config: ReadConfig | None = None, now_ns: int 
     return float(read(grid.evidence([(0, 0)]), [layer], config or ReadConfig(), now_ns)[layer][0, CELL])
 
 
-@pytest.mark.parametrize("c_rr", [zone.c_rr for zone in ZONES] + [0.004, 0.0137, 0.1, 0.4])
+@pytest.mark.parametrize("c_rr", [*ev.RESISTANCE_CENTRES[::8], 0.004, 0.0137, 0.1, 0.4])
 def test_constant_resistance_reads_back(c_rr):
-    half_step = 0.5 / 256 * np.log(100) / 23  # a vote is split in 1/256 of a bin
+    half_step = 0.5 / 256 * LOG_STEP  # a vote is split in 1/256 of a bin
     assert value(folded(samples(20, c_rr=c_rr)), "resistance") == pytest.approx(c_rr, rel=1.01 * half_step + 1e-6)
-
-
-@pytest.mark.parametrize("c_rr", ev.RESISTANCE_CENTRES[::4])
-def test_resistance_at_a_centre_reads_back_exactly(c_rr):
-    assert value(folded(samples(20, c_rr=c_rr)), "resistance") == pytest.approx(c_rr, rel=1e-6)
 
 
 @pytest.mark.parametrize(("east", "north"), [(0.0, 0.0), (0.125, -0.25), (-0.5, 0.5), (0.25 / 32, -3 / 8192)])
@@ -56,11 +44,18 @@ def test_constant_gradient_reads_back_exactly(east, north):
     assert value(grid, "grade") == pytest.approx(np.hypot(east, north), abs=1e-4)
 
 
-@pytest.mark.parametrize(("layer", "column"), [("resistance", "c_rr"), ("grade_east", "grade_e")])
-def test_a_minority_does_not_move_the_value(layer, column):
-    alone = folded(samples(60, **{column: 0.04}))
-    mixed = folded(samples(100, **{column: [0.04] * 60 + [0.4] * 40}))
-    assert value(mixed, layer) == pytest.approx(value(alone, layer), rel=1e-6)
+@pytest.mark.parametrize(
+    ("layer", "column", "most", "rest", "off"),
+    [
+        ("resistance", "c_rr", 0.04, 0.4, 1e-8),
+        ("grade_east", "grade_e", 0.04, 0.4, 1e-8),
+        ("grade_east", "grade_e", 3.3 / 32, 4.9 / 32, 0.01),  # in the bin but one
+    ],
+)
+def test_a_minority_does_not_move_the_value(layer, column, most, rest, off):
+    alone = folded(samples(72, **{column: most}, distance_m=10.0))
+    mixed = folded(samples(100, **{column: [most] * 72 + [rest] * 28}, distance_m=10.0))
+    assert value(mixed, layer) == pytest.approx(value(alone, layer), abs=off)
 
 
 def test_a_majority_by_metres_wins_over_a_majority_by_number():
@@ -93,24 +88,17 @@ def test_confidence_is_the_sharpened_share_of_the_leading_class(share, likely):
     assert value(grid, "resistance_class") == 4
 
 
-def test_class_boundaries_share_the_votes_of_their_bin():
-    for boundary in BOUNDARIES:
-        grid = folded(samples(20, c_rr=boundary, distance_m=10.0))
-        assert 0.3 < value(grid, "confidence") < 0.7
-
-
 def test_boundaries_of_the_read_options_make_the_classes():
     grid = folded(samples(100, c_rr=[0.04] * 60 + [0.008] * 40, distance_m=10.0))
-    assert value(grid, "resistance_class", ReadConfig(boundaries=(0.02,))) == 1
-    assert value(grid, "resistance_class", ReadConfig(boundaries=(0.1,))) == 0
-    assert value(grid, "resistance_class", ReadConfig(boundaries=(0.005, 0.006, 0.007, 0.01, 0.02, 0.03))) == 6
-    assert value(grid, "confidence", ReadConfig(boundaries=(0.1,))) == pytest.approx(1.0, abs=1e-6)
-    assert value(grid, "confidence", ReadConfig(boundaries=(0.02,))) == pytest.approx(0.6475, abs=1e-3)
+    for boundaries, number, confidence in (((0.02,), 1, 0.6475), ((0.1,), 0, 1.0)):
+        config = ReadConfig(boundaries=boundaries)
+        assert value(grid, "resistance_class", config) == number
+        assert value(grid, "confidence", config) == pytest.approx(confidence, abs=1e-3)
 
 
 REFUSED = {
-    "boundaries": [(), (0.03, 0.03), (0.05, 0.03), (0.0, 0.03), (-0.1, 0.03), (float("nan"),)],
-    "fill_reach_m": [0.0, -1.0, 50.1, float("inf"), float("nan")],
+    "boundaries": [(), (0.03, 0.03), (0.0, 0.03), (float("nan"),)],
+    "fill_reach_m": [0.0, 50.1, float("nan")],
     "min_weight_m": [-0.1],
 }
 
@@ -122,16 +110,8 @@ def test_read_options_that_make_no_sense_are_refused_by_name(name):
             ReadConfig(**{name: value})
 
 
-@pytest.mark.parametrize("bins", [1.6, 2.0, 3.0])
-@pytest.mark.parametrize("start", [0.0, 0.3, 0.5, 0.8])
-def test_the_gradient_of_the_majority_is_not_averaged_with_the_rest(bins, start):
-    here, there = (start + 3) / 32, (start + 3 + bins) / 32
-    grid = folded(samples(100, grade_e=[here] * 72 + [there] * 28, distance_m=10.0))
-    assert value(grid, "grade_east") == pytest.approx(here, abs=0.01)
-
-
-@pytest.mark.parametrize("start", np.linspace(0, 1, 9))
-@pytest.mark.parametrize("noise", [0.002, 0.004, 0.008])
+@pytest.mark.parametrize("start", np.linspace(0, 1, 5))
+@pytest.mark.parametrize("noise", [0.002, 0.008])
 def test_noise_does_not_bias_the_gradient(start, noise):
     true, draw = start / 32, np.random.default_rng(3)
     half = draw.normal(0.0, noise, 400)
@@ -139,22 +119,13 @@ def test_noise_does_not_bias_the_gradient(start, noise):
     assert value(grid, "grade_east") == pytest.approx(true, abs=0.0012)
 
 
-@pytest.mark.parametrize("start", np.linspace(0, 1, 7))
-@pytest.mark.parametrize("count", [30, 600])
-def test_votes_that_agree_err_in_what_they_have_in_common_however_many_they_are(start, count):
-    c_rr = 0.03 * np.exp(start * LOG_STEP)
-    grid = folded(samples(count, c_rr=c_rr, grade_e=start / 32, grade_n=-start / 32, distance_m=10.0))
-    assert value(grid, "resistance_std") == pytest.approx(deviation(c_rr, 0.0), rel=0.01)
-    assert value(grid, "grade_std") == pytest.approx(grade_deviation(start / 32 * np.sqrt(2), 0.0), rel=0.03)
-
-
 def test_a_zero_of_the_machines_is_a_larger_share_of_firm_ground():
     stds = [value(folded(samples(30, c_rr=c_rr)), "resistance_std") / c_rr for c_rr in (0.008, 0.04, 0.25)]
     assert stds == pytest.approx([0.194, 0.0625, 0.050], abs=0.003)
 
 
-@pytest.mark.parametrize("start", [0.0, 0.25, 0.5, 0.75])
-@pytest.mark.parametrize("noise_bins", [0.6, 1.0, 1.5])
+@pytest.mark.parametrize("start", [0.0, 0.25, 0.5])
+@pytest.mark.parametrize("noise_bins", [0.6, 1.5])
 def test_noise_of_the_votes_is_their_spread(start, noise_bins):
     z = np.random.default_rng(8).normal(size=(3, 3000))
     z /= z.std(axis=1, keepdims=True)
@@ -170,13 +141,6 @@ def test_noise_of_the_votes_is_their_spread(start, noise_bins):
     assert value(grid, "grade_std") == pytest.approx(grade_deviation(slope, noise_bins / 32), rel=0.05)
 
 
-@pytest.mark.parametrize("start", [0.0, 0.25, 0.5])
-def test_noise_below_a_third_of_a_bin_reads_as_no_more_than_that(start):
-    z = np.random.default_rng(8).normal(size=2000)
-    grid = folded(samples(2000, grade_e=(start + 0.15 * z) / 32, grade_n=0.0))
-    assert value(grid, "grade_std") < grade_deviation(start / 32, THIRD)
-
-
 def test_a_minority_does_not_widen_the_spread():
     z = np.random.default_rng(8).normal(size=2000)
     alone = samples(2000, c_rr=0.04 * np.exp(0.15 * z))
@@ -185,7 +149,7 @@ def test_a_minority_does_not_widen_the_spread():
     assert value(folded(mixed), "resistance_std") == pytest.approx(value(folded(alone), "resistance_std"), rel=0.1)
 
 
-@pytest.mark.parametrize("degrees", [-80.0, -45.0, 0.0, 22.5, 60.0, 88.0])
+@pytest.mark.parametrize("degrees", [-80.0, 0.0, 33.75, 88.0])
 def test_heading_is_the_axis_driven_both_ways(degrees):
     angle = np.radians(degrees)
     there = np.tile([angle, angle + np.pi, angle - np.pi], 20)
@@ -195,23 +159,9 @@ def test_heading_is_the_axis_driven_both_ways(degrees):
     assert -np.pi / 2 <= axis <= np.float32(np.pi / 2)
 
 
-def test_heading_is_the_mean_of_neighbouring_sectors():
-    sector = np.pi / 8
-    grid = folded(samples(40, heading_rad=[0.0] * 20 + [sector + np.pi] * 20, distance_m=10.0))
-    assert value(grid, "heading") == pytest.approx(sector / 2, abs=1e-3)
-
-
 @pytest.mark.parametrize("headings", [np.arange(16) * np.pi / 8, np.array([0.0, np.pi / 2]), np.array([0.3, 1.9])])
 def test_a_cell_driven_all_ways_has_no_heading(headings):
     assert np.isnan(value(folded(samples(len(headings) * 4, heading_rad=np.tile(headings, 4))), "heading"))
-
-
-def test_machines_are_counted_once_however_often_they_come():
-    grid = Grid(1.0, FoldConfig())
-    for machine in ("a", "b", "c", "a"):
-        grid.fold(samples(3, stamp_ns=NOW_NS + np.arange(3) * 600 * 10**9), machine)
-    assert value(grid, "machines") == 3
-    assert value(grid, "visits") > 5
 
 
 def test_age_is_the_time_since_the_newest_sample():
@@ -221,26 +171,8 @@ def test_age_is_the_time_since_the_newest_sample():
     assert np.isnan(value(grid, "age_s", now_ns=0))
 
 
-def test_time_since_the_last_change_is_known_where_one_was_found():
-    evidence = folded(samples(2, x_m=[8.5, 2.5])).evidence([(0, 0)])
-    changed_ns = np.zeros((1, 256), np.int64)
-    changed_ns[0, CELL] = NOW_NS - 50 * 10**9
-    changed = replace(evidence, changed_ns=changed_ns)
-    layer = read(changed, ["changed_s"], ReadConfig(), NOW_NS)["changed_s"][0]
-    assert layer[CELL] == pytest.approx(50.0)
-    assert np.isnan(np.delete(layer, CELL)).all()
-    assert np.isnan(read(changed, ["changed_s"], ReadConfig(), 0)["changed_s"]).all()
-
-
-def test_weight_is_the_metres_of_evidence():
-    grid = folded(samples(3, distance_m=[1.0, 2.5, 0.25], **EXACT))
-    block = read(grid.evidence([(0, 0)]), ["weight"], ReadConfig(min_weight_m=0.0))["weight"]
-    assert np.nansum(block) == pytest.approx(3.75)
-    assert value(grid, "weight") == np.nanmax(block)
-
-
 @pytest.mark.parametrize(("steepness", "expected"), [(SLOPE_LIMIT - 0.005, 0), (SLOPE_LIMIT + 0.005, 1)])
-@pytest.mark.parametrize("angle", [0.0, 2.0, 4.0])
+@pytest.mark.parametrize("angle", [0.0, 4.0])
 def test_slope_class_is_by_steepness(steepness, expected, angle):
     grid = folded(samples(9, grade_e=steepness * np.cos(angle), grade_n=steepness * np.sin(angle)))
     assert value(grid, "slope_class") == expected
@@ -251,16 +183,13 @@ def test_visits_are_counted():
         rows = samples(n, stamp_ns=NOW_NS + np.arange(n) * 60 * 10**9)
         assert value(folded(rows), "visits") == pytest.approx(n, abs=1)
     grid = Grid(1.0, FoldConfig())
-    for machine in ("a", "b", "c"):
+    for machine in ("a", "b", "c", "a"):
         grid.fold(samples(5), machine)
-    assert value(grid, "visits") == 3
-
-
-def test_a_full_bitmap_of_visits_is_finite():
-    evidence = folded(samples(1)).evidence([(0, 0)])
+    assert (value(grid, "visits"), value(grid, "machines")) == (3, 3)
+    evidence = grid.evidence([(0, 0)])
     full = replace(evidence, bitmaps=np.full_like(evidence.bitmaps, 2**64 - 1))
     values = read(full, ["visits", "machines"], ReadConfig())
-    assert (values["visits"][0, CELL], values["machines"][0, CELL]) == (266, 266)
+    assert (values["visits"][0, CELL], values["machines"][0, CELL]) == (266, 266), "a full bitmap is finite"
 
 
 def test_unknown_is_nan_in_every_layer():
@@ -274,13 +203,17 @@ def test_unknown_is_nan_in_every_layer():
         assert np.isfinite(layer[0, CELL]) == (name != "changed_s"), name
 
 
-def test_what_a_cell_has_no_votes_for_is_nan():
-    no_grade = folded(samples(5, grade_e=np.nan, grade_n=np.nan, grade_var=np.nan))
-    assert all(np.isnan(value(no_grade, n)) for n in ("grade", "grade_std", "grade_east", "grade_north", "slope_class"))
-    assert value(no_grade, "resistance_class") == 2
-    no_resistance = folded(samples(5, c_rr=np.nan, c_rr_var=np.nan))
-    assert all(np.isnan(value(no_resistance, name)) for name in RESISTANCE_LAYERS)
-    assert value(no_resistance, "grade_east") == pytest.approx(0.1, abs=1e-3)
+RESISTANCE_LAYERS = {"resistance", "resistance_std", "resistance_class", "confidence"}
+GRADE_LAYERS = {"grade", "grade_std", "grade_east", "grade_north", "slope_class"}
+
+
+@pytest.mark.parametrize(
+    ("columns", "unknown"),
+    [(("grade_e", "grade_n", "grade_var"), GRADE_LAYERS), (("c_rr", "c_rr_var"), RESISTANCE_LAYERS)],
+)
+def test_what_a_cell_has_no_votes_for_is_nan(columns, unknown):
+    grid = folded(samples(5, **dict.fromkeys(columns, np.nan)))
+    assert {name for name in LAYERS if np.isnan(value(grid, name))} == {*unknown, "changed_s"}
 
 
 def test_where_machines_could_measure_nothing_a_cell_is_driven_and_not_known():
@@ -296,7 +229,7 @@ def test_where_machines_could_measure_nothing_a_cell_is_driven_and_not_known():
 
 def test_cells_with_too_little_evidence_are_unknown():
     grid = folded(samples(1, distance_m=0.05, **EXACT))
-    assert np.isnan(value(grid, "resistance"))
+    assert value(grid, "weight", ReadConfig(min_weight_m=0.0)) == pytest.approx(0.05, abs=0.002)
     assert np.isnan(value(grid, "resistance", ReadConfig(min_weight_m=0.06)))
     assert np.isfinite(value(grid, "resistance", ReadConfig(min_weight_m=0.02)))
     wide = folded(samples(9, cov_xx_m2=1.0, cov_yy_m2=1.0))
@@ -310,33 +243,3 @@ def test_no_names_mean_all_layers_of_cells_and_an_unknown_one_is_named():
     assert select(["grade", "resistance_filled", "visits"]) == ("grade", "resistance_filled", "visits")
     with refused(Refusal.UNKNOWN_LAYER, r"`colour`.*resistance_class.*resistance_filled"):
         select(["grade", "colour"])
-
-
-def test_what_an_area_needs_is_read_once_from_cells():
-    assert required(["visits", "grade"]) == ("visits", "grade")
-    assert required(["grade_filled"]) == ("grade_east", "grade_north", "grade_std", "weight")
-    assert required(["resistance", "resistance_class_filled"])[0] == "resistance"
-    every = required([*LAYERS, *AREA_LAYERS])
-    assert sorted(every) == sorted(LAYERS)
-
-
-def test_only_area_layers_need_a_margin():
-    assert margin_cells(list(LAYERS), 0.5, ReadConfig()) == 0
-    assert margin_cells(["visits", "grade_filled"], 1.0, ReadConfig()) == 5
-    assert margin_cells(["grade_filled"], 0.3, ReadConfig(fill_reach_m=2.0)) == 7
-
-
-def test_layers_come_in_the_order_asked_for_and_cells_unchanged():
-    names = ["resistance_filled_std", "visits", "resistance_filled", "grade_filled"]
-    draw = np.random.default_rng(5)
-    cells = {name: draw.uniform(0.1, 1.0, (7, 9)).astype(np.float32) for name in required(names)}
-    made = derive_area(names, cells, 1.0, ReadConfig())
-    assert list(made) == names
-    assert all(layer.dtype == np.float32 and layer.shape == (7, 9) for layer in made.values())
-    assert np.array_equal(made["visits"], cells["visits"])
-
-
-def test_boundaries_are_read_from_a_table():
-    assert from_table(ReadConfig, {"boundaries": [0.01, 0.1]}, "[read]").boundaries == (0.01, 0.1)
-    with pytest.raises(ConfigError, match="boundaries"):
-        from_table(ReadConfig, {"boundaries": [0.1, 0.01]}, "[read]")

@@ -18,16 +18,14 @@ from prometheus_client import CollectorRegistry, Metric, ProcessCollector, gener
 from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 
-from mapserver.journal.location import JournalLocation
 from mapserver.monitoring.exporter import Exporter
-from mapserver.monitoring.metrics import MOST_AGENTS, HealthListener, ReceivedHealth, ServerCollector, size_of
-from mapserver.server import Server
+from mapserver.monitoring.metrics import MOST_AGENTS, HealthListener, ReceivedHealth, ServerCollector
 from protocol.errors import LinkError
 from protocol.wire import keys
-from protocol.wire.codec import MAX_SMALL_BYTES, encode_batch, encode_health
-from protocol.wire.messages import Health, SampleBatch
+from protocol.wire.codec import MAX_SMALL_BYTES, encode_health
+from protocol.wire.messages import Health
 from tests.paths import ROOT
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, now_ns, routed, samples
+from tests.unit.mapserver.data import NOW_NS, routed
 
 Values = dict[tuple[str, frozenset[tuple[str, str]]], float]
 INFO: dict[str, Any] = {
@@ -159,11 +157,6 @@ def test_whatever_an_agent_sends_the_rest_is_exposed(tmp_path: Path, health: dic
     assert not [key for key in values if key[0].startswith("sitegrid_agent_spool")]
 
 
-def test_labels_of_any_text_are_escaped(tmp_path: Path):
-    name = 'a "b"\\n\n\\'
-    assert at(read(exposition(tmp_path, INFO | {"site": {"name": name}})), "sitegrid_info", site=name, version="1.2")
-
-
 def test_the_operators_page_names_every_metric_with_its_labels(tmp_path: Path):
     text = exposition(tmp_path, loader_1=HEALTH)
     exposed = {(name, frozenset(label for label, _ in labels)) for name, labels in read(text)}
@@ -172,19 +165,7 @@ def test_the_operators_page_names_every_metric_with_its_labels(tmp_path: Path):
     assert {(name, frozenset(filter(None, labels.split(",")))) for name, labels in named} == exposed
 
 
-def test_the_size_of_a_folder_is_that_of_all_files_in_it(tmp_path: Path):
-    (tmp_path / "archive").mkdir()
-    (tmp_path / "archive" / "one").write_bytes(b"x" * 1000)
-    (tmp_path / "two").write_bytes(b"x" * 24)
-    assert size_of(tmp_path) == 1024
-
-
-# --- HTTP ------------------------------------------------------------------------------------------------------------
-
-
 class One(Collector):
-    """A collector with one metric, or with a bug."""
-
     def __init__(self, *, fails: bool = False) -> None:
         self.fails = fails
 
@@ -251,9 +232,6 @@ def test_an_address_in_use_is_named():
             Exporter((host, port), One())
 
 
-# --- health over Zenoh -----------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def listening() -> Iterator[tuple[Any, HealthListener]]:
     with routed() as (router, client), closing(HealthListener(router, "pit", lambda: 7.0)) as listener:
@@ -291,20 +269,3 @@ def test_made_up_names_do_not_fill_the_memory():
         assert len(listener.received()) == MOST_AGENTS
         listener._on_health(Sample("m1"))  # type: ignore[arg-type]
         assert "m1" in listener.received()
-
-
-def test_a_server_exposes_its_metrics(tmp_path: Path):
-    with (
-        routed() as (router, client),
-        closing(Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)) as server,
-    ):
-        batch = encode_batch(SampleBatch("loader-1", 5, 3, samples(4), SITE.frame, lost_before=2))
-        for payload in (batch, batch, b"nonsense"):
-            list(client.get(keys.ingest("pit", "loader-1"), payload=payload, timeout=10.0))
-        values = read(exposition(tmp_path, server.answers.info()))
-    assert at(values, "sitegrid_batches_total") == 1
-    assert at(values, "sitegrid_batches_refused_total", reason="not_msgpack") == 1
-    assert at(values, "sitegrid_samples_trimmed_total") == 4
-    assert at(values, "sitegrid_machine_samples_total", machine="loader-1") == 4
-    assert at(values, "sitegrid_machine_samples_lost_total", machine="loader-1") == 2
-    assert at(values, "sitegrid_store_bytes") > 1000

@@ -37,7 +37,6 @@ class PastStore:
         self.sent.append((machine, rows))
 
     def archive(self, rows: int) -> None:
-        """Move so many of the first rows."""
         list(archive(self.folder / FOLDER, self.reader, SITE, NOW_NS + rows * HOUR_NS, self.journal.forget))
 
     def make(self, closed_ns: int, without: Iterable[str] = ()) -> int:

@@ -1,16 +1,20 @@
-"""Maps of the past, and what is read for them."""
+"""Maps of the past and histories of cells, and what is read for them."""
 
 from contextlib import closing
 
 import numpy as np
 import pytest
 
+from mapserver.evidence import cells as ev
+from mapserver.evidence import grid as grids
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.journal.facts import NO_FACTS
+from mapserver.journal.rows import Selection
+from mapserver.past import cell_history as module
+from mapserver.past.cell_history import cell_history
 from mapserver.past.plan import HOUR_NS
-from protocol.errors import StoreError
 from protocol.site.geometry import CellWindow
-from tests.unit.mapserver.data import NOW_NS, random_samples, same, samples
+from tests.unit.mapserver.data import NOW_NS, folded, random_samples, same, samples
 from tests.unit.mapserver.past.past_store import PastStore, S
 
 pytest.importorskip("pyarrow.parquet")
@@ -44,8 +48,8 @@ def test_the_stamp_itself_belongs_to_the_past(tmp_path):
         assert [store.as_of(t).folded for t in (99, 100, 299, 300)] == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("closed_h", [None, 1, 2])
-@pytest.mark.parametrize("cell_m", [0.25, 1.0, 3.0])
+@pytest.mark.parametrize("closed_h", [None, 2])
+@pytest.mark.parametrize("cell_m", [0.25, 3.0])
 def test_a_window_holds_the_same_evidence_as_the_whole(tmp_path, cell_m, closed_h):
     with closing(PastStore(tmp_path, cell_m, FoldConfig(std_cap_m=2.0))) as store:
         for seed, name in enumerate("ab"):
@@ -67,9 +71,6 @@ def test_a_window_holds_the_same_evidence_as_the_whole(tmp_path, cell_m, closed_
     assert len(part.state().blocks) < len(whole.state().blocks), "nothing far from it is read"
 
 
-# --- what is read ----------------------------------------------------------------------------------------------------
-
-
 def two_hours(store: PastStore) -> None:
     """A checkpoint between two hours of one row each, and a row of the first hour that came in late."""
     store.add(samples(10, stamp_ns=NOW_NS + np.arange(10) * S))
@@ -80,7 +81,6 @@ def two_hours(store: PastStore) -> None:
 
 @pytest.fixture
 def read_rows(monkeypatch):
-    """Numbers of the journal rows that are decoded."""
     from mapserver.past import past
 
     numbers, read = [], past.read_history
@@ -108,18 +108,6 @@ def test_rows_are_read_that_a_checkpoint_lacks_and_no_others(tmp_path, read_rows
         assert sorted(read_rows) == [1, 3]
 
 
-def test_rows_are_read_that_touch_the_window_and_no_others(tmp_path, read_rows):
-    with closing(PastStore(tmp_path)) as store:
-        two_hours(store)
-        for x, rows in ((0, []), (100, [2]), (200, [3]), (400, [])):
-            read_rows.clear()
-            store.as_of(NOW_NS + HOUR_NS + 5 * S, window=CellWindow(x, 8, 1, 1))
-            assert read_rows == rows
-
-
-# --- damage ----------------------------------------------------------------------------------------------------------
-
-
 def flip(path, at: int) -> None:
     data = bytearray(path.read_bytes())
     data[at] ^= 0x10
@@ -145,22 +133,75 @@ def test_a_damaged_checkpoint_is_passed_over_counted_and_never_used(tmp_path, at
         assert same(store.as_of(NOW_NS + 3 * HOUR_NS), store.folded(NOW_NS + 3 * HOUR_NS))
 
 
-def test_what_the_archive_lost_is_an_error_also_with_a_checkpoint(tmp_path):
+CELL, PLACE, BLOCK = (-3, 7), 16 * 7 + 13, (-1, 0)
+SPAN_NS = 300 * S
+
+
+@pytest.fixture(params=[0, 12], ids=lambda rows: f"{rows} archived")
+def two_drives(request, tmp_path):
+    with closing(PastStore(tmp_path)) as opened:
+        parts = {name: np.split(random_samples(600, seed, half_m=15.0), 10) for seed, name in enumerate("ab")}
+        for i in range(10):
+            for name in "ab":
+                opened.add(parts[name][i], name)
+        opened.archive(request.param)
+        yield opened
+
+
+@pytest.mark.parametrize("piece", [7, grids.PIECE])
+def test_the_history_of_a_cell_is_its_evidence_span_by_span(two_drives, monkeypatch, piece):
+    monkeypatch.setattr(module, "PIECE", piece)
+    past = cell_history(two_drives.past, two_drives.reader, CELL, SPAN_NS)
+    assert len(past.first_ns) > 2
+    assert (np.diff(past.first_ns) > 0).all()
+    assert (past.first_ns % SPAN_NS == 0).all()
+    assert (past.last_ns == past.first_ns + SPAN_NS - 1).all()
+    assert past.evidence.counts.shape == (len(past.first_ns), 1, ev.COUNTS)
+    for i, (first_ns, last_ns) in enumerate(zip(past.first_ns.tolist(), past.last_ns.tolist(), strict=True)):
+        expected = two_drives.folded(last_ns, from_ns=first_ns).evidence([BLOCK])
+        assert expected.weight[0, PLACE] > 0
+        for name in ("counts", "bitmaps", "newest_ns", "changed_ns"):
+            assert np.array_equal(getattr(past.evidence, name)[i, 0], getattr(expected, name)[0, PLACE])
+    whole = two_drives.folded(NOW_NS + 10**13).evidence([BLOCK]).counts[0, PLACE]
+    assert np.array_equal(past.evidence.counts.sum(axis=(0, 1)), whole)
+
+
+def test_spans_machines_and_times_of_a_history_can_be_chosen(two_drives):
+    day_ns = 86_400 * S
+    one = cell_history(two_drives.past, two_drives.reader, CELL, day_ns)
+    assert (one.first_ns.tolist(), one.last_ns.tolist()) == ([NOW_NS], [NOW_NS + day_ns - 1])
+    only_a = cell_history(two_drives.past, two_drives.reader, CELL, day_ns, Selection(without=frozenset("b")))
+    expected = two_drives.folded(NOW_NS + day_ns, "b").evidence([BLOCK])
+    assert np.array_equal(only_a.evidence.counts[0, 0], expected.counts[0, PLACE])
+    selection = Selection(from_ns=NOW_NS + 900 * S, to_ns=NOW_NS + 1499 * S)
+    half = cell_history(two_drives.past, two_drives.reader, CELL, SPAN_NS, selection)
+    assert half.first_ns.tolist() == [NOW_NS + 900 * S, NOW_NS + 1200 * S]
+    nowhere = cell_history(two_drives.past, two_drives.reader, (5000, 5000), SPAN_NS)
+    assert nowhere.first_ns.shape == (0,)
+    assert nowhere.evidence.counts.shape == (0, 1, ev.COUNTS)
+
+
+def test_cells_are_those_of_the_grid(tmp_path):
+    with closing(PastStore(tmp_path, 0.5)) as store:
+        store.add(samples(1, x_m=-0.25, y_m=20.75))
+        past = cell_history(store.past, store.reader, (-1, 41), SPAN_NS)
+    grid = folded(samples(1, x_m=-0.25, y_m=20.75), cell_m=0.5)
+    assert past.evidence.weight[0, 0] == grid.evidence([(-1, 2)]).weight[0, 9 * 16 + 15] > 0
+
+
+@pytest.mark.parametrize("std_m", [0.0, 1.0, 2.9])
+def test_no_sample_is_passed_over_that_votes_for_the_cell(tmp_path, std_m):
+    """Samples around the cell, a tenth of a metre apart, each a span of its own."""
+    offsets = np.arange(-12.0, 12.0, 0.1)
     with closing(PastStore(tmp_path)) as store:
-        two_hours(store)
-        store.archive(3)
-        next((tmp_path / "archive").glob("*_000003-000003.parquet")).unlink()
-        with pytest.raises(StoreError, match="the file with row 3 is missing"):
-            store.as_of(NOW_NS + 2 * HOUR_NS)
+        stamps = NOW_NS + np.arange(len(offsets)) * S
+        rows = samples(len(offsets), x_m=8.5 + offsets, stamp_ns=stamps, cov_xx_m2=std_m**2, cov_yy_m2=std_m**2)
+        store.add(rows)
+        past = cell_history(store.past, store.reader, (8, 8), S)
+    votes = [stamp for row, stamp in zip(rows, stamps, strict=True) if _votes(row)]
+    assert past.first_ns.tolist() == votes
 
 
-def test_the_next_stamp_is_found_in_journal_and_archive(store):
-    stamps = np.sort(np.concatenate([rows["stamp_ns"] for _, rows in store.sent]))
-    for at in (0, NOW_NS, NOW_NS + HOUR_NS, *(stamps[::37] + 1).tolist()):
-        stamp = store.past.next_stamp(store.reader, at)
-        expected = stamps[stamps >= at]
-        if len(expected):
-            across = any(rows["stamp_ns"].min() < at <= rows["stamp_ns"].max() for _, rows in store.sent)
-            assert stamp == expected[0] or (across and stamp == at)
-        else:
-            assert stamp is None
+def _votes(row) -> bool:
+    evidence = folded(np.array([row])).evidence([(0, 0)])
+    return bool(evidence.weight[0, 8 * 16 + 8])

@@ -31,12 +31,8 @@ class Held:
         self._go.release(n)
 
 
-@pytest.fixture
-def held():
-    return Held()
-
-
-def test_small_answers_pass_large_ones(held):
+def test_small_answers_pass_large_ones():
+    held = Held()
     with closing(AnswerPool("test", 1, 1000)) as pool:
         pool.submit(1, held.work("first"))
         held.begun()
@@ -61,7 +57,8 @@ def test_small_answers_without_end_do_not_keep_a_large_one_waiting():
         assert done.wait(WAIT_S)
 
 
-def test_answers_beyond_the_budget_are_refused_until_some_are_done(held):
+def test_answers_beyond_the_budget_are_refused_until_some_are_done():
+    held = Held()
     with closing(AnswerPool("test", 1, 100)) as pool:
         pool.submit(60, held.work("in work"))
         held.begun()
@@ -77,7 +74,8 @@ def test_answers_beyond_the_budget_are_refused_until_some_are_done(held):
     assert held.done == ["in work", "waits", "again"]
 
 
-def test_a_bug_in_an_answer_costs_neither_thread_nor_budget(held, caplog):
+def test_a_bug_in_an_answer_costs_neither_thread_nor_budget(caplog):
+    held = Held()
     with closing(AnswerPool("test", 1, 1)) as pool:
         pool.submit(1, lambda: 1 // 0)
         wait_for(lambda: not pool._size)
@@ -85,14 +83,3 @@ def test_a_bug_in_an_answer_costs_neither_thread_nor_budget(held, caplog):
         held.let_go(1)
         wait_for(lambda: held.done == ["next"])
     assert "answer failed" in caplog.text
-
-
-def test_what_waits_at_the_end_is_dropped(held):
-    pool = AnswerPool("test", 1, 10)
-    pool.submit(1, held.work("in work"))
-    held.begun()
-    pool.submit(1, held.work("dropped"))
-    held.let_go(2)
-    pool.close()
-    wait_for(lambda: not any(thread.is_alive() for thread in pool._threads))
-    assert held.done[:1] == ["in work"]

@@ -7,26 +7,14 @@ import pytest
 
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
-from mapserver.layers import cell_layers
-from mapserver.layers.cell_layers import LAYERS, ReadConfig
+from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.answering import Answers
 from protocol.errors import Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
-from protocol.queries.requests import PointQuery, RegionQuery
+from protocol.queries.requests import PointQuery, RegionQuery, When
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    folded,
-    incoming,
-    open_writer,
-    random_samples,
-    refused,
-    samples,
-    send,
-)
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
 
 # One sample in each cell of two diagonals, the value tells the cell.
@@ -56,13 +44,6 @@ def test_a_point_is_the_cell_that_it_lies_in(answers):
         assert (point.merged, point.stamp_ns) == (1, NOW_NS + 79 * 10**9)
 
 
-def test_a_point_where_nobody_was_is_nan_in_every_layer(answers):
-    for x, y in ((10.0, 10.0), (1e6, -1e6), (-1e9, 1e9)):
-        values = answers.point(PointQuery(x, y)).values
-        assert tuple(values) == tuple(LAYERS)
-        assert np.isnan(list(values.values())).all()
-
-
 @pytest.mark.parametrize(
     "bounds",
     [(-45, -45, 45, 45), (-20, -3, 3, 20), (3, -16, 13, -3), (-16, 0, 0, 16), (0, -1, 1, 0), (-0.5, -0.5, 0.5, 0.5)],
@@ -80,36 +61,11 @@ def test_a_region_is_cut_from_its_blocks(answers, bounds):
     assert np.isfinite(expected).any()
 
 
-def test_many_blocks_are_read_in_pieces_and_put_together(tmp_path, monkeypatch):
-    monkeypatch.setattr("mapserver.evidence.grid.READ_BLOCKS", 3)
-    rows = random_samples(300, 3)
-    with closing(open_writer(tmp_path)) as writer:
-        send(writer, [incoming(rows)])
-        here = region(answers_of(writer), -64, -64, 64, 64, names=("resistance",))
-    grid = folded(rows)
-    for x in range(-4, 4):
-        for y in range(-4, 4):
-            block = cell_layers.read(grid.evidence([(x, y)]), ["resistance"], ReadConfig())["resistance"].reshape(
-                16, 16
-            )
-            row, column = 16 * (y + 4), 16 * (x + 4)
-            cut = here["resistance"][row : row + 16, column : column + 16]
-            assert np.array_equal(cut, block, equal_nan=True)
-
-
 def test_a_region_that_no_reply_carries_is_refused(answers):
-    region(answers, 0, 0, 4000, 1)
-    with refused(Refusal.TOO_LARGE, "4001 x 4000 cells"):
-        region(answers, 0, 0, 4001, 4000)
-
-
-def test_least_weight_of_the_read_options_is_obeyed(tmp_path):
-    values = []
-    for least_m in (1.9, 2.1):
-        with closing(open_writer(tmp_path / str(least_m), replace(CONFIG, read=ReadConfig(least_m)))) as writer:
-            send(writer, [incoming(samples(distance_m=2.0))])
-            values.append(answers_of(writer).point(PointQuery(8.5, 8.5, ("resistance",))).values["resistance"])
-    assert np.isfinite(values).tolist() == [True, False]
+    bounds = Bounds(0, 0, 5000, 4000)
+    for query in (RegionQuery(bounds), RegionQuery(bounds, resolution_m=1000.0), RegionQuery(bounds, when=When(1))):
+        with refused(Refusal.TOO_LARGE, "5000 x 4000 cells"):
+            answers.region(query)
 
 
 def test_answers_travel_as_bytes(answers):
@@ -120,9 +76,6 @@ def test_answers_travel_as_bytes(answers):
     info = decode_info(answered(answers, "info", {"after": "1"}))
     assert info.layers == (*LAYERS, *AREA_LAYERS)
     assert info.samples_merged == 80
-
-
-# --- change and gaps across the borders of blocks --------------------------------------------------------------------
 
 
 def driven(
@@ -166,7 +119,7 @@ def assert_parts_are_cut_from_the_whole(answers: Answers, cell_m: float, half: i
     """Compare random windows of the site with the same cells of one window of all of it."""
     whole = region(answers, *(np.array([-half, -half, half, half]) * cell_m), names=names)
     draw = np.random.default_rng(seed)
-    for _ in range(25):
+    for _ in range(15):
         west, south = draw.integers(-half, half - 1, 2)
         east, north = (min(half, int(low + draw.integers(1, 30))) for low in (west, south))
         part = region(answers, *(np.array([west, south, east, north]) * cell_m), names=names)
@@ -176,8 +129,8 @@ def assert_parts_are_cut_from_the_whole(answers: Answers, cell_m: float, half: i
     return whole
 
 
-# The repaved area lies across two and across four blocks, and along the border of one.
-@pytest.mark.parametrize("changed", [(10, 2, 22, 12), (-8, -7, 6, 9), (16, 16, 23, 22), (-23, -5, -16, 1)])
+# The repaved area lies across four blocks, and along the border of one.
+@pytest.mark.parametrize("changed", [(-8, -7, 6, 9), (-23, -5, -16, 1)])
 def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, changed):
     writer, answers = map_of(tmp_path, driven(1.0, 40, changed))
     whole = assert_parts_are_cut_from_the_whole(answers, 1.0, 48, CHANGED, seed=1)
@@ -194,31 +147,19 @@ def test_a_change_across_blocks_is_answered_alike_in_every_window(tmp_path, chan
     writer.close()
 
 
-@pytest.mark.parametrize(
-    ("cell_m", "c_rr", "edge_m"),
-    [
-        (1.0, 0.2, 6.0),
-        (1.0, 0.04, 11.0),
-        (0.5, 0.2, 6.0),
-        pytest.param(0.5, 0.04, 11.0, marks=pytest.mark.slow),
-        pytest.param(0.2, 0.2, 6.0, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("cell_m", "c_rr", "edge_m"), [(1.0, 0.04, 11.0), (0.5, 0.2, 6.0)])
 def test_a_change_is_seen_with_all_its_surroundings_in_cells_of_any_size(tmp_path, cell_m, c_rr, edge_m):
     cells = round(edge_m / cell_m)  # a metre more than the least
     rows = driven(cell_m, cells + 20, (-cells + 3, -4, 3, cells - 4), c_rr=c_rr)
     writer, answers = map_of(tmp_path, rows, replace(SITE, cell_m=cell_m))
-    try:
-        names = ("resistance", "grade_east", "changed_s")
+    names = ("resistance", "grade_east", "changed_s")
+    with closing(writer):
         whole = assert_parts_are_cut_from_the_whole(answers, cell_m, cells + 16, names, seed=2)
-    finally:
-        writer.close()
     assert np.isfinite(whole["changed_s"]).any()
 
 
-@pytest.mark.parametrize("step", [3, 5])
-def test_gaps_are_filled_alike_in_every_window(tmp_path, step):
-    writer, answers = map_of(tmp_path, driven(1.0, 40, (-8, -7, 6, 9), step))
+def test_gaps_are_filled_alike_in_every_window(tmp_path):
+    writer, answers = map_of(tmp_path, driven(1.0, 40, (-8, -7, 6, 9), step=3))
     whole = assert_parts_are_cut_from_the_whole(answers, 1.0, 48, FILLED, seed=3)
     writer.close()
     assert np.isfinite(whole["resistance_filled"]).sum() > 2 * np.isfinite(whole["resistance"]).sum()

@@ -1,22 +1,30 @@
-"""Layers that are kept: what anybody would derive afresh, derived again only where something came in."""
+"""Layers that are kept, and answers of them: what a server that begins now would derive, derived again where needed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.block_layers import BlockLayers
+from protocol.arrays import Table
 from protocol.queries.answer_codec import decode_point
-from protocol.site.geometry import BLOCK_CELLS, CellWindow
+from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, When, WhyQuery, encode_query
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow
 from tests.unit.mapserver.data import CONFIG, SITE, incoming, open_writer, random_samples, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
+from tests.unit.mapserver.roads.drives import START_NS, along, passes
 
 ALL = (*LAYERS, *AREA_LAYERS)
 WINDOW = CellWindow(-70, -45, 130, 100)
@@ -34,41 +42,6 @@ def same(a, b) -> None:
     assert a.keys() == b.keys()
     for name, layer in a.items():
         np.testing.assert_array_equal(layer, b[name], err_msg=name)
-
-
-def test_only_what_lies_near_to_new_samples_is_derived_again(tmp_path):
-    names, wide = ("resistance", "grade_east_filled"), CellWindow(-320, -16, 640, 32)
-    kept = fresh()
-    with closing(open_writer(tmp_path)) as writer:
-        line = samples(600, x_m=np.arange(-300, 300) + 0.5, y_m=0.5, distance_m=4.0)
-        send(writer, [incoming(line)])
-        read(kept, writer, wide, names)
-        first = kept.derived
-        read(kept, writer, wide, names)
-        assert kept.derived == first, "nothing came in"
-        assert first >= 600 // BLOCK_CELLS
-        more = samples(5, x_m=np.arange(5) + 0.5, y_m=0.5, distance_m=4.0)
-        more["stamp_ns"] += 10**12
-        send(writer, [incoming(more, first_seq=601)])
-        read(kept, writer, wide, names)
-        assert 0 < kept.derived - first <= 2 * 9 * 3
-        same(read(kept, writer, wide, names), read(fresh(), writer, wide, names))
-
-
-def test_ages_grow_though_nothing_is_derived_again(tmp_path):
-    names, here, there = ("age_s",), CellWindow(0, 0, 16, 16), 400.0
-    kept = fresh()
-    with closing(open_writer(tmp_path)) as writer:
-        send(writer, [incoming(samples(1, x_m=3.5, y_m=3.5, distance_m=4.0))])
-        before = read(kept, writer, here, names)["age_s"]
-        later = samples(1, x_m=there, y_m=there, distance_m=4.0)
-        later["stamp_ns"] += 60 * 10**9
-        send(writer, [incoming(later, first_seq=2)])
-        derived = kept.derived
-        after = read(kept, writer, here, names)["age_s"]
-        assert kept.derived == derived
-        assert after[3, 3] - before[3, 3] == pytest.approx(60.0)
-        assert np.isnan(after[10, 10])
 
 
 def test_another_grid_begins_anew_and_an_old_look_keeps_nothing(tmp_path):
@@ -118,31 +91,6 @@ def test_beside_new_samples_no_block_is_derived_again_whose_pages_count_as_befor
         assert kept.derived - derived == len(folded) > 0
 
 
-def test_a_block_is_derived_again_where_what_came_in_beside_it_shows_that_its_ground_changed(tmp_path):
-    """A strip that is too narrow to be a change becomes one, once the strip beside it in the next block changes."""
-    names, window = ("resistance", "resistance_filled"), CellWindow(0, 0, 32, 16)
-    kept, sent = fresh(), 0
-
-    def drive(writer: Writer, columns: Sequence[int], c_rr: float, after_s: float) -> float:
-        nonlocal sent
-        x, y = (grid.ravel() + 0.5 for grid in np.meshgrid(np.array(columns), np.arange(16)))
-        rows = samples(len(x), x_m=x, y_m=y, distance_m=4.0, c_rr=c_rr, cov_xx_m2=1e-4, cov_yy_m2=1e-4)
-        rows["stamp_ns"] += int(after_s * 1e9)
-        send(writer, [incoming(rows, first_seq=1 + sent)])
-        sent += len(rows)
-        now = read(kept, writer, window, names)
-        same(now, read(fresh(), writer, window, names))
-        return float(now["resistance"][8, 14])
-
-    with closing(open_writer(tmp_path)) as writer:
-        drive(writer, [*range(32)], 0.02, 0.0)
-        drive(writer, [*range(13), *range(16, 32)], 0.02, 3600.0)
-        narrow = drive(writer, [13, 14, 15], 0.2, 3600.0)
-        wide = drive(writer, [16, 17, 18], 0.2, 7200.0)
-        assert wide == pytest.approx(0.2, rel=0.1)
-        assert narrow < wide / 2
-
-
 def test_a_point_that_is_kept_is_what_its_region_says_until_something_comes_in_beside_it(tmp_path):
     names = ("resistance", "grade", "changed_s")
     with closing(open_writer(tmp_path)) as writer:
@@ -165,3 +113,53 @@ def test_a_point_that_is_kept_is_what_its_region_says_until_something_comes_in_b
         again = decode_point(answered(answers, "point", asked))
         assert again.version.row == 2
         assert again.values == decode_point(first).values
+
+
+LINE = along([(-60, -20), (60, 10)])
+ENDS = ((-50.0, -17.5), (50.0, 7.5))
+metres = st.integers(-60, 60).map(float)
+names = st.lists(st.sampled_from((*LAYERS, *AREA_LAYERS)), max_size=4, unique=True).map(tuple)
+times = st.booleans().map(lambda repairs: When(repairs=repairs))
+bounds = st.builds(
+    lambda west, south, width, height: Bounds(west, south, west + width, south + height),
+    *(metres, metres, st.integers(1, 90), st.integers(1, 90)),
+)
+asked = st.one_of(
+    st.builds(PointQuery, metres, metres, names, when=times),
+    st.builds(PointsQuery, st.lists(st.tuples(metres, metres), min_size=1, max_size=4).map(tuple), names, when=times),
+    st.builds(RegionQuery, bounds, names, when=times),
+    st.builds(WhyQuery, metres, metres),
+    st.builds(SegmentsQuery, bounds=st.none() | bounds),
+    st.builds(WorklistQuery, st.sampled_from([0.01, 0.03])),
+    st.builds(RouteQuery, st.just(ENDS), repairs=st.booleans()),
+    st.just(WayQuery(*ENDS)),
+)
+some = st.tuples(st.just("some"), st.integers(0, 9), st.tuples(metres, metres))
+passing = st.tuples(st.just("passes"), st.integers(0, 9), st.sampled_from([0.02, 0.06]))
+
+
+def rows_of(what: str, seed: int, more: object, turn: int) -> Table:
+    """Samples around a place, or some passes of the road on ground of a resistance; each turn is later."""
+    if what == "passes":
+        return passes(LINE, 3, more, seed=seed, after_s=400.0 * turn)  # type: ignore[arg-type]
+    rows = random_samples(80, seed, half_m=8.0)
+    rows["x_m"] += more[0]  # type: ignore[index]
+    rows["y_m"] += more[1]  # type: ignore[index]
+    rows["stamp_ns"] = START_NS + turn * 400 * 10**9 + np.arange(80) * 10**9
+    return rows
+
+
+@pytest.mark.slow
+@settings(max_examples=15)
+@given(st.lists(some | passing | asked, min_size=2, max_size=14))
+def test_an_answer_is_that_of_a_server_that_begins_now(course):
+    with tempfile.TemporaryDirectory() as folder, closing(open_writer(Path(folder))) as writer:
+        kept = answers_of(writer)
+        for turn, step in enumerate([("passes", 1, 0.06), *course]):
+            if isinstance(step, tuple):
+                send(writer, [incoming(rows_of(*step, turn), 1, "ab"[turn % 2], spool_id=1 + turn)])
+                continue
+            newest = writer.run(lambda store: store.merged)
+            words = encode_query(step) if isinstance(step, WhyQuery) else {**encode_query(step), "after": str(newest)}
+            fresh = answers_of(writer)
+            assert answered(kept, step.name, words) == answered(fresh, step.name, words)

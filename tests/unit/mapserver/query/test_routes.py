@@ -1,19 +1,24 @@
-"""Routes and ways over maps that samples made: their costs, their lines, and what is refused, by name."""
+"""Routes and ways over maps that samples made: costs, lines, machines that are named, and what is refused."""
 
 from __future__ import annotations
 
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mapserver.query.answering import Answers
-from protocol.errors import QueryError
+from mapserver.query.named_machines import LOOK_BACK_NS, NamedMachines
+from protocol.arrays import Table
+from protocol.errors import QueryError, Refusal
 from protocol.queries.requests import encode_query, parse_query
 from protocol.queries.route_requests import REFUSE, TIME, RouteQuery, WayQuery
-from protocol.queries.routing import RouteAnswer, RouteMachine, decode_answer
+from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteAnswer, RouteMachine, decode_answer
 from protocol.units import GRAVITY_MPS2
-from tests.unit.mapserver.data import incoming, open_writer, samples, send
+from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 
 HALF = 60
@@ -32,10 +37,11 @@ def ground(resistance, grade_e=lambda x, y: 0 * x, skipped=lambda x, y: x != x):
     return rows
 
 
-def answers_on(tmp_path, rows) -> tuple[closing, Answers]:
-    writer = open_writer(tmp_path)
-    send(writer, [incoming(rows)])
-    return closing(writer), answers_of(writer)
+@contextmanager
+def answers_on(folder: Path, rows: Table) -> Iterator[Answers]:
+    with closing(open_writer(folder)) as writer:
+        send(writer, [incoming(rows)])
+        yield answers_of(writer)
 
 
 def ask(answers: Answers, query: RouteQuery | WayQuery) -> RouteAnswer:
@@ -48,8 +54,7 @@ def ask(answers: Answers, query: RouteQuery | WayQuery) -> RouteAnswer:
 def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
     """Half of it gravel and half wet dirt, on a plane that rises: the sum of both, and brakes take nothing."""
     soils = lambda x, y: np.where(x < 0, 0.02, 0.06)  # noqa: E731
-    closer, answers = answers_on(tmp_path, ground(soils, lambda x, y: 0.015 + 0 * x))
-    with closer:
+    with answers_on(tmp_path, ground(soils, lambda x, y: 0.015 + 0 * x)) as answers:
         there, back = (
             ask(answers, RouteQuery(line, SLOW, ROLLING)) for line in (((-40, 5.0), (40, 5.0)), ((40, 5.0), (-40, 5.0)))
         )
@@ -66,8 +71,7 @@ def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
 
 def test_a_way_leads_around_sand_and_costs_less_than_straight(tmp_path):
     sand = lambda x, y: (abs(x) < 15) & (y < 25)  # noqa: E731
-    closer, answers = answers_on(tmp_path, ground(lambda x, y: np.where(sand(x, y), 0.25, 0.02)))
-    with closer:
+    with answers_on(tmp_path, ground(lambda x, y: np.where(sand(x, y), 0.25, 0.02))) as answers:
         ends = (-40.0, 0.0), (40.0, 0.0)
         way = ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
         straight = ask(answers, RouteQuery(ends, SLOW, ROLLING))
@@ -79,24 +83,10 @@ def test_a_way_leads_around_sand_and_costs_less_than_straight(tmp_path):
         assert again.totals.energy_j == pytest.approx(way.totals.energy_j)
 
 
-def test_up_and_down_have_ways_of_their_own(tmp_path):
-    """A steep short cut with brakes downhill, and a detour that rises gently: nobody saves by braking."""
-    steep = lambda x, y: np.where(abs(y) < 20, 0.12, 0.02)  # noqa: E731
-    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x, steep))
-    with closer:
-        up, down = (
-            ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
-            for ends in (((-40.0, 0.0), (40.0, 0.0)), ((40.0, 0.0), (-40.0, 0.0)))
-        )
-        assert abs(up.line_m[:, 1]).max() > 15
-        assert abs(down.line_m[:, 1]).max() < 15
-
-
 def test_unknown_ground_is_dear_refused_or_as_told(tmp_path):
     gap = lambda x, y: (abs(x) < 10) & (y < 40)  # noqa: E731
     soils = lambda x, y: np.where(y > 45, 0.08, 0.02)  # noqa: E731
-    closer, answers = answers_on(tmp_path, ground(soils, skipped=gap))
-    with closer:
+    with answers_on(tmp_path, ground(soils, skipped=gap)) as answers:
         ends = (-30.0, -30.0), (30.0, -30.0)
         refused = ask(answers, WayQuery(*ends, SLOW, unknown=REFUSE))
         assert refused.totals.unknown == 0.0
@@ -113,9 +103,8 @@ def test_a_way_keeps_to_a_road_of_fifteen_degrees(tmp_path):
     """Unknown ground beside it is no way up for nothing, though most of what is known is even."""
     up = lambda x, y: np.where(abs(x) < 10, 0.27, 0.0)  # noqa: E731
     beside = lambda x, y: (abs(y) > 2) & (abs(x) < 45)  # noqa: E731
-    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.03 + 0 * x, up, beside))
-    with closer:
-        for ends in (((-50.0, 0.0), (50.0, 0.0)), ((-50.0, 0.0), (50.0, 20.0)), ((-50.0, -30.0), (50.0, 30.0))):
+    with answers_on(tmp_path, ground(lambda x, y: 0.03 + 0 * x, up, beside)) as answers:
+        for ends in (((-50.0, 0.0), (50.0, 20.0)), ((-50.0, -30.0), (50.0, 30.0))):
             way = ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
             assert way.totals.lift_m == pytest.approx(20 * 0.27, rel=0.2)
             middle = ask(answers, RouteQuery(tuple(map(tuple, way.line_m.tolist())), SLOW, ROLLING, step_m=1.0)).steps
@@ -128,9 +117,8 @@ def test_a_way_keeps_to_a_road_of_fifteen_degrees(tmp_path):
 def test_unknown_ground_costs_the_same_whoever_asks_from_wherever(tmp_path):
     gap = lambda x, y: (abs(x) < 14) & (abs(y) < 50)  # noqa: E731
     soils = lambda x, y: np.where(y > 45, 0.08, np.where(x < 0, 0.02, 0.05))  # noqa: E731
-    closer, answers = answers_on(tmp_path, ground(soils, lambda x, y: 0.001 * x, skipped=gap))
-    with closer:
-        for ends in (((-20.0, 0.0), (20.0, 0.0)), ((-55.0, 40.0), (55.0, -33.0)), ((20.0, -55.0), (-30.0, 58.0))):
+    with answers_on(tmp_path, ground(soils, lambda x, y: 0.001 * x, skipped=gap)) as answers:
+        for ends in (((-20.0, 0.0), (20.0, 0.0)), ((20.0, -55.0), (-30.0, 58.0))):
             way = ask(answers, WayQuery(*ends, SLOW))
             line = tuple(map(tuple, way.line_m.tolist()))
             again, straight = ask(answers, RouteQuery(line, SLOW)), ask(answers, RouteQuery(ends, SLOW))
@@ -149,11 +137,9 @@ def test_unknown_ground_costs_the_same_whoever_asks_from_wherever(tmp_path):
 def test_no_drive_over_the_way_is_dearer_than_straight_on(tmp_path):
     """Cells know of no stops and curves: a way around that saves less than they cost is none."""
     rough = lambda x, y: (abs(x) < 8) & (y > -4)  # noqa: E731
-    for share in (1.02, 1.1, 1.3):
-        closer, answers = answers_on(
-            tmp_path / str(share), ground(lambda x, y, over=share: np.where(rough(x, y), 0.03 * over, 0.03))
-        )
-        with closer:
+    for share in (1.02, 1.3):
+        rows = ground(lambda x, y, over=share: np.where(rough(x, y), 0.03 * over, 0.03))
+        with answers_on(tmp_path / str(share), rows) as answers:
             ends = (-30.0, 0.0), (30.0, 0.0)
             for cost, total in (("energy", "energy_j"), (TIME, "time_s")):
                 way, straight = ask(answers, WayQuery(*ends, cost=cost)), ask(answers, RouteQuery(ends))
@@ -163,8 +149,7 @@ def test_no_drive_over_the_way_is_dearer_than_straight_on(tmp_path):
 
 
 def test_margins_keep_away_from_parked_machines(tmp_path):
-    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x))
-    with closer:
+    with answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x)) as answers:
         ends, parked = ((-40.0, 0.0), (40.0, 0.0)), ((0.0, 0.0), (10.0, 3.0))
         way = ask(answers, WayQuery(*ends, SLOW, margin_m=8.0, avoid=parked))
         along = np.concatenate([np.linspace(a, b, 200) for a, b in zip(way.line_m[:-1], way.line_m[1:], strict=True)])
@@ -176,8 +161,7 @@ def test_margins_keep_away_from_parked_machines(tmp_path):
 
 def test_no_way_says_which_limit_leaves_none(tmp_path):
     wall = lambda x, y: np.where(abs(x) < 6, 0.25, 0.0)  # noqa: E731
-    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x, wall))
-    with closer:
+    with answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x, wall)) as answers:
         ends = (-40.0, 0.0), (40.0, 0.0)
         assert ask(answers, WayQuery(*ends, SLOW, unknown=REFUSE)).totals.length_m == pytest.approx(80)
         with pytest.raises(QueryError, match="no way: `max_grade` leaves none"):
@@ -191,8 +175,7 @@ def test_no_way_says_which_limit_leaves_none(tmp_path):
 
 def test_the_fastest_way_is_not_the_cheapest(tmp_path):
     soils = lambda x, y: np.where(abs(y) < 20, 0.045, 0.02)  # noqa: E731
-    closer, answers = answers_on(tmp_path, ground(soils))
-    with closer:
+    with answers_on(tmp_path, ground(soils)) as answers:
         strong = RouteMachine(mass_kg=20_000.0, speed_mps=4.0, power_w=400_000.0)
         ends = (-50.0, 0.0), (50.0, 0.0)
         cheapest, fastest = (ask(answers, WayQuery(*ends, strong, cost=cost)) for cost in ("energy", TIME))
@@ -213,8 +196,7 @@ def test_an_empty_map_knows_no_cost(tmp_path):
 
 
 def test_what_lies_off_the_site_is_refused_by_name(tmp_path):
-    closer, answers = answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x))
-    with closer:
+    with answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x)) as answers:
         for name, query in (
             ("line", RouteQuery(((0.0, 0.0), (90_000.0, 0.0)))),
             ("to", WayQuery((0.0, 0.0), (90_000.0, 0.0))),
@@ -223,3 +205,67 @@ def test_what_lies_off_the_site_is_refused_by_name(tmp_path):
         ):
             with pytest.raises(QueryError, match=f"parameter `{name}`: .* is off the site"):
                 ask(answers, query)
+
+
+S = 10**9
+LINE = ((0.0, 8.5), (20.0, 8.5))
+
+
+def drive(stamp_ns: int, mass_kg: float, speed_mps: float = 5.0, n: int = 20):
+    rows = samples(n, x_m=np.arange(n) + 0.5, stamp_ns=stamp_ns + np.arange(n) * S, mass_kg=mass_kg)
+    rows["speed_mps"] = speed_mps
+    return rows
+
+
+@pytest.fixture
+def answers(tmp_path):
+    """A truck that is loaded after half an hour, one without a scale, and a loader that sent two hours ago."""
+    with closing(open_writer(tmp_path)) as writer:
+        half_hour, hours = 1800 * S, 7200 * S
+        batches = [
+            incoming(drive(NOW_NS, 9e3, 9.0), machine="loader-9"),
+            incoming(drive(NOW_NS + hours, 22e3, 7.5), machine="truck-1"),
+            incoming(drive(NOW_NS + hours + half_hour, 47e3, 6.0), 21, machine="truck-1"),
+            incoming(drive(NOW_NS + hours + half_hour, np.nan, -0.5), machine="dumper"),
+        ]
+        send(writer, batches)
+        yield answers_of(writer)
+
+
+def asked(answers, machine: NamedMachine, as_of_ns: int | None = None):
+    query = RouteQuery(LINE, machine, stops=(False, False), as_of_ns=as_of_ns)
+    return decode_answer(answers.answer(query))
+
+
+def test_a_named_machine_weighs_what_it_said_last_and_drives_as_fast_as_it_did(answers):
+    truck = asked(answers, NamedMachine("truck-1")).machine
+    assert truck == replace(MACHINES["truck"], mass_kg=47e3, speed_mps=7.5)
+    given = asked(answers, NamedMachine("truck-1", (("mass_kg", 30e3), ("speed_mps", 3.0)))).machine
+    assert given == replace(truck, mass_kg=30e3, speed_mps=3.0), "what is given holds"
+    then = asked(answers, NamedMachine("truck-1"), NOW_NS + 7200 * S + 60 * S).machine
+    assert then.mass_kg == 22e3
+    early = asked(answers, NamedMachine("loader-9"), NOW_NS + 60 * S).machine
+    assert (early.mass_kg, early.speed_mps) == (9e3, 9.0)
+    assert asked(answers, NamedMachine("loader-9")).machine == MACHINES["loader"], "it said so long ago"
+    assert asked(answers, NamedMachine("dumper")).machine == LOADER, "it hardly moved: that is no speed"
+
+
+def test_a_name_that_sent_nothing_is_refused_with_those_that_did(answers):
+    problem = "'truck-7' has sent nothing to this site; machines: dumper, loader-9, truck-1; kinds:"
+    with refused(Refusal.OUT_OF_RANGE, problem):
+        asked(answers, NamedMachine("truck-7"))
+
+
+def test_new_samples_are_followed_and_old_ones_forgotten(tmp_path):
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(drive(NOW_NS, 22e3), machine="truck-1")])
+        answers = answers_of(writer)
+        machines = NamedMachines(answers.source)
+        assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == 22e3
+        send(writer, [incoming(drive(NOW_NS + 60 * S, 40e3), 21, machine="truck-1")])
+        assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == 40e3
+        late_ns = NOW_NS + 3 * LOOK_BACK_NS
+        send(writer, [incoming(drive(late_ns, np.nan), 41, machine="truck-1")])
+        assert machines.resolve(NamedMachine("truck-1"), None).mass_kg == MACHINES["truck"].mass_kg
+        fresh = NamedMachines(answers.source)
+        assert fresh.resolve(NamedMachine("truck-1"), None) == machines.resolve(NamedMachine("truck-1"), None)

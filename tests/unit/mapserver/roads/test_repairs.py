@@ -1,10 +1,9 @@
-"""Passes over segments, and what is taken for a repair: two passes that agree, and no calibration."""
+"""Passes over segments, and what is taken for a repair: two passes that agree."""
 
 import numpy as np
 import pytest
 
 from mapserver.evidence.fold_config import name_hash
-from mapserver.fleet.correction import Correction, corrected
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.passes import PassTally
 from mapserver.roads.repairs import AGREE, BEFORE, KNOWN_BY, Repair, ages, repairs
@@ -48,100 +47,53 @@ def test_a_pass_is_what_a_machine_drove_on_a_segment_within_a_minute():
     assert known.metres[own] == pytest.approx(25, abs=2)
 
 
-def test_a_repair_is_seen_after_two_passes():
-    repaired, _ = shown(fleet([0.04] * 6 + [0.02] * 4, noise=0.001))
+WORSE, SIX = [0.02] * 6 + [0.05] * 3, [0.04] * 6
+HARD = [0.016] * 8 + [0.0102] * 4  # where what is left of a machine's zero is a large share
+BEFORE_BOTH, AFTER_BOTH = [0.036, 0.049], [0.024, 0.033]  # one machine finds a third more than the other
+
+
+@pytest.mark.parametrize(
+    ("values", "machines", "minutes"),
+    [
+        ([*SIX, *[0.02] * 4], "ab", (2, 3)),  # the next pass is 150 s later
+        (WORSE, "ab", (2, 3)),
+        (HARD, "ab", (4, 6)),  # three passes show it
+        ([*BEFORE_BOTH * 3, *AFTER_BOTH * 2], "ab", (2, 3)),
+        ([*SIX, *[0.02] * 3], "a", (2, 3)),
+    ],
+    ids=["better", "worse", "hard ground", "machines that differ", "one machine"],
+)
+def test_a_change_is_seen_once_passes_agree(values, machines, minutes):
+    repaired, _ = shown(fleet(values, machines, noise=0.0001))
+    begins = next(i for i, c_rr in enumerate(values) if abs(c_rr / values[i % len(machines)] - 1) > 0.25)
     assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
     for each in repaired:
-        assert (each.before, each.after) == (pytest.approx(0.04, rel=0.1), pytest.approx(0.02, rel=0.1))
-        assert each.seen - each.minute <= 3  # the next pass is 150 s later
-        assert each.minute == pytest.approx(START_NS // MINUTE_NS + 15, abs=2)
+        assert each.before == pytest.approx(np.mean(values[:begins]), rel=0.1)
+        assert each.after == pytest.approx(np.mean(values[begins:]), rel=0.1)
+        assert minutes[0] <= each.seen - each.minute <= minutes[1]
+        assert each.minute == pytest.approx(START_NS // MINUTE_NS + 2.5 * begins, abs=2)
 
 
-def test_where_zeros_count_three_passes_show_what_two_do_not():
-    """On hard ground what is left of a machine's zero is a large share."""
-    repaired, _ = shown(fleet([0.016] * 8 + [0.0102] * 4))
-    assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
-    assert all(4 <= each.seen - each.minute <= 6 for each in repaired), "the second pass after the first one shows it"
-    assert not shown(fleet([0.016] * 8 + [0.0102] * 2 + [0.016] * 2))[0], "two do not"
-
-
-def test_machines_that_differ_are_each_compared_with_themselves():
-    """One machine finds a third more than the other, before and after: noise, where passes are taken together."""
-    before, after = [0.036, 0.049], [0.024, 0.033]
-    repaired, _ = shown(fleet([*(before * 3), *after, *after]))
-    assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
-    assert all(each.seen - each.minute <= 3 for each in repaired)
-    assert not shown(fleet(before * 5))[0]
-
-
-def test_one_odd_pass_is_nothing():
-    assert shown(fleet([0.04] * 6 + [0.02] + [0.04] * 4, noise=0.001))[0] == []
-
-
-def test_ground_that_becomes_worse_is_seen_too():
-    repaired, _ = shown(fleet([0.02] * 6 + [0.05] * 3, noise=0.001))
-    assert len(repaired) == 5
-    assert all(each.after > each.before for each in repaired)
+@pytest.mark.parametrize(
+    ("values", "machines"),
+    [
+        ([*SIX, 0.02, *[0.04] * 4], "ab"),
+        ([*SIX, 0.02, 0.04, 0.02, 0.04, 0.02], "ab"),
+        (BEFORE_BOTH * 5, "ab"),
+        ([*HARD[:10], *HARD[:2]], "ab"),
+        ([*SIX, *[0.034] * 6], "ab"),
+        ([*[0.04] * (BEFORE - 1), *[0.02] * AGREE[0]], "ab"),
+    ],
+    ids=["one odd pass", "one machine", "machines that differ", "two passes", "less than a quarter", "hardly known"],
+)
+def test_what_is_no_change(values, machines):
+    assert shown(fleet(values, machines, noise=0.0001))[0] == []
 
 
 def test_a_second_change_is_compared_with_what_came_after_the_first():
     repaired, _ = shown(fleet([0.06] * 6 + [0.03] * 6 + [0.06] * 3, noise=0.001))
     one = [each for each in repaired if each.segment == 1]
     assert [round(each.after, 2) for each in one] == [0.03, 0.06]
-
-
-def test_less_than_a_quarter_is_no_change():
-    assert shown(fleet([0.040] * 6 + [0.034] * 6))[0] == []
-
-
-def test_a_segment_has_to_be_known_first():
-    repaired, looks = shown(fleet([0.04] * (BEFORE - 1) + [0.02] * AGREE[0]))
-    assert repaired == []
-    assert looks == 0
-
-
-def test_one_machine_of_several_is_no_witness():
-    """A machine whose zero steps: the others go on as before."""
-    values = [0.04] * 6 + [0.02, 0.04, 0.02, 0.04, 0.02]
-    assert shown(fleet(values, noise=0.001))[0] == []
-
-
-def test_where_one_machine_drives_alone_it_has_to_do():
-    assert len(shown(fleet([0.04] * 6 + [0.02] * 3, machines=("a",)))[0]) == 5
-
-
-def test_a_calibration_in_between_is_no_repair():
-    """Samples that were sent with a zero of 0.02 until a fact took it off: passes are of samples corrected alike."""
-    machines = fleet([0.04] * 12, noise=0.001)
-    sent = {name: rows.copy() for name, rows in machines.items()}
-    for rows in sent.values():
-        rows["c_rr"] += 0.02
-    fact = {name: Correction(name, 0, 2**61, 0.02, 0.0, 0.0, ()) for name in sent}
-    assert shown(sent)[0] == []
-    assert shown({name: corrected(rows, [fact[name]]) for name, rows in sent.items()})[0] == []
-
-
-def test_a_distrust_in_between_is_no_repair():
-    machines = fleet([0.04, 0.07] * 6, noise=0.001)
-    assert shown(machines)[0] == []
-    assert shown({"a": machines["a"]})[0] == []
-
-
-def test_order_and_batches_do_not_matter():
-    machines = fleet([0.04] * 6 + [0.02] * 4, noise=0.001)
-    ledgers, whole = Ledgers(roads(*machines.values())), tally_of(machines)
-    pieces = PassTally()
-    for name in reversed(list(machines)):
-        rows = machines[name][::-1]
-        for first in range(0, len(rows), 37):
-            part = rows[first : first + 37]
-            pieces.add(part, np.full(len(part), name_hash(name), np.uint64))
-    for one, other in zip(whole.passes(ledgers), pieces.passes(ledgers), strict=True):
-        assert one.tobytes() == other.tobytes()
-
-
-def test_nothing_driven_is_nothing_repaired():
-    assert repairs(PassTally().passes(Ledgers(roads()))) == ([], 0)
 
 
 def test_ground_that_wears_is_compared_with_the_newest_passes():
@@ -169,17 +121,10 @@ def test_a_change_begins_an_age_of_the_cells_of_its_segment_alone(cell_m):
     segments = roads(passes(LINE), passes(beside, seed=1))
     at = segments.ids.index("2_0_e") if "2_0_e" in segments.ids else segments.ids.index("2_0_e.1")
     line = segments.line(at)
-    places, begins = cells_of(ages(segments, [Repair(at, 10, 11, 0.04, 0.02)], cell_m))
+    places, begins = cells_of(ages(segments, [Repair(at, minute, 11, 0.04, 0.02) for minute in (10, 5)], cell_m))
     middles = (places + 0.5) * cell_m
-    assert set(begins.tolist()) == {10 * MINUTE_NS}
+    assert set(begins.tolist()) == {10 * MINUTE_NS}, "of the newest change"
     assert np.abs(middles[:, 1] - line[:, 1].mean()).max() <= 3.5
     assert middles[:, 0].min() == pytest.approx(line[:, 0].min(), abs=1.0)
     assert middles[:, 0].max() == pytest.approx(line[:, 0].max(), abs=1.0)
     assert len(places) * cell_m**2 == pytest.approx(25 * 6, rel=0.25)
-
-
-def test_the_newest_change_of_a_segment_counts_and_none_is_no_age():
-    segments = roads(passes(LINE))
-    changes = [Repair(1, minute, minute + 1, 0.04, 0.02) for minute in (30, 10)]
-    assert set(cells_of(ages(segments, changes, 1.0))[1].tolist()) == {30 * MINUTE_NS}
-    assert ages(segments, [], 1.0) == {}

@@ -1,17 +1,18 @@
-"""Roads of known lines: what is found, how it hangs together, and that nothing but samples and facts decides it."""
+"""Roads of known lines: what is found, where it is cut, and that nothing but samples and facts decides it."""
 
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.roads.cutting import LATTICE_M, SLIVER_M
+from mapserver.roads.cutting import LATTICE_M, LEAST_M, SLIVER_M, cut
 from mapserver.roads.segments import Segments
 from mapserver.roads.skeleton import Skeletons
 from protocol.arrays import Floats
-from tests.unit.mapserver.roads.drives import EVERYWHERE, along, grid_of, passes, ring, roads, roads_of
+from tests.unit.mapserver.roads.drives import along, grid_of, passes, ring, roads, roads_of
 
 END_M = 3.5  # a road ends within so much of where machines turned round
 
@@ -38,11 +39,6 @@ def same(one: Segments, other: Segments) -> bool:
     )
 
 
-def test_an_empty_map_has_no_roads():
-    shown = roads()
-    assert (shown.ids, len(shown.points), shown.ahead.shape, shown.nodes.shape) == ((), 0, (0, 2), (0, 2))
-
-
 def test_a_straight_road_is_cut_at_the_lattice():
     line = along([(10, 10), (210, 10)])
     shown = roads(passes(line))
@@ -53,11 +49,6 @@ def test_a_straight_road_is_cut_at_the_lattice():
     np.testing.assert_allclose(cuts % LATTICE_M, 0.5)  # the first cell of the next one
     assert (shown.length_m >= SLIVER_M).all()
     np.testing.assert_allclose(shown.ahead, [(1.0, 0.0)] * 9, atol=0.05)
-
-
-def test_one_pass_is_a_road():
-    line = along([(10, 10), (210, 60)])
-    assert off_m(line, roads(passes(line, 1))) < 3.0
 
 
 def test_a_one_way_ring_is_closed():
@@ -71,32 +62,22 @@ def test_a_one_way_ring_is_closed():
     assert set(ends.values()) == {2}  # each segment goes on in another one
 
 
-def test_a_loop_with_corners_is_closed():
-    line = along([(20, 20), (220, 20), (220, 120), (20, 120), (20, 20)])
-    shown = roads(passes(line))
-    assert off_m(line, shown) < 3.0
-    assert not degrees(shown)
+@pytest.mark.parametrize(
+    ("lines", "counts", "expected"),
+    [
+        ([[(20, 50), (180, 50)], [(100, 0), (100, 100)]], (60, 2), {1: 4, 4: 1}),  # one that is seldom driven
+        ([[(20, 50), (80, 50)], [(80, 50), (50, 50), (50, 20)], [(50, 20), (50, 80)]], (6, 6, 6), {1: 4, 4: 1}),
+        ([[(20, 50), (100, 50), (180, 80)], [(20, 50), (100, 50), (180, 20)]], (6, 6), {1: 3, 3: 1}),
+    ],
+    ids=["crossing", "y of a loader", "fork"],
+)
+def test_roads_that_meet_hang_together(lines, counts, expected):
+    legs = zip(lines, counts, strict=True)
+    shown = roads(*(passes(along(line), count, seed=i) for i, (line, count) in enumerate(legs)))
+    assert degrees(shown) == expected
 
 
-def test_a_way_that_is_seldom_driven_crosses_one_that_is_driven_much():
-    shown = roads(passes(along([(20, 50), (180, 50)]), 60), passes(along([(100, 0), (100, 100)]), 2, seed=1))
-    assert degrees(shown) == {1: 4, 4: 1}
-
-
-def test_the_y_of_a_loader_has_four_arms():
-    legs = ([(20, 50), (80, 50)], [(80, 50), (50, 50), (50, 20)], [(50, 20), (50, 80)])
-    shown = roads(*(passes(along(leg), seed=i) for i, leg in enumerate(legs)))
-    assert degrees(shown) == {1: 4, 4: 1}
-
-
-def test_a_fork_hangs_together():
-    line = [(20, 50), (100, 50)]
-    shown = roads(passes(along([*line, (180, 80)])), passes(along([*line, (180, 20)]), seed=1))
-    assert degrees(shown) == {1: 3, 3: 1}
-
-
-@pytest.mark.parametrize("weak", [3, 10])
-@pytest.mark.parametrize("turn", [0.0, 0.2, 0.4])
+@pytest.mark.parametrize(("weak", "turn"), [(3, 0.0), (3, 0.4), (10, 0.2)])
 def test_lanes_six_metres_apart_stay_apart(weak, turn):
     c, s = np.cos(turn), np.sin(turn)
     there, back = (along(line) @ np.array([(c, s), (-s, c)]) for line in ([(20, 50), (180, 50)], [(180, 56), (20, 56)]))
@@ -105,15 +86,6 @@ def test_lanes_six_metres_apart_stay_apart(weak, turn):
     assert off_m(np.concatenate([there, back]), shown) < 2.0
     assert beyond_m(np.concatenate([there, back]), shown) < END_M
     assert len(set(shown.ids)) == len(shown.ids)
-
-
-def test_names_do_not_depend_on_order_or_batches():
-    rows = passes(along([(20, 20), (220, 20), (220, 120), (20, 120), (20, 20)]), 4)
-    shuffled = rows[np.random.default_rng(3).permutation(len(rows))]
-    grid = Grid(1.0, FoldConfig())
-    for first in range(0, len(shuffled), 777):
-        grid.fold(shuffled[first : first + 777], "truck-0")
-    assert same(roads_of(grid), roads(rows))
 
 
 def test_names_do_not_depend_on_what_was_made_before():
@@ -158,16 +130,7 @@ def test_halves_of_the_samples_have_the_same_names():
     assert kept / one.length_m.sum() > 0.97
 
 
-def test_small_cells_show_the_same_roads():
-    rows = passes(along([(20, 20), (180, 60)]))
-    grid = Grid(0.5, FoldConfig())
-    grid.fold(rows, "truck-0")
-    blocks = grid.blocks_in(EVERYWHERE)
-    pages = dict(zip(blocks, grid.pages(blocks), strict=True))
-    assert Skeletons(0.5).skeleton(pages).raster_m == 1.0
-
-
-@pytest.mark.parametrize("rounds", [1, 2, 8])
+@pytest.mark.parametrize("rounds", [1, 8])
 def test_a_yard_driven_all_over_gives_roads_that_are_whole(monkeypatch, rounds):
     """However early pruning ends: lines are of cells that are there."""
     monkeypatch.setattr("mapserver.roads.network.ROUNDS", rounds)
@@ -179,3 +142,37 @@ def test_a_yard_driven_all_over_gives_roads_that_are_whole(monkeypatch, rounds):
     assert len(set(shown.ids)) == len(shown.ids)
     steps = [np.hypot(*np.diff(shown.line(i), axis=0).T).max() for i in range(len(shown.ids))]
     assert max(steps) < 8.0
+
+
+def edges(*lines):
+    points = np.concatenate([np.array(line, float) for line in lines])
+    return points, np.cumsum([0, *map(len, lines)])
+
+
+def walk(seed, count=120):
+    """A line of cells' middles that turns slowly."""
+    draw = np.random.default_rng(seed)
+    heading = np.cumsum(draw.normal(0, 0.1, count)) + draw.uniform(0, 6)
+    return 0.5 + np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_pieces_share_their_ends_and_cover_the_line(seed):
+    points, ends = edges(walk(seed), walk(seed + 100, 40))
+    line, pieces = cut(points, ends, np.array([[1, 2], [2, 3]]))
+    for edge, (first, end) in enumerate(pairwise(ends)):
+        own = pieces[(pieces[:, 0] >= first) & (pieces[:, 0] < end)]
+        assert (own[0, 0], own[-1, 1]) == (first, end - 1)
+        np.testing.assert_array_equal(own[1:, 0], own[:-1, 1])
+        np.testing.assert_array_equal(line[[first, end - 1]], points[[first, end - 1]])  # ends stay
+        assert own[0, 2] == edge + 1
+        assert own[-1, 3] == edge + 2
+        assert (own[1:, 2] == -1).all()
+        assert (own[:-1, 3] == -1).all()
+        lengths = [np.hypot(*np.diff(line[a : b + 1], axis=0).T).sum() for a, b in own[:, :2]]
+        assert len(own) == 1 or min(lengths) >= SLIVER_M
+
+
+def test_what_is_shorter_than_a_machine_is_nothing():
+    _, pieces = cut(*edges([(0.5, 0.5), (0.5 + LEAST_M - 1, 0.5)], [(50, 0), (90, 0)]), np.zeros((2, 2), np.int64))
+    assert pieces[:, :2].tolist() == [[2, 3]]

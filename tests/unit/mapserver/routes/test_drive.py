@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from mapserver.routes.drive import CREEP_MPS, LATE_S, Drive, drive, smoothed
+from mapserver.routes.drive import CREEP_MPS, LATE_S, Drive, drive
+from mapserver.routes.ground import CURVE_M, Squares, limits, steps
 from protocol.arrays import Floats
 from protocol.queries.routing import RouteMachine
 from protocol.units import GRAVITY_MPS2
@@ -29,22 +30,6 @@ def test_on_even_ground_energy_is_resistance_times_way_and_what_the_brakes_take(
     assert done.stalls == -1
 
 
-def test_uphill_less_downhill_is_twice_the_height_where_nothing_is_braked() -> None:
-    """c > s, and so far to go that the machine rolls out."""
-    height_m = 0.01 * N
-    gentle = RouteMachine(mass_kg=20_000.0, speed_mps=2.0, power_w=200_000.0)
-    up, down = (rolling(0.03, slope, gentle) for slope in (0.01, -0.01))
-    assert up.braked_j.sum() == down.braked_j.sum() == 0.0
-    assert up.energy_j.sum() - down.energy_j.sum() == pytest.approx(2 * 20_000 * GRAVITY_MPS2 * height_m)
-
-
-def test_a_descent_steeper_than_the_resistance_costs_nothing_and_is_braked() -> None:
-    steady = RouteMachine(mass_kg=20_000.0, speed_mps=2.0, power_w=200_000.0)
-    done = rolling(0.02, -0.05, steady)
-    assert done.energy_j.sum() == 0.0
-    assert done.braked_j.sum() == pytest.approx(20_000 * GRAVITY_MPS2 * 0.03 * N)
-
-
 def test_power_bounds_the_speed_uphill() -> None:
     done = rolling(0.03, 0.1)
     top = 200_000 / (20_000 * GRAVITY_MPS2 * 0.13)
@@ -65,18 +50,6 @@ def test_a_machine_starts_and_stops_within_its_limits() -> None:
     assert done.time_s[:start].sum() == pytest.approx(4.0 / MACHINE.accelerate_mps2, rel=0.05)
 
 
-def test_a_stop_on_the_way_costs_the_energy_of_motion() -> None:
-    limit = np.full(N + 1, np.inf)
-    limit[[0, -1]] = 2.0
-    whole = drive(np.ones(N), np.full(N, 0.02), np.zeros(N), limit, MACHINE)
-    limit[500] = 0.0
-    stopped = drive(np.ones(N), np.full(N, 0.02), np.zeros(N), limit, MACHINE)
-    motion = 0.5 * MACHINE.mass_kg * MACHINE.rotating * MACHINE.speed_mps**2
-    rolled = 20_000 * GRAVITY_MPS2 * 0.02 * MACHINE.speed_mps**2 / 2 / MACHINE.brake_mps2  # resistance helps to brake
-    assert stopped.energy_j.sum() - whole.energy_j.sum() == pytest.approx(motion - rolled, rel=0.02)
-    assert stopped.time_s.sum() > whole.time_s.sum() + 5
-
-
 def test_what_the_power_cannot_do_is_said() -> None:
     slope = np.zeros(N)
     slope[400:] = 2.0
@@ -85,30 +58,6 @@ def test_what_the_power_cannot_do_is_said() -> None:
     done = rolling(0.03, slope, weak)
     assert 400 <= done.stalls <= 402
     assert rolling(0.03, 0.2, weak).stalls == -1
-
-
-def test_smoothing_keeps_what_is_even_and_the_length_of_the_line() -> None:
-    assert smoothed(np.full(40, 0.3), 1.0) == pytest.approx(np.full(40, 0.3))
-    spike = np.zeros(41)
-    spike[20] = 9.0
-    assert smoothed(spike, 1.0)[16:25] == pytest.approx(np.ones(9))
-    assert smoothed(np.array([0.2]), 1.0).tolist() == [0.2]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("mass_kg", 0.0),
-        ("mass_kg", 2e6),
-        ("efficiency", 1.2),
-        ("efficiency", 0.0),
-        ("rotating", 0.5),
-        ("power_w", math.nan),
-    ],
-)
-def test_machines_that_cannot_be_are_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"^{name}: "):
-        RouteMachine(**{name: value})
 
 
 def test_changes_of_the_ground_cost_what_drivers_answer_late() -> None:
@@ -126,3 +75,55 @@ def test_changes_of_the_ground_cost_what_drivers_answer_late() -> None:
         assert done.energy_j.sum() - late_j == pytest.approx(20_000 * GRAVITY_MPS2 * soils.sum())
     down = drive(step, soils, level - 0.2, limit, plain)
     assert down.energy_j.sum() == 0.0
+
+
+CORNER = np.array([[0.0, 0.0], [50.0, 0.0], [50.0, 30.0]])
+
+
+def test_a_plane_is_read_exactly_between_the_centres_of_cells_and_over_edges_of_squares() -> None:
+    squares = {}
+    for x in range(-2, 2):
+        for y in range(-1, 1):
+            column, row = np.meshgrid(np.arange(8) + 8 * x, np.arange(8) + 8 * y)
+            squares[x, y] = {"a": 0.1 * (column + 0.5) * 0.5 + 0.2 * (row + 0.5) * 0.5, "b": np.full((8, 8), 3.0)}
+    places = np.random.default_rng(0).uniform((-7.0, -3.5), (7.0, 3.5), (200, 2))
+    along = Squares.stacked(0.5, 8, squares).at(places)
+    assert along["a"] == pytest.approx(places @ [0.1, 0.2])
+    assert along["b"] == pytest.approx(np.full(200, 3.0))
+
+
+def test_unknown_cells_count_nothing_and_alone_are_unknown() -> None:
+    values = np.full((4, 4), np.nan)
+    values[1, 1] = 0.03
+    field = Squares.stacked(1.0, 4, {(0, 0): {"a": values}})
+    assert field.at(np.array([[1.5, 1.5], [1.9, 1.5]]))["a"].tolist() == [0.03, 0.03]
+    assert np.isnan(field.at(np.array([[2.4, 1.5], [2.4, 2.4], [-5.0, 1.0], [100.0, 1.0]]))["a"]).all()
+
+
+def test_steps_divide_a_line_evenly_and_keep_its_length() -> None:
+    assert steps(np.array([[0.0, 0.0], [3.0, 4.4]]), 1.0).length_m.sum() == pytest.approx(math.hypot(3.0, 4.4))
+    assert len(steps(np.array([[0.0, 0.0], [0.1, 0.0]]), 1.0).length_m) == 1
+    cut = steps(CORNER, 1.0)
+    assert len(cut.length_m) == 80
+    assert cut.length_m == pytest.approx(np.ones(80))
+    assert cut.position_m[0].tolist() == [0.5, 0.0]
+    assert cut.position_m[-1].tolist() == [50.0, 29.5]
+    assert cut.direction[:50] == pytest.approx(np.tile([1.0, 0.0], (50, 1)))
+    assert cut.direction[50:] == pytest.approx(np.tile([0.0, 1.0], (30, 1)))
+
+
+def test_a_corner_slows_down_around_it_alone() -> None:
+    limit = limits(CORNER, steps(CORNER, 1.0).end_m, 0.9)
+    assert np.isinf(limit[: 50 - math.ceil(CURVE_M / 2)]).all()
+    assert limit[50] == pytest.approx(math.sqrt(0.9 * CURVE_M / (math.pi / 2)))
+    assert np.isinf(limit[50 + math.ceil(CURVE_M / 2) + 1 :]).all()
+
+
+def test_where_it_turns_back_a_machine_stands() -> None:
+    back = np.array([[0.0, 0.0], [20.0, 0.0], [5.0, 1.0]])
+    cut = steps(back, 1.0)
+    limit = limits(back, cut.end_m, 0.9)
+    assert np.flatnonzero(limit == 0.0).tolist() == [20]
+    assert cut.direction[18] == pytest.approx([1.0, 0.0])
+    assert cut.direction[22, 0] < -0.9
+    assert np.hypot(*cut.direction.T) == pytest.approx(np.ones(len(cut.direction)))

@@ -1,4 +1,4 @@
-"""Routes over ground whose cost is known: a plane, two soils, unknown ground."""
+"""Routes over ground whose cost is known, and prices of ground where nobody was."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mapserver.routes.ground import Squares
-from mapserver.routes.prices import Prices
-from mapserver.routes.route import LAYERS, STEP_M, mean_std, route
+from mapserver.routes.prices import LOOSE, NEEDS, RESISTANCE, Prices, bare
+from mapserver.routes.route import LAYERS, STEP_M, route
 from protocol.arrays import Floats
 from protocol.errors import QueryError
 from protocol.queries.routing import RouteMachine
@@ -40,18 +40,6 @@ def line(*corners: tuple[float, float]) -> Floats:
     return np.array(corners, float)
 
 
-def test_on_a_plane_a_route_costs_resistance_and_height() -> None:
-    ahead = line((10, 10), (170, 130))
-    layers = fields(0.03, east=0.004, north=0.01)
-    steps, totals = route(ahead, layers, SLOW, stops=ROLLING)
-    assert totals.length_m == pytest.approx(200)
-    assert totals.lift_m == pytest.approx(160 * 0.004 + 120 * 0.01)
-    assert totals.energy_j == pytest.approx(WEIGHT_N * (0.03 * 200 + totals.lift_m))
-    assert totals.fuel_j == pytest.approx(totals.energy_j / SLOW.efficiency)
-    assert (totals.time_s, totals.unknown, totals.braked_j) == pytest.approx((100, 0, 0), abs=1e-6)
-    assert steps.slope == pytest.approx(np.full(8, totals.lift_m / 200))
-
-
 def test_the_interval_holds_the_cost_and_grows_with_what_is_not_sure() -> None:
     ahead = line((10, 10), (170, 130))
     _, sure = route(ahead, fields(0.03, std=0.001), SLOW)
@@ -80,26 +68,6 @@ def test_no_line_is_so_long_that_errors_of_a_map_vanish() -> None:
     _, totals = route(line((1, 1), (219, 219), (1, 219), (219, 1)), fields(0.1, std=1e-6), SLOW, stops=ROLLING)
     half = (totals.energy_high_j - totals.energy_low_j) / 2 / totals.energy_j
     assert half == pytest.approx(1.645 * math.hypot(0.03, 0.02), rel=0.1)
-
-
-def test_errors_along_a_line_average_out_but_not_over_short_stretches() -> None:
-    std, step = np.full(2000, 0.01), np.full(2000, 1.0)
-    assert mean_std(std[:5], step[:5]) == pytest.approx(0.01, rel=0.1)
-    assert mean_std(std, step) == pytest.approx(math.hypot(0.01 * math.sqrt(2 * 25 / 2000), 0.001), rel=0.02)
-
-
-def test_unknown_ground_counts_as_the_dearest_and_is_said() -> None:
-    soils = np.where(np.arange(SIZE) < 150, 0.02, 0.08) + np.zeros((SIZE, 1))
-    soils[:, 80:120] = np.nan
-    layers = fields(soils)
-    layers.layers["visits"][0, :, 80:120] = np.nan
-    steps, totals = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, step_m=10)
-    assert (totals.unknown, totals.unmeasured) == (pytest.approx(40 / 130, abs=0.02), 0.0)
-    assert steps.resistance[8] == totals.unknown_resistance == pytest.approx(0.08, rel=0.02)
-    assert np.isnan(steps.confidence[8])
-    _, given = route(line((10, 50), (140, 50)), layers, SLOW, stops=ROLLING, prices=Prices(layers, 0.02))
-    assert given.energy_j == pytest.approx(WEIGHT_N * 0.02 * 130, rel=0.01)
-    assert totals.energy_high_j - totals.energy_low_j > given.energy_high_j - given.energy_low_j
 
 
 def test_what_was_driven_on_and_not_measured_lies_between_what_was() -> None:
@@ -134,3 +102,61 @@ def test_a_short_line_is_one_step() -> None:
     assert steps.length_m == pytest.approx([0.4])
     assert totals.length_m == pytest.approx(0.4)
     assert STEP_M > 0.4
+
+
+EDGE = 32
+HERE = {(0, 0)}
+
+
+def squares(made: dict[tuple[int, int], dict[str, object]], std: float = 0.001) -> Squares:
+    """Of resistance, grade (east) and where machines were; NaN where nothing is said."""
+    out = {}
+    for place, values in made.items():
+        layers = {name: np.full((EDGE, EDGE), np.nan) for name in NEEDS}
+        layers["resistance_filled"][:] = values.get("resistance", np.nan)
+        layers["grade_east_filled"][:] = values.get("grade", 0.0)
+        layers["grade_north_filled"][:] = 0.0
+        layers["resistance_filled_std"][:] = values.get("std", std)
+        layers["visits"][:] = np.where(values.get("driven", True), 3.0, np.nan)
+        out[place] = layers
+    return Squares.stacked(0.5, EDGE, out)
+
+
+def half(known: float, beyond: float = np.nan) -> np.ndarray:
+    return np.where(np.arange(EDGE) < EDGE // 2, known, beyond) + np.zeros((EDGE, 1))
+
+
+def test_unknown_ground_is_as_dear_as_the_dearest_tenth_around_uphill() -> None:
+    gravel, slope = half(0.03), half(0.04)
+    one = squares({(0, 0): {"resistance": gravel, "grade": slope, "driven": np.isfinite(gravel)}})
+    price = Prices(one).squares(HERE).layers[RESISTANCE][0]
+    assert np.isnan(price[:, : EDGE // 2]).all()
+    assert price[:, EDGE // 2 :] == pytest.approx(0.07, rel=0.02)
+    dear = squares({(0, 0): {"resistance": gravel, "driven": np.isfinite(gravel)}, (0, 1): {"resistance": 0.12}})
+    assert Prices(dear).squares(HERE).layers[RESISTANCE][0][0, -1] == pytest.approx(0.12, rel=0.02)
+    assert Prices(dear, 0.05).squares(HERE).layers[RESISTANCE][0][0, -1] == pytest.approx(0.05)
+
+
+def test_what_is_filled_in_costs_more_the_less_sure_it_is() -> None:
+    road = half(0.03, 0.03)
+    driven = np.arange(EDGE) < EDGE // 2
+    std = np.where(driven, 0.001, 0.03 * np.linspace(0.0, 1.3, EDGE)) + np.zeros((EDGE, 1))
+    beside = {"resistance": road, "std": std, "driven": driven & np.ones((EDGE, 1), bool)}
+    one = squares({(0, 0): beside, (1, 0): {"resistance": 0.13}})
+    price = Prices(one).squares(HERE).layers[RESISTANCE][0][5, EDGE // 2 :]
+    assert (np.diff(price) > 0).all()
+    assert price[-1] == pytest.approx(0.13, rel=0.02)
+    assert 0.03 < price[0] < 0.09
+
+
+def test_far_from_everything_ground_is_as_loose_as_sand_unless_somebody_says_what_it_is() -> None:
+    far = squares({(3, 0): {"resistance": 0.03}})
+    assert (Prices(far).squares(HERE).layers[RESISTANCE] == LOOSE).all()
+    assert (Prices(far, 0.04).squares(HERE).layers[RESISTANCE] == 0.04).all()
+
+
+def test_squares_are_bare_where_any_cell_was_never_driven() -> None:
+    driven = np.ones((EDGE, EDGE), bool)
+    driven[3, 4] = False
+    some = squares({(0, 0): {"resistance": 0.03}, (1, 0): {"resistance": 0.03, "driven": driven}})
+    assert bare(some, {(0, 0), (1, 0), (5, 5)}) == {(1, 0), (5, 5)}

@@ -1,7 +1,7 @@
-"""Judgements: each limit from both sides, votes, clocks."""
+"""Judgements: each limit from both sides, votes, clocks; decisions that come of them."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from math import log
 from typing import Any
 
@@ -10,7 +10,11 @@ import pytest
 
 from mapserver.fleet.observability import FAULT_SIGMAS, MachineState
 from mapserver.fleet.solver import SCALE_STD, ZERO_STD
+from mapserver.journal.rows import Event
+from mapserver.trust.auditor import Verdict
+from mapserver.trust.coarse_map import LEVEL_FLOOR, CoarseMap, Surface, pooled
 from mapserver.trust.comparison import ZERO_ERROR, Difference, Gain
+from mapserver.trust.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER, TrustDecision, TrustDecisions
 from mapserver.trust.judgement import (
     AGREE,
     AGREEMENT,
@@ -30,7 +34,8 @@ from mapserver.trust.judgement import (
     outvoted,
 )
 from mapserver.trust.shift import Shift
-from protocol.arrays import Ints
+from protocol.arrays import Ints, Table
+from tests.unit.mapserver.data import random_samples, samples
 
 ALIKE = Difference(10**9, Gain(0.0, 0.0, 1.0, 1e9), Shift(0.0, 0.0, 0.0, 1.0), 1.0, (0.5, 0.5))
 
@@ -79,8 +84,6 @@ def test_between_maps_that_have_nothing_in_common_gain_and_offset_mean_nothing(c
     assert {judgement.state for judgement in judge(None, sigmas=0.0).values()} == {UNKNOWN}
 
 
-# --- sensors ---------------------------------------------------------------------------------------------------------
-
 STATE = MachineState(0.0, 0.001, 0.0, 0.01, 0.0, 0.001, ("heights",), ("edges",), (0.0, 0.0))
 ZERO_LIMIT, SCALE_LIMIT = FAULT_SIGMAS
 
@@ -117,9 +120,6 @@ def test_faults_are_named_as_long_as_half_of_the_machines_are_right(
     assert faulty([known[each] for each in at_fault]) == expected
 
 
-# --- votes -----------------------------------------------------------------------------------------------------------
-
-
 def states(n: int, *against: tuple[int, int], unknown: tuple[tuple[int, int], ...] = ()) -> Ints:
     matrix = np.full((n, n), AGREE)
     np.fill_diagonal(matrix, UNKNOWN)
@@ -145,9 +145,6 @@ def states(n: int, *against: tuple[int, int], unknown: tuple[tuple[int, int], ..
 )
 def test_the_larger_side_that_agrees_in_itself_outvotes(matrix: Ints, expected: list[tuple[int, ...]]) -> None:
     assert outvoted(matrix) == expected
-
-
-# --- clocks ----------------------------------------------------------------------------------------------------------
 
 
 def judged(sent: Iterator[tuple[str, float]]) -> int:
@@ -187,3 +184,116 @@ def test_only_a_steady_lead_is_a_wrong_clock(case: dict[str, float], state: int)
 
 def test_a_machine_that_has_caught_up_agrees() -> None:
     assert judged(both(late_s=1000.0, pace=2.0)) == AGREE
+
+
+def surface_of(parts: list[Table]) -> Surface:
+    coarse = CoarseMap(1.0)
+    for part in parts:
+        coarse.add(part)
+    return coarse.surface()
+
+
+def test_a_cell_keeps_its_metres_and_its_mean_level() -> None:
+    surface = surface_of([samples(2, c_rr=[0.02, 0.04], distance_m=[1.0, 3.0])])
+    assert surface.metres.tolist() == [4.0]
+    expected = (np.log(0.02 + LEVEL_FLOOR) + 3 * np.log(0.04 + LEVEL_FLOOR)) / 4
+    assert surface.level == pytest.approx([expected], abs=1e-3)
+    assert surface.std_m == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_pooled_map_without_one_of_its_parts_is_the_map_of_the_rest() -> None:
+    one, other = surface_of([random_samples(500, 1)]), surface_of([random_samples(500, 2)])
+    rest = pooled([one, other]).without(one)
+    assert np.array_equal(rest.codes, other.codes)
+    assert np.array_equal(rest.sums, other.sums)
+    assert len(pooled([]).codes) == 0
+
+
+BAD = Verdict("c", (Reason.GAIN, Reason.OFFSET), {"gain": 1.6}, True)
+GOOD = Verdict("c", (), {"gain": 1.0}, False, frozenset({Reason.GAIN, Reason.OFFSET, Reason.DISAGREES}))
+
+
+def decided(decisions: TrustDecisions, verdict: Verdict, times: int) -> list[TrustDecision]:
+    """What the audit decides on the same verdict again and again; each decision counts at once."""
+    made = []
+    for stamp_ns in range(1, times + 1):
+        for decision in decisions.judge({verdict.machine: verdict}, stamp_ns):
+            decisions.add(decision)
+            made.append(decision)
+    return made
+
+
+def test_a_machine_is_distrusted_once_the_verdict_stands():
+    decisions = TrustDecisions([])
+    assert decided(decisions, BAD, DISTRUST_AFTER - 1) == []
+    (decision,) = decided(decisions, BAD, 3)
+    assert (decision.machine, decision.trusted, decision.by, decision.reason) == ("c", False, AUDIT, "gain, offset")
+    assert decision.evidence == {"gain": 1.6}
+    assert decisions.distrusted == {"c"}
+
+
+def test_a_doubtful_verdict_begins_to_count_anew():
+    decisions = TrustDecisions([])
+    for _ in range(5):
+        assert decided(decisions, BAD, DISTRUST_AFTER - 1) == []
+        assert decided(decisions, GOOD, 1) == []
+
+
+def test_a_machine_that_agrees_again_is_trusted_again_but_later():
+    decisions = TrustDecisions([])
+    decided(decisions, BAD, DISTRUST_AFTER)
+    assert decided(decisions, GOOD, TRUST_AFTER - 1) == []
+    (decision,) = decided(decisions, GOOD, 1)
+    assert decision.trusted
+    assert decisions.distrusted == frozenset()
+    assert TRUST_AFTER > DISTRUST_AFTER
+
+
+@pytest.mark.parametrize("agrees", [(), (Reason.GAIN,), (Reason.OFFSET, Reason.DISAGREES, Reason.CLOCK)])
+def test_a_machine_of_which_nothing_shows_that_it_agrees_again_stays_out(agrees):
+    decisions = TrustDecisions([])
+    decided(decisions, BAD, DISTRUST_AFTER)
+    silent = Verdict("c", (), {"cells": 0}, False, frozenset(agrees))
+    assert decided(decisions, silent, 3 * TRUST_AFTER) == []
+    assert decided(decisions, GOOD, TRUST_AFTER - 1) == []
+    assert decided(decisions, silent, 1) == []
+    assert decided(decisions, GOOD, TRUST_AFTER - 1) == [], "four in a row"
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+def test_what_a_person_decided_stands_against_the_audit(trusted):
+    decisions = TrustDecisions([])
+    decisions.add(TrustDecision("c", trusted, PERSON, "because", 1))
+    assert decided(decisions, BAD if trusted else GOOD, 20) == []
+    assert decisions.distrusted == (frozenset() if trusted else {"c"})
+
+
+def test_a_decision_handed_back_lets_the_audit_decide():
+    decisions = TrustDecisions([])
+    decisions.add(TrustDecision("c", False, PERSON, "because", 1))
+    decisions.add(TrustDecision("c", True, AUDIT, "left to the audit", 2))
+    assert decisions.distrusted == frozenset()
+    assert decided(decisions, BAD, DISTRUST_AFTER)
+
+
+@pytest.mark.parametrize("reasons", [(Reason.BEYOND_DATA_SHEET,), (Reason.OFFSET, Reason.BEYOND_DATA_SHEET)])
+def test_a_machine_beyond_its_data_sheet_is_let_in_by_a_person_alone(reasons):
+    decisions = TrustDecisions([])
+    decided(decisions, Verdict("c", reasons, {}, True), DISTRUST_AFTER)
+    assert decided(decisions, GOOD, 20) == []
+    assert decisions.distrusted == {"c"}
+    decisions.add(TrustDecision("c", True, PERSON, "its samples are corrected", 30))
+    assert decisions.distrusted == frozenset()
+    assert decided(decisions, Verdict("c", reasons, {}, True), 20) == []
+
+
+def test_decisions_come_back_from_events_the_newest_of_each_machine():
+    made = [
+        TrustDecision("c", False, AUDIT, "gain", 1, {"gain": 1.6}),
+        TrustDecision("b", False, PERSON, "broken", 2),
+        TrustDecision("c", True, PERSON, "repaired", 3),
+    ]
+    decisions = TrustDecisions(Event(i, "trust", d.stamp_ns, asdict(d)) for i, d in enumerate(made, 1))
+    assert decisions.distrusted == {"b"}
+    assert decisions.newest("c") == made[2]
+    assert decisions.newest("b") == made[1]

@@ -17,17 +17,15 @@ from mapserver.evidence.grid import Grid
 from mapserver.fleet import calibration
 from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import corrected
-from mapserver.fleet.ledger import Ledger
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.upkeep import calibrating as calibrating_module
-from mapserver.upkeep import upkeep
 from mapserver.upkeep.calibrating import EVERY_NS, Calibrating
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.arrays import Table
-from protocol.errors import QueryError, Refusal
+from protocol.errors import Refusal
 from protocol.queries.commands import CalibrateCommand
 from tests.unit.mapserver.data import SITE, WAIT_S, grid_copy, incoming, open_writer, past_of, refused, same, send
 from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, START_NS, Errors, drive
@@ -41,7 +39,6 @@ S = 10**9
 
 
 def deliver(writer: Writer, first: float = 0.0, last: float = 1.0, batch: int = 150) -> None:
-    """A share of each machine's samples, in batches that take turns."""
     spans = {name: range(int(first * len(rows)), int(last * len(rows)), batch) for name, rows in DRIVES.items()}
     for i in range(max(map(len, spans.values()))):
         for name, starts in spans.items():
@@ -58,7 +55,6 @@ def writer(tmp_path: Path) -> Iterator[Writer]:
 
 
 def calibrating(writer: Writer, *doubtful: str) -> tuple[Calibrating, list[int]]:
-    """A job without a thread, and when it had something decided."""
     decided: list[int] = []
 
     def decide(_: Calibration, now_ns: int) -> None:
@@ -130,7 +126,6 @@ def test_it_solves_in_site_time(tmp_path):
 
 
 def folded(upkeep: Upkeep, writer: Writer) -> Grid:
-    """The fold of all samples with the corrections that count."""
     each = writer.run(lambda store: store.facts.corrections).each
     grid = Grid(SITE.cell_m, writer.config.fold)
     for name, rows in DRIVES.items():
@@ -200,51 +195,6 @@ def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, 
             assert same(writer.run(grid_copy), folded(site, writer))
 
 
-def test_what_a_person_takes_off_is_no_measured_fault(writer, monkeypatch):
-    deliver(writer)
-    with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
-        monkeypatch.setattr(site._calibrating, "states", dict)  # nothing is solved yet
-        site.correct(CalibrateCommand("a", zero=0.03, scale=0.4, reason="known to read too much", wait_s=WAIT_S))
-        corrections, known = site._known()
-        assert corrections.newest("a") is not None
-        assert known == {}
-        site.calibrate(WAIT_S)
-        assert {*site._known()[1]} == {"b", "c"}, "of what the solver decided, the deviation is known"
-
-
-def test_the_end_does_not_wait_for_a_solve_that_a_person_asked_for(writer, monkeypatch):
-    deliver(writer, last=0.1)
-    monkeypatch.setattr(upkeep, "END_S", 0.1)
-    solving, may_end = threading.Event(), threading.Event()
-
-    def slow(*_: object) -> Calibration:
-        solving.set()
-        assert may_end.wait(WAIT_S)
-        return calibrate({})
-
-    site = Upkeep(writer, lambda _: None, past_of(writer))
-    monkeypatch.setattr(calibrating_module, "calibrate", slow)
-    problems: list[str] = []
-
-    def ask() -> None:
-        with pytest.raises(QueryError) as refused:
-            site.calibrate(WAIT_S)
-        problems.append(str(refused.value))
-
-    asks, ends = threading.Thread(target=ask), threading.Thread(target=site.close)
-    asks.start()
-    assert solving.wait(WAIT_S)
-    ends.start()
-    ends.join(WAIT_S / 2)
-    assert not ends.is_alive()
-    may_end.set()
-    asks.join(WAIT_S)
-    assert problems == ["the server is stopping, and nothing is decided; ask again later"]
-
-
-# --- what cannot be read, and large fleets ----------------------------------------------------------------------------
-
-
 def test_rows_that_cannot_be_read_do_not_keep_the_others_from_counting(writer, tmp_path):
     deliver(writer)
     whole = solved(writer)
@@ -260,28 +210,6 @@ def test_rows_that_cannot_be_read_do_not_keep_the_others_from_counting(writer, t
     assert without != whole
     for name, state in whole.machines.items():
         assert without.machines[name].zero == pytest.approx(state.zero, abs=2 * state.zero_std)
-
-
-def test_what_fails_on_its_entry_is_not_counted_twice(writer, monkeypatch):
-    deliver(writer)
-    whole = solved(writer)
-    job, _ = calibrating(writer)
-    add, failing = Ledger.add, iter([False, True])
-
-    def fails_once(ledger: Ledger, rows: Table) -> None:
-        if next(failing, False):
-            raise MemoryError
-        add(ledger, rows)
-
-    with closing(job):
-        monkeypatch.setattr(Ledger, "add", fails_once)
-        with pytest.raises(MemoryError):
-            job.run()
-        job.solve()
-        for name, ledger in job._ledgers.items():
-            table = ledger.stays()
-            assert int(table["n"].sum()) <= len(DRIVES[name]), name
-    assert {*job.states()} <= {*whole.machines}
 
 
 def test_a_large_fleet_is_solved_in_groups_that_take_turns(writer, monkeypatch):
@@ -323,11 +251,7 @@ def test_it_says_from_when_on_there_may_be_samples_of_a_machine(writer):
         assert job.solve()[0].begins_ns["d"] == int(rows["stamp_ns"][0]), "and late ones count"
 
 
-# --- wrong clocks, and machines that leave and come back --------------------------------------------------------------
-
-
 def follows(job: Calibrating, writer: Writer, rows: Table, name: str = "a", first_seq: int = 1) -> None:
-    """Samples come in, some 15 s at a time, and the job has its turn after each."""
     for first in range(0, len(rows), 120):
         send(writer, [incoming(rows[first : first + 120], first_seq + first, name)])
         job._due_s = 0.0
@@ -383,16 +307,3 @@ def test_a_running_server_knows_no_more_of_machines_that_left_than_one_that_is_s
             assert {*job._ledgers} == {"here"}
             assert job._ledgers["here"].epochs == 20, "there is room again"
             assert running == solved(writer)
-
-
-def test_of_a_machine_that_was_away_when_the_server_started_there_may_be_older_samples(writer):
-    deliver(writer, last=0.2)
-    later = drive(LOW, seconds=100, start_s=3 * 86_400)
-    send(writer, [incoming(later, 1, "other")])
-    job, _ = calibrating(writer)
-    with closing(job):
-        assert {*job.solve()[0].begins_ns} == {"other"}, "the others' were days ago"
-        back = drive(LOW, seconds=100, start_s=3 * 86_400 + 400)
-        send(writer, [incoming(back, 1, "a", spool_id=8), incoming(back, 1, "new")])
-        begins_ns = job.solve()[0].begins_ns
-    assert begins_ns == {"a": 0, "other": 0, "new": int(back["stamp_ns"][0])}

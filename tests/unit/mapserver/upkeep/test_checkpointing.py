@@ -19,23 +19,12 @@ from mapserver.past.plan import HOUR_NS
 from mapserver.upkeep import checkpointing
 from mapserver.upkeep.checkpointing import RESERVE_BYTES, Checkpointing
 from protocol.arrays import Table
-from tests.unit.mapserver.data import (
-    NOW_NS,
-    SITE,
-    incoming,
-    open_store,
-    past_of,
-    random_samples,
-    same,
-    send,
-)
+from tests.unit.mapserver.data import NOW_NS, SITE, incoming, past_of, random_samples, same, send
 
 TURNS = 500
 
 
 class Site:
-    """A writer, the job alone, and what was sent, also to a writer before it."""
-
     def __init__(self, folder: Path, sent: list[tuple[str, Table]], checkpoints_gb: float = 5.0) -> None:
         self.config = ServerConfig(store=StoreConfig(archive_after_h=0.0, checkpoints_gb=checkpoints_gb))
         self.writer = Writer(Store(JournalLocation(folder), SITE, self.config, lambda: NOW_NS + 200 * HOUR_NS))
@@ -46,7 +35,6 @@ class Site:
         self.sent = sent
 
     def drive(self, hours: list[float], n: int = 30, machine: str = "a") -> None:
-        """Send samples of half an hour from each of these hours on."""
         for hour in hours:
             rows = random_samples(n, len(self.sent), half_m=20.0)
             rows["stamp_ns"] += round(hour * HOUR_NS)
@@ -55,12 +43,10 @@ class Site:
             self.sent.append((machine, rows))
 
     def exclude(self, *machines: str) -> None:
-        """Have the map without some machines, as after a decision."""
         grid = self.folded(2**62, frozenset(machines))
         self.writer.run(lambda store: store.adopt(grid, store.merged, Facts(frozenset(machines))))
 
     def run(self) -> None:
-        """Turns until nothing is left to do."""
         idle = 0
         for _ in range(TURNS):
             self.job.run()
@@ -159,56 +145,6 @@ def test_after_a_decision_about_a_machine_they_are_made_again_and_until_then_not
         assert all(site.is_true(hour) for hour in (8.9, 9.5, 10.4))
 
 
-def test_a_decision_ends_what_was_in_the_making(opened, monkeypatch):
-    monkeypatch.setattr(checkpointing, "PIECE_S", 0.0)
-    with opened() as site:
-        site.drive([8, 9])
-        site.drive([8.1, 9.1], machine="bad")
-        site.job.run()
-        assert site.job._making.depends_on["excluded"] == []
-        site.exclude("bad")
-        site.job.run()
-        assert site.job._making.depends_on["excluded"] == ["bad"]
-        site.run()
-        assert site.is_true(9, frozenset(["bad"]))
-
-
-def test_a_turn_is_short_and_the_next_one_goes_on(opened, monkeypatch):
-    monkeypatch.setattr(checkpointing, "PIECE_S", 0.0)
-    with opened() as site:
-        site.drive([8, 8.1, 9])
-        turns = 0
-        while not site.hours:
-            site.job.run()
-            turns += 1
-        assert turns > 2
-        assert site.hours == [9]
-
-
-def test_a_damaged_one_is_made_again(opened, caplog):
-    with opened() as site:
-        site.drive([8, 9, 10])
-        site.run()
-        path = site.past.checkpoints.path(NOW_NS + 9 * HOUR_NS)
-        path.write_bytes(path.read_bytes()[:-1])
-        assert site.is_true(9.5)
-        site.run()
-        assert site.hours == [9, 10]
-        assert site.past.checkpoints.state["passed_over"] == 1
-        assert "checkpoint passed over" in caplog.text
-        assert site.is_true(9.5)
-
-
-def test_those_of_a_wrong_clock_are_removed_once_it_is_known(opened):
-    with opened() as site:
-        site.drive([8, 9, 10])
-        site.run()
-        shutil.copy(site.past.checkpoints.path(NOW_NS + 9 * HOUR_NS), site.past.checkpoints.path(NOW_NS + 99 * HOUR_NS))
-        site.run()
-        assert not site.past.checkpoints.path(NOW_NS + 99 * HOUR_NS).exists()
-        assert site.hours == [9, 10]
-
-
 def test_room_is_kept_to(opened, tmp_path):
     with opened() as site:
         site.drive(list(range(8, 16)))
@@ -254,21 +190,6 @@ def test_a_disk_that_is_nearly_full_is_left_to_what_machines_send(opened, monkey
         assert site.hours[-1] == 11
 
 
-def test_a_disk_that_fails_is_said_and_tried_again_later(opened, monkeypatch):
-    with opened() as site:
-        site.drive([8, 9])
-        site.past.checkpoints.folder.parent.joinpath("checkpoints").write_text("a file in its place")
-        with pytest.raises(OSError, match="checkpoints"):
-            site.run()
-        assert site.job._making is None
-        site.job.run()
-        assert site.job._making is None, "not at once"
-        site.past.checkpoints.folder.unlink()
-        site.job._due_s = 0.0
-        site.run()
-        assert site.hours == [9]
-
-
 def test_what_a_killed_server_left_is_removed_at_the_start(opened, tmp_path):
     folder = tmp_path / "store" / "checkpoints"
     folder.mkdir(parents=True)
@@ -278,34 +199,3 @@ def test_what_a_killed_server_left_is_removed_at_the_start(opened, tmp_path):
         site.drive([8, 9])
         site.run()
         assert [path.name for path in folder.iterdir()] == ["2026-01-01T09.checkpoint"]
-
-
-def test_the_end_of_the_server_leaves_no_half_checkpoint(opened, monkeypatch, tmp_path):
-    monkeypatch.setattr(checkpointing, "PIECE_S", 0.0)
-    with opened() as site:
-        site.drive([8, 9])
-        site.job.run()
-        site.job.run()
-        assert site.job._making
-    assert list((tmp_path / "store" / "checkpoints").glob("*")) == []
-
-
-def test_those_beyond_the_journal_are_removed_when_a_store_is_opened(opened, tmp_path, caplog):
-    """As after a restore of an older journal: once it grew again they would pass for true."""
-    with opened() as site:
-        site.drive([8, 9])
-        shutil.copy(tmp_path / "store" / JOURNAL_FILE, tmp_path / "backup")
-        site.run()
-    with opened() as site:
-        site.drive([10, 11])
-        site.run()
-        assert site.hours == [9, 10, 11]
-    for path in (tmp_path / "store").glob("journal.db*"):
-        path.unlink()
-    for path in (tmp_path / "store").glob("snapshot-*"):
-        path.unlink()
-    shutil.copy(tmp_path / "backup", tmp_path / "store" / JOURNAL_FILE)
-    with closing(open_store(tmp_path / "store")):
-        assert "checkpoint removed" in caplog.text
-        left = [path.name for path in (tmp_path / "store" / "checkpoints").iterdir()]
-        assert "2026-01-01T11.checkpoint" not in left

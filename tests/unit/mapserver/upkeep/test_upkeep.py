@@ -19,13 +19,12 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER
 from mapserver.journal.location import JOURNAL_FILE
-from mapserver.journal.sqlite import reader as journal_reader
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.judgement import Reason
 from mapserver.upkeep import refolding, upkeep
 from mapserver.upkeep.jobs import Archiving, Audit
 from mapserver.upkeep.upkeep import Upkeep
-from protocol.errors import QueryError, StoreError
+from protocol.errors import QueryError
 from protocol.queries.answers import GroundChange
 from protocol.site.ground_classes import ZONES
 from tests.unit.mapserver.data import (
@@ -49,8 +48,6 @@ HOUR_NS = 3600 * 10**9
 
 
 class Site:
-    """A writer with its upkeep over a folder, and what was published."""
-
     def __init__(self, folder: Path, judge_s: float = 60.0, *, exclude: bool = True, calibrates: bool = True) -> None:
         self.published: list[GroundChange] = []
         self.config = ServerConfig(
@@ -88,7 +85,6 @@ def opened(tmp_path, monkeypatch):
 
 @pytest.fixture
 def store(tmp_path):
-    """A writer without a upkeep, and a reader of its journal."""
     folder = tmp_path / "store"
     with closing(open_writer(folder)) as writer, SqliteReader(folder / JOURNAL_FILE) as reader:
         yield writer, reader
@@ -112,7 +108,6 @@ def fleet(bad: dict[str, float], passes: int = 2, size: int = 48) -> dict[str, l
 
 
 def deliver(site: Site, sent: dict[str, list[Any]]) -> None:
-    """Batches of all machines in turn, as they come in."""
     seq = dict.fromkeys(sent, 1)
     parts = {name: np.array_split(np.concatenate(rows), 20) for name, rows in sent.items()}
     for i in range(20):
@@ -145,20 +140,6 @@ def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
         assert site.writer.run(lambda store: store.facts).excluded == {"b"}
         assert site.upkeep.trust("b", True, "repaired", 20.0)["trusted"]
         assert same(site.grid, fold_of(sent, site.config))
-
-
-@pytest.mark.parametrize("snapshot", [True, False])
-def test_a_decision_outlives_the_server(opened, tmp_path, snapshot):
-    sent = fleet({}, size=16)
-    with opened() as site:
-        deliver(site, sent)
-        site.upkeep.trust("b", False, "why", 20.0)
-    if not snapshot:
-        for path in (tmp_path / "store").glob("snapshot-*"):
-            path.unlink()
-    with opened() as site:
-        assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert (site.machine("b")["trusted"], site.machine("b")["reason"]) == (False, "why")
 
 
 def test_a_machine_that_contradicts_all_others_is_excluded(opened):
@@ -196,13 +177,6 @@ def test_a_person_overrules_the_audit_and_hands_back(opened):
         assert site.writer.run(lambda store: store.facts).excluded == {"c"}
 
 
-def test_a_machine_that_sent_nothing_is_refused_by_name(opened):
-    with opened() as site:
-        send(site.writer, [incoming(samples(3), machine="a")])
-        with pytest.raises(QueryError, match="`nobody` has sent nothing; known: a"):
-            site.upkeep.trust("nobody", False, "", 1.0)
-
-
 def repaved(site: Site) -> None:
     size = 40
     x, y = (v.ravel() + 0.5 for v in np.meshgrid(np.arange(size), np.arange(size)))
@@ -227,9 +201,6 @@ def test_a_change_is_published_listed_and_kept(opened):
         wait_for(lambda: not site.writer.run(lambda store: store.grid.take_touched(1)))
         assert site.published == []
         assert site.upkeep.changes(after=change.id) == []
-
-
-# --- archiving -------------------------------------------------------------------------------------------------------
 
 
 def archiving(writer: Writer, reader: SqliteReader, after_h: float, hours_later: float = 3.0) -> Archiving:
@@ -260,7 +231,6 @@ def test_decisions_are_written_beside_the_archive_with_a_new_file_or_once_in_an_
     job = archiving(writer, reader, 1.0)
 
     def decide(zero: float) -> list[float]:
-        """What is beside the archive after one more decision and a run of the job."""
         correction = Correction("a", 0, 2**62, zero, 0.0, 0.0, ())
         decision = CalibrationDecision("a", "person", "why", NOW_NS, (correction,))
         writer.run(lambda store: store.adopt(store.grid, store.merged, store.decide(decision)))
@@ -274,15 +244,6 @@ def test_decisions_are_written_beside_the_archive_with_a_new_file_or_once_in_an_
     assert decide(0.003) == [0.001, 0.002]
     job._keep_s = 0.0  # an hour later
     assert decide(0.004) == [0.001, 0.002, 0.003, 0.004]
-
-
-def test_where_nothing_was_old_enough_it_looks_again_only_later(store):
-    writer, reader = store
-    job = archiving(writer, reader, 1.0)
-    job.run()
-    send(writer, [incoming(samples(5))])
-    job.run()
-    assert reader.archived_row == 0, "it looked a moment ago"
 
 
 def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, caplog):
@@ -300,9 +261,6 @@ def test_a_damaged_archive_is_named_and_the_server_goes_on(opened, tmp_path, cap
         assert site.grid.state().folded == 10
 
 
-# --- the audit -------------------------------------------------------------------------------------------------------
-
-
 def audit_of(
     writer: Writer,
     reader: SqliteReader,
@@ -312,22 +270,6 @@ def audit_of(
 ) -> Audit:
     writer.config = ServerConfig(trust=TrustConfig(judge_s))
     return Audit(writer, reader, report, known, threading.Event())
-
-
-def test_a_journal_that_cannot_be_read_does_not_keep_machines_from_being_judged(store, monkeypatch):
-    writer, reader = store
-    send(writer, [incoming(samples(5))])
-    reports: list[Any] = []
-
-    def damaged(*_: Any, **__: Any) -> Any:
-        raise StoreError("journal.db", "is damaged")
-
-    audit = audit_of(writer, reader, lambda *report: reports.append(report))
-    audit.run()
-    monkeypatch.setattr(reader, "read_many", damaged)
-    with pytest.raises(StoreError):
-        audit.run()
-    assert [(list(verdicts), stamp_ns) for verdicts, stamp_ns in reports] == [(["a"], NOW_NS + 4 * 10**9)] * 2
 
 
 def test_corrected_samples_are_judged_also_those_that_came_before_the_correction(store):
@@ -351,25 +293,3 @@ def test_corrected_samples_are_judged_also_those_that_came_before_the_correction
     audit.run()
     assert not audit.verdicts["c"].contradicts
     assert not any(audit.verdicts[name].contradicts for name in "abd")
-
-
-@pytest.mark.parametrize(("judge_s", "times"), [(1e-9, 3), (60.0, 1)])
-def test_machines_are_judged_so_often(store, judge_s, times):
-    writer, reader = store
-    reports: list[Any] = []
-    audit = audit_of(writer, reader, lambda *report: reports.append(report), judge_s)
-    for _ in range(3):
-        audit.run()
-    assert len(reports) == times
-
-
-def test_an_audit_that_is_to_end_ends_after_what_it_read(store, monkeypatch):
-    monkeypatch.setattr(journal_reader, "BYTES_AT_ONCE", 1)
-    monkeypatch.setattr(journal_reader, "ROWS_AT_ONCE", 1)
-    writer, reader = store
-    send(writer, [incoming(samples(5), machine=name) for name in "abc"])
-    audit = audit_of(writer, reader, lambda *_: None)
-    audit._ending.set()
-    for followed in ("a", "ab", "abc", "abc"):
-        audit.run()
-        assert sorted(audit.verdicts) == list(followed)

@@ -36,10 +36,6 @@ def test_the_newest_value_of_each_name_counts(path, mark):
     assert read_mark(path) == {"row": 3, "a 7": 2**63}
 
 
-def test_no_mark_says_nothing(path):
-    assert read_mark(path) == {}
-
-
 def test_a_mark_that_is_torn_or_damaged_is_behind_and_never_ahead(path, mark):
     rng, states = random.Random(1), [{}]
     for row in range(1, 12):
@@ -99,17 +95,6 @@ def test_a_disk_that_takes_no_more_leaves_the_mark_behind_until_it_does(path, ma
     assert read_mark(path) == {"row": 1}
     mark.write({"row": 3})
     assert read_mark(path) == {"row": 3, "a 7": 1}
-
-
-def test_half_a_write_is_overwritten_by_the_next(path, mark, monkeypatch):
-    mark.write({"row": 1})
-    pwrite = os.pwrite
-    with monkeypatch.context() as patched:
-        patched.setattr(os, "pwrite", lambda file, data, at: pwrite(file, data[:-3], at))
-        mark.write({"row": 2})
-    assert read_mark(path) == {"row": 1}
-    mark.write({"row": 3})
-    assert read_mark(path) == {"row": 3}
 
 
 def test_a_closed_mark_writes_to_no_other_file(path, tmp_path):

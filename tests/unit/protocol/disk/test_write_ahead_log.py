@@ -128,28 +128,6 @@ def test_what_rolled_back_transactions_left_is_no_damage(tmp_path, db):
     assert recovered_rows(tmp_path, log) == 6
 
 
-def test_commits_that_failed_one_after_the_other_are_no_damage(tmp_path, db):
-    """Each leaves a commit of its own; the later, shorter ones overwrite the beginning of those before."""
-    rng = random.Random(6)
-    fill(db, rng, 3)
-    base = log_of(tmp_path)
-    image = bytearray()
-    for n in (9, 5, 1):
-        folder = tmp_path / str(n)
-        folder.mkdir()
-        (folder / "t.db").write_bytes((tmp_path / "t.db").read_bytes())
-        (folder / "t.db-wal").write_bytes(base)
-        with closing(sqlite3.connect(folder / "t.db", isolation_level=None)) as other:
-            other.execute("BEGIN")
-            fill(other, rng, n)
-            other.execute("COMMIT")
-            log = log_of(folder)
-        image[: len(log)] = log
-    held = scan(bytes(image))
-    assert held.frames > held.recovered > (len(base) - HEADER) // FRAME
-    assert held.damaged_at is None
-
-
 def test_frames_of_an_earlier_use_are_not_looked_at(tmp_path, db):
     rng = random.Random(7)
     fill(db, rng, 12)

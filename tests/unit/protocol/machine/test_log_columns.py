@@ -1,4 +1,4 @@
-"""What a log may have in place of a reading's own columns, and what it need not have."""
+"""Columns and files of a log: what may stand in place of a reading's own columns, and how files are written."""
 
 import math
 from pathlib import Path
@@ -6,15 +6,13 @@ from typing import Any
 
 import pytest
 
-from protocol.errors import ConfigError, LogFolderError
-from protocol.machine.log_columns import std_name
+from protocol.errors import ConfigError
 from protocol.machine.log_folder import LogFolder, open_log
-from protocol.machine.readings import KINDS, columns
 from protocol.site.site_config import Projection
-from protocol.units import factor
 
+T0 = 1_750_000_000_000_000_000
 MANIFEST = """
-log = { name = "test", start_ns = 1750000000000000000 }
+log = { name = "test", start_ns = 1_750_000_000_000_000_000 }
 site = { name = "yard", origin_lat_deg = 49.0, origin_lon_deg = 8.4, origin_height_m = 110.0 }
 machine = { name = "loader-1" }
 [[sensor]]
@@ -22,7 +20,7 @@ name = "it"
 kind = "KIND"
 file = "it.csv"
 KEYS
-columns = { stamp = "t", COLUMNS }
+columns = COLUMNS
 """
 METRES = 'x_m = "x", y_m = "y"'
 STATED = 'var_e_m2 = "e", var_n_m2 = "n"'
@@ -30,6 +28,7 @@ STATED = 'var_e_m2 = "e", var_n_m2 = "n"'
 
 def opened(folder: Path, text: str, kind: str, described: str, keys: str = "") -> LogFolder:
     (folder / "it.csv").write_text(text)
+    described = described if described.startswith("{") else f'{{ stamp = "t", {described} }}'
     manifest = MANIFEST.replace("KIND", kind).replace("KEYS", keys).replace("COLUMNS", described)
     (folder / "log.toml").write_text(manifest)
     return open_log(folder)
@@ -53,11 +52,6 @@ def test_fixes_in_metres_come_back_as_the_metres_that_they_were(tmp_path: Path, 
     assert (fix.var_e_m2, fix.var_n_m2) == (2.0, 3.0)
 
 
-def test_a_receiver_that_states_no_variance_has_a_std_instead(tmp_path: Path) -> None:
-    fix = only(opened(tmp_path, "t,x,y\n1,2,3\n", "gps", METRES, "std = { position = 2.5 }"))
-    assert (fix.var_e_m2, fix.var_n_m2) == (6.25, 6.25)
-
-
 def test_standard_deviations_in_any_unit_become_variances(tmp_path: Path) -> None:
     described = f'{METRES}, std_e_m = {{ column = "acc", unit = "mm" }}, std_n_m = {{ columns = {{ hdop = 2.5 }} }}'
     fix = only(opened(tmp_path, "t,x,y,acc,hdop\n1,2,3,1500,0.8\n", "gps", described))
@@ -69,7 +63,6 @@ def test_standard_deviations_in_any_unit_become_variances(tmp_path: Path) -> Non
     [
         ("1,350000,5427000,2", "out_of_range", "x_m: 350000.0 is not within 100 km of the site's origin"),
         ("1,nan,5,2", "not_finite", "x_m: nan is not within"),
-        ("1,4,-inf,2", "not_finite", "y_m: -inf is not within"),
         ("1,4,5,-2", "out_of_range", "std_e_m: -2.0 is negative"),
         ("1,4,5,nan", "not_finite", "it.var_e_m2: nan is not between"),
         ("1,4,5,0", "out_of_range", "it.var_e_m2: 0.0 is not between"),
@@ -81,13 +74,6 @@ def test_a_value_that_cannot_be_is_refused_with_its_line(tmp_path: Path, row: st
     assert len(list(log.readings())) == 1
     assert log.refused == {reason: 1}
     assert log.first_refused[reason].startswith(f"it.csv line 3: {problem}")
-
-
-def test_metres_that_count_from_elsewhere_are_refused_as_a_whole(tmp_path: Path) -> None:
-    text = "t,x,y\n" + "".join(f"{i},{350_000 + i},5427000\n" for i in range(5))
-    log = opened(tmp_path, text, "gps", METRES, "std = { position = 2.0 }")
-    with pytest.raises(LogFolderError, match=r"it\.csv: none of its rows can be used; line 2: x_m: 350000\.0"):
-        list(log.readings())
 
 
 @pytest.mark.parametrize(
@@ -102,15 +88,6 @@ def test_speed_and_course_become_a_velocity(tmp_path: Path, course: float, east:
     assert (velocity.var_e_m2ps2, velocity.var_n_m2ps2) == pytest.approx((0.04, 0.04))
 
 
-def test_a_velocity_has_the_standard_deviations_that_its_receiver_states(tmp_path: Path) -> None:
-    mm = ', unit = "mm/s" }'
-    described = f"""velocity_e_mps = {{ column = "e"{mm}, velocity_n_mps = {{ column = "n"{mm},
-        std_e_mps = {{ column = "acc"{mm}, std_n_mps = {{ column = "acc"{mm}""".replace("\n", " ")
-    velocity = only(opened(tmp_path, "t,e,n,acc\n1,1500,-250,300\n", "gps_velocity", described))
-    assert (velocity.velocity_e_mps, velocity.velocity_n_mps) == pytest.approx((1.5, -0.25))
-    assert (velocity.var_e_m2ps2, velocity.var_n_m2ps2) == pytest.approx((0.09, 0.09))
-
-
 # --- other kinds -----------------------------------------------------------------------------------------------------
 
 
@@ -119,7 +96,6 @@ def test_a_velocity_has_the_standard_deviations_that_its_receiver_states(tmp_pat
     [
         ("odometry", "", 'speed_x_mps = "a", rate_z_radps = "b"', {"speed_x_mps": 1.0, "rate_z_radps": 2.0}),
         ("odometry", 'measures = ["speed"]', 'speed_x_mps = "a"', {"speed_x_mps": 1.0, "speed_y_mps": 0.0}),
-        ("odometry", 'measures = ["rate"]', 'rate_z_radps = "b"', {"rate_z_radps": 2.0, "speed_x_mps": 0.0}),
         (
             "imu",
             'measures = ["rate"]',
@@ -153,19 +129,9 @@ def test_columns_of_what_a_sensor_does_not_measure_need_not_be_there(
         ("gps", "", f'{METRES}, lat_deg = "a", {STATED}', "`lat_deg` and `x_m` are described"),
         ("gps", "", f'x_m = "x", {STATED}', "column `y_m` is not described; `x_m` needs it"),
         ("gps", "", STATED, "column `lat_deg` is not described, nor `x_m`"),
-        ("gps", "", f'{METRES}, {STATED}, std_e_m = "e"', "`var_e_m2` and `std_e_m` are described"),
         ("gps", "", METRES, "nor `std_e_m`, nor `std = { position = ... }` of the sensor"),
         ("gps", "", f'{METRES}, std_e_m = "e"', "column `var_n_m2` is not described, nor `std_n_m`"),
-        (
-            "gps",
-            "",
-            f'{METRES}, {STATED}, x_mm = "x"',
-            "unknown column `x_mm`; a gps has stamp, lat_deg, lon_deg, height_m",
-        ),
-        ("gps", "", f'{STATED}, x_m = {{ column = "x", unit = "deg" }}, y_m = "y"', "`deg` does not fit `x_m`"),
         ("gps_velocity", "std = { velocity = 0.1 }", 'speed_mps = "v"', "column `course_deg` is not described"),
-        ("odometry", "", 'speed_x_mps = "a"', "column `rate_z_radps` is not described"),
-        ("imu", "", 'x_m = "x"', "unknown column `x_m`; a imu has stamp, gyro_x_radps"),
     ],
 )
 def test_what_is_missing_or_there_twice_is_refused_by_name(
@@ -177,10 +143,106 @@ def test_what_is_missing_or_there_twice_is_refused_by_name(
     assert "[[sensor]] 1" in str(caught.value)
 
 
-def test_every_variance_has_a_standard_deviation_in_a_unit_that_is_known():
-    names = [name for kind in KINDS for name in columns(kind) if name.startswith("var_")]
-    assert len(names) == 8
-    assert all(
-        factor({"_m": "m", "_mps": "m/s", "_rad": "rad"}["_" + std_name(n).split("_")[-1]], std_name(n)) == 1
-        for n in names
-    )
+# --- files, and columns of wheels ------------------------------------------------------------------------------------
+
+WHEELS = '{ stamp = "t", speed_x_mps = "v", rate_z_radps = "w" }'
+
+
+def wheels(folder: Path, text: str, keys: str = "", columns: str = WHEELS) -> LogFolder:
+    return opened(folder, text, "odometry", columns, keys)
+
+
+def speeds(log: LogFolder) -> list[tuple[float, float]]:
+    return [(reading.speed_x_mps, reading.rate_z_radps) for reading in log.readings()]
+
+
+def test_a_speed_is_the_mean_of_wheels_and_a_turn_is_their_difference_over_the_track(tmp_path: Path) -> None:
+    columns = """{ stamp = "t", speed_x_mps = { columns = { l = 0.5, r = 0.5 }, unit = "km/h" },
+        rate_z_radps = { columns = { r = 0.2, l = -0.2 } } }"""
+    made = speeds(wheels(tmp_path, "t,l,r\n0,3.6,7.2\n", columns=columns.replace("\n", " ")))
+    assert made == [(pytest.approx(1.5), pytest.approx(0.72))]
+
+
+def test_an_offset_counts_in_the_unit_of_the_file(tmp_path: Path) -> None:
+    """A raw value of a bus: 0.1 km/h a step, counted from -40 km/h."""
+    columns = WHEELS.replace('"v"', '{ columns = { v = 0.1 }, offset = -40.0, unit = "km/h" }')
+    made = speeds(wheels(tmp_path, "t,v,w\n0,436,0\n1,400,0\n", columns=columns))
+    assert [v for v, _ in made] == pytest.approx([1.0, 0.0])
+    turned = WHEELS.replace('"v"', '{ column = "v", offset = 2.0 }')
+    assert speeds(wheels(tmp_path, "t,v,w\n0,1,0\n", columns=turned)) == [(3.0, 0.0)]
+
+
+@pytest.mark.parametrize(("seconds", "nanoseconds"), [("1", "5"), ("12", "999999999"), ("0", "000000007")])
+def test_seconds_and_nanoseconds_of_two_columns_are_exact(tmp_path: Path, seconds: str, nanoseconds: str) -> None:
+    columns = WHEELS.replace('"t"', "{ columns = { s = 1.0, ns = 1e-9 } }")
+    log = wheels(tmp_path, f"s,ns,v,w\n{seconds},{nanoseconds},1,0\n", columns=columns)
+    assert [r.stamp_ns for r in log.readings()] == [T0 + int(seconds) * 10**9 + int(nanoseconds)]
+
+
+@pytest.mark.parametrize(
+    ("column", "problem"),
+    [
+        ("{ columns = { t = 1e-10 } }", "no whole number of nanoseconds"),
+        ("{ column = 't', offset = 3.0 }", "times count from `start_ns`"),
+        ("{ value = 3.0 }", "a column is expected"),
+        ("{ columns = { t = 0.0 } }", "other than 0"),
+        ("{ columns = { t = 1.0 }, column = 't' }", "write"),
+    ],
+)
+def test_a_time_that_cannot_be_is_refused_by_name(tmp_path: Path, column: str, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem) as caught:
+        wheels(tmp_path, "", columns=WHEELS.replace('"t"', column))
+    assert "[[sensor]] 1 columns.stamp" in str(caught.value)
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ("", "t,v,w\n0,1,0.5\n1,2,0.25\n"),
+        ('delimiter = ";"', "t;v;w\n0;1;0.5\n1;2;0.25\n"),
+        ('delimiter = "\\t"', "t\tv\tw\n0\t1\t0.5\n1\t2\t0.25\n"),
+        ('delimiter = " "', "t v  w\n0  1 0.5 \n 1\t2   0.25\n"),
+        ('names = ["t", "v", "w"]', "0,1,0.5\n1,2,0.25\n"),
+        ('names = ["t", "v", "w"]\ndelimiter = " "', "# by a robot\n# t v w\n0 1 0.5\n\n1 2 0.25\n"),
+        ("at_least = { mode = 2 }", "t,v,w,mode\n0,1,0.5,3\n0.5,9,9,1\n0.6,9,9,nan\n1,2,0.25,2\n"),
+    ],
+)
+def test_files_of_other_shapes_hold_the_same(tmp_path: Path, keys: str, text: str) -> None:
+    log = wheels(tmp_path, text, keys)
+    assert speeds(log) == [(1.0, 0.5), (2.0, 0.25)]
+    assert dict(log.refused) == ({"below_least": 2} if "mode" in text else {})
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ('delimiter = "|"', "'|' is none of"),
+        ('names = ["t", "t"]', "'t' is empty, or stands there twice"),
+        ('names = ["t", ""]', "'' is empty"),
+    ],
+)
+def test_a_file_that_cannot_be_is_refused_by_name(tmp_path: Path, keys: str, problem: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        wheels(tmp_path, "", keys)
+    assert problem in str(caught.value)
+
+
+def test_blanks_behind_a_delimiter_belong_neither_to_a_name_nor_to_a_value(tmp_path: Path) -> None:
+    log = wheels(tmp_path, 't, v, w\n0, 1, 0\n1, "2", 0\n')
+    assert speeds(log) == [(1.0, 0.0), (2.0, 0.0)]
+    assert not log.refused
+
+
+def test_the_first_bad_row_of_each_reason_is_named_with_its_line(tmp_path: Path) -> None:
+    text = "# a comment\n0 1 0.5\n1 x 0.5\n2 y 0.5\n\n3 500 0\n2 1 0\n1 1 0\n"
+    log = wheels(tmp_path, text, 'names = ["t", "v", "w"]\ndelimiter = " "')
+    assert len(speeds(log)) == 2
+    assert log.refused == {"wrong_type": 2, "out_of_range": 1, "stamp_goes_back": 1}
+    assert log.first_refused == {
+        "wrong_type": "it.csv line 3: v: 'x' is not a number",
+        "out_of_range": "it.csv line 6: it.speed_x_mps: 500.0 is not between -100 and 100",
+        "stamp_goes_back": "it.csv line 8: it is older than the row before it",
+    }

@@ -1,17 +1,15 @@
-import dataclasses
 import gzip
 import math
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.errors import ConfigError, LogFolderError, Refusal
+from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import KINDS, Articulation, Encoder, Gps, Imu, Torque
-from protocol.site.site_config import KnownGround, SiteConfig
+from protocol.machine.readings import KINDS, Articulation
+from protocol.site.site_config import SiteConfig
 
 T0 = 1_750_000_000_000_000_000
 MANIFEST = f"""
@@ -51,23 +49,6 @@ def test_units_are_converted_and_stamps_count_from_the_start(tmp_path):
     assert not log.refused
 
 
-@pytest.mark.parametrize(
-    ("column", "expected"),
-    [('"angle"', 90.0), ("{ value = 0.5 }", 0.5), ('{ value = 90.0, unit = "deg" }', math.pi / 2)],
-)
-def test_column_may_be_plain_or_constant(tmp_path, column, expected):
-    manifest = MANIFEST.replace('{ column = "angle", unit = "deg" }', column)
-    log = open_log(folder(tmp_path, manifest, joint="t,angle\n0,90\n"))
-    if expected > math.pi:
-        with pytest.raises(
-            LogFolderError, match=r"line 2: joint.angle_rad: 90\.0 is not between"
-        ):  # no angle of a joint
-            list(log.readings())
-        assert log.refused == {Refusal.OUT_OF_RANGE: 1}
-    else:
-        assert [r.angle_rad for r in log.readings()] == pytest.approx([expected])
-
-
 def test_bad_rows_are_left_out_and_counted_by_reason(tmp_path):
     text = "t,angle\n0,1\n1,x\n2\n,3\n3,nan\n4,inf\n5,400\n6,2\n5,2\ninf,1\n7,2\n7,3\n"
     log = open_log(folder(tmp_path, joint=text))
@@ -75,12 +56,6 @@ def test_bad_rows_are_left_out_and_counted_by_reason(tmp_path):
     for _ in range(2):  # counted anew each time
         assert [r.stamp_ns - T0 for r in log.readings()] == [0, 6_000_000, 7_000_000, 7_000_000]
         assert log.refused == expected
-
-
-def test_nanoseconds_are_exact(tmp_path):
-    manifest = MANIFEST.replace(f"start_ns = {T0}", "").replace('unit = "ms"', 'unit = "ns"')
-    log = open_log(folder(tmp_path, manifest, joint=f"t,angle\n{T0 + 1},1\n"))
-    assert next(iter(log.readings())).stamp_ns == T0 + 1
 
 
 def test_gzip_and_the_mark_of_spreadsheets(tmp_path):
@@ -102,50 +77,14 @@ def test_damaged_gzip_is_named(tmp_path, damage):
         list(open_log(tmp_path).readings())
 
 
-def test_manifest_may_lie_apart_from_the_data(tmp_path):
-    (tmp_path / "data").mkdir()
-    folder(tmp_path, joint=None)
-    (tmp_path / "data" / "joint.csv").write_text("t,angle\n0,1\n")
-    log = open_log(tmp_path / "log.toml", tmp_path / "data")
-    assert len(list(log.readings())) == 1
-
-
-def test_missing_file_and_column_are_named(tmp_path):
-    with pytest.raises(LogFolderError, match=r"joint\.csv"):
-        list(open_log(folder(tmp_path, joint=None)).readings())
-    with pytest.raises(LogFolderError, match="has no column `angle`; it has t, alpha"):
-        list(open_log(folder(tmp_path, joint="t,alpha\n0,1\n")).readings())
-    with pytest.raises(LogFolderError, match="has no column"):
-        list(open_log(folder(tmp_path, joint="")).readings())
-    (tmp_path / "joint.csv").write_bytes(b"t,angle\n0,\xff\xfe\n")
-    with pytest.raises(LogFolderError, match=r"joint\.csv"):
-        list(open_log(tmp_path).readings())
-
-
-def test_unused_sensor_is_not_even_opened(tmp_path):
-    log = open_log(folder(tmp_path, MANIFEST.replace("file =", "use = false\nfile ="), joint=None))
-    assert list(log.readings()) == []
-    assert log.machine.sensor("joint").use is False
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ('name = "test"', "", "`name` is missing"),
         ("[log]", "[extra]\n[log]", "unknown key `extra`"),
-        ('name = "paper"', 'name = "paper"\ncells = 1', "unknown key `cells`"),
-        ('name = "loader-1"', 'name = "loader-1"\nmas_kg = 1', "unknown key `mas_kg`"),
         ('kind = "articulation"', 'kind = "sonar"', "'sonar' is none of"),
-        ('file = "joint.csv"', "", "`file` is missing"),
         ('angle_rad = { column = "angle", unit = "deg" }', "", "`angle_rad` is not described"),
-        ("angle_rad =", 'angle_rads = "a"\nangle_rad =', "unknown column `angle_rads`"),
         ('unit = "deg"', 'unit = "furlong"', "unit `furlong` is not known"),
-        ('unit = "deg"', 'unit = "km/h"', "does not fit `angle_rad`"),
-        ('unit = "ms"', 'unit = "deg"', "no unit of time"),
-        ('{ column = "t", unit = "ms" }', "{ value = 0.0 }", "a column is expected"),
-        ('{ column = "angle", unit = "deg" }', '""', "columns.angle_rad: write"),
-        ('{ column = "angle", unit = "deg" }', "{}", "columns.angle_rad: write"),
-        ('{ column = "angle", unit = "deg" }', '{ column = "a", value = 1.0 }', "columns.angle_rad: write"),
         ('{ column = "angle", unit = "deg" }', "{ value = nan }", "finite"),
         ("[[sensor]]", "[sensor]", "no .*sensor.* is described"),
         ("[[sensor]]", MANIFEST[MANIFEST.index("[[sensor]]") :] + "[[sensor]]", "two are named 'joint'"),
@@ -187,41 +126,3 @@ def test_written_log_reads_back_exactly(tmp_path_factory, readings):
     assert [r.stamp_ns for r in got] == [r.stamp_ns for r in readings]
     assert sorted(map(repr, got)) == sorted(map(repr, readings))
     assert not log.refused
-
-
-def test_known_ground_of_the_site_reads_back_exactly(tmp_path):
-    areas = (
-        KnownGround('the "pad"', 0.012, ((0.0, 0.1), (10.0, 0.0), (10.5, 1e-3))),
-        KnownGround("näher", 1 / 3, ((-5.0, 0.0), (-1.0, 0.0), (-1.0, 4.0), (-5.0, 4.0))),
-        KnownGround("whole numbers", 0, ((0, 0), (10, 0), (10, 10))),
-    )
-    site = dataclasses.replace(SITE, known_ground=areas)
-    write_log(tmp_path, "pad", site, MACHINE, [])
-    assert open_log(tmp_path).site == site
-
-
-def test_numbers_of_numpy_read_back(tmp_path):
-    machine = MachineConfig("m-1", sensors=(SensorConfig("drive", "torque", Mount(tuple(np.zeros(3)))),))
-    write_log(tmp_path, "numpy", SITE, machine, [Torque("drive", np.int64(T0), np.float64(0.1))])
-    log = open_log(tmp_path)
-    assert list(log.readings()) == [Torque("drive", T0, 0.1)]
-    assert log.machine.sensors[0].mount == Mount()
-
-
-def test_reading_of_an_unknown_sensor_is_not_written(tmp_path):
-    with pytest.raises(LogFolderError, match="no sensor `axle`"):
-        write_log(tmp_path, "x", SITE, MACHINE, [Encoder("axle", T0, 0.0, 0.0)])
-
-
-def test_sensors_are_merged_in_the_order_of_time(tmp_path):
-    gps = [Gps("gps-1", T0 + i * 200, 49.0, 8.0, 1.0, 1.0, 1.0, 1.0) for i in range(5)]
-    imu = [Imu("imu-1", T0 + i * 30, *[0.0] * 6) for i in range(30)]
-    write_log(tmp_path, "two", SITE, MACHINE, [*gps, *imu])
-    stamps = [r.stamp_ns for r in open_log(tmp_path).readings()]
-    assert stamps == sorted(stamps)
-    assert len(stamps) == 35
-
-
-def test_a_folder_without_a_manifest_is_told_what_it_lacks(tmp_path):
-    with pytest.raises(ConfigError, match=r"has no log\.toml that describes its files; docs/log-folders\.md"):
-        open_log(tmp_path)

@@ -27,12 +27,6 @@ def test_pieces_are_joined():
     assert (region.version, region.stamp_ns) == (VERSION, 5)
 
 
-def test_pieces_are_taken_one_after_the_other():
-    taken = []
-    joined((taken.append(n) or piece(n) for n in range(2)), lambda done, _: taken.append(f"copied {done}"))
-    assert taken == [0, "copied 1", 1, "copied 2"]
-
-
 @pytest.mark.parametrize(
     "second",
     [
@@ -52,10 +46,6 @@ def test_pieces_of_two_maps_are_not_joined(second):
 def test_a_missing_piece_is_seen():
     with pytest.raises(MessageError, match="4 of 3 x 2 cells"):
         joined([piece(0)])
-
-
-def test_a_piece_travels_with_its_place():
-    assert decode_region(encode_region(piece(1))).piece == piece(1).piece
 
 
 @pytest.mark.parametrize("changes", [{"column": 3}, {"row": -1}, {"number": 2}, {"columns": 10**9}, {"rows": 1}])

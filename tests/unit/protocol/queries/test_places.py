@@ -1,4 +1,4 @@
-"""Lists of places and outlines: read as they were written, and refused by name where they are none."""
+"""Lists of places, outlines, routes and ways: read as they were written, and refused by name where they are none."""
 
 import math
 
@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from protocol.errors import QueryError
 from protocol.queries.parameters import selector_of, split_selector
-from protocol.queries.places import MAX_CORNERS, check_outline
+from protocol.queries.places import MAX_CORNERS, MAX_PLACES, check_outline
 from protocol.queries.requests import Freshness, PointsQuery, RegionQuery, When, encode_query, parse_query
-from protocol.queries.route_requests import RouteQuery
-from protocol.queries.routing import MACHINES, NamedMachine, machine_of
+from protocol.queries.route_requests import REFUSE, TIME, RouteQuery, WayQuery
+from protocol.queries.routing import MACHINES, NamedMachine, RouteMachine, machine_of
 from protocol.site.geometry import Bounds
 
 PLACE = st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
@@ -109,3 +109,31 @@ def test_a_machine_is_a_kind_or_a_name_and_keeps_what_is_given():
     assert machine_of("truck-1") == NamedMachine("truck-1")
     with pytest.raises(ValueError, match="mass_kg"):
         NamedMachine("truck-1", (("mass_kg", -1.0),))
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        RouteQuery(((0.1, -0.2), (1e5 / 3, 7.0), (0.0, 0.0))),
+        RouteQuery(((0.0, 0.0), (1.0, 1.0)), MACHINES["truck"], (False, True), 1.5, REFUSE, 17, Freshness(3, 5.0)),
+        WayQuery((0.0, 0.0), (30.0, 40.0)),
+        WayQuery(
+            (0.0, 0.0), (3.0, 4.0), MACHINES["truck"], TIME, 0.1, 5.0, ((1.0, 2.0),), (False, False), 9.0, 0.05, 17
+        ),
+    ],
+)
+def test_a_route_or_way_is_asked_as_it_was_meant(query):
+    assert round_trip(query) == query
+
+
+def test_a_machine_is_a_kind_with_values_of_its_own():
+    query = parse_query("route", {"line": "0,0,30,40", "machine": "truck", "mass": "30000"})
+    assert isinstance(query, RouteQuery)
+    assert query.machine == RouteMachine(30_000.0, power_w=240_000.0, rotating=1.1)
+    assert parse_query("route", {"line": "0,0,30,40"}) == RouteQuery(((0.0, 0.0), (30.0, 40.0)))
+
+
+def test_as_many_places_as_a_line_may_have():
+    places = tuple((i / 3, 0.1) for i in range(MAX_PLACES))
+    query = RouteQuery(places)
+    assert parse_query("route", encode_query(query)) == query

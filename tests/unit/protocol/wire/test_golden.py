@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tests.golden import make as golden
 from tests.paths import GOLDEN
 
 FOLDER = GOLDEN
@@ -24,22 +25,22 @@ def same(a, b) -> bool:
     return a == b
 
 
-def test_every_message_has_a_golden_file(golden):
+def test_every_message_has_a_golden_file():
     assert sorted([*golden.GOLDEN, golden.OLDER, golden.NEWER]) == NAMES
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("batch_older.bin", "batch_newer.bin")])
-def test_golden_file_decodes_to_the_record_and_back(golden, name):
+def test_golden_file_decodes_to_the_record_and_back(name):
     entry, data = golden.GOLDEN[name], (FOLDER / name).read_bytes()
     assert same(entry.decode(data), entry.record)
     assert entry.encode(entry.decode(data)) == data
 
 
-def test_unknown_field_and_column_of_a_newer_agent_are_ignored(golden):
+def test_unknown_field_and_column_of_a_newer_agent_are_ignored():
     assert same(golden.decode_batch((FOLDER / golden.NEWER).read_bytes()), golden.BATCH)
 
 
-def test_an_agent_that_states_neither_calibration_nor_mass_has_applied_none_and_is_of_unknown_mass(golden):
+def test_an_agent_that_states_neither_calibration_nor_mass_has_applied_none_and_is_of_unknown_mass():
     rows = golden.BATCH.rows.copy()
     rows["applied_zero"] = rows["applied_scale"] = 0.0
     rows["mass_kg"] = np.nan

@@ -1,4 +1,3 @@
-import os
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -7,7 +6,7 @@ import pytest
 from mapserver.query.region_pieces import PIECE_BYTES
 from protocol.errors import LinkError
 from protocol.wire.credentials import Credentials, Identity
-from protocol.wire.session import SessionConfig, _settings, free_endpoint, open_session, use_many_threads
+from protocol.wire.session import SessionConfig, _settings, free_endpoint, open_session
 
 CREDENTIALS = Credentials(Path("/keys/a"), Identity("paper", "a", "machine", datetime(2100, 1, 1, tzinfo=UTC)))
 
@@ -29,47 +28,6 @@ def test_a_whole_answer_fits_into_what_a_router_keeps_for_a_link():
     batches = _settings(SessionConfig(mode="router"))["transport/link/tx/queue/size/data"]
     assert batches * 65_000 >= PIECE_BYTES + 2**14  # the rest of the answer, and headers
     assert "transport/link/tx/queue/size/data" not in _settings(SessionConfig())
-
-
-def test_threads_that_were_asked_for_from_outside_stay(monkeypatch):
-    monkeypatch.setenv("ZENOH_RUNTIME", "(rx: (worker_threads: 3))")
-    use_many_threads()
-    assert os.environ["ZENOH_RUNTIME"] == "(rx: (worker_threads: 3))"
-    monkeypatch.delenv("ZENOH_RUNTIME")
-    use_many_threads()
-    assert "worker_threads: 64" in os.environ["ZENOH_RUNTIME"]
-    monkeypatch.delenv("ZENOH_RUNTIME")
-
-
-def test_negative_wait_is_for_ever():
-    assert _settings(SessionConfig(wait_s=-1))["connect/timeout_ms"] == -1
-    assert _settings(SessionConfig(wait_s=-1))["connect/exit_on_failure"] is False
-    assert _settings(SessionConfig(wait_s=0.25))["connect/timeout_ms"] == 250
-
-
-def test_unreachable_router_says_what_to_do():
-    endpoint = free_endpoint()
-    with pytest.raises(LinkError, match="sitegrid router") as caught:
-        open_session(SessionConfig(endpoint, wait_s=0.2))
-    assert str(caught.value).startswith(endpoint)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("endpoint", ["tcp/", "foo/bar", "tcp/256.0.0.1:x"])
-def test_odd_endpoint_is_a_link_error(endpoint):
-    with pytest.raises(LinkError):
-        open_session(SessionConfig(endpoint, wait_s=0.1))
-
-
-def test_address_that_is_taken_is_a_link_error():
-    endpoint = free_endpoint()
-    router = open_session(SessionConfig(endpoint, mode="router"))
-    try:
-        with pytest.raises(LinkError, match="cannot listen"):
-            open_session(SessionConfig(endpoint, mode="router"))
-        open_session(SessionConfig(endpoint)).close()
-    finally:
-        router.close()
 
 
 @pytest.mark.parametrize(
@@ -95,12 +53,6 @@ def test_both_ends_prove_their_names(mode, end):
     assert tls["root_ca_certificate"] == "/keys/a/ca.pem"
     assert (tls[f"{end}_certificate"], tls[f"{end}_private_key"]) == ("/keys/a/cert.pem", "/keys/a/key.pem")
     assert "transport/link/tls" not in _settings(SessionConfig(mode=mode))
-
-
-def test_only_a_router_takes_rules():
-    guard = {"access_control": {"enabled": True}}
-    assert _settings(SessionConfig(mode="router", guard=guard))["access_control"] == {"enabled": True}
-    assert "access_control" not in _settings(SessionConfig(guard=guard))
 
 
 def test_with_keys_a_router_that_is_not_there_may_be_one_that_refuses(tmp_path):

@@ -3,11 +3,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from protocol.errors import ConfigError
-from protocol.machine.machine_config import MachineConfig
-from sim.machines.model import BASE, FOLDER, FRONT, PAYLOAD, WHEELS, MachineModel, load_model
+from sim.machines.model import BASE, FRONT, PAYLOAD, WHEELS, MachineModel
 from sim.machines.urdf import Mass, Transform, combined, read_urdf, rigid_urdf
-from tests.unit.sim.planes import BOTH, LOADER, TRUCK
+from tests.unit.sim.planes import BOTH, LOADER
 
 
 @BOTH
@@ -23,60 +21,10 @@ def test_lengths_and_masses_are_those_of_the_urdf(model: MachineModel) -> None:
     assert {robot.links[wheel].mass.inertia_kgm2[1, 1] for wheel in WHEELS} == {model.wheel_inertia_kgm2}
 
 
-@BOTH
-def test_what_agents_assume_follows_from_the_body(model: MachineModel) -> None:
-    assert model.load_centre_m == pytest.approx(model.front_share() * model.wheelbase_m, abs=0.01)
-    rim = 4 * model.wheel_inertia_kgm2 / model.wheel_radius_m**2
-    assert model.rotating_mass_factor == pytest.approx(1 + rim / model.mass_kg, abs=0.005)
-    assert model.weight().centre_m[1] == 0
-
-
-def test_the_loader_is_the_machine_that_configs_describe_by_default() -> None:
-    nominal = MachineConfig("x")
-    for name in ("mass_kg", "wheel_radius_m", "rotating_mass_factor"):
-        assert getattr(LOADER, name) == pytest.approx(getattr(nominal, name)), name
-
-
-@BOTH
-def test_payload_moves_the_weight_to_where_it_lies(model: MachineModel) -> None:
-    place = model.robot.place(PAYLOAD, BASE).xyz_m
-    full = model.weight(model.payload_kg)
-    empty = model.weight()
-    assert full.mass_kg == model.mass_kg + model.payload_kg
-    expected = (model.mass_kg * empty.centre_m + model.payload_kg * place) / full.mass_kg
-    np.testing.assert_allclose(full.centre_m, expected, atol=1e-9)
-    assert 0.2 < model.front_share(model.payload_kg) < 0.8
-
-
-@BOTH
-def test_antennas_stand_high_and_imus_on_both_frames(model: MachineModel) -> None:
-    assert len(model.gps_mounts()) == 3
-    assert min(mount.xyz_m[2] for mount in model.gps_mounts()) > 3
-    assert [frame for frame, _ in model.imu_mounts()] == [FRONT, FRONT, BASE, BASE]
-    assert model.imu_mounts()[1][1].rpy_deg == (180.0, 0.0, 0.0)
-
-
-def test_rear_frame_rolls_with_the_front_or_with_its_own_wheels() -> None:
-    assert LOADER.rolls_with_front
-    assert not TRUCK.rolls_with_front
-
-
-def test_unknown_machine_is_refused_with_those_that_exist() -> None:
-    with pytest.raises(ConfigError, match=r"no 'crane'; known: dump_truck, wheel_loader"):
-        load_model("crane")
-
-
 @pytest.mark.parametrize("name", [f.name for f in fields(MachineModel) if f.type == "float"])
 def test_values_that_no_machine_has_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match=name):
         replace(LOADER, **{name: 0.0})
-
-
-def test_broken_urdf_is_refused_with_its_name(tmp_path) -> None:
-    path = tmp_path / "broken.urdf"
-    path.write_text("<robot><link/></robot>", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"broken\.urdf"):
-        read_urdf(path)
 
 
 def test_joining_masses_is_steiner_and_does_not_depend_on_the_order() -> None:
@@ -108,9 +56,3 @@ def test_the_few_rigid_bodies_weigh_and_lie_as_the_whole(model: MachineModel, tm
     np.testing.assert_allclose(whole.inertia_kgm2, 1.1 * full.inertia_kgm2, rtol=1e-9, atol=1e-6)
     boxes = sum(len(link.boxes) for link in rigid.links.values())
     assert boxes == sum(len(link.boxes) for link in model.robot.links.values()) >= 2
-
-
-def test_every_model_file_loads() -> None:
-    names = [path.stem for path in FOLDER.glob("*.toml")]
-    assert len(names) >= 2
-    assert {load_model(name).name for name in names} == set(names)

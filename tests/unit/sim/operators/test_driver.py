@@ -1,7 +1,6 @@
 import math
 from dataclasses import fields
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import pytest
 from protocol.units import GRAVITY_MPS2
 from sim.config import SimConfig
 from sim.operators.driver import bend
-from sim.scenario.ground import build_terrain
 from sim.state import FleetState
 from tests.unit.sim.drives import Driven, drive
 
@@ -24,12 +22,6 @@ def paper(world: str) -> Driven:
 def quarry() -> Driven:
     """Trucks and a loader at work for eight minutes."""
     return drive(SimConfig(scenario="haul_road", world="fast", seed=1), 480.0)
-
-
-@pytest.fixture(scope="module")
-def loading() -> Driven:
-    """Four loaders at work together for more than two cycles."""
-    return drive(SimConfig(scenario="loading", world="fast", seed=1), 450.0)
 
 
 @pytest.mark.parametrize("steer", [0.1, -0.4, 0.6])
@@ -86,41 +78,6 @@ def test_work_cycles_load_reverse_dump_and_wait_on_their_routes(quarry: Driven) 
     cycles = (np.diff((payload[:, loader] > 2000).astype(int)) == 1).sum()
     assert cycles >= 4
     assert still > (cycles - 1) * 10.0  # 6 s at the pile and 4 s at the hopper
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_loaders_at_work_get_round_over_all_soils_in_each_others_company(loading: Driven) -> None:
-    speed, payload = loading.states.speed_mps, loading.payload_kg
-    assert ((np.diff((payload > 2000).astype(int), axis=0) == 1).sum(axis=0) >= 2).all()  # two cycles, each of them
-    assert (payload.min(axis=0) == 0).all()
-    assert payload.max(axis=0) == pytest.approx([4000.0] * 4)
-    assert loading.nearest_m > 6.0
-    ramp = abs(loading.states.grade_e) > 0.2
-    for machine in range(4):
-        backwards = speed[:, machine] < -1.0
-        assert (backwards & ramp[:, machine]).sum() > 50
-        assert (backwards & (payload[:, machine] > 2000)).sum() > 50
-        assert (backwards & ~ramp[:, machine]).sum() > 50
-    x, y, metres = loading.states.x_m, loading.states.y_m, abs(loading.states.speed_mps) * 0.1
-    zones = build_terrain(loading.scenario.ground, 1).zone(x, y)
-    assert np.bincount(zones.ravel(), metres.ravel(), minlength=5).min() > 150
-    assert loading.off_m.max() < 0.6
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_each_of_the_loaders_routes_can_be_driven_alone(tmp_path: Path) -> None:
-    """Machines that neither collide nor give way are alone."""
-    path = tmp_path / "alone.toml"
-    path.write_text('base = "loading"\nworld = "fast"\ngive_way = false\n')
-    alone = drive(SimConfig(scenario=str(path), seed=2), 270.0)
-    loaded = np.diff((alone.payload_kg > 2000).astype(int), axis=0)
-    assert (loaded == 1).any(axis=0).all()
-    assert (loaded == -1).any(axis=0).all()
-    starts = alone.joint_m[:50].mean(axis=0)
-    back = np.hypot(*(alone.joint_m[1400:] - starts).transpose(2, 0, 1)) < 3.0
-    assert back.any(axis=0).all()  # they have come round
 
 
 @pytest.mark.slow

@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 
 from protocol.site.ground_classes import ZONES
-from sim.config import SimConfig, resolve
+from sim.config import SimConfig
 from sim.pictures import picture
 from sim.pictures import render as render_module
-from sim.pictures.canvas import WRITTEN, Canvas
-from sim.pictures.plan import draw_plan, stops_of
+from sim.pictures.canvas import Canvas
+from sim.pictures.plan import draw_plan
 from sim.pictures.render import render
 from sim.simulator import Simulator
 
@@ -39,12 +39,6 @@ def test_the_plan_names_routes_machines_and_slope(monkeypatch) -> None:
     assert all((image == colour).all(axis=-1).any() for colour in pale)
 
 
-@pytest.mark.slow
-def test_many_machines_are_dots_without_names(monkeypatch) -> None:
-    _, written = plan(monkeypatch, "busy_site")
-    assert sorted(written) == sorted(["west", "east", "middle", "15 deg uphill"])
-
-
 HAUL = {"loads 22 t in 30 s", "dumps 22 t in 15 s", "loads 4.5 t in 6 s", "dumps 4.5 t in 4 s"}
 CHANGES = {"after 150 s: dry concrete", "after 200 s: wet dirt"}
 
@@ -60,21 +54,6 @@ CHANGES = {"after 150 s: dry concrete", "after 200 s: wet dirt"}
 )
 def test_the_plan_tells_of_stops_changes_and_faults(monkeypatch, scenario: str, labels: set[str]) -> None:
     assert labels <= set(plan(monkeypatch, scenario)[1])
-
-
-def test_a_change_of_direction_is_no_stop() -> None:
-    routes = {route.name: route.build() for route in resolve(SimConfig(scenario="haul_road")).route}
-    assert stops_of(routes["stockpile"].legs) == ["loads 4.5 t in 6 s", "", "dumps 4.5 t in 4 s", ""]
-
-
-def test_labels_lie_apart_until_there_is_no_room() -> None:
-    canvas = Canvas(np.full((60, 160, 3), 255, np.uint8), np.zeros((60, 160), np.uint8), 1.0)
-    covered = [0]
-    while canvas.label("label", np.array([80.0, 30.0]), (0, 0, 0)):
-        covered.append(int((canvas.busy == WRITTEN).sum()))
-    added = np.diff(covered)
-    assert 2 <= len(added) < 10
-    assert (added > 0.75 * added[0]).all()  # only margins may be shared
 
 
 @pytest.mark.slow

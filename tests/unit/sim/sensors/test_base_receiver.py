@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +9,9 @@ import numpy as np
 import pytest
 
 from agents.config import load_agent
-from protocol.errors import ConfigError
 from protocol.machine.readings import Gps
 from protocol.site.site_config import Projection
 from sim.config import SimConfig, resolve, write_configs
-from sim.recorder import record
 from sim.scenario.file import load_scenario
 from sim.simulator import Simulator
 
@@ -82,18 +79,3 @@ def test_survey_that_is_off_is_what_the_agent_is_given(tmp_path: Path) -> None:
             replace(station, **wrong)
     with pytest.raises(ValueError, match="two machine or base stations are named 'loader-1'"):
         replace(scenario, base_station=(replace(station, name="loader-1"),))
-
-
-def test_base_of_an_unknown_preset_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "site.toml"
-    path.write_text('base = "paper_site"\n[[base_station]]\nname = "b"\nplace_m = [1, 1]\npreset = "best"\n')
-    with pytest.raises(ConfigError, match="best"):
-        load_scenario(str(path))
-
-
-@pytest.mark.slow
-def test_recording_has_a_log_of_the_base(tmp_path: Path) -> None:
-    record(SimConfig(scenario="base_station", machines=1, seconds=2.0, world="fast"), tmp_path)
-    manifest = tomllib.loads((tmp_path / "base-1" / "log.toml").read_text(encoding="utf-8"))
-    assert manifest["machine"]["name"] == "base-1"
-    assert (tmp_path / "base-1" / "gps-1.csv").is_file()

@@ -42,23 +42,6 @@ def test_imu_shakes_while_driving(speed: float, share: float) -> None:
     np.testing.assert_allclose(seen[..., :3], 0.0, atol=1e-12)
 
 
-def test_imu_reads_in_its_own_axes() -> None:
-    turning = {"rates_radps": (0.1, 0.2, 0.3)}
-    motion = groups([rig(perfect(), imu=(1, 2, 3, 4), only="imu")], still(1, 1, **turning))
-    assert motion["imu"].names == ("imu-3", "imu-4")  # the last group: those on the front frame are in another
-    front = [values(rig(perfect(), imu=(i,), only="imu"), "imu", 0.01, **turning)[0, 0] for i in (1, 2)]
-    rear = motion["imu"].values[0]
-    for reading, signs in zip((*front, *rear), ([1, 2, 3], [1, -2, -3], [1, 2, 3], [2, -1, 3]), strict=True):
-        np.testing.assert_allclose(reading[:3], [0.1 * s for s in signs], atol=1e-8)
-        assert math.copysign(1, reading[5]) == math.copysign(1, signs[2])
-
-
-def test_imu_off_the_frames_origin_feels_the_rotation() -> None:
-    turning = {"rates_radps": (0.0, 0.0, 0.5), "rates_dot_radps2": (0.0, 0.0, 0.2)}
-    (reading,) = values(rig(perfect(), imu=(3,), only="imu"), "imu", 0.01, **turning)[0]
-    np.testing.assert_allclose(reading[3:], [-(0.5**2) * 0.4, 0.2 * 0.4, GRAVITY_MPS2])
-
-
 def rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
     return Mount(rpy_deg=tuple(np.degrees([roll, pitch, yaw]))).frame_from_sensor()
 

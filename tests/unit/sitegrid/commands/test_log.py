@@ -1,14 +1,12 @@
 """`sitegrid log`, in process: tables, JSON, exit codes, and errors of one line."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from sitegrid import cli
-from tests.unit.sitegrid.logs.data import MANIFEST, write_circle
+from tests.unit.sitegrid.logs.data import write_circle
 
 TRUTH = '[truth]\nfile = "true.csv"\nstamp = "t"\nx_m = "x"\ny_m = "y"\n'
 
@@ -60,35 +58,11 @@ def test_run_prints_rows_and_what_it_cannot_compare_and_draws(circle: Path, caps
     assert list(report["missing"]) == ["ground"]
 
 
-@pytest.mark.slow
-def test_a_log_needs_the_extra_of_agents_alone() -> None:
-    code = "import sys, sitegrid.logs.check, sitegrid.logs.run; print(*sorted(sys.modules))"
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    packages = {name.partition(".")[0] for name in output.split()}
-    assert {"agents", "scipy"} <= packages
-    assert not packages & {"cv2", "filterpy", "mapserver", "matplotlib", "numba", "pyarrow", "pybullet", "sim", "lab"}
-
-
 REFUSED = {  # what is written to which file, words of the command, what is said
     "no manifest": ("log.toml", None, ["run"], "has no log.toml that describes its files; docs/log-folders.md"),
-    "no manifest to check": ("log.toml", None, ["check"], "has no log.toml that describes its files"),
-    "no sensors": ("log.toml", MANIFEST.partition("[[sensor]]")[0], ["check"], "no [[sensor]] is described"),
     "no TOML": ("log.toml", "[log", ["check"], "log.toml: not valid TOML"),
     "no file": ("gps.csv", None, ["run"], "gps.csv: is not there; `--data` names the folder of the files"),
     "two columns of a name": ("gps.csv", "t,x,y,x\n0,1,2,3\n", ["run"], "has 2 columns `x`; name its columns"),
-    "no fixes in use": (
-        "log.toml",
-        MANIFEST.replace('"gps.csv"', '"gps.csv"\nuse = false'),
-        ["run"],
-        "no sensor in use",
-    ),
-    "another sensor": ("evaluation.toml", "", ["run", "--sensors", "gps-9"], "has no 'gps-9', but gps-1, wheels"),
-    "truth without columns": (
-        "evaluation.toml",
-        "[truth]\nfile = 'true.csv'\n",
-        ["run"],
-        "its columns are stamp, x_m, y_m",
-    ),
     "truth of another table": ("evaluation.toml", "[turth]\n", ["run"], "unknown key `turth`; known: truth, ground"),
     "an option that is none": ("evaluation.toml", "", ["run", "--set", "sart=[0,0,0]"], "--set: unknown key `sart`"),
     "an outage behind the end": ("evaluation.toml", "", ["run", "--withhold", "900,5"], "the log ends after 80 s"),

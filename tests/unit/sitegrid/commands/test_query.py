@@ -133,14 +133,6 @@ def test_point_and_region_are_asked_as_of_a_time_and_less_another(session: Sessi
     assert region == RegionQuery(Bounds(-5, 0, 1, 2), when=when)
 
 
-def test_a_probe_is_one_line_or_one_object(session: Session, capsys):
-    assert main(["query", "alive"]) == 0
-    assert capsys.readouterr().out == "batches are taken: journal row 18, merged 17\n"
-    assert main(["query", "alive", "--json"]) == 0
-    expected = {"store": STORE, "journalled": 18, "merged": 17, "busy_s": 0.5}
-    assert json.loads(capsys.readouterr().out) == expected
-
-
 def test_a_worklist_is_a_table_with_what_changed_below(session: Session, capsys):
     assert main(["query", "worklist", "--target", "0.03", "--as-of", str(T0)]) == 0
     assert session.asked[-1] == WorklistQuery(0.03, as_of_ns=T0)
@@ -237,20 +229,6 @@ def test_segments_are_a_table(session: Session, capsys):
     assert capsys.readouterr().out == "no roads are known\n"
 
 
-def test_a_target_that_is_none_is_a_usage_error(session: Session, capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["query", "worklist", "--target", "0"])
-    assert end.value.code == 2
-    assert "--target" in capsys.readouterr().err
-
-
-def test_without_times_the_map_is_asked_as_it_is(session: Session):
-    main(["query", "point", "1", "2"])
-    main(["query", "region", "0", "0", "1", "2"])
-    assert session.asked == [PointQuery(1.0, 2.0), RegionQuery(Bounds(0, 0, 1, 2))]
-    assert session.timeouts == pytest.approx([10.0, 10.0], abs=0.5)
-
-
 def test_a_history_is_asked_with_its_times(session: Session):
     assert main(["query", "--layers", "a,b", "history", "1", "-2"]) == 0
     times = ["--from", "-1h", "--to", str(T0), "--span", "60"]
@@ -289,19 +267,6 @@ def test_the_python_client_passes_every_argument(session: Session):
         HistoryQuery(1.0, 2.0, ("a",), 5, 6, 7.0, fresh),
     ]
     assert [span.first_ns for span in spans] == [T0, T0 + 300 * S]
-
-
-def test_people_see_the_time_of_an_answer(session: Session, capsys):
-    def first_line(*words: str) -> str:
-        assert main(["query", *words]) == 0
-        return capsys.readouterr().out.splitlines()[0]
-
-    assert first_line("point", "1", "2") == "cell at 0.5, 1.5 m"
-    as_of, minus = ["--as-of", str(T0 - 40 * S)], ["--minus", str(T0 - 100 * S)]
-    assert first_line("point", "1", "2", *as_of) == "cell at 0.5, 1.5 m, as of 2025-06-15 15:06:00Z"
-    assert first_line("point", "1", "2", *minus) == "cell at 0.5, 1.5 m, minus that of 2025-06-15 15:05:00Z"
-    line = first_line("region", "0", "1", "1", "2", *as_of, *minus)
-    assert "as of 2025-06-15 15:06:00Z, minus that of 2025-06-15 15:05:00Z, journal row 17" in line
 
 
 def test_every_option_of_query_stands_before_its_name_or_after_it(capsys):
@@ -351,3 +316,24 @@ def test_a_history_is_a_table_for_people(session: Session, capsys):
     ]
     main(["query", "history", "-1", "2"])
     assert capsys.readouterr().out == "nobody was there\n"
+
+
+def test_a_probe_is_one_line_or_one_object(session: Session, capsys):
+    assert main(["query", "alive"]) == 0
+    assert capsys.readouterr().out == "batches are taken: journal row 18, merged 17\n"
+    assert main(["query", "alive", "--json"]) == 0
+    expected = {"store": STORE, "journalled": 18, "merged": 17, "busy_s": 0.5}
+    assert json.loads(capsys.readouterr().out) == expected
+
+
+def test_people_see_the_time_of_an_answer(session: Session, capsys):
+    def first_line(*words: str) -> str:
+        assert main(["query", *words]) == 0
+        return capsys.readouterr().out.splitlines()[0]
+
+    assert first_line("point", "1", "2") == "cell at 0.5, 1.5 m"
+    as_of, minus = ["--as-of", str(T0 - 40 * S)], ["--minus", str(T0 - 100 * S)]
+    assert first_line("point", "1", "2", *as_of) == "cell at 0.5, 1.5 m, as of 2025-06-15 15:06:00Z"
+    assert first_line("point", "1", "2", *minus) == "cell at 0.5, 1.5 m, minus that of 2025-06-15 15:05:00Z"
+    line = first_line("region", "0", "1", "1", "2", *as_of, *minus)
+    assert "as of 2025-06-15 15:06:00Z, minus that of 2025-06-15 15:05:00Z, journal row 17" in line

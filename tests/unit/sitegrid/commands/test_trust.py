@@ -7,10 +7,8 @@ import os
 import re
 import sys
 import threading
-from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -128,28 +126,6 @@ def sitegrid(server: FakeServer, *words: str) -> int:
 
 
 # --- from Python -----------------------------------------------------------------------------------------------------
-
-
-def test_commands_say_what_was_meant(server: FakeServer, client: Client):
-    assert client.trust("a") == TrustAnswer(**vars(machine_state("a")), store=STORE, merged=17, fact=3)
-    assert not client.distrust("a", "gain; x=1.6", wait_s=3.0).trusted
-    client.judge_automatically("a", wait_s=4.0)
-    client.trust("a", "checked")
-    assert server.asked == [
-        TrustCommand("a", True),
-        TrustCommand("a", False, "gain; x=1.6", 3.0),
-        TrustCommand("a", None, "", 4.0),
-        TrustCommand("a", True, "checked"),
-    ]
-    with pytest.raises(QueryError, match="`nobody` is not known") as caught:
-        client.trust("nobody")
-    assert caught.value.reason == Refusal.UNKNOWN_MACHINE
-
-
-def test_machines_and_changes_are_records(server: FakeServer, client: Client):
-    assert client.machines(after=3, wait_s=1.0) == MACHINES
-    assert client.changes() == client.changes(after=3) == [CHANGE]
-    assert server.asked == [MachinesQuery(Freshness(3, 1.0)), ChangesQuery(0), ChangesQuery(3)]
 
 
 class Callback:
@@ -288,13 +264,6 @@ def test_a_calibration_that_cannot_be_meant_is_refused_before_anybody_is_asked(w
     assert capsys.readouterr().err.startswith(f"sitegrid: {problem}")
 
 
-@pytest.mark.parametrize("words", [["distrust", "b"], ["trust"], ["trust", "b", "--wait", "-1"]])
-def test_commands_need_their_words(words: list[str]):
-    with pytest.raises(SystemExit) as end:
-        main(words)
-    assert end.value.code == 2
-
-
 def test_machines_are_a_table_for_people(server: FakeServer, capsys):
     assert sitegrid(server, "query", "machines") == 0
     head, first, second = capsys.readouterr().out.splitlines()
@@ -316,12 +285,6 @@ def test_changes_are_a_line_each(server: FakeServer, capsys):
     assert sitegrid(server, "query", "changes", "--json") == 0
     assert json.loads(capsys.readouterr().out) == {"changes": [plain(CHANGE)]}
     assert server.asked == [ChangesQuery(3), ChangesQuery(0)]
-
-
-def test_no_changes_are_said():
-    client = SimpleNamespace(changes=lambda after: [])
-    _, lines = query._changes(client, Namespace(follow=False, after=0), ())  # type: ignore[arg-type]
-    assert lines == ["no change of the ground was found"]
 
 
 @pytest.mark.parametrize("as_json", [True, False])

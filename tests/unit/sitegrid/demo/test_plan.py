@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.site.site_file import load_site
 from sitegrid.demo.plan import DemoPlan, make_plan, start_sim
 from sitegrid.demo.run import stays
 from sitegrid.door import build_parser
@@ -17,20 +16,6 @@ from tests.paths import ROOT
 
 def plan_of(tmp_path: Path, *words: str) -> DemoPlan:
     return make_plan(build_parser().parse_args(["demo", "--out", str(tmp_path), *words]))
-
-
-def test_options_reach_the_simulation(tmp_path: Path):
-    words = ("--seconds", "33", "--speed", "7", "--machines", "2", "--seed", "9", "--scenario", "repaved")
-    demo = plan_of(tmp_path, *words, "--world", "fast")
-    scenario = demo.scenario
-    assert (scenario.seconds, scenario.seed, scenario.world, len(scenario.change)) == (33, 9, "fast", 2)
-    assert (scenario.machine_names, demo.config.speed) == (("loader-1", "loader-2"), 7)
-
-
-def test_the_demo_drives_the_papers_site_in_pybullet_by_default(tmp_path: Path):
-    demo = plan_of(tmp_path)
-    assert (demo.scenario.site.name, demo.scenario.world) == ("paper", "pybullet")
-    assert len(demo.configs) == 3
 
 
 def test_every_option_is_passed_on_to_the_simulator(tmp_path: Path):
@@ -43,13 +28,6 @@ def test_every_option_is_passed_on_to_the_simulator(tmp_path: Path):
     words = start_sim(plan_of(tmp_path, *options), Started())
     pairs = dict(zip(options[::2], options[1::2], strict=True))
     assert all(words[words.index(name) + 1] == value for name, value in pairs.items())
-
-
-def test_the_plan_writes_a_file_for_the_site_and_each_machine(tmp_path: Path):
-    demo = plan_of(tmp_path, "--machines", "2")
-    assert [path.name for path in demo.configs] == ["loader-1.toml", "loader-2.toml"]
-    assert load_site(demo.site_file).name == "paper"
-    assert demo.out == tmp_path
 
 
 @pytest.mark.parametrize(
@@ -77,11 +55,6 @@ def test_what_is_not_of_an_earlier_run_is_left_alone(tmp_path: Path):
     with pytest.raises(ConfigError, match="is not of an earlier demo"):
         plan_of(tmp_path)
     assert mine.exists()
-
-
-def test_the_data_of_no_log_are_refused(tmp_path: Path):
-    with pytest.raises(ConfigError, match="--data: is the folder of a log"):
-        plan_of(tmp_path, "--data", str(tmp_path))
 
 
 def test_a_log_is_replayed_where_it_is_named(tmp_path: Path):

@@ -11,7 +11,7 @@ from protocol.machine.log_folder import open_log
 from sitegrid.logs import picture as pictures
 from sitegrid.logs.log_truth import LogTruth
 from sitegrid.logs.outages import Outage
-from sitegrid.logs.picture import draw_log, picture
+from sitegrid.logs.picture import picture
 from sitegrid.logs.replay import Trace
 from sitegrid.logs.run import Recording
 from sitegrid.proof.tracks import Truth
@@ -63,22 +63,9 @@ def test_an_ellipse_is_as_large_as_its_covariance_says(recording: Recording, mon
     assert abs(turn) % 180 == pytest.approx(90.0)
 
 
-def test_a_log_without_a_pose_is_drawn_with_its_fixes(recording: Recording) -> None:
-    one = trace(n=1)
-    names = ("stamp_ns", "position_m", "covariance_m2", "heading_rad")
-    nothing = Trace(**{**vars(one), **{name: vars(one)[name][:0] for name in names}})
-    drawn = picture(recording, None, nothing)
-    assert pictures.FIX in colours(drawn)
-
-
 def test_stray_fixes_do_not_make_the_rest_small(recording: Recording, tmp_path: Path) -> None:
     near = picture(recording, None, trace())
     rows = (tmp_path / "gps.csv").read_text() + "80,9000,9000\n"
     (tmp_path / "gps.csv").write_text(rows)
     strays = replace(recording, readings=list(recording.log.readings()))
     assert picture(strays, None, trace()).shape == near.shape
-
-
-def test_a_picture_is_a_file(recording: Recording, tmp_path: Path) -> None:
-    draw_log(tmp_path / "log.png", recording, None, trace())
-    assert cv2.imread(str(tmp_path / "log.png")).shape == picture(recording, None, trace()).shape

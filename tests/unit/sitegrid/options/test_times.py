@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
-from sitegrid.options.values import SiteTime, parse_stamp, parse_time, utc_text
+from sitegrid.options.values import SiteTime, parse_time, utc_text
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
 S = 10**9
@@ -25,7 +25,6 @@ S = 10**9
         ("2025-06-15T15:06:40.000001", T0 + 1000),
         ("2025-06-15", T0 - (15 * 3600 + 6 * 60 + 40) * S),
         (str(T0 + 1), T0 + 1),
-        ("1", 1),
     ],
 )
 def test_a_time_is_iso_or_a_stamp(text: str, ns: int):
@@ -47,23 +46,15 @@ def test_every_stamp_is_a_time_and_is_shown_to_the_second(ns: int):
     assert parse_time(utc_text(ns)).ns == ns // S * S
 
 
-def test_a_stamp_as_people_read_it():
-    assert (utc_text(T0 + 999_999_999), utc_text(0)) == ("2025-06-15 15:06:40Z", "never")
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("yesterday", "'yesterday' is no time: ISO 8601"),
         ("", "'' is no time"),
-        ("2h", "'2h' is no time"),
         ("-2", "'-2' is no time"),
-        ("-2w", "'-2w' is no time"),
-        ("2025-13-01", "is no time"),
         ("0", "0 is not between the years 1970 and 2100"),
         ("1969-12-31", "is not between"),
         ("2101-01-01", "is not between"),
-        ("9" * 20, "is not between"),
         ("9" * 5000, "is no time"),
     ],
 )
@@ -75,8 +66,3 @@ def test_a_bad_time_is_refused_by_what_it_is(text: str, words: str):
 def test_a_time_before_1970_names_its_option():
     with pytest.raises(ConfigError, match="--minus: so long before the site's now, 2025-06-15 15:06:40Z, is before"):
         parse_time("-99999d").stamp("--minus", lambda: T0)
-
-
-def test_a_stamp_does_not_count_back_from_the_sites_now():
-    with pytest.raises(ArgumentTypeError, match="'-2h' is no time: ISO 8601"):
-        parse_stamp("-2h")

@@ -47,21 +47,11 @@ def test_what_is_not_key_and_value_is_the_event_as_it_is(given: tuple[Any, ...],
     assert as_json(*given)["event"] == event
 
 
-def test_json_has_values_of_every_kind_and_never_loses_a_field_of_its_own():
-    line = as_json("done level=%s took_s=%.3f share=%g path=%s", "high", float("nan"), 0.5, print)
-    assert (line["level"], line["took_s"], line["share"], line["path"]) == ("WARNING", "nan", 0.5, str(print))
-
-
 def test_a_traceback_stays_in_the_line_of_json_and_follows_for_people():
     assert as_json("failed work=%s", "fold", error=True)["traceback"].endswith('ValueError: no "good"\nat all')
     lines = TextFormatter().format(record("failed work=%s", "fold", error=True)).splitlines()
     assert lines[0].endswith("failed work=fold")
     assert lines[1].startswith("Traceback")
-
-
-def test_people_read_one_line_per_event():
-    line = TextFormatter().format(record("stopped why=%s", "a\r\nb"))
-    assert line == "2026-01-01T00:00:00.500Z level=WARNING logger=mapserver stopped why=a\\r\\nb"
 
 
 @pytest.mark.parametrize(("terminal", "read"), [(True, lambda s: "event one=1" in s), (False, json.loads)])

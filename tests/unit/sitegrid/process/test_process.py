@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-import platform
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from sitegrid.door import build_parser
+from sitegrid.process import progress
 from sitegrid.process.children import Children, ProcessError
-from sitegrid.process.progress import COMPILING
+from sitegrid.process.progress import COMPILING, Display
 
 STUBBORN = """
 import sys, time
@@ -50,25 +51,6 @@ except KeyboardInterrupt:
 sys.exit(3)
 """
 # Blocks that are freed between others that stay: the second of each size used to lie in the heap.
-GREEDY = """
-import os, sys
-import numpy as np
-from sitegrid.process.lifetime import return_large_blocks
-
-def resident_mib():
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-if sys.argv[1] == "steady" and not return_large_blocks():
-    sys.exit("no such thing in this C library")
-before, kept = resident_mib(), []
-for _ in range(8):
-    np.ones(30 * 2**17)
-    block = np.ones(30 * 2**17)
-    kept.append(np.ones(2**14))
-    del block
-print(resident_mib() - before)
-"""
 
 
 def ended(code: str, number: signal.Signals = signal.SIGTERM) -> tuple[int, str, str, float]:
@@ -102,11 +84,6 @@ def test_who_does_not_end_is_ended_and_that_is_logged():
     assert took_s >= 0.3
 
 
-def test_who_needs_time_gets_it():
-    code, output, errors, _ = ended(STUBBORN.format(end_s=None, late_s=0.5))
-    assert (code, output, errors) == (3, "done\n", "")
-
-
 def test_a_process_that_is_stuck_outside_of_python_is_ended_too():
     assert ended(STUCK)[0] == 0
 
@@ -124,24 +101,6 @@ def test_a_process_that_is_stuck_outside_of_python_is_ended_too():
 def test_metrics_are_for_this_host_unless_told(words: list[str], address: tuple[str, int] | None):
     arguments = build_parser().parse_args(["server", "--site-file", "s", "--store", "x", *words])
     assert arguments.metrics == address
-
-
-@pytest.mark.parametrize("text", ["", "http", "host:", "1.2.3.4:65536", "-1", "9464/metrics"])
-def test_what_is_no_address_is_a_usage_error(text: str):
-    with pytest.raises(SystemExit) as end:
-        build_parser().parse_args(["server", "--site-file", "s", "--store", "x", f"--metrics={text}"])
-    assert end.value.code == 2
-
-
-@pytest.mark.slow
-@pytest.mark.skipif("glibc" not in platform.libc_ver()[0], reason="other C libraries keep no such blocks")
-def test_large_blocks_go_back_to_the_system():
-    def grown_mib(how: str) -> float:
-        words = [sys.executable, "-c", GREEDY, how]
-        return float(subprocess.run(words, capture_output=True, text=True, check=True, timeout=60).stdout)
-
-    assert grown_mib("steady") < 10
-    assert grown_mib("as it is") > 25
 
 
 def test_a_child_is_waited_for_as_long_as_it_says_that_it_goes_on(tmp_path, monkeypatch):
@@ -182,3 +141,20 @@ with compilation_reported():
     first, second = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2))
     assert json.loads(first) == {"compiling": 1, "note": COMPILING}
     assert second == ""
+
+
+def test_plain_lines_come_now_and_then_only(monkeypatch, capsys):
+    now = iter([100.0, 100.0, 101.0, 106.0, 106.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    display = Display("machines drive", headless=True)
+    for second in (1, 2, 3):
+        display.show(second, 10, "recording")
+    assert capsys.readouterr().err.count("recording") == 2
+
+
+@pytest.mark.parametrize("kept", [None, Path("out")])
+def test_who_interrupts_is_told_whether_the_command_goes_on(kept: Path | None, capsys):
+    with pytest.raises(KeyboardInterrupt), Display("machines drive", headless=True, kept=kept):
+        raise KeyboardInterrupt
+    said = capsys.readouterr().err
+    assert ("interrupted; what is done is kept in out, and the same command goes on with it" in said) == bool(kept)

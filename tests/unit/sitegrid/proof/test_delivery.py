@@ -109,11 +109,6 @@ def test_samples_dropped_from_a_row_are_lost(run, journal):
     assert result.unrecorded == 0
 
 
-def test_the_last_rows_dropped_from_the_journal_are_lost(run):
-    result = run("DELETE FROM journal WHERE row > 10", "UPDATE sqlite_sequence SET seq = 10")
-    assert result.lost >= 2 * BATCH
-
-
 @pytest.mark.parametrize(("spool", "unrecorded"), [({}, 0), ({"spool_id": 1}, BATCH)])
 def test_a_row_repeated_in_the_journal_is_double_by_its_content_under_any_identity(run, journal, spool, unrecorded):
     result = run(replace(journal[3], row=len(journal) + 1, **spool))
@@ -154,13 +149,6 @@ def test_a_grid_with_a_row_twice_has_doubles(clean, journal):
     assert result.double == pytest.approx(BATCH, abs=5)
 
 
-def test_votes_in_a_place_of_their_own_are_doubles(clean, journal):
-    far = journal[0].rows.copy()
-    far["x_m"] += 1000.0
-    result = audit_of(clean, journal, grid_of([*journal, replace(journal[0], rows=far)]))
-    assert (result.lost, result.double) == (0, pytest.approx(BATCH, abs=5))
-
-
 def test_a_grid_without_one_sample_of_a_few_centimetres_has_lost_it(clean, journal):
     rows = journal[1].rows.copy()
     rows["distance_m"][3] -= 0.02
@@ -186,20 +174,6 @@ def test_renumbered_samples_count_once_under_their_new_identity(clean, journal, 
     log.close()
     recorded = read_audits({"c": tmp_path / "c.audit"})
     assert recorded == {("c", 6, i + 1): (content_hash(row),) for i, row in enumerate(rows)}
-
-
-def test_an_empty_store_has_lost_everything(clean, tmp_path):
-    Store(JournalLocation(tmp_path / "store"), SITE, CONFIG, time.time_ns).close()
-    result = audit_store(clean[1], tmp_path / "store", SITE, CONFIG)
-    assert result == AuditResult(recorded=2 * N, merged=0, lost=2 * N, double=0, unrecorded=0)
-
-
-def test_equal_grids_do_not_differ_and_unequal_ones_do(journal):
-    whole, less = grid_of(journal).state(), grid_of(journal[1:]).state()
-    assert grid_difference(whole, whole) == (0, 0)
-    short, over = grid_difference(whole, less)
-    assert short > over == 0
-    assert grid_difference(less, whole) == (over, short)
 
 
 def test_pages_that_were_summed_by_age_are_compared_too(journal):

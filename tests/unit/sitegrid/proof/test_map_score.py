@@ -1,11 +1,17 @@
 """Maps against the truth: all known cells, and those where machines truly drove."""
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from protocol.queries.answers import Region
-from protocol.site.ground_classes import SLOPE_LIMIT, UNKNOWN
-from sitegrid.proof.map_score import by_border_distance, driven_cells, score, score_driven
+from protocol.site.ground_classes import SLOPE_LIMIT
+from protocol.wire.messages import Pose
+from sitegrid.proof.figures import root_mean_square
+from sitegrid.proof.map_score import driven_cells, score, score_driven
+from sitegrid.proof.tracks import Truth, position_rmse, read_track
 from tests.unit.records import version
 
 NAN = np.nan
@@ -77,12 +83,6 @@ def test_only_cells_that_were_truly_driven_count():
     assert np.isnan(far["wrong_pct"])
 
 
-def test_a_site_that_nobody_drove_has_no_score():
-    result = score_driven(TRUE, TRUE, [])
-    assert result.cells == 0
-    assert np.isnan([result.known_pct, result.wrong_resistance_pct]).all()
-
-
 def test_cells_without_truth_do_not_count():
     estimated, truth = region([[0.04, 0.06, 0.06]]), region([[0.04, 0.04, NAN]])
     whole, driven = score(estimated, truth), score_driven(estimated, truth, ROW_0)
@@ -91,8 +91,45 @@ def test_cells_without_truth_do_not_count():
     assert driven.by_border[-1]["cells"] == 2  # what is not known is no border
 
 
-def test_distance_counts_from_the_lower_edge_of_a_bin():
-    estimated, true = np.array([1, 1, UNKNOWN]), np.array([1, 2, 2])
-    parts = by_border_distance(estimated, true, np.array([0.99, 1.0, np.inf]))
-    assert [part["cells"] for part in parts] == [1, 1, 0, 0, 0, 0, 1]
-    assert (parts[0]["wrong_pct"], parts[1]["wrong_pct"], parts[6]["known_pct"]) == (0.0, 100.0, 0.0)
+def test_root_mean_square_of_nothing_is_not_known():
+    assert root_mean_square(np.array([3.0, -4.0])) == pytest.approx(math.sqrt(12.5))
+    assert math.isnan(root_mean_square(np.empty(0)))
+
+
+START_NS = 1_767_225_600_000_000_000
+
+
+def pose(name: str, seconds: float, x_m: float, y_m: float) -> Pose:
+    return Pose(name, START_NS + round(seconds * 1e9), x_m, y_m, 0.0, 1.0, 1.0, 0.0, 1.0)
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Path:
+    """Machine `a` drives east with 2 m/s, machine `b` stands at (5, -5)."""
+    (tmp_path / "tracks").mkdir()
+    for name, place in (("a", lambda t: (2.0 * t, 0.0)), ("b", lambda _: (5.0, -5.0))):
+        lines = [f"{START_NS + t * 10**9},{place(t)[0]},{place(t)[1]}" for t in range(11)]
+        (tmp_path / "tracks" / f"{name}.csv").write_text("\n".join(["stamp_ns,x,y", *lines]) + "\n")
+    return tmp_path
+
+
+def test_error_is_the_root_mean_square_in_the_plane(truth):
+    poses = {
+        "a": [pose("a", 1.0, 2.0 + 3.0, 4.0), pose("a", 2.0, 4.0, 0.0)],  # 5 m and 0 m off
+        "b": [pose("b", t, 5.0, -7.0) for t in range(10)],
+    }
+    assert position_rmse(poses, truth) == pytest.approx({"a": (25 / 2) ** 0.5, "b": 2.0}, abs=1e-5)
+
+
+def test_truth_is_interpolated_and_unknown_beyond_its_ends():
+    truth = Truth(START_NS + np.array([0, 10**9]), np.array([[0.0, 5.0], [4.0, 5.0]]))
+    places = truth.at(START_NS + np.array([-1, 0, 250_000_000, 10**9, 10**9 + 1]))
+    assert places[1:4] == pytest.approx(np.array([[0.0, 5.0], [1.0, 5.0], [4.0, 5.0]]))
+    assert np.isnan(places[[0, 4]]).all()
+
+
+def test_track_of_a_simulation_keeps_exact_stamps(tmp_path: Path):
+    (tmp_path / "a.csv").write_text(f"stamp_ns,x,y,z\n{START_NS + 1},1.5,2.5,0\n{START_NS + 100_000_001},2.5,3.5,0\n")
+    truth = read_track(tmp_path / "a.csv")
+    assert truth.stamp_ns.tolist() == [START_NS + 1, START_NS + 100_000_001]
+    assert truth.position_m.tolist() == [[1.5, 2.5], [2.5, 3.5]]

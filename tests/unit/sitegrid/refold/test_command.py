@@ -16,7 +16,6 @@ import pytest
 
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet import decisions
 from mapserver.fleet.correction import LAST_NS, Correction
 from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.ingest.store import Incoming, Store
@@ -31,13 +30,12 @@ from protocol.config import from_table
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
 from protocol.files import load_toml
 from protocol.machine.samples import empty
-from protocol.site.site_config import KnownGround, SiteConfig, site_toml
+from protocol.site.site_config import SiteConfig, site_toml
 from protocol.site.site_file import load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main
-from sitegrid.refold import cluster, command, new_store, work
-from sitegrid.refold.engine import Here
+from sitegrid.refold import cluster, new_store, work
 from sitegrid.refold.sources import joined_decisions
 from tests.journals import history_beside
 from tests.unit.mapserver.data import same_evidence
@@ -179,23 +177,6 @@ def test_corrections_go_with_the_samples_and_the_map_is_the_live_one(tmp_path: P
         assert same_evidence(again.grid, live)
 
 
-def test_a_correction_that_was_taken_back_and_given_again_counts(tmp_path: Path):
-    source = make_store(tmp_path / "source", archived=9)
-    back = CalibrationDecision("b", PERSON, "", T0 + 700 * S, ())
-    decided = [FACTS[1], back, FACTS[1]]
-    with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
-        opened_store.decide(*decided)
-        archived_decisions.save(source / FOLDER, opened_store.identity.id, decided[:2])  # a little behind
-    with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
-        live = opened_store.grid
-    for i, paths in enumerate(([source], [source, source / FOLDER], [source / FOLDER])):
-        out = tmp_path / str(i)
-        assert run(*paths, "--out", out) == 0
-        with closing(opened(out)) as new:
-            assert same_evidence(new.grid, live) == (i < 2)
-            assert new.fact == (3 if i < 2 else 2)
-
-
 def test_a_copy_of_a_history_that_is_behind_brings_nothing_back():
     """Of two stores, with the archive of the second as it was, and a store that was folded of both and went on."""
 
@@ -224,34 +205,14 @@ def test_corrections_are_beside_the_files_of_an_archive_too(tmp_path: Path):
         assert same_evidence(plain_store.grid, folded())
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        (lambda text: text.replace("0.02", "0.03"), "calibration.json: is damaged"),
-        (lambda text: text[:-20], "calibration.json: cannot be read"),
-    ],
-)
-def test_damaged_corrections_of_an_archive_are_not_folded_without(tmp_path: Path, capsys, change, problem):
+def test_damaged_corrections_of_an_archive_are_not_folded_without(tmp_path: Path, capsys):
     source = make_store(tmp_path / "source", archived=9)
     decide(source)
     path = source / FOLDER / archived_decisions.FILE
-    path.write_text(change(path.read_text()))
+    path.write_text(path.read_text().replace("0.02", "0.03"))
     assert run(source / FOLDER, "--out", tmp_path / "new") == 1
-    assert problem in capsys.readouterr().err
+    assert "calibration.json: is damaged" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
-
-
-def test_corrections_of_another_version_are_refused(tmp_path: Path, capsys, monkeypatch):
-    source = make_store(tmp_path / "source", archived=9)
-    with monkeypatch.context() as later:
-        later.setattr(decisions, "VERSION", 2)
-        with closing(Store(JournalLocation(source), SITE, ServerConfig(), time.time_ns)) as opened_store:
-            opened_store.decide(FACTS[0])
-            archived_decisions.save(source / FOLDER, opened_store.identity.id, FACTS)
-    for path in (source, source / FOLDER):
-        assert run(path, "--out", tmp_path / "new") == 1
-        assert "has a correction of version 2, this program knows 1" in capsys.readouterr().err
-        assert not (tmp_path / "new").exists()
 
 
 def test_a_store_that_lacks_what_was_acknowledged_is_not_folded_without_a_word(tmp_path: Path, capsys):
@@ -327,33 +288,7 @@ def test_a_span_of_time_is_cut_out_of_batches(store: Path, tmp_path: Path, capsy
     again.close()
 
 
-def test_samples_out_of_time_in_the_middle_of_a_batch_cut_it_in_two(tmp_path: Path):
-    folder = make_store(tmp_path / "store", "a", batch=120)
-    rows = TRACKS["a"][:6].copy()
-    rows["stamp_ns"] = T0 + S * np.array([5, 6, 900, 7, 8, 901])
-    store = Store(JournalLocation(folder), SITE, ServerConfig(), lambda: T0)
-    store.commit([Incoming("d", encode_batch(SampleBatch("d", 3, 1, rows, SITE.frame)))])
-    store.close()
-    assert run(folder, "--out", tmp_path / "new", "--until", "2026-01-01T00:00:10") == 0
-    pieces = [(r.first_seq, len(r.rows)) for r in rows_of(tmp_path / "new") if r.machine == "d"]
-    assert pieces == [(1, 2), (4, 2)]
-
-
 # --- several archives ------------------------------------------------------------------------------------------------
-
-
-def test_files_folders_and_stores_are_folded(store: Path, tmp_path: Path):
-    files = sorted((store / FOLDER).glob("*.parquet"))
-    assert len(files) == 2
-    assert run(store / FOLDER, "--out", tmp_path / "folder") == 0
-    assert run(*files, "--out", tmp_path / "files") == 0
-    assert run(files[1], "--out", tmp_path / "file") == 0
-    assert identities(tmp_path / "folder") == identities(tmp_path / "files") == identities(store)[:6]
-    assert identities(tmp_path / "file") == identities(store)[3:6]
-    again = opened(tmp_path / "folder")  # the files say which site they are of
-    assert again.site == SITE
-    assert {(mark.seq, mark.lost) for mark in again.journal.watermarks().values()} == {(40, 0)}
-    again.close()
 
 
 def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, capsys):
@@ -370,19 +305,6 @@ def test_what_is_in_two_archives_is_folded_once(store: Path, tmp_path: Path, cap
     again.close()
 
 
-def test_archives_are_merged_in_one_order_however_they_are_given(store: Path, tmp_path: Path):
-    one = make_store(tmp_path / "one", "a", spool_id=1, batch=30)
-    two = make_store(tmp_path / "two", "ab", spool_id=2, batch=40, archived=2)
-    orders = [(store, one, two), (two, store, one), (one, two / FOLDER, two, store)]
-    for i, order in enumerate(orders):
-        assert run(*order, "--out", tmp_path / f"new{i}") == 0
-    made = [identities(tmp_path / f"new{i}") for i in range(len(orders))]
-    assert made[0] == made[1] == made[2]
-    parts = [path.name for path in sorted((tmp_path / "new0" / FOLDER).glob("*.parquet"))]
-    assert parts == [path.name for path in sorted((tmp_path / "new2" / FOLDER).glob("*.parquet"))]
-    assert parts == sorted(parts, key=lambda name: name.partition("_")[2]), "hours of reception, as rows go on"
-
-
 def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Path, capsys):
     other = make_store(tmp_path / "other", "b", batch=30, changed=76)
     assert run(store, other, "--out", tmp_path / "new") == 1
@@ -390,14 +312,6 @@ def test_the_same_sample_with_another_content_is_named(store: Path, tmp_path: Pa
     assert "sample 77 of b, spool 0000000000000007, is another in a further archive" in error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other"]  # nothing half-made is left
     assert run(store, other, "--out", tmp_path / "new", "--without", "b") == 0
-
-
-def test_known_ground_is_kept(tmp_path: Path):
-    ground = (KnownGround("pad", 0.012, ((0.0, 0.0), (5.0, 0.0), (0.0, 5.5))), KnownGround('"x"', 0.1, ((0, 0),) * 3))
-    site = replace(SITE, known_ground=ground)
-    folder = make_store(tmp_path / "store", "a", archived=6, site=site)
-    assert run(folder / FOLDER, "--out", tmp_path / "new") == 0
-    assert load_site(tmp_path / "new" / "site.toml") == site
 
 
 # --- refusals --------------------------------------------------------------------------------------------------------
@@ -408,15 +322,6 @@ def refused(capsys, *words: object) -> str:
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     return error
-
-
-def test_a_place_that_is_taken_is_refused(store: Path, tmp_path: Path, capsys):
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "something").touch()
-    assert "exists and is not empty; choose another --out" in refused(capsys, store, "--out", tmp_path / "full")
-    assert "something is no folder" in refused(capsys, store, "--out", tmp_path / "full" / "something")
-    (tmp_path / "empty").mkdir()
-    assert run(store, "--out", tmp_path / "empty") == 0
 
 
 def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys):
@@ -433,33 +338,17 @@ def test_other_sites_are_refused(store: Path, tmp_path: Path, capsys):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_journal_alone_needs_a_site_file(tmp_path: Path, capsys):
-    folder = make_store(tmp_path / "store", "a")
-    site_file = (folder / "site.toml").rename(tmp_path / "pit.toml")
-    assert "give --site-file" in refused(capsys, folder, "--out", tmp_path / "new")
-    assert run(folder, "--out", tmp_path / "new", "--site-file", site_file) == 0
-    with_archive = make_store(tmp_path / "archived", "a", archived=3)
-    (with_archive / "site.toml").unlink()
-    assert run(with_archive, "--out", tmp_path / "newer") == 0
-
-
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
         (("STORE", "--without", "d"), "'d' is no machine of these archives; they are: a, b, c"),
         (("STORE", "--from", "2026-01-02", "--until", "2026-01-02"), "--until: is not after --from"),
         (("STORE", "--from", "2027-01-01"), "no sample is left"),
-        (("STORE", "--without", "a", "--without", "b", "--without", "c"), "no sample is left"),
-        (("STORE", "--cell", "1000"), "--cell: cell_m: 1000.0 is not between"),
-        (("STORE", "--config", "nowhere.toml"), "nowhere.toml: no such file"),
         (("STORE", "--engine", "tcp://127.0.0.1:1"), "'tcp://127.0.0.1:1' is no dask://HOST:PORT"),
         (("STORE", "--engine", "dask://127.0.0.1:1"), "no Dask scheduler answers at dask://127.0.0.1:1"),
-        (("STORE", "--engine", "dask://127.0.0.1"), "no Dask scheduler answers at dask://127.0.0.1;"),
-        (("STORE", "--engine", "dask://127.0.0.1:99999"), "no Dask scheduler answers"),
         (("s3://bucket/years",), "s3://bucket/years: is reached with a library that is not installed: Install s3fs"),
         (("nowhere://years",), "nowhere://years: no store is known as 'nowhere'"),
         (("memory://nothing",), "memory://nothing: no such file or folder"),
-        (("nowhere",), "no such file or folder"),
     ],
 )
 def test_what_makes_no_sense_is_refused_and_leaves_nothing(
@@ -486,30 +375,6 @@ def test_what_is_no_archive_is_refused(store: Path, tmp_path: Path, capsys):
 # --- what is shown ---------------------------------------------------------------------------------------------------
 
 
-def test_people_read_what_became_of_the_samples(store: Path, tmp_path: Path, capsys):
-    assert run(store, "--out", tmp_path / "new", "--without", "b") == 0
-    printed = capsys.readouterr()
-    assert "240 samples in 12 journal rows" in printed.out
-    assert "  a: 120 samples" in printed.out
-    assert "excluded: 120 of machines, 0 by time, 0 duplicates" in printed.out
-    assert f"sitegrid server --store {tmp_path}/new --site-file {tmp_path}/new/site.toml" in printed.out
-    assert printed.err == ""
-
-
-@pytest.mark.parametrize(
-    ("terminal", "as_json", "shown"), [(True, False, True), (False, False, False), (True, True, False)]
-)
-def test_progress_is_shown_on_a_terminal(
-    store: Path, tmp_path: Path, monkeypatch, *, terminal: bool, as_json: bool, shown: bool
-):
-    seen = []
-    monkeypatch.setattr(Here, "task_samples", 100)
-    monkeypatch.setattr(command.sys.stderr, "isatty", lambda: terminal)
-    monkeypatch.setattr(command.Display, "show", lambda _, *what: seen.append(what[:2]))
-    assert run(store, "--out", tmp_path / "new", *(["--json"] if as_json else [])) == 0
-    assert seen == ([(60, 360), (120, 360), (360, 360)] if shown else [])
-
-
 # --- who does the work, and where archives are -----------------------------------------------------------------------
 
 
@@ -523,14 +388,6 @@ def test_processes_fold_a_store_as_one_does(store: Path, tmp_path: Path, jobs: i
     assert same_evidence(again.grid, folded("ac"))
     assert again.snapshot_row == again.journalled == 12
     again.close()
-
-
-@pytest.mark.parametrize(("word", "problem"), [("0", "0 is not positive"), ("-1", "-1 is not positive"), ("x", "'x'")])
-def test_jobs_that_cannot_be_are_refused(store: Path, tmp_path: Path, capsys, word: str, problem: str):
-    with pytest.raises(SystemExit) as ended:
-        run(store, "--out", tmp_path / "new", "--jobs", word)
-    assert ended.value.code == 2
-    assert problem in capsys.readouterr().err
 
 
 def test_a_port_that_says_nothing_is_no_scheduler(store: Path, tmp_path: Path, capsys, monkeypatch):
@@ -558,15 +415,6 @@ def test_archives_elsewhere_are_folded(store: Path, tmp_path: Path):
         assert new.fact == 3
     assert identities(tmp_path / "new") == identities(source)
     assert len(rows_of(tmp_path / "one")) == 3
-
-
-def test_a_file_elsewhere_that_is_cut_off_is_named(store: Path, tmp_path: Path, capsys):
-    files, path = fsspec.filesystem("memory"), min((store / FOLDER).glob("*.parquet"))
-    files.pipe_file(f"/cut/{path.name}", path.read_bytes()[:-100])
-    try:
-        assert f"memory://cut/{path.name}: is damaged" in refused(capsys, "memory://cut", "--out", tmp_path / "new")
-    finally:
-        files.rm("/cut", recursive=True)
 
 
 def test_a_disk_that_is_full_ends_a_fold_in_one_line(store: Path, tmp_path: Path, capsys, monkeypatch):
@@ -598,15 +446,6 @@ def test_what_is_done_is_kept_when_a_later_step_fails_and_used_when_the_fold_goe
     with closing(opened(tmp_path / "new")) as new:
         assert same_evidence(new.grid, folded())
     assert not (tmp_path / "new.part").exists()
-
-
-def test_two_folds_into_one_place_do_not_meet(store: Path, tmp_path: Path, capsys):
-    """Neither one that looks while the first is at work, nor one that has waited for its lock when the first ends."""
-    site, place = SITE, tmp_path / "new.part"
-    with new_store.making(place, site, ("0123456789abcdef",), 10) as first:
-        assert "another process is at work there" in refused(capsys, store, "--out", tmp_path / "new")
-        assert first.work.exists()
-    assert [path.name for path in tmp_path.iterdir()] == []
 
 
 def test_decisions_count_in_the_order_of_their_stamps_however_archives_are_given():

@@ -45,14 +45,3 @@ def test_a_journal_in_postgresql_gives_the_store_that_its_copy_in_sqlite_gives(
     assert same(*grids)
     assert summaries[0] == summaries[1]
     assert summaries[0][0] == 400
-
-
-def test_a_database_that_holds_no_journal_is_one_line(
-    tmp_path: Path, database: Database, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["fold", database.url, "--out", str(tmp_path / "out")]) == 1
-    error = capsys.readouterr().err.strip()
-    assert "holds no journal" in error
-    assert "\n" not in error
-    assert main(["fold", "postgresql://127.0.0.1:1/x", "--out", str(tmp_path / "out")]) == 1
-    assert "cannot be read" in capsys.readouterr().err

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
 import pytest
 
 from protocol.errors import ConfigError, MessageError, Refusal
 from protocol.wire import keys
+from sitegrid.security.tokens import TOKENS_FILE, TokenFile, Tokens, load_tokens, save_tokens
 
 signing = pytest.importorskip("sitegrid.security.signing", reason="cryptography is not installed")
 
@@ -23,20 +27,12 @@ def verifier(made):
     return signing.Verifier({name: public for name, (_, public) in made.items()})
 
 
-def test_a_machine_signs_what_it_sends(made, verifier):
-    signature = signing.Signer(made["loader-1"][0]).sign(KEY, BATCH)
-    assert len(signature) == 64
-    verifier.check("loader-1", KEY, BATCH, signature)
-
-
 @pytest.mark.parametrize(
     ("machine", "key", "payload"),
     [
         ("loader-1", KEY, BATCH + b"\0"),
-        ("loader-1", KEY, BATCH[:-1]),
         ("loader-1", keys.ingest("north", "loader-1"), BATCH),
         ("loader-2", KEY, BATCH),
-        ("loader-2", keys.ingest("paper", "loader-2"), BATCH),
     ],
 )
 def test_nothing_else_passes_with_that_signature(made, verifier, machine: str, key: str, payload: bytes):
@@ -44,20 +40,6 @@ def test_nothing_else_passes_with_that_signature(made, verifier, machine: str, k
     with pytest.raises(MessageError, match="is not that of") as caught:
         verifier.check(machine, key, payload, signature)
     assert caught.value.reason == Refusal.WRONG_MACHINE
-
-
-@pytest.mark.parametrize("bit", [0, 255, 511])
-def test_an_altered_signature_is_none(made, verifier, bit: int):
-    signature = bytearray(signing.Signer(made["loader-1"][0]).sign(KEY, BATCH))
-    signature[bit // 8] ^= 1 << bit % 8
-    with pytest.raises(MessageError, match="is not that of"):
-        verifier.check("loader-1", KEY, BATCH, bytes(signature))
-
-
-@pytest.mark.parametrize("signature", [b"x", bytes(63), bytes(64), bytes(65), bytes(4096)])
-def test_bytes_that_are_no_signature_are_refused(verifier, signature: bytes):
-    with pytest.raises(MessageError, match="is not that of"):
-        verifier.check("loader-1", KEY, BATCH, signature)
 
 
 def test_a_batch_without_signature_and_a_machine_without_key_are_told_apart(verifier):
@@ -110,3 +92,69 @@ def test_a_reply_is_believed_as_the_answer_to_one_batch_of_one_machine(made, ser
 def test_no_machine_can_sign_a_reply_to_another_one(made, server):
     forged = signing.Signer(made["loader-2"][0]).sign_reply(KEY, BATCH, REPLY)
     assert not signing.ReplyVerifier([server[1]]).is_genuine(KEY, BATCH, REPLY, forged)
+
+
+NOW = datetime(2026, 5, 1, tzinfo=UTC)
+LATER = NOW + timedelta(days=30)
+
+
+def test_a_token_is_its_persons_until_it_expires():
+    tokens, token = Tokens().with_new("anna", LATER)
+    assert tokens.person(token, NOW) == "anna"
+    assert tokens.person(token, LATER) is None
+    assert tokens.person(token[:-1] + "x", NOW) is None
+    assert tokens.person("", NOW) is None
+    assert len(token) >= 22, "128 bits"
+
+
+def test_nothing_that_is_kept_is_the_token(tmp_path: Path):
+    tokens, token = Tokens().with_new("anna", LATER)
+    tokens, other = tokens.with_new("ben", LATER)
+    save_tokens(tmp_path, tokens)
+    text = (tmp_path / TOKENS_FILE).read_text()
+    assert token not in text
+    assert other not in text
+    assert load_tokens(tmp_path) == tokens
+    assert (tmp_path / TOKENS_FILE).stat().st_mode & 0o077 == 0
+
+
+def test_a_new_token_replaces_the_old_one_and_revoked_ones_count_no_more(tmp_path: Path):
+    tokens, first = Tokens().with_new("anna", LATER)
+    tokens, second = tokens.with_new("anna", LATER)
+    assert (tokens.person(first, NOW), tokens.person(second, NOW)) == (None, "anna")
+    assert tokens.without("anna").person(second, NOW) is None
+    with pytest.raises(ConfigError, match="'ben' has no token"):
+        tokens.without("ben")
+
+
+def test_a_file_is_read_again_when_it_changes(tmp_path: Path):
+    with pytest.raises(ConfigError, match="sitegrid keys token NAME"):
+        TokenFile(tmp_path)  # nobody has one yet
+    tokens, token = Tokens().with_new("anna", datetime.now(UTC) + timedelta(days=1))
+    save_tokens(tmp_path, tokens)
+    file = TokenFile(tmp_path)
+    assert file.person("x") is None
+    assert file.person(token) == "anna"
+    save_tokens(tmp_path, tokens.without("anna"))
+    assert file.person(token) is None
+
+
+def test_a_file_that_is_damaged_later_lets_nobody_in_and_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    tokens, token = Tokens().with_new("anna", datetime.now(UTC) + timedelta(days=1))
+    save_tokens(tmp_path, tokens)
+    file = TokenFile(tmp_path)
+    (tmp_path / TOKENS_FILE).write_text("[")
+    assert file.person(token) is None
+    assert file.person(token) is None
+    assert [TOKENS_FILE in record.getMessage() for record in caplog.records] == [True], "logged once"
+    save_tokens(tmp_path, tokens)
+    assert file.person(token) == "anna"
+
+
+@pytest.mark.parametrize(
+    "text", ['[names.a]\nsha256 = "x"\nexpires = 2026-01-01T00:00:00Z\n', "[names.a]\n", "names = 3\n", "["]
+)
+def test_a_damaged_file_is_refused(tmp_path: Path, text: str):
+    (tmp_path / TOKENS_FILE).write_text(text)
+    with pytest.raises(ConfigError, match=TOKENS_FILE):
+        load_tokens(tmp_path)

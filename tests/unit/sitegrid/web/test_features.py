@@ -5,7 +5,6 @@ import pytest
 
 from protocol.queries.answers import GroundChange, MapVersion
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer
-from protocol.queries.roads import RoadChange, RoadSegment, WorklistRow
 from protocol.site.ground_classes import BOUNDARIES
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire.messages import Pose
@@ -45,11 +44,6 @@ def test_areas_follow_the_edges_of_cells_with_their_holes():
     assert gravel[0][0] == gravel[0][-1], "closed"
 
 
-def test_an_empty_map_has_no_areas():
-    empty = TilesAnswer(MapVersion("s", 0, 0), 0, 1.0, whole=True, tiles=())
-    assert features.zones(empty, BOUNDARIES, PROJECTION) == {"type": "FeatureCollection", "features": []}
-
-
 def test_a_change_is_a_rectangle_with_its_times():
     change = GroundChange(3, 10**9, 2 * 10**9, (0.0, 0.0, 10.0, 20.0), 200, 0.02, None, None, None)
     (feature,) = features.changes([change], PROJECTION)["features"]
@@ -65,44 +59,3 @@ def test_a_track_is_a_line_in_the_order_of_time():
     assert line == pytest.approx([10.0, 20.0, 30.0], abs=1e-3)
     assert feature["properties"]["machine"] == "loader-1"
     assert feature["properties"]["last_time"] == "1970-01-01T00:00:03.000000000Z"
-
-
-LINE = ((0.0, 0.0), (10.0, 0.0), (24.0, 7.0))
-ROAD = RoadSegment(
-    "0_0_e", LINE, 25.6, 0.04, 0.002, None, None, 0.0, (6.0, 1.0), (270.0, 20.0), guessed=False, machines=2
-)
-
-
-def test_a_road_is_a_line_with_what_drives_there_and_back():
-    (feature,) = features.segments([ROAD], PROJECTION)["features"]
-    line = [PROJECTION.to_map(lat, lon, 0)[:2] for lon, lat in feature["geometry"]["coordinates"]]
-    assert np.array(line) == pytest.approx(np.array(ROAD.line), abs=1e-3)
-    properties = feature["properties"]
-    assert (properties["passes_ph"], properties["passes_ph_back"]) == (6.0, 1.0)
-    assert (properties["tonnes_ph"], properties["tonnes_ph_back"]) == (270.0, 20.0)
-    assert properties["grade"] is None
-    assert all(not isinstance(value, list | tuple | dict) for value in properties.values()), "GIS read plain values"
-
-
-def test_a_stretch_of_the_worklist_has_its_loss_and_how_sure_it_is():
-    lost = (3.0, 2.0, 4.0), (0.9, 0.6, 1.2), (40.0, 30.0, 50.0)
-    row = WorklistRow(
-        1, ROAD, *lost, since_ns=10**9, before=0.03, saved_kwh_ph=-1.0, day_ns=(0,), day_resistance=(0.04,)
-    )
-    (feature,) = features.worklist([row], PROJECTION)["features"]
-    properties = feature["properties"]
-    assert (properties["rank"], properties["id"]) == (1, "0_0_e")
-    assert [properties[f"kwh_ph{end}"] for end in ("_low", "", "_high")] == [2.0, 3.0, 4.0]
-    assert properties["seconds_ph"] == 40.0
-    assert (properties["since_time"], properties["resistance_before"]) == ("1970-01-01T00:00:01.000000000Z", 0.03)
-
-
-def test_a_repair_is_a_line_with_what_was_before():
-    change = RoadChange("0_0_e", LINE, 10**9, 3 * 10**9, 0.05, 0.02, 1.5)
-    (feature,) = features.repairs([change], PROJECTION)["features"]
-    line = [PROJECTION.to_map(lat, lon, 0)[:2] for lon, lat in feature["geometry"]["coordinates"]]
-    assert np.array(line) == pytest.approx(np.array(LINE), abs=1e-3)
-    properties = feature["properties"]
-    assert (properties["resistance_before"], properties["resistance_after"]) == (0.05, 0.02)
-    assert properties["seen_time"] == "1970-01-01T00:00:03.000000000Z"
-    assert features.repairs([], PROJECTION)["features"] == []

@@ -11,9 +11,8 @@ from agents.localisation.filters.belief import Belief, Filter, Measurement
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel, motion
-from agents.localisation.filters.state import POSITION, SPEED, VELOCITY, YAW, Layout
+from agents.localisation.filters.state import POSITION, SPEED, YAW, Layout
 from agents.localisation.filters.ukf import Ukf
-from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 
 LAYOUT = Layout()
@@ -95,17 +94,8 @@ def test_only_a_fix_makes_the_place_unsure_when_it_is_believed_again() -> None:
 
 
 @BOTH
-def test_in_order_it_is_plain_filtering(engine: Filter) -> None:
-    groups = drive(seed=1)
-    fusion = fused(engine)
-    for group in groups:
-        assert [b.stamp_ns for b in fusion.add(group)] == [group[0].stamp_ns]
-    same(fusion.belief, plainly(engine, groups, start()))
-
-
-@BOTH
-@pytest.mark.parametrize("seed", range(2))
-def test_any_order_within_the_window_gives_the_same_belief(engine: Filter, seed: int) -> None:
+def test_any_order_within_the_window_gives_the_belief_of_plain_filtering(engine: Filter) -> None:
+    seed = 1
     groups = drive(seed)
     rng = np.random.default_rng(seed)
     # by the time of arrival: each up to 0.4 s late
@@ -129,16 +119,6 @@ def test_a_late_measurement_changes_its_own_belief_and_all_after_it() -> None:
     same(changed[-1], fusion.belief)
 
 
-def test_every_measurement_counts_once_however_often_it_is_filtered_again() -> None:
-    fusion = fused()
-    for t in (100, 200, 400):
-        fusion.add([wheels(t)])
-    fusion.add([fix(300)])
-    fusion.add([fix(50, 500.0, gate=4.0)])
-    fusion.add([fix(150)])
-    assert fusion.counters == {"wheels_used": 3, "gps-1_used": 2, "gps-1_gated": 1, "duplicate": 0}
-
-
 @pytest.mark.parametrize(("ms", "accepted"), [(901, True), (900, False), (899, False), (100, False), (-1, False)])
 def test_what_lies_before_the_window_is_refused_and_counted(ms: int, accepted: bool) -> None:
     fusion = fused(window_s=1.0)
@@ -150,18 +130,13 @@ def test_what_lies_before_the_window_is_refused_and_counted(ms: int, accepted: b
     assert (fusion.belief is before) is not accepted
 
 
-def test_what_lies_before_the_window_is_refused_where_measurements_are_rare_too() -> None:
+def test_the_window_begins_at_the_start_and_moves_on_where_measurements_are_rare_too() -> None:
     fusion = fused(window_s=1.0)
+    assert fusion.add([wheels(-1)]) == []
+    assert fusion.add([wheels(0)])
     fusion.add([wheels(10_000)])
     assert fusion.add([wheels(8_999)]) == []
-    assert fusion.counters["too_late"] == 1
-
-
-def test_nothing_from_before_the_start_is_used() -> None:
-    fusion = fused()
-    assert fusion.add([wheels(-1)]) == []
-    assert fusion.counters["too_late"] == 1
-    assert fusion.add([wheels(0)])
+    assert fusion.counters["too_late"] == 2
 
 
 def test_a_duplicate_is_refused_and_counted() -> None:
@@ -175,32 +150,6 @@ def test_a_duplicate_is_refused_and_counted() -> None:
     assert (fusion.counters["duplicate"], fusion.counters["gps-1_used"]) == (2, 3)
     assert len(fusion.add([fix(300, 1.0), replace(fix(300), sensor="gps-2")])) == 1  # what is new of it counts
     assert (fusion.counters["duplicate"], fusion.counters["gps-2_used"]) == (3, 1)
-
-
-@BOTH
-def test_sensors_of_one_stamp_give_the_same_belief_in_any_order(engine: Filter) -> None:
-    at_once = [fix(100, 0.3), fix(100, -0.1, 0.5, "gps-2"), wheels(100, 2.1)]
-    lever_less = [replace(m, h=_linear(m), jacobian=lambda x, m=m: _jacobian(m)) for m in at_once]
-    beliefs = []
-    for order in itertools.permutations(lever_less):
-        for groups in ([list(order)], [[m] for m in order], [[order[0]], list(order[1:])]):
-            fusion = fused(engine)
-            for group in groups:
-                fusion.add(group)
-            fusion.add([wheels(200)])
-            beliefs.append(fusion.belief)
-    for belief in beliefs[1:]:
-        same(belief, beliefs[0])
-
-
-def _jacobian(measurement: Measurement) -> Floats:
-    """Position or velocity itself, which is linear: then, and only then, the order of conditioning is all one."""
-    states = VELOCITY if measurement.sensor == "wheels" else slice(0, 2)
-    return np.eye(LAYOUT.n)[states]
-
-
-def _linear(measurement: Measurement) -> Any:
-    return lambda states: states @ _jacobian(measurement).T
 
 
 # --- gates -----------------------------------------------------------------------------------------------------------
@@ -249,34 +198,21 @@ def test_a_late_measurement_does_not_undo_that_a_sensor_is_believed_again() -> N
     assert fusion.counters["gps-1_relocked"] == 1
 
 
-def test_what_is_no_position_is_believed_again_too() -> None:
+@pytest.mark.parametrize("relocks", [True, False])
+def test_sensors_that_are_no_position_are_believed_again_too_and_what_is_assumed_never_is(relocks: bool) -> None:
     fusion = fused(relock=3)
     for t in (10, 20):
-        fusion.add([replace(wheels(t, 9.0), gate_sigma=4.0)])
+        fusion.add([replace(wheels(t, 9.0), gate_sigma=4.0, relocks=relocks)])
     assert fusion.belief.x[SPEED] == pytest.approx(2.0, abs=0.1)
-    fusion.add([replace(wheels(30, 9.0), gate_sigma=4.0)])
-    assert (fusion.counters["wheels_gated"], fusion.counters["wheels_relocked"]) == (3, 1)
-    assert fusion.belief.x[SPEED] > 3.0
+    fusion.add([replace(wheels(30, 9.0), gate_sigma=4.0, relocks=relocks)])
+    assert (fusion.counters["wheels_gated"], fusion.counters["wheels_relocked"]) == (3, int(relocks))
+    assert bool(fusion.belief.x[SPEED] > 3.0) is relocks
 
 
-def test_what_is_assumed_is_never_believed_against_the_sensors() -> None:
-    fusion = fused(relock=3)
-    for t in range(10, 100, 10):
-        fusion.add([replace(wheels(t, 9.0), gate_sigma=4.0, relocks=False)])
-    assert (fusion.counters["wheels_gated"], fusion.counters["wheels_relocked"]) == (9, 0)
-    assert fusion.belief.x[SPEED] == pytest.approx(2.0, abs=0.1)
-
-
-@BOTH
-@pytest.mark.parametrize("broken", ["z", "inf", "R", "negative"])
-def test_an_invalid_measurement_is_counted_and_changes_nothing(engine: Filter, broken: str) -> None:
-    bad = {
-        "z": replace(fix(200), z=np.array([np.nan, 0.0])),
-        "inf": replace(fix(200), z=np.array([0.0, np.inf])),
-        "R": replace(fix(200), R=np.full((2, 2), np.nan)),
-        "negative": replace(fix(200), R=-np.eye(2)),
-    }[broken]
-    fusion = fused(engine, relock=1)
+@pytest.mark.parametrize("broken", [{"z": np.array([np.nan, 0.0])}, {"R": np.full((2, 2), np.nan)}, {"R": -np.eye(2)}])
+def test_an_invalid_measurement_is_counted_and_changes_nothing(broken: dict[str, Any]) -> None:
+    bad = replace(fix(200), **broken)
+    fusion = fused(relock=1)
     fusion.add([wheels(100)])
     before = fusion.at(bad.stamp_ns)
     (after,) = fusion.add([bad])
@@ -300,13 +236,11 @@ def test_beliefs_are_predicted_between_and_beyond(engine: Filter) -> None:
     assert fusion.belief.stamp_ns == START_NS + 300 * MS  # asking changes nothing
 
 
-@pytest.mark.parametrize("window_s", [0.5, 1.0])
-def test_history_is_no_longer_than_the_window(window_s: float) -> None:
-    fusion = fused(window_s=window_s)
-    for t in range(10, 5000, 10):
+def test_history_is_no_longer_than_the_window() -> None:
+    fusion = fused(window_s=0.5)
+    for t in range(10, 2000, 10):
         fusion.add([wheels(t)])
-        assert len(fusion._nodes) <= window_s * 100 + 1
-    assert fusion._nodes[0].stamp_ns >= fusion.belief.stamp_ns - round(window_s * 1e9)
+    assert len(fusion._nodes) <= 51
 
 
 def known_anew(belief: Belief) -> Belief:

@@ -1,18 +1,12 @@
-import ast
 import math
 from collections.abc import Sequence
-from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import agents
 from agents.localisation import measurements
-from agents.localisation.filters import late_measurements
 from agents.localisation.filters.belief import (
     Belief,
     Filter,
@@ -24,12 +18,11 @@ from agents.localisation.filters.belief import (
 )
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
-from agents.localisation.filters.motion import GpsError, MotionModel, motion
+from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import KEPT, SmoothedPose, nothing_past
-from agents.localisation.filters.state import POSITION, RATE, SPEED, VELOCITY, YAW, Layout
+from agents.localisation.filters.state import POSITION, RATE, SPEED, YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from protocol.arrays import Floats
-from tests.unit.agents.localisation.filters.rauch import Recorder, Smoothed
 
 LAYOUT = Layout(imus=1, wheel_scale=True, receivers=1)
 MODEL = MotionModel(LAYOUT, gps_errors=(GpsError(2.0, 30.0),))
@@ -48,8 +41,8 @@ def start(lag_s: float = WHOLE_S, yaw: float = 0.7) -> Belief:
     return Belief(START_NS, x, np.diag(deviation**2), past=nothing_past(LAYOUT.n, lag_s))
 
 
-def drive(seed: int, seconds: float = 14.0, change: Any = None, off_m: float = 0.0) -> Groups:
-    """Noisy measurements of a machine in a bend; change: with the first fix; off_m: of all fixes of the last half."""
+def drive(seed: int, seconds: float = 14.0) -> Groups:
+    """Noisy measurements of a machine in a bend."""
     rng, R = np.random.default_rng(seed), np.diag([1e-5] * 3 + [1.0] * 3)
     groups: Groups = []
     drift_m = rng.normal(size=2)
@@ -69,12 +62,8 @@ def drive(seed: int, seconds: float = 14.0, change: Any = None, off_m: float = 0
             place += (
                 [c * LEVER_M[0] - s * LEVER_M[1], s * LEVER_M[0] + c * LEVER_M[1]] + drift_m + 0.5 * rng.normal(size=2)
             )
-            place[0] += off_m * (t > seconds / 2)
-            first = change if i == 3 else None
             error = LAYOUT.gps_error(0)
-            groups.append(
-                [measurements.fix(stamp + 7_000_000, "gps", place, np.eye(2) * 0.25, LEVER_M, error, 4.0, change=first)]
-            )
+            groups.append([measurements.fix(stamp + 7_000_000, "gps", place, np.eye(2) * 0.25, LEVER_M, error, 4.0)])
     return groups
 
 
@@ -104,57 +93,6 @@ def same(poses: Sequence[SmoothedPose], others: Sequence[SmoothedPose], toleranc
         assert pose.correction == pytest.approx(other.correction, abs=tolerance)
 
 
-def agrees(poses: Sequence[SmoothedPose], smoothed: Smoothed) -> None:
-    """To a micrometre, with the covariance."""
-    assert len(poses) > 12
-    for pose in poses:
-        x, P = smoothed[pose.stamp_ns]
-        assert (pose.x_m, pose.y_m) == pytest.approx(x[:2], abs=1e-6)
-        assert math.remainder(pose.heading_rad - x[YAW], math.tau) == pytest.approx(0.0, abs=1e-6)
-        assert pose.covariance_m2 == pytest.approx(P[:2, :2], abs=1e-6)
-
-
-# --- it is the textbook's smoother -----------------------------------------------------------------------------------
-
-
-def recorded(engine: Filter) -> tuple[Recorder, Any]:
-    """A recorder, and the change that the first fix of a receiver makes."""
-    recorder, M = Recorder(engine), np.eye(LAYOUT.n)
-    M[LAYOUT.gps_error(0)] = 0.0
-    return recorder, recorder.changing(partial(reset_states, states=LAYOUT.gps_error(0), variance=3.0), M)
-
-
-@BOTH
-@pytest.mark.parametrize("seed", [None, 5], ids=["in order", "late"])
-def test_with_a_lag_beyond_the_run_it_is_the_smoother_of_the_whole_run(engine: Filter, seed: int | None) -> None:
-    recorder, change = recorded(engine)
-    groups = drive(1, change=change)
-    fusion, final = fused(recorder, groups if seed is None else late(groups, seed))
-    assert not final
-    agrees(fusion.remaining(), recorder.smoothed(fusion.belief))
-    assert max(abs(p.correction[0]) for p in fusion.remaining()) > 0.05
-
-
-@BOTH
-def test_it_is_that_where_a_sensor_is_believed_again_too(engine: Filter, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorder, change = recorded(engine)
-    monkeypatch.setattr(late_measurements, "open_states", recorder.changing(open_states))
-    fusion, _ = fused(recorder, drive(2, change=change, off_m=40.0))
-    assert fusion.counters["gps_relocked"] == 1
-    agrees(fusion.remaining(), recorder.smoothed(fusion.belief))
-
-
-@BOTH
-def test_an_anchor_is_smoothed_with_what_it_counts_from(engine: Filter) -> None:
-    recorder, states = Recorder(engine), LAYOUT.gps_error(0)
-    H, M = np.zeros((2, LAYOUT.n)), np.eye(LAYOUT.n)
-    H[:, :2] = np.eye(2)
-    M[states] = -H
-    change = recorder.changing(partial(anchor_states, states=states, H=H, variance=0.5), M)
-    fusion, _ = fused(recorder, drive(3, change=change))
-    agrees(fusion.remaining(), recorder.smoothed(fusion.belief))
-
-
 class Augmented:
     """A Kalman filter whose state holds the past too: copies of what is kept of it, which never move."""
 
@@ -178,9 +116,10 @@ class Augmented:
         self.x, self.P = self.x + K @ (measurement.z - H @ self.x), self.P - K @ H @ self.P
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from(["move", "see", "reset", "anchor", "open"]), max_size=20))
-def test_it_is_the_kalman_filter_of_a_state_that_holds_the_past(seed: int, steps: list[str]) -> None:
+@BOTH
+def test_it_is_the_kalman_filter_of_a_state_that_holds_the_past(engine: Filter, seed: int, steps: list[str]) -> None:
     rng, n, states, Q = np.random.default_rng(seed), 8, slice(6, 8), np.eye(2) * 0.7
     root = rng.normal(size=(n, n))
     belief = Belief(0, rng.normal(size=n), root @ root.T + np.eye(n), past=nothing_past(n, WHOLE_S))
@@ -190,7 +129,7 @@ def test_it_is_the_kalman_filter_of_a_state_that_holds_the_past(seed: int, steps
         if step == "move":  # a second passes, and what was the newest becomes a node
             M = 0.9 * M + 0.2 * rng.normal(size=(n, n))
             moves = Motion(lambda x, F=M: x @ F.T, lambda _, F=M: F, np.eye(n) * 0.1, ())
-            belief = Ekf().predict(belief, moves, belief.stamp_ns + 1_000_000_000)
+            belief = engine.predict(belief, moves, belief.stamp_ns + 1_000_000_000)
             reference.copy()
             reference.map(M, slice(n), moves.Q)
             reference.x[:n] = M @ reference.x[:n]
@@ -198,7 +137,7 @@ def test_it_is_the_kalman_filter_of_a_state_that_holds_the_past(seed: int, steps
             measured = Measurement(
                 "a", 0, rng.normal(size=2), 0.3 * np.eye(2), lambda x, H=H: x @ H.T, lambda _, H=H: H
             )
-            belief = Ekf().condition(belief, measured).belief
+            belief = engine.condition(belief, measured).belief
             reference.see(measured)
         elif step == "open":
             belief = open_states(belief, states, Q)
@@ -255,9 +194,8 @@ def test_a_pose_becomes_final_once_with_all_that_was_measured_within_the_lag() -
 def test_late_measurements_in_any_order_make_the_same_poses(engine: Filter) -> None:
     groups = drive(6, 12.0)
     in_order, final = fused(engine, groups, start(3.0))
-    for seed in (1, 2):
-        other, poses = fused(engine, late(groups, seed), start(3.0))
-        same(poses + other.remaining(), final + in_order.remaining(), 1e-8)
+    other, poses = fused(engine, late(groups, 1), start(3.0))
+    same(poses + other.remaining(), final + in_order.remaining(), 1e-8)
 
 
 def test_after_a_gap_longer_than_the_lag_nothing_of_before_waits() -> None:
@@ -267,9 +205,6 @@ def test_after_a_gap_longer_than_the_lag_nothing_of_before_waits() -> None:
     assert [s for s in final if s < 12] == sorted(s for s in final + left if s < 12)
     assert len([s for s in final if s < 5.01]) == 6
     assert not [s for s in final if 5.01 < s < 12]
-
-
-# --- covariances -----------------------------------------------------------------------------------------------------
 
 
 @BOTH
@@ -287,47 +222,6 @@ def test_smoothing_never_makes_a_place_less_sure(engine: Filter) -> None:
     assert np.mean(middle[3:-6]) < 0.9
 
 
-@pytest.mark.slow
-@BOTH
-def test_nodes_and_state_keep_one_covariance_through_dropouts_and_extremes(engine: Filter) -> None:
-    """All nodes together with the state; measured with anything between 1e-8 and 1e8, and nothing for hours."""
-    seed = 9
-    rng, belief, stamp_ns = np.random.default_rng(seed), start(30.0), START_NS
-    for step in range(1500):
-        dt_s = 10.0 ** rng.uniform(-2, 0) if rng.random() < 0.99 else 10.0 ** rng.uniform(0, 4)
-        stamp_ns += round(dt_s * 1e9)
-        belief = engine.predict(belief, motion(MODEL, belief, dt_s), stamp_ns)
-        states = [slice(2), slice(YAW, YAW + 1), VELOCITY, RATE, LAYOUT.gps_errors][rng.integers(5)]
-        H = np.eye(LAYOUT.n)[states]
-        k = len(H)
-        R = np.eye(k) * 10.0 ** (rng.uniform(-8, 8) if rng.random() < 0.1 else rng.uniform(-4, 1))
-        z = H @ belief.x + rng.normal(size=k)
-        belief = engine.condition(belief, Measurement("any", 0, z, R, lambda x, H=H: x @ H.T, lambda _, H=H: H)).belief
-        if rng.random() < 0.01:
-            belief = reset_states(belief, LAYOUT.gps_errors, 2.0)
-        if rng.random() < 0.01:
-            belief = open_states(belief, slice(2), np.diag(10.0 ** rng.uniform(0, 5, 2)))
-        assert belief.past is not None
-        for pose in belief.past.final:
-            assert np.linalg.eigvalsh(pose.covariance_m2)[0] > 0, f"{seed=} {step=}"
-            assert np.isfinite([pose.x_m, pose.y_m, *pose.correction]).all(), f"{seed=} {step=}"
-        if step % 20 == 0:
-            for s, C in _jointly(belief):
-                joint = np.block([[s, C], [C.T, belief.P]])
-                scale = 1 / np.sqrt(np.diag(joint))
-                assert np.linalg.eigvalsh(joint * np.outer(scale, scale))[0] > -1e-6, f"{seed=} {step=}"
-
-
-def _jointly(belief: Belief) -> list[tuple[Floats, Floats]]:
-    """Covariance of each node, and that with the state."""
-    assert belief.past is not None
-    nodes = belief.past.nodes_with(belief.stamp_ns, belief.x, belief.P)
-    return list(zip(nodes.covariance[:-1], nodes.cross[:-1], strict=True))
-
-
-# --- headings, and who may change a belief ---------------------------------------------------------------------------
-
-
 def test_headings_are_smoothed_across_the_back() -> None:
     """The machine turns past +-180 degrees; corrections stay small, headings in +-pi."""
     belief, groups = start(4.0, yaw=2.9), []
@@ -343,13 +237,3 @@ def test_headings_are_smoothed_across_the_back() -> None:
         assert abs(pose.heading_rad) <= math.pi
         assert math.remainder(pose.heading_rad - true, math.tau) == pytest.approx(0.0, abs=0.02)
         assert abs(pose.correction[2]) < 0.1
-
-
-def test_whoever_changes_a_belief_minds_its_past() -> None:
-    """Made elsewhere it would have none, or a wrong one: changes belong to `belief.py`."""
-    makers = set()
-    for path in Path(agents.__path__[0]).rglob("*.py"):
-        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
-        if any(isinstance(call.func, ast.Name) and call.func.id == "Belief" for call in calls):
-            makers.add(path.name)
-    assert makers == {"belief.py", "square_root.py", "alignment.py", "textbook.py"}

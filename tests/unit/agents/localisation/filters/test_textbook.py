@@ -4,7 +4,6 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -62,44 +61,23 @@ def test_each_step_of_a_drive_is_that_of_our_own_filter(
     """Alignment, turns across +-180 degrees, an attitude reference, fixes with a lever, one of them an outlier."""
     vehicle = machine(receivers=2)
     vehicle = type(vehicle)(**{**vars(vehicle), "sensors": (*vehicle.sensors, AHRS)})
-    made = drive(S_BEND, vehicle, heading_rad=3.0)
+    made = drive(S_BEND[:3], vehicle, heading_rad=3.0)
     compared = Compared(stock, own)
     monkeypatch.setattr(localiser_module, "_engine", lambda _: compared)
     located = RunLocaliser(vehicle, PROJECTION, LocalisationConfig(profile="paper", filter=name))
     located.run(with_ahrs(made))
-    assert compared.steps > 2500
-    assert compared.accepted > 2000
+    assert compared.steps > 1000
+    assert compared.accepted > 800
     assert compared.difference < 1e-9
 
 
 @STOCK
-def test_a_measurement_beyond_its_gate_changes_nothing(stock: Filter) -> None:
+def test_what_is_no_number_is_refused(stock: Filter) -> None:
     belief = Belief(0, np.zeros(2), np.eye(2))
-    result = stock.condition(belief, seen([10.0], gate_sigma=4.0))
-    assert not result.accepted
-    assert result.belief is belief
-    assert result.nis == pytest.approx(50.0)
-    assert stock.condition(belief, seen([10.0])).accepted
-
-
-@STOCK
-@pytest.mark.parametrize("z", [math.nan, math.inf])
-@pytest.mark.parametrize("R", [1.0, math.nan])
-def test_what_is_no_number_is_refused(stock: Filter, z: float, R: float) -> None:
-    belief = Belief(0, np.zeros(2), np.eye(2))
-    for bad in (seen([z]), seen([1.0], R=math.nan), seen([z], R=R)):
+    for bad in (seen([math.nan]), seen([math.inf]), seen([1.0], R=math.nan)):
         result = stock.condition(belief, bad)
         assert result.belief is belief
         assert math.isnan(result.nis)
-
-
-@STOCK
-def test_it_writes_to_nothing_that_it_is_given(stock: Filter) -> None:
-    belief = Belief(0, frozen([1.0, 2.0]), frozen(np.eye(2)))
-    moved = stock.predict(belief, still(frozen(np.eye(2) * 0.1)), 5)
-    assert moved.stamp_ns == 5
-    np.testing.assert_allclose(moved.P, np.eye(2) * 1.1, atol=1e-15)
-    assert stock.condition(belief, seen([1.5])).accepted
 
 
 NO_COVARIANCE = np.array([[1.0, 2.0], [2.0, 1.0]])  # one eigenvalue is -1
@@ -131,10 +109,8 @@ def test_a_filter_that_failed_starts_again_and_is_counted(monkeypatch: pytest.Mo
             lost = True
             assert positioning.pose is None  # the start that was configured is far behind by now
     assert positioning.counters["filter_restarts"] == 1
-    assert positioning.pose is not None
-    x, y, heading = made.at(positioning.pose.stamp_ns)
-    assert math.dist((positioning.pose.x_m, positioning.pose.y_m), (x, y)) < 0.5
-    assert abs(positioning.pose.heading_rad - heading) < 0.1
+    assert made.off_m(positioning.pose) < 0.5
+    assert made.turned_rad(positioning.pose) < 0.1
 
 
 class FailsOnce:
@@ -154,9 +130,8 @@ class FailsOnce:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("profile", "loaded"), [("default", False), ("paper", True)])
-@pytest.mark.parametrize("name", ["ekf", "ukf"])
-def test_only_the_paper_s_profile_loads_the_library(profile: str, loaded: bool, name: str) -> None:
+@pytest.mark.parametrize(("profile", "name", "loaded"), [("default", "ukf", False), ("paper", "ekf", True)])
+def test_only_the_paper_s_profile_loads_the_library(profile: str, name: str, loaded: bool) -> None:
     code = (
         "import sys; from tests.unit.agents.drives import *; from agents.agent import Agent\n"
         f"run = localiser(VEHICLE, profile={profile!r}, filter={name!r}, start=START)\n"
@@ -166,12 +141,6 @@ def test_only_the_paper_s_profile_loads_the_library(profile: str, loaded: bool, 
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert ("filterpy" in output) == loaded
     assert loaded or "matplotlib" not in output
-
-
-def frozen(values: Any) -> Floats:
-    array = np.array(values, float)
-    array.setflags(write=False)
-    return array
 
 
 def still(Q: Floats) -> Motion:
