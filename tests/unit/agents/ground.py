@@ -44,6 +44,7 @@ STEADY = Balance(
     torque_s=0.01,
     wheels_s=0.02,
     mass_kg=17_500.0,
+    brake=0.0,
 )
 
 
