@@ -22,7 +22,7 @@ from operator import add
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import SlopeFilter
 from protocol.arrays import Floats
-from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
+from protocol.machine.machine_config import BASE, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import (
     Articulation,
     Brake,
@@ -47,18 +47,21 @@ NO_SUMS = (0.0,) * 8
 class Balance:
     """One step of the force balance.
 
-    speed_mps, accel_mps2, distance_m: of the wheels; distance_m counts up in reverse too. unbalanced: the left side of
-    the equation, share: what the torque sensor states of F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad] with
-    their variance, as the body has them, without squat; sine_x: of the one ahead, by the accelerometer alone.
-    pitch_radps: rate of the pitch, nose up positive. norm_mps2: of the specific force. on_front: share of the load on
-    the front axle, 0 if not known. body_mps2: acceleration ahead by the accelerometer. torque_s, wheels_s: age of their
-    newest reading. mass_kg: with payload. brake: how much of a brake is applied whose force nobody reads, 0 to 1; NaN
-    of a machine without any reading of its brakes.
+    speed_mps, accel_mps2, distance_m: of the wheels; distance_m counts up in reverse too; speed_std_mps: of their
+    resolution and noise. unbalanced: the left side of the equation, share: what the torque sensor
+    states of F / (m g), both [-] and signed ahead.
+    slope_x, slope_y: angles ahead and to the left [rad] with their variance, as the body has them, without squat;
+    sine_x: of the one ahead, by the accelerometer alone. pitch_radps: rate of the pitch, nose up positive. yaw_radps:
+    of the turn to the left. norm_mps2: of the specific force. on_front: share of the load on the front axle, 0 if not
+    known. body_mps2: acceleration ahead by the accelerometer. torque_s, wheels_s: age of their newest reading.
+    mass_kg: with payload. brake: how much of a brake is applied whose force nobody reads, 0 to 1; NaN of a machine
+    without any reading of its brakes.
     """
 
     stamp_ns: int
     dt_s: float
     speed_mps: float
+    speed_std_mps: float
     accel_mps2: float
     distance_m: float
     unbalanced: float
@@ -68,6 +71,7 @@ class Balance:
     slope_var: float
     sine_x: float
     pitch_radps: float
+    yaw_radps: float
     norm_mps2: float
     on_front: float
     body_mps2: float
@@ -120,8 +124,7 @@ class Balancer:
         self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = 0
         # Count; force ahead at base_link, norm; rates about x, y, z; forces ahead and left that change the speed.
         self._imu_sums = NO_SUMS
-        # Ahead and left at the IMU, by the wheels; None where they said nothing in this step.
-        self._speed_mps: tuple[float, float] | None = None
+        self._rolls = False  # whether wheels said something in this step
         self._torque_nm, self._torque_sums = 0.0, (0, 0.0)
         self._brakes: dict[str, Brake] = {}
         self._brake_forces: dict[str, BrakeForce] = {}
@@ -172,21 +175,25 @@ class Balancer:
         accel, speed = (wheels.accel_mps2, wheels.speed_mps) if shows_speed else (0.0, 0.0)
         at_base = ahead + (wy**2 + wz**2) * x_m  # without what turning adds at the sensor's place
         vx, vy, vz = speed + wz * (wheels.offset_m - y_m) + wy * z_m, wz * x_m - wx * z_m, wx * y_m - wy * x_m
-        self._speed_mps = (vx, vy) if shows_speed and self._wheels_ns > self._begin_ns else None
+        self._rolls = shows_speed and self._wheels_ns > self._begin_ns
         norm, turned = math.hypot(ahead, left, up), (ahead - wy * vz + wz * vy, left - wz * vx + wx * vz)
         self._imu_sums = tuple(map(add, self._imu_sums, (1, at_base, norm, wx, wy, wz, *turned)))
         if imu.stamp_ns - self._begin_ns < STEP_NS:
             return None
-        return self._balance(dead_reckoning, speed, accel)
+        return self._balance(dead_reckoning, sensor.mount, speed, accel)
 
-    def _balance(self, dead_reckoning: DeadReckoning, speed: float, accel: float) -> Balance:
+    def _balance(self, dead_reckoning: DeadReckoning, mount: Mount, speed: float, accel: float) -> Balance:
         machine, g = self._machine, GRAVITY_MPS2
         (n, *sums), (torques, torque_nm) = self._imu_sums, self._torque_sums
         force, norm, about_x, about_y, about_z, *turned = (value / n for value in sums)
         rate = -about_y  # the nose rises
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
         self._imu_sums, self._torque_sums = NO_SUMS, (0, 0.0)
-        self._slope.update(dt_s, (about_x, about_y, about_z), turned, self._speed_mps)
+        # At the sensor, with mean rates: those of one reading shake.
+        x_m, y_m, z_m = mount.xyz_m
+        ahead = speed + about_z * (dead_reckoning.wheels.offset_m - y_m) + about_y * z_m
+        at_sensor = (ahead, about_z * x_m - about_x * z_m) if self._rolls else None
+        self._slope.update(dt_s, (about_x, about_y, about_z), turned, at_sensor)
         drive_n = (torque_nm / torques if torques else self._torque_nm) / machine.wheel_radius_m
         share = drive_n / (self.mass_kg * g)
         on_front = front_share(machine, self.payload_kg, force)
@@ -200,6 +207,7 @@ class Balancer:
             stamp_ns=self._imu_ns,
             dt_s=dt_s,
             speed_mps=speed,
+            speed_std_mps=dead_reckoning.wheels.std_mps,
             accel_mps2=accel,
             distance_m=dead_reckoning.distance_m,
             unbalanced=unbalanced,
@@ -209,6 +217,7 @@ class Balancer:
             slope_var=self._slope.variance,
             sine_x=(force - accel) / g - squat,
             pitch_radps=rate,
+            yaw_radps=about_z,
             norm_mps2=norm,
             on_front=on_front,
             body_mps2=force - g * self._slope.shown_ahead,

@@ -110,24 +110,30 @@ class Calibrator:
         zero, scale = np.clip(self._x, (-MOST_ZERO, -MOST_SCALE), (MOST_ZERO, MOST_SCALE)).tolist()
         return Calibration(zero, scale, ((zz, zs), (zs, ss)), self._stamp_ns, self._passages, self._offer_ns)
 
-    def update(self, balance: Balance, dead_reckoning: DeadReckoning, known_c_rr: float | None) -> None:
-        """Add a usable balance; known_c_rr: of the ground here, where the site states it."""
+    def update(
+        self, balance: Balance, dead_reckoning: DeadReckoning, known_c_rr: float | None, shaking_var: float = 0.0
+    ) -> None:
+        """Add a usable balance.
+
+        known_c_rr: of the ground here, where the site states it. shaking_var: of one balance, beyond the usual [-].
+        """
         newest = self._stretch[-1] if self._stretch else balance
         if newest.direction != balance.direction or balance.stamp_ns - newest.stamp_ns > MAX_GAP_NS:
             self._stretch.clear()
         self._stretch.append(balance)
         if balance.distance_m - self._stretch[0].distance_m < STRETCH_M:
             return
+        variance = STRETCH_STD**2 + shaking_var / len(self._stretch) ** 2  # a body that shakes goes nowhere
         stretch = self._end_stretch(dead_reckoning)
         if known_c_rr is not None:
             cosine = math.cos(balance.slope_x)
             measured = stretch.unbalanced - stretch.direction * cosine * known_c_rr
-            self._learn(stretch.stamp_ns, measured, stretch.share, STRETCH_STD**2)
+            self._learn(stretch.stamp_ns, measured, stretch.share, variance)
             self.counters["known_ground"] += 1
         elif partner := self._partner(stretch):
             self._past.remove(partner)  # a passage counts once
             mean, share = (stretch.unbalanced + partner.unbalanced) / 2, (stretch.share + partner.share) / 2
-            self._learn(stretch.stamp_ns, mean, share, STRETCH_STD**2 / 2)
+            self._learn(stretch.stamp_ns, mean, share, variance / 2)
             self.counters["pairs"] += 1
             return
         self._past.append(stretch)

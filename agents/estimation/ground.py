@@ -19,6 +19,8 @@ from agents.estimation.offers import Offers
 from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility
 from agents.estimation.resistance_kalman import KalmanResistance
 from agents.estimation.resistance_rls import RecursiveGrade, RecursiveResistance
+from agents.estimation.shaking import LongerSteps
+from agents.estimation.skid_steering import SkidSteering
 from agents.localisation.filters.belief import PoseBelief
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Reading
@@ -101,7 +103,9 @@ class GroundEstimator:
         """calibration: from before."""
         self._machine, self._config = machine, config
         self._balancer = Balancer(machine, weighs=config.mass == "message")
-        self._plausibility = Plausibility()
+        self._plausibility = Plausibility(machine.wheelbase_m)
+        self._longer = LongerSteps()
+        self._skid_steering = SkidSteering(machine)
         self._calibrator = Calibrator(calibration)
         self._tours = ClosedTours()
         self._offers = Offers(machine.name, calibration.offer_ns if calibration else 0)
@@ -153,6 +157,7 @@ class GroundEstimator:
         return {
             "fault": self.fault,
             "payload_kg": self._balancer.payload_kg,
+            "skid_steers": self._skid_steering.is_so,
             "calibration": {
                 "zero": applied.zero,
                 "zero_std": math.sqrt(applied.covariance[0][0]),
@@ -178,6 +183,7 @@ class GroundEstimator:
     ) -> None:
         """Add a reading, after dead reckoning did. known_c_rr: of the ground here, where the site states it."""
         self._newest_reading_ns = max(self._newest_reading_ns, reading.stamp_ns)
+        self._skid_steering.update(reading, sensor, dead_reckoning)
         if balance := self._balancer.update(reading, sensor, dead_reckoning):
             self._step(balance, dead_reckoning, known_c_rr)
             if self._config.calibrate and self._config.closed_tours:
@@ -225,7 +231,8 @@ class GroundEstimator:
             self._apply_calibration(balance.stamp_ns)
         cosine = math.cos(balance.slope_x)
         raw = self._applied.corrected(balance)
-        reason = self._plausibility.judge(balance, balance.direction * raw / cosine)
+        skids = self._skid_steering.turns(balance)
+        reason = self._plausibility.judge(balance, balance.direction * raw / cosine, skids=skids)
         slope_x = self._grade.update(balance.dt_s, balance.sine_x) if self._grade else balance.slope_x
         self._judged.append(_JudgedBalance(balance.stamp_ns, balance, reason, slope_x))
         if reason == "standstill":
@@ -235,9 +242,12 @@ class GroundEstimator:
             return
         self._stands_s = 0.0
         distance_m, self._usable_m = balance.distance_m - self._usable_m, balance.distance_m
-        self._resistance.update(self._balance_step(balance, distance_m, raw, balance.direction * cosine))
+        step = self._balance_step(balance, distance_m, raw, balance.direction * cosine)
+        shaking_var = self._plausibility.shaking_var
+        for ready in self._longer.add(step, shakes=shaking_var > 0):
+            self._resistance.update(ready)
         if self._config.calibrate:
-            self._calibrator.update(balance, dead_reckoning, known_c_rr)
+            self._calibrator.update(balance, dead_reckoning, known_c_rr, shaking_var)
 
     def _follow(self, balance: Balance, pose: PoseBelief | None) -> None:
         """Follow the track; what a tour shows takes effect at once, since a machine on tours may never stand."""
@@ -271,4 +281,5 @@ class GroundEstimator:
             before, self._applied = self._applied, self._calibrator.calibration
             zero, scale = self._applied.zero - before.zero, self._applied.scale - before.scale
             if zero or scale:
+                self._longer.clear()  # what waits there has the old one
                 self._resistance.recalibrate(zero, scale)

@@ -12,6 +12,7 @@ or its torque has braked before: then that sees them.
 import math
 
 from agents.estimation.balance import SLOW_MPS, Balance
+from agents.estimation.shaking import Shaking
 from protocol.units import GRAVITY_MPS2
 
 # Reasons that make the slope worthless too: such a sample says that the machine was there, and how heavy.
@@ -21,10 +22,18 @@ FAULTS = frozenset({"accelerometer", "no_torque", "no_wheels", "torque_frozen", 
 # Norm of a specific force in m/s2. One in g or in mm/s2 is outside, and so is a broken sensor.
 FORCE_NORMS_MPS2 = (5.0, 15.0)
 STALE_S = 0.5  # torque or wheel readings older than this are missing
-MIN_SPEED_MPS = 0.4  # slower is a standstill
-# The pitch rate over the speed is the change of slope per metre: with more than this, the axles stand on slopes that
-# differ by 2 to 3 degrees.
-MAX_CURVE_RADPM = 0.013
+# Wheels certainly roll, and in this direction, if their speed is so many times its standard deviation: 0.15 m/s by an
+# encoder of 100 ticks on a wheel of 0.75 m, at 20 Hz. Slower than the second number they roll into the ground's play.
+ROLLS_SIGMA, MIN_SPEED_MPS = 3.0, 0.05
+# The pitch rate over the speed is the change of slope per metre. At the first limit the axles of a loader stand on
+# slopes that differ by the second, 2.5 degrees; a shorter machine may bend its way by more. Where a machine shakes, the
+# rate is the mean over the way from axle to axle.
+MAX_CURVE_RADPM, MAX_DIFFERENCE_RAD = 0.013, 0.0429
+# What a step may shake by, ahead and in pitch, before limits widen. A loader on tyres has 0.15 m/s2 and 0.002 rad/s,
+# 0.013 rad/s at the foot of a ramp. The second is half the rate that is too much.
+USUAL_MPS2, USUAL_RADPS = 0.25, 0.013
+AXLES_M = 3.3  # the way from axle to axle where the wheelbase is not known: a loader's
+AXLES_S = (0.5, 1.0)  # limits of the time that the way takes: a gyro's bias turns the slope of who creeps
 MAX_BRAKE_MPS2 = 1.5  # the wheels slow down faster than by any resistance but that of sand
 # Of drive force over weight, in the direction of travel: who pulls more does not brake, but sand or a ramp slows it
 # down. Above noise and zero of the torque of one that coasts, and no more than gravel resists.
@@ -37,7 +46,7 @@ MAX_C_RR = 0.45  # no ground that a machine drives on resists more: the bucket d
 MIN_C_RR = -0.08  # the ground pushes: the torque that does it is missing, and no accelerometer's zero is so far off
 MAX_SLIP_MPS2 = 1.0  # the wheels' acceleration is this far from the body's: they spin or lock
 MEAN_S = 0.3  # over which wheels and body are compared
-HOLD_S = 0.5  # forces settle for so long after slip, braking and digging
+HOLD_S = 0.5  # forces settle for so long after slip, braking, digging and a turn of a machine that skids
 # Torque that stays exactly the same for so long, while the force that the motion takes changes by this share of the
 # weight, is stuck or at the end of its range.
 FROZEN_S, FROZEN_SHARE = 2.0, 0.03
@@ -52,9 +61,13 @@ LEAST_VARIED = 0.3 / GRAVITY_MPS2  # standard deviation of the force that the mo
 
 
 class Plausibility:
-    """Judges balances one after another."""
+    """Judges balances one after another. axles_m: the wheelbase, 0 where it is not known."""
 
-    def __init__(self) -> None:
+    def __init__(self, axles_m: float = 0.0) -> None:
+        self._axles_m = axles_m or AXLES_M
+        self._shaking, self._pitching = Shaking(USUAL_MPS2), Shaking(USUAL_RADPS)
+        self._norm_mps2 = GRAVITY_MPS2  # of the specific force, low-passed
+        self._pitch_radps = 0.0  # mean over the way from axle to axle
         self._mismatch_mps2 = 0.0  # wheels against body, low-passed
         self._hold = ("", 0.0)  # reason, and for how long still
         self._frozen = _Frozen()
@@ -63,50 +76,75 @@ class Plausibility:
         self._braked = 0.0  # drive force over weight in the direction of travel, low-passed
         self._torque_brakes = False  # whether the torque was seen to brake
 
-    def judge(self, balance: Balance, resistance: float) -> str:
-        """Why this balance shows nothing of the resistance; "" if it does. resistance: c_rr by this balance."""
-        if not FORCE_NORMS_MPS2[0] <= balance.norm_mps2 <= FORCE_NORMS_MPS2[1]:
+    @property
+    def shaking_var(self) -> float:
+        """Variance of c_rr by one balance, from what the machine shakes beyond the usual [-]."""
+        return self._shaking.variance / GRAVITY_MPS2**2
+
+    def judge(self, balance: Balance, resistance: float, *, skids: bool = False) -> str:
+        """Why this balance shows nothing of the resistance; "" if it does.
+
+        resistance: c_rr by this balance. skids: whether the wheels slide sideways in a turn.
+        """
+        self._follow(balance)
+        norm_mps2 = self._norm_mps2 if self._shaking.variance else balance.norm_mps2  # a jolt is no vibration
+        if not FORCE_NORMS_MPS2[0] <= norm_mps2 <= FORCE_NORMS_MPS2[1]:
             return "accelerometer"
         if fault := self._fault(balance, resistance):
             return fault
-        if abs(balance.speed_mps) < MIN_SPEED_MPS:
+        if not _rolls(balance):
             return "standstill"
-        if abs(balance.pitch_radps) > MAX_CURVE_RADPM * max(abs(balance.speed_mps), SLOW_MPS):
+        pitch_radps = self._pitch_radps if self._pitching.variance else balance.pitch_radps
+        curve = max(MAX_CURVE_RADPM, MAX_DIFFERENCE_RAD / self._axles_m)
+        if abs(pitch_radps) > curve * max(abs(balance.speed_mps), SLOW_MPS):
             return "pitch_transient"
-        return self._unsteady(balance, resistance)
+        return self._unsteady(balance, resistance, skids=skids)
+
+    def _follow(self, balance: Balance) -> None:
+        """Average what shakes."""
+        self._norm_mps2 += min(balance.dt_s / MEAN_S, 1.0) * (balance.norm_mps2 - self._norm_mps2)
+        low_s, high_s = AXLES_S
+        way_s = max(low_s, min(high_s, self._axles_m / max(abs(balance.speed_mps), MIN_SPEED_MPS)))
+        self._pitch_radps += min(2 * balance.dt_s / way_s, 1.0) * (balance.pitch_radps - self._pitch_radps)
+        self._shaking.update(balance.dt_s, balance.accel_mps2 - balance.body_mps2)
+        self._pitching.update(balance.dt_s, balance.pitch_radps)
 
     def _fault(self, balance: Balance, resistance: float) -> str:
         if balance.wheels_s > STALE_S:
             return "no_wheels"
         if balance.torque_s > STALE_S:
             return "no_torque"
-        drives = abs(balance.speed_mps) >= MIN_SPEED_MPS
-        if self._frozen.update(balance, drives=drives) >= FROZEN_SHARE and self._frozen.same_s >= FROZEN_S:
+        drives = _rolls(balance)
+        frozen_share = FROZEN_SHARE + 2 * self._shaking.margin(MEAN_S) / GRAVITY_MPS2  # its top and its bottom shake
+        is_frozen = self._frozen.update(balance, drives=drives) >= frozen_share and self._frozen.same_s >= FROZEN_S
+        if is_frozen and abs(balance.share) > ROLLS_SHARE:  # none at all is that of a machine that rolls or brakes
             return "torque_frozen"
         if abs(balance.share) > MAX_SHARE:
             return "torque_implausible"
         if drives:
             self._gain.update(balance)
             self._resisted += min(balance.dt_s / SMOOTH_S, 1.0) * (resistance - self._resisted)
-        return "torque_implausible" if self._resisted < MIN_C_RR or self._gain.is_wrong else ""
+        least = MIN_C_RR - self._shaking.margin(SMOOTH_S) / GRAVITY_MPS2
+        return "torque_implausible" if self._resisted < least or self._gain.is_wrong else ""
 
-    def _unsteady(self, balance: Balance, resistance: float) -> str:
+    def _unsteady(self, balance: Balance, resistance: float, *, skids: bool) -> str:
         """Whether forces that the balance does not include act, or acted a moment ago."""
         may_brake = self._may_brake_unseen(balance)
         difference = balance.accel_mps2 - balance.body_mps2
         self._mismatch_mps2 += min(balance.dt_s / MEAN_S, 1.0) * (difference - self._mismatch_mps2)
-        if abs(self._mismatch_mps2) > MAX_SLIP_MPS2:
+        if abs(self._mismatch_mps2) > MAX_SLIP_MPS2 + self._shaking.margin(MEAN_S):
             self._hold = "slip", HOLD_S
         elif _brakes(balance):
             self._hold = "braking", HOLD_S
         elif may_brake:
             self._hold = "braking_unseen", HOLD_S
-        elif resistance > MAX_C_RR:
+        elif resistance > MAX_C_RR + self._shaking.margin() / GRAVITY_MPS2:
             self._hold = "digging", HOLD_S
+        elif skids:
+            self._hold = "skid_turn", HOLD_S
         reason, left_s = self._hold
         self._hold = reason, left_s - balance.dt_s
         return reason if left_s > 0 else ""
-
 
     def _may_brake_unseen(self, balance: Balance) -> bool:
         """Whether the machine rolls without torque, and nothing has shown its brakes."""
@@ -116,12 +154,14 @@ class Plausibility:
         return not self._torque_brakes and math.isnan(balance.brake) and pulls < ROLLS_SHARE
 
 
+def _rolls(balance: Balance) -> bool:
+    return abs(balance.speed_mps) >= max(MIN_SPEED_MPS, ROLLS_SIGMA * balance.speed_std_mps)
+
+
 def _brakes(balance: Balance) -> bool:
     """Whether a brake is applied, or the machine slows down fast, not because the ground does it while it pulls."""
     slows_mps2 = -balance.direction * balance.accel_mps2
-    return balance.brake > APPLIED or (
-        slows_mps2 > MAX_BRAKE_MPS2 and balance.direction * balance.share < PULLS_SHARE
-    )
+    return balance.brake > APPLIED or (slows_mps2 > MAX_BRAKE_MPS2 and balance.direction * balance.share < PULLS_SHARE)
 
 
 class _Frozen:
@@ -151,6 +191,10 @@ class _Gain:
     Both vary together as the machine starts, stops and climbs. Only their common variation counts, so neither zeros nor
     resistances that stay the same matter. 1 until they have varied enough.
 
+    The accelerometer, which measures the motion's force x, shakes; that would make the slope look flat. So both are
+    compared with the motion by wheels and slope, z, whose errors are others: the slope is cov(z, y) / cov(z, x) (errors
+    in variables, by an instrument; Wald 1940, Durbin 1954), and cov(z, x) is the variance without the noise.
+
     Resistance that varies with the motion does matter: sand takes force and slows the machine down, so that more force
     comes with less acceleration, as if the sign were wrong. But sand resists all the time. With a wrong gain k, c_rr by
     a balance is k c_rr plus (k - 1) times the motion's force, which falls below 0 as the machine climbs or slows down.
@@ -158,24 +202,20 @@ class _Gain:
     """
 
     def __init__(self) -> None:
-        self._weight = self._x = self._y = self._xx = self._xy = 0.0
-        self._means = (0.0, 0.0)
+        self._means = (0.0, 0.0, 0.0)  # x, y and z, low-passed
+        self._sums: tuple[float, ...] = (0.0,) * 6  # weight; x, y, z; z x, z y
         self._least = 0.0  # c_rr of late
 
     def update(self, balance: Balance) -> None:
         """Add a balance of a machine that drives."""
-        fade = math.exp(-balance.dt_s / FORGET_S)
-        # The force of the motion and the drive force, both smooth: noise of the first would make the slope look flat.
-        news_xy = (balance.share - balance.unbalanced, balance.share)
-        share = min(balance.dt_s / SMOOTH_S, 1.0)
-        x, y = (mean + share * (new - mean) for mean, new in zip(self._means, news_xy, strict=True))
-        self._means = (x, y)
+        fade, share = math.exp(-balance.dt_s / FORGET_S), min(balance.dt_s / SMOOTH_S, 1.0)
+        moves = balance.accel_mps2 / GRAVITY_MPS2 + math.sin(balance.slope_x)
+        newest = (balance.share - balance.unbalanced, balance.share, moves)
+        x, y, z = (mean + share * (new - mean) for mean, new in zip(self._means, newest, strict=True))
+        self._means = (x, y, z)
         self._least = min(fade * self._least, balance.direction * (y - x))
-        sums = (self._weight, self._x, self._y, self._xx, self._xy)
-        news = (1.0, x, y, x * x, x * y)
-        self._weight, self._x, self._y, self._xx, self._xy = (
-            fade * old + balance.dt_s * new for old, new in zip(sums, news, strict=True)
-        )
+        news = (1.0, x, y, z, z * x, z * y)
+        self._sums = tuple(fade * old + balance.dt_s * new for old, new in zip(self._sums, news, strict=True))
 
     @property
     def is_wrong(self) -> bool:
@@ -185,10 +225,9 @@ class _Gain:
     @property
     def _value(self) -> float:
         """The slope [-]."""
-        if self._weight < LEAST_COMPARED_S:
+        weight = self._sums[0]
+        if weight < LEAST_COMPARED_S:
             return 1.0
-        x, y = self._x / self._weight, self._y / self._weight
-        varied = self._xx / self._weight - x * x
-        if varied < LEAST_VARIED**2:
-            return 1.0
-        return (self._xy / self._weight - x * y) / varied
+        x, y, z, zx, zy = (total / weight for total in self._sums[1:])
+        varied = zx - z * x
+        return (zy - z * y) / varied if varied > LEAST_VARIED**2 else 1.0

@@ -36,6 +36,7 @@ from protocol.arrays import Floats
 LEAD, TRAIL, SCALE = 0, 1, 2
 KEPT = 100  # steps: 5 s, more than a sample waits for what comes after it
 NEAR_NS = 150_000_000  # a stamp this far from a usable step has no estimate
+PAUSE_S = 0.1  # steps further apart do not follow one another
 NOISE = 0.004  # least density of the noise of raw c_rr [1/sqrt(Hz)]; larger noise is measured
 NOISE_S = 20.0  # over which noise is measured
 OUTLIER = 16.0  # squares beyond so many times the mean are no noise, but a border
@@ -202,11 +203,16 @@ class _Noise:
 
     def update(self, step: BalanceStep) -> None:
         last, self._last = self._last, step
-        if last is None or last.regressor * step.regressor < 0 or step.stamp_ns - last.stamp_ns > NEAR_NS:
+        if last is None or last.regressor * step.regressor < 0 or _pause_s(last, step) > PAUSE_S:
             return
         measured = min(0.5 * (step.raw - last.raw) ** 2 * step.dt_s, OUTLIER * self.density)
         share = min(step.dt_s / NOISE_S, 1.0)
         self.density = max(self.density + share * (measured - self.density), NOISE**2)
+
+
+def _pause_s(last: BalanceStep, step: BalanceStep) -> float:
+    """Between the end of a step and the beginning of the next."""
+    return (step.stamp_ns - last.stamp_ns) * 1e-9 - step.dt_s
 
 
 def _start(scale_var: float) -> _Filtered:

@@ -136,7 +136,9 @@ def stamp_reader(column: Column) -> Callable[[Row], int]:
     """
     unit_ns = stamp_scale(column.unit or "s")
     if not column.weights or column.offset or column.over:
-        raise ValueError("a column is expected, neither a constant, an offset nor a quotient: times count from `start_ns`")
+        raise ValueError(
+            "a column is expected, neither a constant, an offset nor a quotient: times count from `start_ns`"
+        )
     scales = {name: round(weight * unit_ns) for name, weight in column.weights.items()}
     for name, weight in column.weights.items():
         if not scales[name] or not math.isclose(scales[name], weight * unit_ns, rel_tol=1e-9):
@@ -164,7 +166,7 @@ def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str
         raise LogFolderError(path, f"cannot be read: {error}") from None
 
 
-def require(names: Mapping[str, float], rows: "csv.DictReader[str]", path: Path) -> None:
+def require(names: Iterable[str], rows: "csv.DictReader[str]", path: Path) -> None:
     """Refuse a file that lacks a column, or has two of its name."""
     header = list(rows.fieldnames or ())
     for name in names:

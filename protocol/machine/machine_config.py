@@ -136,7 +136,8 @@ class MachineConfig:
 
     load_centre_m: how far ahead of `base_link` the wheel loads' centre lies. rotating_mass_factor: mass plus the
     wheels' inertia over mass. A machine without a drive torque sensor needs no mass. machine_share: share of the slow
-    variance that its GPS receivers have in common, None to estimate it.
+    variance that its GPS receivers have in common, None to estimate it. skid_steers: whether its two sides drive at
+    different speeds to turn it, None to see it by its turns on the spot.
 
     The rest, 0 where not known: wheelbase_m: from the rear axle to the front one, straight ahead. axle_stiffness_npm:
     vertical, of the two tyres of one axle together. cog_height_m: of the empty machine's centre of mass above the
@@ -151,6 +152,7 @@ class MachineConfig:
     load_centre_m: float = 1.5
     rotating_mass_factor: float = 1.07
     machine_share: float | None = None
+    skid_steers: bool | None = None
     wheelbase_m: float = 0.0
     axle_stiffness_npm: float = 0.0
     cog_height_m: float = 0.0

@@ -55,6 +55,7 @@ class Chassis(NamedTuple):
     steer_gain_per_s: Floats
     steer_lag_s: Floats
     engine_lag_s: Floats
+    skid_grip: Floats
 
 
 class Weight(NamedTuple):

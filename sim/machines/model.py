@@ -26,7 +26,8 @@ class MachineModel:
     """One kind of articulated machine on four wheels, as it leaves the works; `sim/machines/*.toml` explain the values.
 
     urdf: file beside the TOML file. mass_kg: empty. payload_kg: the most it carries. load_centre_m: how far ahead of
-    the rear axle the wheel loads' centre lies, empty.
+    the rear axle the wheel loads' centre lies, empty. skid_grip: of a machine that skid-steers, whose joint only stands
+    for its steering: side force over load of wheels that slide; 0: none do.
     """
 
     name: str
@@ -52,13 +53,14 @@ class MachineModel:
     tyre_stiffness_npm: float
     tyre_damping_nspm: float
     relaxation_m: float
+    skid_grip: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 < self.max_articulation_rad < 1.2:
             raise ValueError("max_articulation_rad: not between 0 and 1.2")
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, float) and value <= 0:
+            if isinstance(value, float) and value <= 0 and field.name != "skid_grip":
                 raise ValueError(f"{field.name}: {value:g} is not positive")
 
     @property

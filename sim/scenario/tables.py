@@ -208,6 +208,8 @@ class Scenario:
             model, preset = load_model(fleet.model), self.preset(fleet.preset)
             payload = self._loads(fleet) if fleet.payload is None else fleet.payload
             config = machine_config(name, model, preset, fleet.gps, fleet.imu, fleet.attitude, payload=payload)
+            if model.skid_grip and self.world != "fast":
+                raise ValueError(f'fleet: {fleet.name}: machines that skid-steer need world = "fast"')
             rigs.append(Rig(config, model, preset, faults.get(name, Faults())))
         return rigs
 

@@ -15,7 +15,9 @@ from protocol.arrays import Floats
 # The order fixes which generator a sensor gets: append only, or all seeds change their meaning.
 STREAMS: tuple[str, ...] = ("body", "gps-1", "gps-2", "gps-3", "imu-1", "imu-2", "imu-3", "wheels", "torque")
 STREAMS += ("articulation", "outage", "imu-4", "attitude-1", "attitude-2", "attitude-3", "attitude-4", "payload")
-STREAMS += ("receivers", "driver", "brake")  # what the receivers of one machine have in common; its driver
+STREAMS += ("receivers", "driver")  # what the receivers of one machine have in common; its driver
+STREAMS += ("vibration",)  # of one machine: all its IMUs shake alike
+STREAMS += ("brake",)
 SITE = 2**32 - 1  # in the place of a machine's number: what all machines of a site share
 # Drawn at a time: a call for every reading would cost more than its numbers. No power of two, or the rows that all
 # sensors take together would share a few lines of the cache (six times slower).

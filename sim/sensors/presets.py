@@ -83,6 +83,8 @@ class ImuNoise(SensorErrors):
     """An IMU, per axis: white noise, a zero that is drawn at turn-on, slow drift of it, scale (of 1), mounting.
 
     force_vibration_mps2: added to the white noise of the force while driving, in full from vibration_speed_mps on.
+    shake_mps2, wheel_mps2, engine_mps2: standard deviations of how the body itself shakes, per axis: broad-band, with
+    the lugs of the wheels, and with the engine (`vibration`). degps_per_mps2: the rates that go with them.
     """
 
     gyro_white_degps: NotNegative
@@ -96,6 +98,10 @@ class ImuNoise(SensorErrors):
     drift_time_s: Positive
     scale: Scale
     mounting_deg: Tilt
+    shake_mps2: NotNegative = 0.0
+    wheel_mps2: NotNegative = 0.0
+    engine_mps2: NotNegative = 0.0
+    degps_per_mps2: NotNegative = 0.0
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def machine_config(
     sensors = [_inertial("imu", number, model) for number in imu]
     sensors += [_inertial("attitude", number, model) for number in attitude]
     sensors += [SensorConfig("torque", "torque"), SensorConfig("wheels", "encoder", ticks_per_rev=ticks)]
-    sensors += [SensorConfig("articulation", "articulation")]
+    sensors += [] if model.skid_grip else [SensorConfig("articulation", "articulation")]
     sensors += [_receiver(number, model, preset.gps) for number in gps]
     sensors += [SensorConfig("payload", "payload")] if payload else []
     sensors += [SensorConfig("brake", kind)] if (kind := BRAKE_READINGS[preset.brake.reads]) else []
@@ -77,6 +77,7 @@ def machine_config(
         wheel_radius_m=model.wheel_radius_m,
         load_centre_m=model.load_centre_m,
         rotating_mass_factor=model.rotating_mass_factor,
+        skid_steers=True if model.skid_grip else None,
         wheelbase_m=round(model.wheelbase_m, 3),
         axle_stiffness_npm=2 * model.tyre_stiffness_npm,
         cog_height_m=round(model.centre_height_m(), 2),

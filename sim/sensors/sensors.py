@@ -21,6 +21,7 @@ from sim.sensors.gps import GpsGroup
 from sim.sensors.noise import Draws, GaussMarkov, generator
 from sim.sensors.rigs import Rig
 from sim.sensors.sensor_group import GroupReadings, SensorGroup, SensorUnit
+from sim.sensors.vibration import Vibration, shakes
 from sim.state import FleetState
 
 _LEVEL = np.zeros(1)
@@ -157,7 +158,7 @@ class FrameMotion:
 class ImuGroup(SensorGroup):
     """Gyroscopes and accelerometers; three axes of rate, then three of force."""
 
-    def __init__(self, units: Sequence[SensorUnit]) -> None:
+    def __init__(self, units: Sequence[SensorUnit], seed: int) -> None:
         super().__init__(units)
         noises = [unit.rig.preset.imu for unit in units]
         self._gyro_white = np.radians([noise.gyro_white_degps for noise in noises])
@@ -182,10 +183,17 @@ class ImuGroup(SensorGroup):
         self._lever_m = self.per_unit(lambda unit: unit.sensor.mount.xyz_m)[:, None]
         self._joint_m = self.per_unit(lambda unit: unit.rig.model.robot.place(FRONT, BASE).xyz_m)[:, None]
         self._on_front = units[0].sensor.frame == FRONT
+        machines = [unit.machine for unit in units]
+        self._body = Vibration(noises, machines, seed) if any(map(shakes, noises)) else None
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """Angular rate and specific force in the sensor's frame."""
         motion = self._motion(rows, states)
+        if self._body:
+            speed, turned_rad = self.pick(states.speed_mps, rows), self.pick(states.wheel_rad, rows)[0]
+            shaken = self._body.run(steps, speed, turned_rad)
+            rates, force = motion.rates_radps + shaken[:3], motion.force_mps2 + shaken[3:]
+            motion = FrameMotion(rates, motion.rates_dot_radps2, force)
         truth = (motion.rates_radps, motion.force_at(self._lever_m))
         values: Floats = np.concatenate([turned(self._sensor_from_frame, vector) for vector in truth])
         values *= self._scale
@@ -243,7 +251,6 @@ class AttitudeGroup(SensorGroup):
 
 
 _GROUPS: dict[str, type[SensorGroup]] = {
-    "imu": ImuGroup,
     "attitude": AttitudeGroup,
     "torque": TorqueGroup,
     "brake": BrakeGroup,
@@ -252,6 +259,13 @@ _GROUPS: dict[str, type[SensorGroup]] = {
     "articulation": ArticulationGroup,
     "payload": PayloadGroup,
 }
+
+
+def _group(kind: str, units: Sequence[SensorUnit], seed: int, projection: Projection) -> SensorGroup:
+    """Sensors of one kind; the seed is for what those of one machine or site have in common."""
+    if kind == "gps":
+        return GpsGroup(units, seed, projection)
+    return ImuGroup(units, seed) if kind == "imu" else _GROUPS[kind](units)
 
 
 @dataclass(frozen=True)
@@ -287,10 +301,7 @@ class Sensors:
                 group.append(SensorUnit(i, rig, sensor, generator(seed, i, sensor.name)))
         number = {key: i for i, key in enumerate(groups)}
         self._places = [[(number[key], unit) for key, unit in sensors] for sensors in places]
-        self._groups = [
-            GpsGroup(units, seed, projection) if kind == "gps" else _GROUPS[kind](units)
-            for (kind, _, _), units in groups.items()
-        ]
+        self._groups = [_group(kind, units, seed, projection) for (kind, _, _), units in groups.items()]
 
     def sample(self, steps: Ints, stamps_ns: Ints, states: FleetState) -> FleetReadings:
         """Read the states (arrays (k, n, ...)) after the steps with these numbers; their order is that of time."""

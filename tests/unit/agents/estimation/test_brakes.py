@@ -35,7 +35,9 @@ def braked(readings: Sequence[Reading], vehicle: MachineConfig, sensors: Sequenc
 
 
 @pytest.mark.parametrize(
-    ("sensors", "reason"), [((), "braking_unseen"), (BRAKES[:1], "braking"), (BRAKES[1:], "")], ids=str
+    ("sensors", "reason"),
+    [((), "braking_unseen"), (BRAKES[:1], "braking"), (BRAKES[1:], "")],
+    ids=["nothing", "switch", "force"],
 )
 def test_a_descent_by_brakes_never_passes_for_rough_ground(sensors: Sequence[SensorConfig], reason: str) -> None:
     vehicle = machine()
@@ -49,7 +51,6 @@ def test_a_descent_by_brakes_never_passes_for_rough_ground(sensors: Sequence[Sen
 
 
 def test_a_torque_that_brakes_is_believed_when_it_is_zero() -> None:
-    """Downhill it brakes; after that it rolls on the level, held by the ground alone."""
     vehicle = machine()
     descent = drive(DOWNHILL, vehicle, ground=Ground(C_RR, DOWN_RAD)).readings
     assert {e.reason for e in EstimatorRun(vehicle).feed(descent).between(10, 17)} == {""}

@@ -8,6 +8,7 @@ import pytest
 
 from agents.estimation.balance import Balance
 from agents.estimation.plausibility import Plausibility
+from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.ground import STEADY, after
 
 
@@ -27,7 +28,8 @@ def at_work(seconds: float, gain: float = 1.0, offset: float = 0.0, c_rr: float 
     for i in range(round(seconds / 0.05)):
         taken = 0.1 * math.sin(0.4 * i * 0.05) + 0.05 * math.sin(1.1 * i * 0.05)
         share = gain * (taken + c_rr) + offset
-        judged.append(after(i, share=share, unbalanced=share - taken))
+        moves = {"accel_mps2": GRAVITY_MPS2 * taken, "body_mps2": GRAVITY_MPS2 * taken}
+        judged.append(after(i, share=share, unbalanced=share - taken, **moves))
     return judged
 
 
@@ -41,7 +43,9 @@ CASES = [  # a change of the steady balance, and why it is withheld
     ({"wheels_s": 0.6}, "no_wheels"),
     ({"torque_s": math.inf}, "no_torque"),
     ({"share": 1.3}, "torque_implausible"),
-    ({"speed_mps": 0.39}, "standstill"),
+    ({"speed_mps": 0.14}, "standstill"),  # of wheels that are off by 0.05 m/s
+    ({"speed_mps": 0.04, "speed_std_mps": 0.001}, "standstill"),
+    ({"speed_mps": 0.5, "speed_std_mps": 0.2}, "standstill"),  # a few ticks a turn
     ({"pitch_radps": 0.03}, "pitch_transient"),
     ({"pitch_radps": -0.03, "speed_mps": 0.5}, "pitch_transient"),
     ({"pitch_radps": 0.11, "speed_mps": 8.0}, "pitch_transient"),
@@ -55,7 +59,8 @@ CASES = [  # a change of the steady balance, and why it is withheld
     ({"norm_mps2": 0.0, "torque_s": 9.0, "speed_mps": 0.0}, "accelerometer"),
     ({"speed_mps": 0.1, "accel_mps2": -3.0, "pitch_radps": 0.1}, "standstill"),
     # below the thresholds
-    ({"speed_mps": 0.41}, ""),
+    ({"speed_mps": 0.16}, ""),
+    ({"speed_mps": 0.06, "speed_std_mps": 0.001}, ""),  # a paver
     ({"pitch_radps": 0.025}, ""),
     ({"pitch_radps": 0.1, "speed_mps": 8.0}, ""),  # the same crown as at 2 m/s, passed four times as fast
     ({"accel_mps2": 1.6, "body_mps2": 1.6}, ""),  # accelerates

@@ -23,6 +23,7 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import HOUR_NS, archive
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import LAST
+from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.journal.table_writer import meta_line
 from mapserver.past.making import make
 from mapserver.past.past import Past
@@ -415,4 +416,39 @@ def test_a_replica_that_is_behind_another_one_has_lost_nothing_and_says_how_old_
                 assert version(of_any) == store.version
                 replica.sql("SELECT pg_wal_replay_resume()")
                 wait_for(lambda: version(of_one) == store.version and of_one.behind()[1] < 2.5)
+        assert "rows are gone" not in caplog.text
+
+
+def test_without_any_notification_it_looks_again_by_itself(tmp_path, monkeypatch):
+    def lost(self, known, timeout_s):  # the notification; the time-out is not
+        wait_for(lambda: True)
+        return self.state()
+
+    monkeypatch.setattr(SqliteReader, "follow", lost)
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+        deliver(writer, 2)
+        catches_up(one, writer)
+
+
+def test_a_damaged_row_behind_a_sound_one_takes_no_map_away(tmp_path, caplog):
+    with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
+        deliver(writer, 1)
+        catches_up(one, writer)
+
+        def damage(store) -> None:
+            db = store.journal._db
+            record = bytearray(db.execute("SELECT record FROM journal WHERE row = 3").fetchone()[0])
+            record[60] ^= 1
+            db.execute("UPDATE journal SET record = ? WHERE row = 3", (bytes(record),))
+
+        with one._lock:  # it sees both rows at once
+            for seed in (2, 3):
+                deliver(writer, seed)
+            writer.run(damage)
+        wait_for(lambda: "journal row 3" in caplog.text)
+        wait_for(lambda: one.behind()[1] > 2.5)  # it has opened the journal again
+        assert version(one).row == 2
+        assert one.behind()[0] == 1
         assert "rows are gone" not in caplog.text

@@ -21,7 +21,7 @@ def test_lengths_and_masses_are_those_of_the_urdf(model: MachineModel) -> None:
     assert {robot.links[wheel].mass.inertia_kgm2[1, 1] for wheel in WHEELS} == {model.wheel_inertia_kgm2}
 
 
-@pytest.mark.parametrize("name", [f.name for f in fields(MachineModel) if f.type == "float"])
+@pytest.mark.parametrize("name", [f.name for f in fields(MachineModel) if f.type == "float" and f.name != "skid_grip"])
 def test_values_that_no_machine_has_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match=name):
         replace(LOADER, **{name: 0.0})

@@ -48,6 +48,8 @@ def test_broken_presets_are_refused_by_name(table: dict[str, Any], words: list[s
 def test_every_value_has_its_range(kind: str) -> None:
     noise = getattr(DGPS, kind)
     for field in fields(noise):
+        if isinstance(getattr(noise, field.name), bool):
+            continue
         for bad in (math.nan, -1, 1e9):
             with pytest.raises(ValueError, match=rf"^{field.name}: .*"):
                 replace(noise, **{field.name: bad})
