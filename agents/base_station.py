@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from agents.ground_speed import MIN_FIX_STD_M
 from agents.localisation.filters.motion import BASE_OFFSET_WALK
-from agents.localisation.fix import MIN_FIX_STD_M
 from agents.localisation.gps import MIN_DRIFT_M2
 from agents.stream_order import Decision, StreamOrder
 from protocol.arrays import Floats

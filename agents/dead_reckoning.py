@@ -1,19 +1,38 @@
 """Dead reckoning: distance, turn and speed of a machine from its wheels and gyros.
 
+Where wheels are missing or silent, speed over ground by GPS stands in for them (`ground_speed`).
+
 Several sensors of a kind count as their mean, of those that spoke within the last second. So no result depends on the
 order in which they are described, and one that dies leaves the others.
+
+It is one module because all that shows the motion moves the same pose.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from agents.ground_speed import FRESH_NS, GroundSpeed, GroundTracker
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder, Imu, Odometry, Payload, Reading, Steering, Torque, WheelReading
+from protocol.machine.readings import (
+    Encoder,
+    Gps,
+    GpsVelocity,
+    Imu,
+    Odometry,
+    Payload,
+    Reading,
+    Steering,
+    Torque,
+    WheelReading,
+)
 from protocol.units import GRAVITY_MPS2
 
+WHEELS = ("encoder", "odometry")
 TURNS = {"imu": "rate", "odometry": "rate", "steering": "angle"}  # what shows the turn, the best kind first
 STALE_S = 2.0  # an older steering angle, or an older speed to go with it, is not used
+SILENT_NS = 3_000_000_000  # after so long without wheels, speed over ground stands in for them
+MAX_REACH_S = 8.0  # of one speed over ground; differences of fixes come at least so often
 LOADING_S = 3.0  # a machine that stands so long may have loaded or dumped
 PAUSE_S = 1.0  # a sensor that was silent for longer starts anew: nobody knows what happened meanwhile
 PAUSE_NS = round(PAUSE_S * 1e9)
@@ -107,7 +126,7 @@ class DeadReckonedPose:
 class WheelSpeed:
     """Mean speed and acceleration of the wheels. offset_m: how far left of the middle they are, on average.
 
-    std_mps: standard deviation of the speed, as measured. is_known: whether their readings show a speed yet.
+    std_mps: standard deviation of the speed, as measured. is_known: whether readings show a speed yet.
     """
 
     speed_mps: float = 0.0
@@ -134,7 +153,8 @@ class DeadReckoning:
     slip: wheel slip per traction (drive force over weight), taken off where the machine has a torque sensor. weighs:
     whether payload readings count. mass_kg: with payload; a caller that estimates it may set it. travel_m:
     of `base_link`, down in reverse; distance_m: up in reverse too. traction: the newest. wheels: as of their newest
-    reading. stands_since_ns: since when no wheel has rolled.
+    reading, which came at wheels_ns; a wheel that does not count is as good as silent. ground: the newest speed over
+    ground.
     """
 
     def __init__(self, machine: MachineConfig, slip: float, *, weighs: bool = True) -> None:
@@ -145,7 +165,12 @@ class DeadReckoning:
         self.distance_m = 0.0
         self.traction = 0.0
         self.mass_kg = machine.mass_kg
-        self.stands_since_ns = 0
+        self.wheels_ns = 0
+        self._newest_ns = self._resumed_ns = (
+            0  # stamps of the newest reading, and of the first one after a pause of all
+        )
+        self.ground: GroundSpeed | None = None
+        self._stands_since_ns = 0
         self._machine, self._weighs = machine, weighs
         self._slip = slip
         self._up: dict[str, list[float]] = {}  # the vertical of `base_link` in each gyro's axes
@@ -154,13 +179,19 @@ class DeadReckoning:
         source = turn_source(machine)
         self._turn_sensor = source.name if source else ""
         self._steers = source is not None and source.kind == "steering"
+        self._has_wheels = any(s.kind in WHEELS and s.use and s.provides("speed") for s in machine.sensors)
+        self._ground_tracker, self._ground_rad = GroundTracker(turns=source is not None), 0.0
+        self._moved_ns = 0  # over ground
         self._turned_ns = 0  # by odometry or steering
         self._curvature = 0.0  # [1/m], by steering
         self._x_m = 0.0
         self._y_m = 0.0
 
     def update(self, reading: Reading, sensor: SensorConfig) -> None:
-        """Take in a reading of the wheels, or of a sensor that shows the turn; others change nothing."""
+        """Take in a reading of the wheels, of GPS, or of a sensor that shows the turn; others change nothing."""
+        if reading.stamp_ns - self._newest_ns > PAUSE_NS:
+            self._resumed_ns = reading.stamp_ns
+        self._newest_ns = reading.stamp_ns
         if isinstance(reading, Imu) and sensor.frame == BASE and sensor.provides("rate"):
             self._turn(reading, sensor)
         elif isinstance(reading, WheelReading):
@@ -171,6 +202,8 @@ class DeadReckoning:
         elif isinstance(reading, Steering) and sensor.name == self._turn_sensor:
             self._curvature = math.tan(reading.angle_rad) / self._machine.wheelbase_m
             self._turned_ns = reading.stamp_ns
+        elif isinstance(reading, Gps | GpsVelocity):
+            self._follow_ground(reading, sensor)
         elif isinstance(reading, Torque):
             weight_n = self.mass_kg * GRAVITY_MPS2
             traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
@@ -182,6 +215,29 @@ class DeadReckoning:
     def pose(self) -> DeadReckonedPose:
         """The newest pose."""
         return DeadReckonedPose(self.stamp_ns, self.travel_m, self.angle_rad, self._x_m, self._y_m)
+
+    def is_silent(self, stamp_ns: int) -> bool:
+        """Whether there are no wheels, or none has been read for so long that they do not count."""
+        return not self._has_wheels or stamp_ns - max(self.wheels_ns, self._resumed_ns) > SILENT_NS
+
+    def motion(self, stamp_ns: int) -> WheelSpeed:
+        """Speed by the wheels; where they are silent, over ground."""
+        if not self.is_silent(stamp_ns):
+            return self.wheels
+        return WheelSpeed(self.ground.speed_mps, is_known=True) if self.ground else WheelSpeed()
+
+    def still_s(self, stamp_ns: int) -> float:
+        """How long nothing has moved by the wheels; where they are silent, how long speeds over ground showed none."""
+        if not self.is_silent(stamp_ns):
+            return (stamp_ns - self._stands_since_ns) * 1e-9
+        if not self.ground or stamp_ns - self.ground.stamp_ns > FRESH_NS:
+            return 0.0
+        return (self.ground.stamp_ns - self._stands_since_ns) * 1e-9
+
+    def turn_round(self) -> None:
+        """Take the first motion over ground for one in reverse."""
+        self._ground_tracker.turn_round()
+        self.ground = None
 
     def _turn(self, imu: Imu, sensor: SensorConfig) -> None:
         """Integrate the vertical rate of a gyro on the rear frame, by its share in the mean."""
@@ -208,12 +264,13 @@ class DeadReckoning:
         wheel = self._wheels.setdefault(reading.sensor, _Wheel(reading, offset_m, self.angle_rad))
         others = [w for w in self._wheels.values() if w is not wheel and _speaks(w.reading.stamp_ns, stamp_ns)]
         is_new = not _speaks(wheel.reading.stamp_ns, stamp_ns) or wheel.reading is reading
-        rolled_m = 0.0 if is_new and others else self._rolled_between(wheel.reading, reading, sensor)
+        is_counted = bool(others) or (self.is_silent(stamp_ns) and self.ground is not None)  # by what moved meanwhile
+        rolled_m = 0.0 if is_new and is_counted else self._rolled_between(wheel.reading, reading, sensor)
         if rolled_m or is_new:
-            self.stands_since_ns = stamp_ns
+            self._stands_since_ns = stamp_ns
         wheel.reading, wheel.rolled_m = reading, wheel.rolled_m + rolled_m
         wheel.tracker.update(stamp_ns, wheel.rolled_m, reading.speed_x_mps if isinstance(reading, Odometry) else None)
-        self.wheels = _mean_speed([wheel, *others])
+        self.wheels, self.wheels_ns = _mean_speed([wheel, *others]), stamp_ns
         self._advance(wheel, rolled_m, 1 + len(others))
 
     def _rolled_between(self, last: WheelReading, now: WheelReading, sensor: SensorConfig) -> float:
@@ -235,10 +292,33 @@ class DeadReckoning:
             self.angle_rad += travel_m * curvature
         else:
             travel_m = (gripped_m + wheel.offset_m * (self.angle_rad - wheel.angle_rad)) / wheels
-        middle_rad = (wheel.angle_rad + self.angle_rad) / 2
+        self._move(stamp_ns, travel_m, wheel.angle_rad)
         wheel.angle_rad = self.angle_rad
+
+    def _follow_ground(self, reading: Gps | GpsVelocity, sensor: SensorConfig) -> None:
+        """Keep the speed over ground that a reading shows; move by it while wheels are silent."""
+        stamp_ns, before, is_silent = reading.stamp_ns, self.ground, self.is_silent(reading.stamp_ns)
+        wheels_mps = None if is_silent else self.wheels.speed_mps
+        shown = self._ground_tracker.update(reading, sensor, self.angle_rad, wheels_mps)
+        if not shown:
+            return
+        self.ground = shown
+        if is_silent:
+            since_ns = max(self._moved_ns, self.wheels_ns) if before else stamp_ns
+            travel_m = shown.speed_mps * min((stamp_ns - since_ns) * 1e-9, MAX_REACH_S)
+            curvature = self._curvature if self._steers and stamp_ns - self._turned_ns < STALE_S * 1e9 else 0.0
+            self.angle_rad += shown.turned_rad + travel_m * curvature
+            self._move(stamp_ns, travel_m, self._ground_rad, counts=shown.moves)
+            self._moved_ns = stamp_ns
+            if not shown.stands:
+                self._stands_since_ns = stamp_ns
+        self._ground_rad = self.angle_rad
+
+    def _move(self, stamp_ns: int, travel_m: float, from_rad: float, *, counts: bool = True) -> None:
+        """Move `base_link` as the angle went from one to the present one. counts: whether it is no mere noise."""
+        middle_rad = (from_rad + self.angle_rad) / 2
         self.travel_m += travel_m
-        self.distance_m += abs(travel_m)
+        self.distance_m += abs(travel_m) * counts
         self._x_m += travel_m * math.cos(middle_rad)
         self._y_m += travel_m * math.sin(middle_rad)
         self.stamp_ns = max(self.stamp_ns, stamp_ns)

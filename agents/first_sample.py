@@ -13,6 +13,7 @@ from protocol.machine.readings import Correction, Encoder, Gps, Odometry, Readin
 WAIT_NS = 30 * 10**9  # in the readings' time; a machine that drives off has its heading after 10 to 20 s
 UNIT = 1.5  # no tyre is so far off: wheels that turn so much further or less far than the fixes go have another unit
 WHEELS = frozenset({Encoder.kind, Odometry.kind})
+FOR_RESISTANCE = {"no wheel readings (encoder or odometry)": WHEELS, "no torque readings": frozenset({Torque.kind})}
 
 
 class FirstSample:
@@ -52,10 +53,10 @@ class FirstSample:
         if waits_for_proof and waited_ns < WAIT_NS + PROVEN_S * 1e9:
             return ""
         self._is_judged = True
-        has_torque = Torque.kind in self._kinds
+        lacks = [what for what, kinds in FOR_RESISTANCE.items() if not kinds & self._kinds]
         if self._is_sampled:
-            return "" if has_torque else "samples have no rolling resistance: no torque readings"
-        causes = missing(self._kinds, state) + ["no torque readings"] * (not has_torque)
+            return f"samples have no rolling resistance: {', '.join(lacks)}" if lacks else ""
+        causes = missing(self._kinds, state) + lacks
         self.why_not = f"no sample after {waited_ns // 10**9} s of readings: {', '.join(causes)}"
         return self.why_not
 
@@ -67,7 +68,7 @@ def missing(kinds: Collection[str], health: Mapping[str, Any]) -> list[str]:
     if health["heading_proven"]:
         unsure = health["withheld"].get("unsure_position")
         return [f"the position is less certain than {MAX_STD_M:g} m" if unsure else "the machine has not moved"]
-    causes = [] if WHEELS & set(kinds) else ["no wheel readings (encoder or odometry)"]
+    causes = []
     if Gps.kind not in kinds:
         causes.append("no GPS fixes")
     elif health["counters"].get("fix_outside_site"):
@@ -76,7 +77,7 @@ def missing(kinds: Collection[str], health: Mapping[str, Any]) -> list[str]:
         causes.append(f"{', '.join(health['repeating'])} repeats one fix")
     if not causes and health["aligned"]:
         turned = 1 + health["wheel_scale"]
-        if not 1 / UNIT < turned < UNIT:
+        if WHEELS & set(kinds) and not 1 / UNIT < turned < UNIT:
             return [f"the wheels turn {turned:.1f} times as far as the fixes go: look at their unit"]
         return [f"the heading is not proven until fixes agree with it for {PROVEN_S:g} s and {DISTANCE_M:g} m"]
     return causes or [f"the heading is unknown until the machine has driven {DISTANCE_M:g} m with GPS fixes"]

@@ -126,12 +126,12 @@ class Pipeline:
         stamp_ns = readings[0][0].stamp_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
-        speed_mps, known_c_rr, newest = float(belief.x[SPEED]) if belief else 0.0, self._known_c_rr(), self.pose
+        speed_mps, known_c_rr, newest = float(belief.x[SPEED]) if belief else None, self._known_c_rr(), self.pose
         if mass_kg := self._estimator.estimated_mass_kg:
             dead_reckoning.mass_kg = mass_kg
         for reading, sensor in readings:
             self._estimator.update(reading, sensor, dead_reckoning, known_c_rr, newest)
-            distance_m = self._odometer.update(reading, dead_reckoning.distance_m, speed_mps)
+        distance_m = self._odometer.update(stamp_ns, dead_reckoning.wheels_ns, dead_reckoning.distance_m, speed_mps)
         self._sampler.mark(stamp_ns, distance_m)
         made += self._due_samples()
         if smoothed:

@@ -17,7 +17,6 @@ import numpy as np
 from agents.estimation.ground import GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
 from protocol.arrays import Table
-from protocol.machine.readings import Reading, WheelReading
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.rotations import wrap_angle
 
@@ -94,18 +93,19 @@ class Odometer:
 
     def __init__(self) -> None:
         self._distance_m = self._wheels_m = 0.0
-        self._wheels_ns = self._counted_ns = 0
+        self._counted_ns = 0
 
-    def update(self, reading: Reading, wheels_m: float, speed_mps: float) -> float:
-        """Take in a reading, the wheels' distance so far and the filter's speed; returns the distance [m]."""
-        now_ns = reading.stamp_ns
-        if isinstance(reading, WheelReading):
-            self._wheels_ns = now_ns
-        self._distance_m += wheels_m - self._wheels_m
-        self._wheels_m = wheels_m
-        if now_ns - self._wheels_ns > SILENT_NS and abs(speed_mps) > MIN_SPEED_MPS and self._counted_ns:
+    def update(self, now_ns: int, wheels_ns: int, wheels_m: float, speed_mps: float | None) -> float:
+        """The distance [m] by now.
+
+        wheels_ns, wheels_m: stamp of the newest wheel reading, and the distance of dead reckoning. speed_mps: the
+        filter's; None before it has one, then dead reckoning counts, by GPS.
+        """
+        if speed_mps is None or now_ns - wheels_ns <= SILENT_NS:
+            self._distance_m += wheels_m - self._wheels_m
+        elif abs(speed_mps) > MIN_SPEED_MPS and self._counted_ns:
             self._distance_m += abs(speed_mps) * max(now_ns - self._counted_ns, 0) * 1e-9
-        self._counted_ns = max(self._counted_ns, now_ns)
+        self._wheels_m, self._counted_ns = wheels_m, max(self._counted_ns, now_ns)
         return self._distance_m
 
 

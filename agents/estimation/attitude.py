@@ -14,6 +14,8 @@ By the linear tyre model the angle of slip goes with the sideways acceleration a
 
     v_y = -k a |v_x|            dv_x/dt = ... - k a^2 sign(v_x)
 
+Where wheels say nothing, speeds over ground by GPS take their place ahead, each with a variance of its own.
+
 The parts of u ahead and to the left are the sines of the two slopes, positive uphill.
 """
 
@@ -36,8 +38,9 @@ ZERO_WALK = 1e-4  # random walk of that zero [1/sqrt(s)]: most of it again in an
 FORCE_WALK = 0.05  # of the summed forces [m/s/sqrt(s)]: vibration of 0.35 m/s2, white over 20 ms
 SPEED_WALK = 0.027  # noise of the wheels' speed [m/s sqrt(s)]: 0.05 m/s, shared by readings over 0.3 s
 # Wheels that jump by more than this against the forces slip, or grip again: that says nothing about the slope. One
-# sigma is rare: noise is shared by readings that are counted as if it were each one's own.
-JUMP_SIGMA = 1.0
+# sigma is rare: noise is shared by readings that are counted as if it were each one's own. A speed over ground does not
+# slip, but it has outliers.
+JUMP_SIGMA, OUTLIER_SIGMA = 1.0, 3.0
 MAX_JUMPS_S = 3.0  # at every step: wheels do not slip like that, the slope is wrong, after a knock or a fault
 SLIP_STD = 0.03  # of the tyres' angle of slip per sideways acceleration at start [rad s2/m]: 0.01 firm, 0.03 on sand
 SLIP_WALK = 1e-3  # random walk of that [rad s2/m/sqrt(s)]: another ground in a quarter of an hour
@@ -92,19 +95,21 @@ class SlopeFilter:
         dt_s: float,
         rates_radps: Sequence[float],
         force_mps2: Sequence[float],
-        speed_mps: Sequence[float] | None,
+        speed_mps: Sequence[float | None] | None,
+        variance: float | None = None,
     ) -> None:
         """Predict with means over dt_s, correct with the speed at its end; None: it is not known.
 
         rates_radps: about the axes ahead, left and up. force_mps2: ahead and to the left, what changes the speeds and
-        gravity's share, without omega x v. speed_mps: ahead and to the left, at the sensor.
+        gravity's share, without omega x v. speed_mps: ahead and to the left, at the sensor. variance: of the speed
+        ahead, None of wheels.
         """
         if not self._is_started:
             self._start(force_mps2)
         else:
             self._predict(dt_s, rates_radps, force_mps2)
         if speed_mps is not None:
-            jumped = self._correct(self._lateral_mps2(rates_radps[2]), speed_mps, SPEED_WALK**2 / dt_s)
+            jumped = self._correct(self._lateral_mps2(rates_radps[2]), speed_mps, SPEED_WALK**2 / dt_s, variance)
             self._jumps_s = self._jumps_s + dt_s if jumped else 0.0
             if self._jumps_s > MAX_JUMPS_S:
                 self.restart()
@@ -139,21 +144,27 @@ class SlopeFilter:
         P.flat[::10] += dt_s * _WALKS**2
         self._covariance = 0.5 * (P + P.T)  # rounding does not add up over hours
 
-    def _correct(self, lateral_mps2: float, speed_mps: Sequence[float], noise: float) -> bool:
-        """Correct both speeds; returns whether one of them jumped."""
-        P, jumped = self._covariance, False
-        slips_mps = -lateral_mps2 * abs(speed_mps[0])  # per state of slip: to the left, which the wheels do not show
-        for i, speed, shown in zip((6, 7), speed_mps, (0.0, -slips_mps), strict=True):
+    def _correct(
+        self, lateral_mps2: float, speed_mps: Sequence[float | None], noise: float, variance_ahead: float | None
+    ) -> bool:
+        """Correct both speeds, of those that are known; returns whether one of them jumped."""
+        P, jumped, (ahead, left) = self._covariance, False, speed_mps
+        slips_mps = -lateral_mps2 * abs(ahead if ahead is not None else self._x[6])  # per state of slip: to the left
+        of_ahead = (noise, JUMP_SIGMA) if variance_ahead is None else (variance_ahead, OUTLIER_SIGMA)
+        both = (6, ahead, 0.0, *of_ahead), (7, left, -slips_mps, noise, JUMP_SIGMA)
+        for i, speed, shown, white, sigma in both:
+            if speed is None:
+                continue
             seen = P[:, i] + shown * P[:, SLIP]  # covariance with what they show
             variance = float(seen[i] + shown * seen[SLIP])
             innovation = speed - float(self._x[i] + shown * self._x[SLIP])
-            beyond = innovation**2 - JUMP_SIGMA**2 * (variance + noise)
+            beyond = innovation**2 - sigma**2 * (variance + white)
             if beyond > 0:
                 jumped = True
                 P[i, i] += beyond
                 seen[i] += beyond
                 variance += beyond
-            gain = seen / (variance + noise)
+            gain = seen / (variance + white)
             self._x += gain * innovation
             P -= np.outer(gain, seen)
         return jumped

@@ -21,6 +21,7 @@ from operator import add
 
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import SlopeFilter
+from agents.ground_speed import GroundSpeed
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import (
@@ -31,12 +32,12 @@ from protocol.machine.readings import (
     Payload,
     Reading,
     Torque,
-    WheelReading,
 )
 from protocol.units import GRAVITY_MPS2
 
 STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
 MAX_PAUSE_S = 1.0  # of the IMU, or of the wheels' readings, before their last values no longer count
+MAX_GROUND_NS = 2_000_000_000  # and so of a speed over ground, of which there may be one a second
 SLOW_MPS = 2.0  # a slower machine pitches by its own forces rather than by the ground
 MOVES_MPS = 0.2  # a slower machine is held by friction and brakes, nobody knows which way
 AIR_KGPM3 = 1.2  # density of the air near the ground
@@ -47,15 +48,14 @@ NO_SUMS = (0.0,) * 8
 class Balance:
     """One step of the force balance.
 
-    speed_mps, accel_mps2, distance_m: of the wheels; distance_m counts up in reverse too; speed_std_mps: of their
-    resolution and noise. unbalanced: the left side of the equation, share: what the torque sensor
-    states of F / (m g), both [-] and signed ahead.
-    slope_x, slope_y: angles ahead and to the left [rad] with their variance, as the body has them, without squat;
-    sine_x: of the one ahead, by the accelerometer alone. pitch_radps: rate of the pitch, nose up positive. yaw_radps:
-    of the turn to the left. norm_mps2: of the specific force. on_front: share of the load on the front axle, 0 if not
-    known. body_mps2: acceleration ahead by the accelerometer. torque_s, wheels_s: age of their newest reading.
-    mass_kg: with payload. brake: how much of a brake is applied whose force nobody reads, 0 to 1; NaN of a machine
-    without any reading of its brakes.
+    speed_mps, accel_mps2, distance_m: of the wheels, speed_mps else over ground; distance_m counts up in reverse too.
+    speed_std_mps: of the wheels' resolution and noise. unbalanced: the left side of the equation, share: what the
+    torque sensor states of F / (m g), both [-] and signed ahead. slope_x, slope_y: angles ahead and to the left [rad]
+    with their variance, as the body has them, without squat; sine_x: of the one ahead, by the accelerometer alone.
+    pitch_radps: rate of the pitch, nose up positive. yaw_radps: of the turn to the left. norm_mps2: of the specific
+    force. on_front: share of the load on the front axle, 0 if not known. body_mps2: acceleration ahead by the
+    accelerometer. torque_s, wheels_s: age of their newest reading. mass_kg: with payload. brake: how much of a brake is
+    applied whose force nobody reads, 0 to 1; NaN of a machine without any reading of its brakes.
     """
 
     stamp_ns: int
@@ -121,7 +121,7 @@ class Balancer:
         self._bend_rad = 0.0
         self._rotation: dict[str, Floats] = {}
         self._sensor: str | None = None
-        self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = 0
+        self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = self._ground_ns = 0
         # Count; force ahead at base_link, norm; rates about x, y, z; forces ahead and left that change the speed.
         self._imu_sums = NO_SUMS
         self._rolls = False  # whether wheels said something in this step
@@ -144,8 +144,6 @@ class Balancer:
             self._brakes[reading.sensor] = reading
         elif isinstance(reading, BrakeForce):
             self._brake_forces[reading.sensor] = reading
-        elif isinstance(reading, WheelReading):
-            self._wheels_ns = reading.stamp_ns
         elif isinstance(reading, Articulation):
             self._bend_rad = reading.angle_rad
         elif isinstance(reading, Payload) and self._weighs:
@@ -171,29 +169,36 @@ class Balancer:
         rotation, wheels, (x_m, y_m, z_m) = self._rotation[imu.sensor], dead_reckoning.wheels, sensor.mount.xyz_m
         wx, wy, wz = rotation.dot((imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps)).tolist()
         ahead, left, up = rotation.dot((imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)).tolist()
-        shows_speed = wheels.is_known and self._wheels_s() < MAX_PAUSE_S
-        accel, speed = (wheels.accel_mps2, wheels.speed_mps) if shows_speed else (0.0, 0.0)
+        self._wheels_ns = dead_reckoning.wheels_ns
+        rolls = wheels.is_known and self._wheels_s() < MAX_PAUSE_S
+        ground = self._fresh(dead_reckoning.ground) if dead_reckoning.is_silent(imu.stamp_ns) else None
+        accel, speed = (wheels.accel_mps2, wheels.speed_mps) if rolls else (0.0, ground.speed_mps if ground else 0.0)
         at_base = ahead + (wy**2 + wz**2) * x_m  # without what turning adds at the sensor's place
         vx, vy, vz = speed + wz * (wheels.offset_m - y_m) + wy * z_m, wz * x_m - wx * z_m, wx * y_m - wy * x_m
-        self._rolls = shows_speed and self._wheels_ns > self._begin_ns
+        self._rolls = rolls and self._wheels_ns > self._begin_ns
         norm, turned = math.hypot(ahead, left, up), (ahead - wy * vz + wz * vy, left - wz * vx + wx * vz)
         self._imu_sums = tuple(map(add, self._imu_sums, (1, at_base, norm, wx, wy, wz, *turned)))
         if imu.stamp_ns - self._begin_ns < STEP_NS:
             return None
-        return self._balance(dead_reckoning, sensor.mount, speed, accel)
+        return self._balance(dead_reckoning, sensor.mount, speed, accel, ground)
 
-    def _balance(self, dead_reckoning: DeadReckoning, mount: Mount, speed: float, accel: float) -> Balance:
+    def _balance(
+        self, dead_reckoning: DeadReckoning, mount: Mount, speed: float, accel: float, ground: GroundSpeed | None
+    ) -> Balance:
         machine, g = self._machine, GRAVITY_MPS2
         (n, *sums), (torques, torque_nm) = self._imu_sums, self._torque_sums
         force, norm, about_x, about_y, about_z, *turned = (value / n for value in sums)
         rate = -about_y  # the nose rises
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
         self._imu_sums, self._torque_sums = NO_SUMS, (0, 0.0)
-        # At the sensor, with mean rates: those of one reading shake.
+        # At the sensor, with mean rates: those of one reading shake. None sideways, with wheels or without.
         x_m, y_m, z_m = mount.xyz_m
         ahead = speed + about_z * (dead_reckoning.wheels.offset_m - y_m) + about_y * z_m
-        at_sensor = (ahead, about_z * x_m - about_x * z_m) if self._rolls else None
-        self._slope.update(dt_s, (about_x, about_y, about_z), turned, at_sensor)
+        is_new = ground.stamp_ns > self._ground_ns if ground else self._rolls
+        at_sensor = (ahead if is_new else None, about_z * x_m - about_x * z_m) if is_new or ground else None
+        variance = self._ground_variance(ground, turned[0]) if ground else None
+        self._slope.update(dt_s, (about_x, about_y, about_z), turned, at_sensor, variance)
+        self._ground_ns = ground.stamp_ns if ground else 0
         drive_n = (torque_nm / torques if torques else self._torque_nm) / machine.wheel_radius_m
         share = drive_n / (self.mass_kg * g)
         on_front = front_share(machine, self.payload_kg, force)
@@ -215,7 +220,7 @@ class Balancer:
             slope_x=math.asin(self._slope.shown_ahead) - squat,
             slope_y=math.asin(self._slope.left),
             slope_var=self._slope.variance,
-            sine_x=(force - accel) / g - squat,
+            sine_x=(self._slope.shown_ahead if ground else (force - accel) / g) - squat,
             pitch_radps=rate,
             yaw_radps=about_z,
             norm_mps2=norm,
@@ -234,6 +239,14 @@ class Balancer:
         drag_n = AIR_KGPM3 * self._machine.drag_area_m2 * speed_mps**2 / 2
         brakes_n = sum(brake.force_n for brake in self._brake_forces.values())
         return math.copysign(drag_n + self._machine.drive_friction_n + brakes_n, speed_mps)
+
+    def _fresh(self, ground: GroundSpeed | None) -> GroundSpeed | None:
+        return ground if ground and self._imu_ns - ground.stamp_ns < MAX_GROUND_NS else None
+
+    def _ground_variance(self, ground: GroundSpeed, force_mps2: float) -> float:
+        """Variance of a speed over ground [m2/s2], with what the machine has sped up since."""
+        accel_mps2 = force_mps2 - GRAVITY_MPS2 * self._slope.shown_ahead
+        return ground.std_mps**2 + (accel_mps2 * (self._imu_ns - ground.middle_ns) * 1e-9) ** 2
 
     def _climb_of_bend(self, on_front: float, squat: float) -> float:
         """Sine of the slope of the front frame of a bent machine, less that of the rear one, by the front's load [-].

@@ -4,9 +4,9 @@ A machine that stands, brakes, digs or spins its wheels shows nothing of the gro
 its axles stand on two slopes; and sensors fail: they fall silent, freeze (stuck, or at the end of their range), or come
 in the wrong unit.
 
-Brakes that neither the torque sensor nor a reading shows make the ground seem rough: downhill at constant speed, without
-torque, c_rr would be just the grade. So a machine that rolls without torque shows nothing, unless its brakes are read,
-or its torque has braked before: then that sees them.
+Brakes that neither the torque sensor nor a reading shows make the ground seem rough: downhill at constant speed and
+without torque, c_rr would be just the grade. So a machine that rolls without torque shows nothing, unless its brakes
+are read, or its torque has braked before: then that sees them.
 """
 
 import math

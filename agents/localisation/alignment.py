@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agents.dead_reckoning import DeadReckonedPose
+from agents.ground_speed import MIN_FIX_STD_M
 from agents.localisation.filters import state
 from agents.localisation.filters.belief import Belief
-from agents.localisation.fix import MIN_FIX_STD_M, Fix
+from agents.localisation.fix import Fix
 from agents.localisation.imu_steps import FilterStep
 from protocol.arrays import Floats
 from protocol.rotations import wrap_angle

@@ -10,7 +10,6 @@ from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, SensorConfig
 
 GPS_GATE_SIGMA = 4.0  # what comes by satellites and is further off is refused: reflections make outliers
-MIN_FIX_STD_M = 0.3  # receivers state less than their error; one whose std is configured may be better
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from agents.dead_reckoning import DeadReckonedPose
+from agents.ground_speed import MIN_FIX_STD_M
 from agents.localisation import measurements
 from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor
 from agents.localisation.filters.belief import (
@@ -27,7 +28,7 @@ from agents.localisation.filters.belief import (
 from agents.localisation.filters.late_measurements import RELOCK
 from agents.localisation.filters.motion import GpsError, gps_covariance
 from agents.localisation.filters.state import YAW, Layout
-from agents.localisation.fix import GPS_GATE_SIGMA, MIN_FIX_STD_M, Fix
+from agents.localisation.fix import GPS_GATE_SIGMA, Fix
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from agents.localisation.shared_errors import MOST_SHARED, SharedFix, ShareEstimator
 from protocol.arrays import Floats

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.dead_reckoning import (
-    STALE_S,
+    SILENT_NS,
     DeadReckonedPose,
     DeadReckoning,
     WheelSpeed,
@@ -18,7 +18,17 @@ from agents.dead_reckoning import (
 )
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, SensorConfig
-from protocol.machine.readings import Articulation, Attitude, Imu, Odometry, Reading, Steering, WheelReading
+from protocol.machine.readings import (
+    Articulation,
+    Attitude,
+    Gps,
+    GpsVelocity,
+    Imu,
+    Odometry,
+    Reading,
+    Steering,
+    WheelReading,
+)
 
 Sensed = tuple[Reading, SensorConfig]
 NOTHING = (0.0,) * 7  # count and sums
@@ -50,8 +60,9 @@ class FilterStep:
     """Readings of fast sensors since the step before, up to a stamp.
 
     reckoned: the dead-reckoned pose at its end. attitudes: the last one of each attitude reference that can be used.
-    wheels: their speed at its end. rolled: whether they were read in this step, and show a speed. traction:
-    drive force over weight; still_s: how long without travel. turn: of a machine without IMU.
+    wheels: their speed at its end, or that over ground while they are silent. rolled: whether they were read in this
+    step, and show a speed. traction: drive force over weight; still_s: how long without travel. turn: of a machine
+    without IMU. silent: whether wheels are missing, or have been silent for long.
     """
 
     stamp_ns: int
@@ -63,6 +74,7 @@ class FilterStep:
     traction: float
     still_s: float
     turn: Turn | None = None
+    silent: bool = False
 
 
 class StepGatherer:
@@ -80,16 +92,24 @@ class StepGatherer:
         self._steers = source is not None and source.kind == "steering"
         self._wheelbase_m = machine.wheelbase_m
         self._turn_values: list[float] = []  # rates of odometry, or curvatures of steering
-        self._rolled_ns = 0
         self._begin_ns = 0
+        self._sensed_ns = 0
         self._joint = WheelTracker()  # the angle of articulation, smoothed in the same manner
         self._rolled = False
 
     def gather(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> FilterStep | None:
-        """Add the readings of one stamp, after dead reckoning took them; returns the step that they end."""
-        for reading, sensor in readings:
-            self._add(reading, sensor)
+        """Add the readings of one stamp, after dead reckoning took them; returns the step that they end.
+
+        Those of GPS end one only where no other sensor has been heard for long.
+        """
         stamp_ns = readings[0][0].stamp_ns
+        fast = [(r, sensor) for r, sensor in readings if not isinstance(r, Gps | GpsVelocity)]
+        if fast or not self._sensed_ns:
+            self._sensed_ns = stamp_ns
+        if not fast and stamp_ns - self._sensed_ns <= SILENT_NS:
+            return None
+        for reading, sensor in fast:
+            self._add(reading, sensor)
         self._begin_ns = self._begin_ns or stamp_ns
         return self._finish(stamp_ns, dead_reckoning) if stamp_ns - self._begin_ns >= self._step_ns else None
 
@@ -107,7 +127,7 @@ class StepGatherer:
 
     def _add_wheels(self, reading: WheelReading, sensor: SensorConfig) -> None:
         if sensor.provides("speed"):
-            self._rolled, self._rolled_ns = True, reading.stamp_ns
+            self._rolled = True
         if isinstance(reading, Odometry) and sensor.name == self._turn_sensor:
             self._turn_values.append(reading.rate_z_radps)
 
@@ -157,19 +177,19 @@ class StepGatherer:
         attitudes, self._attitudes = self._attitudes, {}
         self._sums.clear()
         self._begin_ns = stamp_ns
-        wheels, reckoned, traction = dead_reckoning.wheels, dead_reckoning.pose, dead_reckoning.traction
-        rolled, self._rolled = self._rolled and wheels.is_known, False
-        still_s = (stamp_ns - dead_reckoning.stands_since_ns) * 1e-9
-        turn = self._turn(stamp_ns, wheels) if self._turn_values else None
-        return FilterStep(stamp_ns, reckoned, imu_means, attitudes, wheels, rolled, traction, still_s, turn)
+        wheels, silent = dead_reckoning.motion(stamp_ns), dead_reckoning.is_silent(stamp_ns)
+        rolled, self._rolled = self._rolled and wheels.is_known and not silent, False
+        turn = self._turn(wheels) if self._turn_values else None
+        reckoned, traction, still_s = dead_reckoning.pose, dead_reckoning.traction, dead_reckoning.still_s(stamp_ns)
+        return FilterStep(stamp_ns, reckoned, imu_means, attitudes, wheels, rolled, traction, still_s, turn, silent)
 
-    def _turn(self, stamp_ns: int, wheels: WheelSpeed) -> Turn | None:
+    def _turn(self, wheels: WheelSpeed) -> Turn | None:
         """By the readings of this step; steering shows no turn without a speed."""
         values, self._turn_values = self._turn_values, []
         mean = sum(values) / len(values)
         if not self._steers:
             return Turn(mean, 1.0)
-        if not wheels.is_known or stamp_ns - self._rolled_ns >= STALE_S * 1e9:
+        if not wheels.is_known:
             return None
         speed_mps = wheels.speed_mps / narrowing(mean, wheels.offset_m)
         return Turn(speed_mps * mean, speed_mps)

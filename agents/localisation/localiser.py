@@ -22,10 +22,10 @@ from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import YAW
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.fix import Fix
-from agents.localisation.gps_velocity import gps_velocity
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.repeats import Repeats
-from agents.localisation.tracker import Event, Tracker, TrackerConfig
+from agents.localisation.tracker import Event, Tracker, TrackerConfig, gps_velocity
+from agents.localisation.travel_sign import TravelSign
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction, Gps, GpsVelocity
 from protocol.rotations import wrap_angle
@@ -34,6 +34,7 @@ from protocol.site.site_config import Projection
 STEP_S = 0.05  # time step of the filter; its cost grows with the inverse
 COLLECTED = 24_000  # steps, fixes and poses kept while the heading is unproven: 20 minutes
 PROVEN_S = 30.0  # without refusals, after which a heading is proven if the machine has driven DISTANCE_M once more
+UNSIGNED_M = 60.0  # way over ground after which its first motion is taken for one ahead: the speed may never change
 REFUTED_SIGMA = 3.0  # a proven heading is refuted if refused fixes show one that is further off
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
@@ -111,6 +112,9 @@ class Localiser:
         self._tracker = Tracker(self._tracker_config)
         self._gatherer = StepGatherer(machine, step_s)
         self._repeats = Repeats()
+        self._accelerometers = [s.name for s in machine.sensors if s.kind == "imu" and s.use and s.provides("force")]
+        self._sign = TravelSign() if self._accelerometers and not config.start else None  # None: known, or not shown
+        self._stepped_ns = 0
         self._counters: Counter[str] = Counter()
         self._steps: deque[FilterStep] = deque(maxlen=COLLECTED)
         self._fixes: deque[Fix] = deque(maxlen=COLLECTED)
@@ -190,8 +194,11 @@ class Localiser:
         distance_m, was_proven = dead_reckoning.distance_m, self.is_proven
         beliefs: list[Belief] = []
         for event in self._events(readings, dead_reckoning):
+            if isinstance(event, FilterStep) and event.silent and self._sign:
+                self._judge_sign(self._sign, event, dead_reckoning)
             beliefs += self._filter(event, distance_m) if self.is_aligned else self._collect(event, distance_m)
-        poses = [pose_of(belief, dead_reckoning.wheels.speed_mps) for belief in beliefs]
+        wheels_mps = None if dead_reckoning.is_silent(readings[0][0].stamp_ns) else dead_reckoning.wheels.speed_mps
+        poses = [pose_of(belief, wheels_mps) for belief in beliefs]
         if was_proven:
             return poses
         self._keep(poses)
@@ -204,9 +211,33 @@ class Localiser:
         self.is_proven = True
         return self._proven_poses()
 
+    def _judge_sign(self, sign: TravelSign, step: FilterStep, dead_reckoning: DeadReckoning) -> None:
+        """Judge whether speeds over ground have the right sign: their first motion may have been one in reverse.
+
+        What was collected until then has the wrong one, and does not count. Raises HeadingRefutedError where a proven
+        heading came of it.
+        """
+        dt_s, self._stepped_ns = (step.stamp_ns - self._stepped_ns) * 1e-9, step.stamp_ns
+        for mean in (step.imu_means[name] for name in self._accelerometers if name in step.imu_means):
+            sign.add_force(float(mean.force_mps2[0]), -float(mean.rates_radps[1]), dt_s)
+            break  # one is enough
+        if dead_reckoning.ground:
+            sign.add_speed(dead_reckoning.ground.middle_ns, dead_reckoning.ground.speed_mps)
+        if not (shown := sign.sign):
+            return
+        self._sign = None
+        if shown < 0:
+            self._counters["first_motion_reversed"] += 1
+            if self.is_proven:
+                raise HeadingRefutedError(0.0)
+            dead_reckoning.turn_round()
+            self._tracker = Tracker(self._tracker_config)
+            self._smoothed.clear()
+            for kept in (self._steps, self._fixes, self._velocities, self._refused, self._poses):
+                kept.clear()
+
     def _events(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[Event]:
         """What the filter takes of the readings of one stamp; a step that they end comes first."""
-        fast: list[Sensed] = []
         events: list[Event] = []
         for reading, sensor in readings:
             if isinstance(reading, Gps):
@@ -214,9 +245,7 @@ class Localiser:
                     events.append(self._tracker.receivers.fix(reading, dead_reckoning.pose))
             elif isinstance(reading, GpsVelocity):
                 events.append(gps_velocity(reading, sensor))
-            else:
-                fast.append((reading, sensor))
-        step = self._gatherer.gather(fast, dead_reckoning) if fast else None
+        step = self._gatherer.gather(readings, dead_reckoning)
         return [step, *events] if step else events
 
     def _filter(self, event: Event, distance_m: float) -> list[Belief]:
@@ -302,13 +331,20 @@ class Localiser:
 
     def _collect(self, event: Event, distance_m: float) -> list[Belief]:
         """Keep an event until the heading is known, then filter all that was kept."""
+        is_blind = isinstance(event, FilterStep) and event.silent and not event.wheels.is_known
+        if is_blind and not self._config.start:
+            return []  # nothing to start from before it moved
         self._remember(event)
         alignment: Alignment | None = None
         if isinstance(event, FilterStep):
             alignment = align_start(self._config.start, self._steps[0].reckoned) if self._config.start else None
-        elif isinstance(event, Fix) and self._steps and distance_m >= DISTANCE_M:
+        elif isinstance(event, Fix) and self._steps and distance_m >= self._least_m():
             alignment = align_fixes(self._fixes)
         return self._start(alignment, distance_m) if alignment else []
+
+    def _least_m(self) -> float:
+        """Way before the heading is taken from GPS."""
+        return UNSIGNED_M if self._sign and self._steps[-1].silent else DISTANCE_M
 
     def _start(self, alignment: Alignment, distance_m: float) -> list[Belief]:
         """Filter all that was kept. A start that is given needs no proof, nor has the profile `paper` any."""

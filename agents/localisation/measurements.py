@@ -4,6 +4,8 @@ x: the state (`filters.state`): position p, attitude (roll, pitch, yaw), velocit
 v, w and a are in `base_link`, R = map_from_base turns them into `map`, r is the lever arm of a sensor in `base_link`,
 and [.]_en are the components east and north. States (m, n) come as rows; where a model takes more than a few operations
 it works on columns, whose values adjoin. Angular rates and forces are turned into `base_link` before they come here.
+
+It is one module because each model is a few lines, and most share their rotations.
 """
 
 import math
@@ -25,8 +27,10 @@ SPEED_MPS = 0.04  # of wheels
 SIDE_MPS = 0.04  # how fast a machine slides sideways
 STILL_MPS = 0.005  # of a machine at rest
 STILL_R = np.diag([STILL_MPS**2] * 3 + [(0.1 * RATE_RADPS) ** 2] * 3)
+SIDES_R, REST_R = SIDE_MPS**2 * EYE[:2, :2], RATE_RADPS**2 * EYE
 STANDSTILL = "standstill"  # the name that its measurement counts under
 GATE_SIGMA = 6.0  # measurements further off are refused; mounting and slip are not Gaussian
+REST_SIGMA = 3.0  # the same for a standstill that wheels do not show
 
 ROLL, PITCH, YAW = range(ATTITUDE.start, ATTITUDE.stop)
 PLACE = slice(POSITION.start, POSITION.start + 2)
@@ -176,6 +180,16 @@ def wheels(
     return Measurement(sensor, stamp_ns, velocity_mps, R, h, jacobian, gate_sigma=gate)
 
 
+def sides(stamp_ns: int) -> Measurement:
+    """A machine whose wheels say nothing still moves along its own axis: 0 = (v_y, v_z) at `base_link`."""
+    return _nothing("sides", stamp_ns, slice(VELOCITY.start + 1, VELOCITY.stop), SIDES_R, GATE_SIGMA)
+
+
+def rest(stamp_ns: int) -> Measurement:
+    """No rotation of a machine that stands as far as GPS shows: 0 = w. It may creep round a bend: the gate is close."""
+    return _nothing(STANDSTILL, stamp_ns, RATE, REST_R, REST_SIGMA)
+
+
 def turn(
     stamp_ns: int, sensor: str, rate_radps: float, std_radps: float, error: int | None, per_error: float, gate: float
 ) -> Measurement:
@@ -260,8 +274,12 @@ def standstill(stamp_ns: int) -> Measurement:
 
     Gated without relocking: an articulated machine turns its rear frame as it steers, also while its wheels stand.
     """
-    model = _picked(slice(VELOCITY.start, RATE.stop))
-    return Measurement(STANDSTILL, stamp_ns, np.zeros(6), STILL_R, *model, gate_sigma=GATE_SIGMA, relocks=False)
+    return _nothing(STANDSTILL, stamp_ns, slice(VELOCITY.start, RATE.stop), STILL_R, GATE_SIGMA)
+
+
+def _nothing(sensor: str, stamp_ns: int, states: slice, R: Floats, gate: float) -> Measurement:
+    """No motion in some states: an assumption, which no sensor measures, so it never relocks."""
+    return Measurement(sensor, stamp_ns, np.zeros(len(R)), R, *_picked(states), gate_sigma=gate, relocks=False)
 
 
 def _picked(states: slice) -> tuple[Model, Model]:

@@ -29,6 +29,7 @@ from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATI
 from protocol.units import GRAVITY_MPS2
 
 STANDSTILL_S = 1.0  # after so long without travel the machine stands; coarse ticks of one that crawls come sooner
+REST_S = 2.0  # and so long without a speed over ground, of which there may be one a second
 STEERED_S = 1.0  # how long the error of a steering angle stays the same
 ROLLING_S = 0.5  # time constant of the low-pass on the rolling resistance
 LOAD_DOUBT = 0.5  # standard deviation of the slip, over the slip, where a load of up to the empty mass is not weighed
@@ -113,7 +114,10 @@ class MotionSensors:
         return math.hypot(measurements.RATE_RADPS, std * math.sqrt(max(2 * STEERED_S / dt_s, 1.0)))
 
     def wheels(self, step: FilterStep) -> list[Measurement]:
-        """Speed of the wheels less their slip, and a standstill; nothing of wheels that are silent, not at rest."""
+        """Speed of the wheels less their slip, and a standstill. Silent ones leave what holds without them."""
+        if step.silent:
+            still = [measurements.rest(step.stamp_ns)] if step.still_s >= REST_S else []
+            return [measurements.sides(step.stamp_ns), *still]
         if not step.rolled or not self._wheels:
             return []
         if forces := self.forces(step):

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from agents.dead_reckoning import turn_source
+from agents.ground_speed import velocity_variances
+from agents.localisation import measurements
 from agents.localisation.alignment import Alignment, start_belief
 from agents.localisation.corrections import Corrections, not_used
 from agents.localisation.filters.belief import Belief, Filter, Measurement
@@ -18,15 +20,15 @@ from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import nothing_past
 from agents.localisation.filters.state import YAW, Layout, X, Y, Z
-from agents.localisation.fix import Fix
+from agents.localisation.fix import GPS_GATE_SIGMA, Fix
 from agents.localisation.gps import Receivers, drifting
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep
 from agents.localisation.measurements import STANDSTILL
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
-from protocol.machine.machine_config import ABSOLUTE, MachineConfig
-from protocol.machine.readings import Correction
+from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
+from protocol.machine.readings import Correction, GpsVelocity
 from protocol.site.site_config import Projection
 
 # Without GPS for so long, wheels and IMUs teach neither place and heading nor the gyros' bias: they show none of them,
@@ -81,7 +83,10 @@ class Tracker:
             machine, layout, config.step_s, config.tyres, on_plane=on_plane, is_weighed=config.is_weighed or not slow
         )
         turn_error = self._body.turn_error_radps if slow and source and source.kind == "odometry" else 0.0
-        self._model = MotionModel(layout, on_plane, self._gps_errors(), turn_error_radps=turn_error)
+        unseen = slow and source is None
+        self._model = MotionModel(
+            layout, on_plane, self._gps_errors(), turn_error_radps=turn_error, turns_unseen=unseen
+        )
         self._placed_ns = 0  # stamp of the newest fix or velocity by GPS that was accepted
 
     @property
@@ -161,8 +166,8 @@ class Tracker:
             inertial, wheels = ([_considering(m, considers) for m in several] for several in (inertial, wheels))
         elif scale:
             wheels = [_considering(m, scale) for m in wheels]
-        measurements = [*inertial, *absolute, *turn, *wheels]
-        return beliefs + (fusion.add(measurements) if measurements else [])
+        shown = [*inertial, *absolute, *turn, *wheels]
+        return beliefs + (fusion.add(shown) if shown else [])
 
     def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:
         """Beliefs that a fix or a velocity by GPS changed."""
@@ -223,3 +228,15 @@ def layout_of(machine: MachineConfig) -> Layout:
     receivers, references = drifting(machine.sensors), heading_references(machine.sensors)
     base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
     return Layout(turns, True, len(receivers) + base, len(references), base)
+
+
+def gps_velocity(reading: GpsVelocity, sensor: SensorConfig) -> Measurement:
+    """Velocity of the antenna in `map` by Doppler, with the variance that is configured, else with its own.
+
+    It knows nothing of the slow errors of fixes: carrier frequencies suffer little from what delays the code. So it
+    shows the heading and the scale of the wheels at once, and lasts through errors of the fixes.
+    """
+    variances = np.array(velocity_variances(reading, sensor))
+    z, lever_m = np.array([reading.velocity_e_mps, reading.velocity_n_mps]), np.array(sensor.mount.xyz_m)
+    gate = sensor.gate(GPS_GATE_SIGMA)
+    return measurements.velocity(reading.stamp_ns, sensor.name, z, np.diag(variances), lever_m, gate)

@@ -172,16 +172,17 @@ def check_positions(data: Sequence[SensorData], *, is_barred: bool) -> Finding:
     kinds, problem, advice = {sensor.kind for sensor in there}, "", ""
     if not any(_is_receiver(sensor) for sensor in there):
         problem, advice = "no usable GPS fixes", "add a receiver, or `sitegrid log run --set start=[x,y,heading]`"
-    elif not kinds & WHEELS:
-        problem, advice = "no usable wheel readings", "the heading needs an encoder or odometry"
     elif is_barred or any(_stands(one) for one in data):
         problem, advice = "readings do not fit together", "mend the stamps and places that are named above"
     if problem:
         return Finding(Level.FAIL, "positions", problem, advice)
     named = ", ".join(sensor.name for sensor in there)
-    if "steering" in kinds or any(s.provides("rate") for s in there if s.kind in ("imu", "odometry")):
-        return Finding(Level.PASS, "positions", f"by {named}")
-    return Finding(Level.WARN, "positions", f"{named}: none shows the turn", "add a gyro or a steering angle")
+    if not ("steering" in kinds or any(s.provides("rate") for s in there if s.kind in ("imu", "odometry"))):
+        return Finding(Level.WARN, "positions", f"{named}: none shows the turn", "add a gyro or a steering angle")
+    if not kinds & WHEELS:
+        what, advice = f"{named}: no wheels, speed is by GPS", "an encoder or odometry would show rolling resistance"
+        return Finding(Level.WARN, "positions", what, advice)
+    return Finding(Level.PASS, "positions", f"by {named}")
 
 
 def missing_for_ground(machine: MachineConfig, areas: Sequence[KnownArea]) -> str:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -100,6 +101,7 @@ def test_a_server_that_hangs_is_no_answer_in_time(site: SiteRun):
     with connect(site.endpoint, site.site, timeout_s=1.0) as client, site.connect() as patient:
         assert patient.info().site.name == site.site, "it is there, also after its router was another one"
         site.server.send(signal.SIGSTOP)
+        until(lambda: "T (stopped)" in Path(f"/proc/{site.server.pid}/status").read_text(), "does not stop")
         began_s = time.monotonic()
         with pytest.raises(LinkError, match="did not answer in time"):
             client.info()

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from agents.localisation.filters.smoother import Past
-from agents.localisation.filters.state import YAW, X, Y
+from agents.localisation.filters.state import SPEED, YAW, X, Y
 from protocol.arrays import Floats
 from protocol.rotations import wrap_angle
 
@@ -101,7 +101,7 @@ class Conditioned:
 
 @dataclass(frozen=True)
 class PoseBelief:
-    """Pose in `map` at a stamp: position [m], heading [rad, in +-pi], wheel speed [m/s], covariance (2, 2) [m2]."""
+    """Pose in `map` at a stamp: position [m], heading [rad, in +-pi], speed [m/s], covariance (2, 2) [m2]."""
 
     stamp_ns: int
     x_m: float
@@ -125,8 +125,9 @@ class Filter(Protocol):
         """Condition the belief on a measurement of its stamp."""
 
 
-def pose_of(belief: Belief, speed_mps: float) -> PoseBelief:
-    """The pose that a belief holds, with the wheels' speed."""
+def pose_of(belief: Belief, wheels_mps: float | None) -> PoseBelief:
+    """The pose that a belief holds, with the wheels' speed; None: with its own."""
+    speed_mps = float(belief.x[SPEED]) if wheels_mps is None else wheels_mps
     x, y, heading = float(belief.x[X]), float(belief.x[Y]), wrap_angle(float(belief.x[YAW]))
     return PoseBelief(belief.stamp_ns, x, y, heading, speed_mps, belief.P[:2, :2].copy())
 

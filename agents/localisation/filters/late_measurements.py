@@ -129,8 +129,11 @@ class Fusion:
             node.belief = self._condition(prior, node, node.measurements, fresh if i == index else NO_SENSOR)
 
     def _moved(self, belief: Belief, stamp_ns: int) -> Belief:
-        dt_s = (stamp_ns - belief.stamp_ns) * 1e-9
-        return self._engine.predict(belief, motion(self.model, belief, dt_s), stamp_ns) if dt_s > 0 else belief
+        while belief.stamp_ns < stamp_ns:
+            to_ns = min(stamp_ns, belief.stamp_ns + self.model.max_step_ns)
+            dt_s = (to_ns - belief.stamp_ns) * 1e-9
+            belief = self._engine.predict(belief, motion(self.model, belief, dt_s), to_ns)
+        return belief
 
     def _condition(
         self, belief: Belief, node: _Node, measurements: Iterable[Measurement], fresh: Collection[str]

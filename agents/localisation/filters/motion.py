@@ -11,9 +11,12 @@ Over a step dt, with R = map_from_base and E the matrix from body rates to the r
 `velocity` is that of base_link's origin in its own axes and `acceleration` its rate of change; what an accelerometer
 measures besides (rate x velocity, gravity) belongs to the measurement. On a plane (two_d_mode of robot_localization)
 the states off it are zero before and after each step, with a small variance so that the covariance stays definite.
+
+It is one module because f, its Jacobian and its noise are one model.
 """
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,6 +33,7 @@ from agents.localisation.filters.state import (
     RATE,
     SPEED,
     VELOCITY,
+    YAW_RATE,
     Layout,
     Z,
 )
@@ -53,6 +57,8 @@ WHEEL_SCALE_WALK = 2e-4  # [1/sqrt(s)]
 SLIP_STD = 0.08  # of the wheels' slip per traction, which the speed is corrected by
 SLIP_TIME_S = 5.0  # how long a ground's slip stays the same
 BASE_OFFSET_WALK = 5e-3  # [m/sqrt(s)]: after an hour a mean over fixes says no more
+TURN_S = 3.0  # how long a turn lasts that no sensor shows
+CURVATURE, MAX_TURN_RADPS, LEAST_TURN_RADPS = 0.1, 0.3, 0.005  # it: standard deviation per metre driven, and its limits
 BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a wrong scale makes another in every bend
 
 
@@ -91,7 +97,7 @@ class MotionModel:
     of the first references of the layout; headings of the others count from an anchor, and their errors walk. traction:
     drive force over weight [-], 0 where it is not known; slip_std: of the wheels' slip per traction. turn_error_radps:
     standard deviation of the lasting error of an odometry's turn rate, 0 where the turn comes from another sensor.
-    reckons: whether nothing shows the place.
+    reckons: whether nothing shows the place. turns_unseen: whether no sensor shows the turn.
     """
 
     layout: Layout
@@ -102,12 +108,18 @@ class MotionModel:
     slip_std: float = SLIP_STD
     turn_error_radps: float = 0.0
     reckons: bool = False
+    turns_unseen: bool = False
 
     def __post_init__(self) -> None:
         if len(self.gps_errors) != self.layout.receivers:
             raise ValueError(f"{len(self.gps_errors)} GPS errors for {self.layout.receivers} receivers")
         if len(self.heading_errors) > self.layout.references:
             raise ValueError(f"{len(self.heading_errors)} heading errors for {self.layout.references} references")
+
+    @property
+    def max_step_ns(self) -> int:
+        """Longest step, within which a motion is straight: sensors of the turn make short ones, fixes alone do not."""
+        return 250_000_000 if self.turns_unseen else sys.maxsize
 
 
 def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
@@ -130,6 +142,11 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     if model.turn_error_radps:
         turn = layout.gyro_biases.stop - 1
         Q[turn, turn] += 2 * model.turn_error_radps**2 * dt_s / BEND_S
+
+    if model.turns_unseen:  # a stationary Gauss-Markov process: a machine that stands does not turn
+        std_radps = min(CURVATURE * abs(float(belief.x[SPEED])), MAX_TURN_RADPS) + LEAST_TURN_RADPS
+        scale[YAW_RATE] = math.exp(-dt_s / TURN_S)
+        Q[YAW_RATE, YAW_RATE] = std_radps**2 * -math.expm1(-2 * dt_s / TURN_S)
 
     def f(states: Floats) -> Floats:
         return _moved(states, scale, dt_s)

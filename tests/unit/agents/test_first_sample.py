@@ -49,13 +49,12 @@ UNKNOWN = [replace(r, sensor=f"x-{r.sensor}") for r in DRIVEN]
 @pytest.mark.parametrize(
     ("readings", "missing"),
     [
-        (without("encoder"), NO_WHEELS),
         (without("gps"), "no GPS fixes"),
-        (without("gps", "encoder", "torque"), f"{NO_WHEELS}, no GPS fixes, {NO_TORQUE}"),
+        (without("gps", "encoder", "torque"), f"no GPS fixes, {NO_WHEELS}, {NO_TORQUE}"),
         (STANDING, "the heading is unknown until the machine has driven 12 m with GPS fixes"),
         (STUCK, "gps-1 repeats one fix"),
         (ELSEWHERE, "GPS fixes outside the site"),
-        (UNKNOWN, f"none of them is of a sensor in the config, {NO_TORQUE}"),
+        (UNKNOWN, f"none of them is of a sensor in the config, {NO_WHEELS}, {NO_TORQUE}"),
     ],
 )
 def test_what_is_missing_is_said_once(readings: list[Reading], missing: str):
@@ -87,6 +86,9 @@ def test_a_machine_that_stands_where_it_was_placed_has_not_moved():
 
 def test_samples_without_resistance_have_their_reason_too():
     assert said(without("torque")) == [f"samples have no rolling resistance: {NO_TORQUE}"]
+    parked = without("encoder", readings=[r for r in STANDING if r.stamp_ns < STANDING[-1].stamp_ns])
+    heading = "the heading is unknown until the machine has driven 12 m with GPS fixes"
+    assert said(parked) == [f"{NO_SAMPLE}{heading}, {NO_WHEELS}"]
 
 
 def test_nothing_is_said_of_a_machine_that_has_all_nor_before_the_time():

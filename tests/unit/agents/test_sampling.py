@@ -9,7 +9,6 @@ from agents.estimation.ground import NOTHING_KNOWN, GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
 from agents.sampling import EVERY_M, HISTORY_S, LAG_S, Odometer, PoseHistory, Sampler
 from protocol.arrays import Table
-from protocol.machine.readings import Encoder, Imu, Reading
 from protocol.machine.samples import GRADE, RESISTANCE, check_samples
 
 S = 10**9
@@ -155,20 +154,12 @@ def test_samples_of_an_unsure_place_are_withheld_and_counted() -> None:
 # --- the odometer ----------------------------------------------------------------------------------------------------
 
 
-def imu(seconds: float) -> Reading:
-    return Imu("imu", ns(seconds), 0.0, 0.0, 0.0, 0.0, 0.0, 9.81)
-
-
-def wheels(seconds: float) -> Reading:
-    return Encoder("wheels", ns(seconds), 0.0, 0.0)
-
-
 @pytest.mark.parametrize("speed_mps", [2.0, -2.0], ids=["forwards", "reverse"])
 def test_distance_goes_on_by_the_filter_s_speed_when_wheels_fall_silent(speed_mps: float) -> None:
     """From when they fell silent, which is noticed half a second later; up in reverse too."""
     odometer = Odometer()
-    odometer.update(wheels(0.0), 5.0, speed_mps)
-    distances = [odometer.update(imu(i * 0.01), 5.0, speed_mps) for i in range(1, 1001)]
+    odometer.update(ns(0.0), ns(0.0), 5.0, speed_mps)
+    distances = [odometer.update(ns(i * 0.01), ns(0.0), 5.0, speed_mps) for i in range(1, 1001)]
     assert distances[49] == 5.0
     assert distances[-1] == pytest.approx(5.0 + 2.0 * 10.0, abs=1.1)
     assert (np.diff(distances) >= 0).all()
@@ -176,19 +167,18 @@ def test_distance_goes_on_by_the_filter_s_speed_when_wheels_fall_silent(speed_mp
 
 def test_wheels_that_are_read_again_count_on_and_nothing_twice() -> None:
     odometer = Odometer()
-    odometer.update(wheels(0.0), 5.0, 2.0)
-    for i in range(1, 301):
-        before = odometer.update(imu(i * 0.01), 5.0, 2.0)
-    assert odometer.update(wheels(3.01), 5.0, 2.0) == pytest.approx(before)  # counted from where they were
-    for i in range(302, 400):
-        after = odometer.update(imu(i * 0.01) if i % 5 else wheels(i * 0.01), 5.0 + 0.02 * (i - 301), 2.0)
-    assert after == pytest.approx(before + 0.02 * 98, abs=0.05)
+    odometer.update(ns(0.0), ns(0.0), 5.0, 2.0)
+    for i in range(1, 301):  # dead reckoning goes on over ground
+        before = odometer.update(ns(i * 0.01), ns(0.0), 5.0 + 0.02 * i, 2.0)
+    assert odometer.update(ns(3.01), ns(3.01), 11.0, 2.0) == pytest.approx(before)  # counted from where they were
+    after = odometer.update(ns(3.05), ns(3.05), 11.1, 2.0)
+    assert after == pytest.approx(before + 0.1)
 
 
 def test_noise_of_the_filter_s_speed_at_a_standstill_is_no_distance() -> None:
     odometer = Odometer()
-    start = odometer.update(imu(0.0), 0.0, 0.0)
-    assert [odometer.update(imu(i * 0.01), 0.0, 0.29 * (-1) ** i) for i in range(1, 1000)] == [start] * 999
+    start = odometer.update(ns(0.0), 0, 0.0, 0.0)
+    assert [odometer.update(ns(i * 0.01), 0, 0.0, 0.29 * (-1) ** i) for i in range(1, 1000)] == [start] * 999
 
 
 # --- where the machine was -------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 
 from agents.estimation.balance import squat_rad
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Encoder, Imu, Torque
+from protocol.machine.readings import Encoder, Gps, Imu, Torque
 from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, changed_sensor, drive, machine
 from tests.unit.agents.ground import balances
@@ -147,7 +147,7 @@ def test_torque_between_two_steps_is_averaged_and_the_last_one_kept() -> None:
 def test_ages_of_wheels_and_torque_and_silent_wheels_that_stand() -> None:
     made = drive(FORWARDS, VEHICLE)
     cut = made.stamps_ns[700]
-    silent = [r for r in made.readings if not isinstance(r, Encoder | Torque) or r.stamp_ns <= cut]
+    silent = [r for r in made.readings if not isinstance(r, Encoder | Torque | Gps) or r.stamp_ns <= cut]
     steps = balances(VEHICLE, silent)
     last = steps[-1]
     assert last.wheels_s == pytest.approx((last.stamp_ns - cut) * 1e-9, abs=0.06)

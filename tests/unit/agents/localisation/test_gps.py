@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agents.ground_speed import MIN_VELOCITY_STD_MPS
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Conditioned
 from agents.localisation.filters.ekf import Ekf
@@ -15,8 +16,7 @@ from agents.localisation.filters.motion import MotionModel
 from agents.localisation.filters.state import POSITION, SPEED, VELOCITY
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Receivers
-from agents.localisation.gps_velocity import MIN_STD_MPS, gps_velocity
-from agents.localisation.tracker import layout_of
+from agents.localisation.tracker import gps_velocity, layout_of
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, GpsVelocity, Reading
@@ -317,7 +317,7 @@ def end_error_m(vehicle: MachineConfig, made: Drive, readings: Sequence[Reading]
 
 def test_a_stated_error_has_a_least_value_and_a_configured_one_counts_as_it_is() -> None:
     reading = GpsVelocity("doppler", 7, 1.0, 2.0, 1e-6, 0.09)
-    assert np.diag(gps_velocity(reading, DOPPLER).R) == pytest.approx([MIN_STD_MPS**2, 0.09])
+    assert np.diag(gps_velocity(reading, DOPPLER).R) == pytest.approx([MIN_VELOCITY_STD_MPS**2, 0.09])
     configured = replace(DOPPLER, std={"velocity": 0.01})
     assert np.diag(gps_velocity(reading, configured).R) == pytest.approx([1e-4, 1e-4])
     assert gps_velocity(reading, replace(DOPPLER, gate_sigma=9.0)).gate_sigma == 9.0

@@ -108,7 +108,7 @@ def test_what_is_wrong_with_a_file_is_one_line_that_says_what_to_do(
             'kind = "odometry"\n',
             'kind = "odometry"\nuse = false\n',
             "positions",
-            "FAIL.*no usable wheel.*; the heading",
+            "WARN.*gps-1: none shows the turn; add a gyro",
         ),
         ('file = "gps.csv"', 'file = "gps.csv"\nuse = false', "positions", "FAIL.*no usable GPS fixes; .*--set start="),
         (
