@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from agents.holdout import Holdout, HoldoutConfig
+from agents.holdout import FIGURES, Holdout, HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
@@ -73,6 +73,7 @@ def test_errors_are_right_on_a_made_up_case(vehicle: MachineConfig, made: Drive)
     assert report["median_m"] == pytest.approx(off_m, abs=0.5)
     assert report["median_m"] <= report["max_m"]
     assert report["rms_m"] <= report["max_m"]
+    assert report["expected_rms_m"] == pytest.approx(off_m, abs=1.0)  # none of it was believed before
 
 
 @pytest.mark.slow
@@ -103,7 +104,7 @@ def test_velocities_are_withheld_with_the_fixes_and_judged_by_nobody(made: Drive
 
 @pytest.mark.slow
 def test_report_without_a_judged_fix_says_so(vehicle: MachineConfig, made: Drive) -> None:
-    none = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None, "end_m": None}
+    none = {"fixes": 0, **dict.fromkeys(FIGURES)}
     assert run(vehicle, made.readings[:100])[1] == none
     assert run(vehicle, made.readings, settle_s=1000.0)[1] == none
 
