@@ -1,6 +1,8 @@
 """Fixes that are withheld from the filter and compared with its poses: an honest error on real logs.
 
-A receiver that is away has no velocity either, so that is withheld with the fixes.
+A receiver that is away has no velocity either, so that is withheld with the fixes. A fix is compared twice: with the
+place, and with where it is expected, the place plus the receiver's believed slow error. The first alone would punish a
+filter that does not follow slow errors.
 """
 
 import math
@@ -16,7 +18,7 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, GpsVelocity, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
-FIGURES = ("rms_m", "median_m", "max_m", "end_m")
+FIGURES = ("rms_m", "median_m", "max_m", "end_m", "expected_rms_m", "expected_median_m")
 NOTHING: dict[str, float | int | None] = {"fixes": 0, **dict.fromkeys(FIGURES)}  # the report if no fix was judged
 SETTLE_S = 40.0  # fixes are judged from so long after the first reading on: by then a machine that drives is aligned
 
@@ -55,7 +57,7 @@ class Holdout:
         self._sensors = {s.name: s for s in machine.sensors}
         self._first_ns = 0
         self._waiting: deque[tuple[Gps, int]] = deque()  # and of which outage
-        self._errors_m: list[float] = []
+        self._errors_m: list[tuple[float, float]] = []  # against the place, and where the fix is expected
         self._last_m: dict[int, float] = {}  # errors of the last fix of each outage
         self._outage, self._is_dark = 0, False
 
@@ -74,15 +76,26 @@ class Holdout:
                 c, s = math.cos(at.heading_rad), math.sin(at.heading_rad)
                 dx = at.x_m + c * lever[0] - s * lever[1] - x
                 dy = at.y_m + s * lever[0] + c * lever[1] - y
+                slow_x, slow_y = pipeline.slow_error_m(fix.sensor).tolist()
                 self._last_m[outage] = math.hypot(dx, dy)
-                self._errors_m.append(self._last_m[outage])
+                self._errors_m.append((self._last_m[outage], math.hypot(dx + slow_x, dy + slow_y)))
 
     def report(self) -> dict[str, float | int | None]:
-        """How many fixes were judged, and the error against them [m]; end_m: rms of the last ones of the outages."""
+        """How many fixes were judged, and the error against them [m].
+
+        end_m: rms of the last ones of the outages. expected_: with the receiver's believed slow error.
+        """
         if not self._errors_m:
             return dict(NOTHING)
-        errors, last = np.array(self._errors_m), np.array(list(self._last_m.values()))
-        figures = np.sqrt((errors**2).mean()), np.median(errors), errors.max(), np.sqrt((last**2).mean())
+        (errors, expected), last = np.array(self._errors_m).T, np.array(list(self._last_m.values()))
+        figures = (
+            np.sqrt((errors**2).mean()),
+            np.median(errors),
+            errors.max(),
+            np.sqrt((last**2).mean()),
+            np.sqrt((expected**2).mean()),
+            np.median(expected),
+        )
         return {"fixes": len(errors), **dict(zip(FIGURES, (round(float(f), 3) for f in figures), strict=True))}
 
     def _is_withheld(self, reading: Reading) -> bool:

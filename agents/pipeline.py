@@ -26,6 +26,7 @@ from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
 from agents.positioning import Accepted, PipelineConfig, Positioning, in_name_order
 from agents.sampling import NOTHING, Odometer, Sampler, Samples, joined
+from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from protocol.rotations import wrap_angle
@@ -57,6 +58,10 @@ class Pipeline:
     def pose_at(self, stamp_ns: int) -> PoseBelief | None:
         """Pose at a recent stamp, None where it is not known."""
         return self._positioning.pose_at(stamp_ns)
+
+    def slow_error_m(self, receiver: str) -> Floats:
+        """The slow error of a receiver as it is believed now (2,), east and north [m]."""
+        return self._positioning.slow_error_m(receiver)
 
     @property
     def pending(self) -> int:

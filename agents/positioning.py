@@ -14,6 +14,7 @@ from agents.localisation.imu_steps import Sensed
 from agents.localisation.localiser import HeadingRefutedError, LocalisationConfig, Localiser
 from agents.sampling import PoseHistory
 from agents.stream_order import Decision, StreamOrder, by_stamp
+from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig
 from protocol.machine.readings import Correction, Gps, Reading
 from protocol.site.site_config import Projection, SiteConfig
@@ -63,6 +64,10 @@ class Positioning:
     def pose_at(self, stamp_ns: int) -> PoseBelief | None:
         """Pose at a recent stamp, None where it is not known."""
         return self.poses.at(stamp_ns)
+
+    def slow_error_m(self, receiver: str) -> Floats:
+        """The slow error of a receiver as it is believed now (2,), east and north [m]."""
+        return self.localiser.slow_error_m(receiver)
 
     @property
     def counters(self) -> Counter[str]:

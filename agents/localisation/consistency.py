@@ -8,11 +8,14 @@ Innovations show errors that change faster than the filter takes for possible. A
 slower leaves no trace in them: the filter moves with it, and the ellipse misses the truth for as long as it lasts. It
 shows where another receiver, which errs on its own, disagrees: then the slow errors that the filter believes in are
 larger than stated. With one receiver, or with several that err alike, nobody can tell.
+
+A receiver that misstates its error shows it in the size of its innovations. So its variance is taken times a factor
+that brings their NIS to 1 (stochastic approximation: Robbins and Monro 1951; adaptive filters: Mehra 1972).
 """
 
 import math
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -24,6 +27,10 @@ MAX_GATED, MIN_NIS, MAX_NIS, MAX_CORRELATION = 0.2, 0.2, 2.5, 0.6
 LEVEL_S = 300.0  # how long slow errors are remembered: some independent ones of less than a minute
 MAX_LEVEL = 1.6  # twice what they are on average where their stated variance is right
 MAX_SHARE = 0.5  # receivers with more of their slow variance in common do not check each other
+ADAPTING_S = 45.0  # time in which the factor follows: some slow errors must not pass for a wrong statement
+LEAST_FACTOR, MOST_FACTOR = 0.25, 16.0  # a smoothed output says nothing of slow errors: at most half of the deviation
+CLIPPED_NIS = 4.0  # of one innovation, per component: an outlier is no statement
+PAUSE_S = 2.0  # innovations further apart teach no more than that
 INCONSISTENT, CONSISTENT, CANNOT_TELL = "inconsistent", "consistent", "cannot_tell"
 
 
@@ -33,6 +40,7 @@ class Consistency:
 
     slow_error: mean square of its believed slow error over the stated variance, at most about 1 if that is right.
     is_checked: whether another receiver, which errs on its own, would show a slow error that is larger.
+    variance_factor: what the stated variance is taken times [-].
     """
 
     gated: float
@@ -40,6 +48,7 @@ class Consistency:
     correlation: float
     slow_error: float
     is_checked: bool
+    variance_factor: float = 1.0
 
     @property
     def verdict(self) -> str:
@@ -91,3 +100,22 @@ class InnovationMonitor:
         square = float((normalised**2).mean())
         correlation = float((normalised[1:] * normalised[:-1]).mean()) / max(square, 1e-12)
         return Consistency(sum(self._gated) / len(self._gated), square, correlation, self._slow_error, is_checked)
+
+
+@dataclass
+class VarianceFactor:
+    """What the variance that a receiver states is multiplied by [-], the slow part too, as its innovations show it."""
+
+    factor: float = 1.0
+    _stamp_ns: int = field(default=0, repr=False)
+
+    def note(self, result: Conditioned) -> None:
+        """Follow an innovation (k,) that the filter accepted: others may be the filter's fault, or outliers."""
+        if not (result.accepted and math.isfinite(result.nis)):
+            return
+        stamp_ns = result.belief.stamp_ns
+        passed_s = min(max(stamp_ns - (self._stamp_ns or stamp_ns), 0) * 1e-9, PAUSE_S)
+        self._stamp_ns = max(stamp_ns, self._stamp_ns)
+        surplus = min(result.nis / len(result.innovation), CLIPPED_NIS) - 1.0
+        followed = self.factor * math.exp(passed_s / ADAPTING_S * surplus)
+        self.factor = min(max(followed, LEAST_FACTOR), MOST_FACTOR)

@@ -16,7 +16,7 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.ground_speed import MIN_FIX_STD_M
 from agents.localisation import measurements
-from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor
+from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor, VarianceFactor
 from agents.localisation.filters.belief import (
     Belief,
     Change,
@@ -74,6 +74,7 @@ class Receivers(ModalSensors[Fix]):
         self._estimator = ShareEstimator(len(absolute))
         self._configured = machine_share
         self._monitors = {name: InnovationMonitor() for name in self._sensors}
+        self._factors = {name: VarianceFactor() for name in self._sensors}
         self._judged: dict[str, tuple[int, bool]] = {}  # stamp of the last fix of each, and whether it was accepted
         self._refused: Counter[str] = Counter()  # in a row
         self._off_m: dict[str, list[Floats]] = {}  # innovations of these, since the last relock
@@ -91,6 +92,10 @@ class Receivers(ModalSensors[Fix]):
         machine = tuple(self._error(name, site_share) for name in self._states)
         return *machine, GpsError(base.variance_m2, base.time_s, (0.0, site_share * base.variance_m2))
 
+    def error_states(self, receiver: str) -> slice | None:
+        """States of the slow error of a receiver; None where the filter has none."""
+        return self._layout.gps_error(self._states[receiver]) if receiver in self._states else None
+
     @property
     def machine_share(self) -> float | None:
         """Share of the slow variance that all receivers of the machine have in common; None of fewer than two."""
@@ -105,15 +110,15 @@ class Receivers(ModalSensors[Fix]):
         share = self.machine_share
         checks = share is not None and share <= MAX_SHARE and sum(n in self._states for n in speaking) > 1
         judged = {n: self._monitors[n].consistency(is_checked=checks and n in self._states) for n in speaking}
-        return {name: value for name, value in judged.items() if value}
+        return {n: replace(c, variance_factor=self._factors[n].factor) for n, c in judged.items() if c}
 
     def fix(self, gps: Gps, reckoned: DeadReckonedPose) -> Fix:
         """A reading in `map`, with the variances that are configured, else with its own."""
         sensor = self._sensors[gps.sensor]
         x, y, _ = self._projection.to_map(gps.lat_deg, gps.lon_deg, gps.height_m)
         stated = (gps.var_e_m2, gps.var_n_m2)
-        variance = [sensor.std["position"] ** 2] * 2 if "position" in sensor.std else stated
-        return Fix(gps.stamp_ns, sensor, np.array([x, y]), np.array(variance), reckoned)
+        variance = np.array([sensor.std["position"] ** 2] * 2 if "position" in sensor.std else stated)
+        return Fix(gps.stamp_ns, sensor, np.array([x, y]), self._factors[gps.sensor].factor * variance, reckoned)
 
     def expected(self, fix: Fix) -> tuple[float, GpsError]:
         """What a fix is off: variance of its white noise, per axis [m2], and the slow error of its receiver."""
@@ -136,6 +141,8 @@ class Receivers(ModalSensors[Fix]):
         if name in self._states and (name not in self._stated_m2 or self._is_restated(name)):
             self._stated_m2[name] = self._drift_m2[name]
         self._monitors[name].note(result, self._believed_error(name, result.belief))
+        if self._slow:
+            self._factors[name].note(result)
         if fix.sensor.mode == DIFFERENTIAL or not math.isfinite(result.nis):
             return  # a velocity says nothing of the place
         self._judged[name] = (fix.stamp_ns, result.accepted)
@@ -160,9 +167,9 @@ class Receivers(ModalSensors[Fix]):
 
     def _believed_error(self, name: str, belief: Belief) -> float | None:
         """Square of a receiver's slow error as it is believed over its variance, per component; None without states."""
-        if name not in self._states:
+        if (states := self.error_states(name)) is None:
             return None
-        error = belief.x[self._layout.gps_error(self._states[name])]
+        error = belief.x[states]
         return float(error.dot(error)) / 2 / self._error(name).variance_m2
 
     def _error(self, name: str, site_share: float = 0.0) -> GpsError:

@@ -26,6 +26,7 @@ from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.repeats import Repeats
 from agents.localisation.tracker import Event, Tracker, TrackerConfig, gps_velocity
 from agents.localisation.travel_sign import TravelSign
+from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction, Gps, GpsVelocity
 from protocol.rotations import wrap_angle
@@ -144,6 +145,10 @@ class Localiser:
     def consistency(self) -> dict[str, Consistency]:
         """How consistent the filter is with each GPS receiver, of those with enough fixes."""
         return self._tracker.receivers.consistency
+
+    def slow_error_m(self, receiver: str) -> Floats:
+        """The believed slow error of a receiver (2,), east and north [m]; zeros where it is no state."""
+        return self._tracker.slow_error_m(receiver)
 
     def base_report(self) -> dict[str, Any] | None:
         """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""

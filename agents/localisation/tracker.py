@@ -27,6 +27,7 @@ from agents.localisation.imu_steps import FilterStep
 from agents.localisation.measurements import STANDSTILL
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
+from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
 from protocol.machine.readings import Correction, GpsVelocity
 from protocol.site.site_config import Projection
@@ -105,6 +106,11 @@ class Tracker:
         """How much further the wheels turn than the machine moves [-], as believed; None where it is no state."""
         states = self._model.layout.wheel_scales
         return float(self.belief.x[states.start]) if self.belief and states.stop > states.start else None
+
+    def slow_error_m(self, receiver: str) -> Floats:
+        """The believed slow error of a receiver (2,), east and north [m]; zeros where it is no state."""
+        states = self.receivers.error_states(receiver)
+        return self.belief.x[states] if self.belief and states else np.zeros(2)
 
     def base_report(self) -> dict[str, Any] | None:
         """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""

@@ -38,6 +38,7 @@ OF_SERVER = ("server", "losses", "clock", "time", "writer", "followers", "versio
 CORRECTION_S = 1.5  # they come five times a second
 SURE, OFF_M = 3.0, 1.0  # a lasting error of so many standard deviations, and of so much, is a wrong place
 REFUTED = "fixes are further off than the filter expects: look at the variance that the receiver states, and at mounts"
+MISSTATED = 2.25  # variance over the stated one: half as far again, more than chance makes of it
 UNSEEN = "a slow GPS error that is larger than stated would not show: there is one receiver, or several that err alike"
 
 
@@ -211,16 +212,27 @@ def check_base(correction: Correction | MessageError | None) -> Finding:
 def check_positions(machine: str, values: Mapping[str, Any]) -> Finding:
     """The verdicts on an agent's receivers, by the values of its health report: they may be anything."""
     pipeline = values.get("pipeline")
-    receivers = pipeline.get("consistency") if isinstance(pipeline, Mapping) else None
-    verdicts = {
-        str(name): each.get("verdict")
-        for name, each in (receivers.items() if isinstance(receivers, Mapping) else ())
+    shown = pipeline.get("consistency") if isinstance(pipeline, Mapping) else None
+    receivers = {
+        str(name): each
+        for name, each in (shown.items() if isinstance(shown, Mapping) else ())
         if isinstance(each, Mapping)
     }
+    verdicts = {name: each.get("verdict") for name, each in receivers.items()}
     if not verdicts:
         return skipped("positions", f"{machine} has had too few fixes")
     named = ", ".join(f"{name} {str(verdict).replace('_', ' ')}" for name, verdict in sorted(verdicts.items()))
     if "inconsistent" in verdicts.values():
         return Finding(Level.WARN, "positions", f"{machine}: {named}", REFUTED)
+    if misstated := [text for name, each in sorted(receivers.items()) if (text := _misstated(name, each))]:
+        return Finding(Level.WARN, "positions", f"{machine}: {', '.join(misstated)}", "set `std` in its config to that")
     unseen = f"; {UNSEEN}" if "consistent" not in verdicts.values() else ""
     return Finding(Level.PASS, "positions", f"{machine}: {named}{unseen}", "")
+
+
+def _misstated(receiver: str, consistency: Mapping[str, Any]) -> str:
+    """How far off what a receiver states of its error is; empty where it is about right."""
+    factor = consistency.get("variance_factor")
+    if not isinstance(factor, int | float) or not factor > 0 or 1 / MISSTATED < factor < MISSTATED:
+        return ""
+    return f"the fixes of {receiver} err {math.sqrt(factor):.1f} times as far as stated"

@@ -124,7 +124,7 @@ def measurements(rows: Sequence[Row]) -> list[Row]:
         counters = row["counters"]
         for name in (counter.removesuffix("_used") for counter in counters if counter.endswith("_used")):
             consistency = row["consistency"].get(name, {})
-            figures = {key: consistency.get(key) for key in ("nis", "correlation", "verdict")}
+            figures = {key: consistency.get(key) for key in ("nis", "correlation", "variance_factor", "verdict")}
             counted = {key: counters.get(f"{name}_{key}", 0) for key in ("used", "gated", "relocked")}
             listed.append(rounded({"withhold": row["withhold"], "measurement": name, **counted, **figures}, 2))
     return listed

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from agents.holdout import Holdout, HoldoutConfig
+from agents.holdout import FIGURES, Holdout, HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
@@ -65,8 +65,9 @@ def test_errors_are_right_on_a_made_up_case(vehicle: MachineConfig, made: Drive)
     assert report["fixes"] == 20  # 5 Hz for 1 s in 5, from 10 to 30 s
     assert report["rms_m"] == pytest.approx(off_m, abs=0.5)
     assert report["median_m"] == pytest.approx(off_m, abs=0.5)
-    none = {"fixes": 0, "rms_m": None, "median_m": None, "max_m": None, "end_m": None}
+    none = {"fixes": 0, **dict.fromkeys(FIGURES)}
     assert run(vehicle, made.readings[:100])[1] == none
+    assert report["expected_rms_m"] == pytest.approx(off_m, abs=1.0)  # none of it was believed before
 
 
 @pytest.mark.slow

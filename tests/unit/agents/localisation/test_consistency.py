@@ -1,7 +1,17 @@
 import numpy as np
 import pytest
 
-from agents.localisation.consistency import CANNOT_TELL, CONSISTENT, ENOUGH, INCONSISTENT, MAX_LEVEL, InnovationMonitor
+from agents.localisation.consistency import (
+    CANNOT_TELL,
+    CONSISTENT,
+    ENOUGH,
+    INCONSISTENT,
+    LEAST_FACTOR,
+    MAX_LEVEL,
+    MOST_FACTOR,
+    InnovationMonitor,
+    VarianceFactor,
+)
 from agents.localisation.filters.belief import Belief, Conditioned
 from tests.unit.agents.drives import START_NS
 
@@ -88,3 +98,25 @@ def test_a_slow_error_is_seen_by_its_size_and_denied_by_another_receiver_alone(
 
 def test_a_slow_error_is_no_verdict_before_it_has_lasted() -> None:
     assert noted(2 * MAX_LEVEL, 30.0).consistency().verdict == CANNOT_TELL
+
+
+def followed(std: float, seconds: float = 300.0, rate_hz: float = 5.0, accepted: bool = True) -> float:
+    """The factor after innovations that are `std` times as large as stated."""
+    draw, factor = np.random.default_rng(5), VarianceFactor()
+    for i in range(round(seconds * rate_hz)):
+        innovation, S = std * draw.standard_normal(2), factor.factor * np.eye(2)
+        belief = Belief(START_NS + round(i / rate_hz * 1e9), np.zeros(2), np.eye(2))
+        factor.note(Conditioned(belief, innovation, S, float(innovation @ innovation) / factor.factor, accepted))
+    return factor.factor
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0])
+@pytest.mark.parametrize("std", [0.5, 0.7, 1.0, 2.0, 3.0])
+def test_the_variance_follows_the_innovations_within_five_minutes(std: float, rate_hz: float) -> None:
+    assert followed(std, rate_hz=rate_hz) == pytest.approx(std**2, rel=0.35)
+
+
+def test_the_variance_stays_within_its_bounds_and_follows_no_refused_innovation() -> None:
+    assert followed(0.01, 3600) == LEAST_FACTOR
+    assert followed(100.0, 3600) == MOST_FACTOR
+    assert followed(3.0, accepted=False) == 1.0

@@ -112,8 +112,8 @@ def store(site: SiteConfig | None = SITE, **change: Any) -> Finding:
     return disk.check_store(replace(STORE, **change), site)
 
 
-def positions(**verdicts: str) -> Finding:
-    receivers = {name: {"verdict": verdict} for name, verdict in verdicts.items()}
+def positions(variance_factor: Any = 1.0, **verdicts: str) -> Finding:
+    receivers = {name: {"verdict": v, "variance_factor": variance_factor} for name, v in verdicts.items()}
     return check_positions("loader-1", {"pipeline": {"consistency": receivers}})
 
 
@@ -191,6 +191,9 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
         (positions(a="cannot_tell"), PASS, "a cannot tell; a slow GPS error that is larger than stated would not show"),
         (positions(a="consistent", b="inconsistent"), WARN, "b inconsistent; fixes are further off than"),
         (check_positions("loader-1", {"pipeline": {"consistency": {"a": 7}}}), SKIP, "too few fixes"),
+        (positions(4.0, gps="cannot_tell"), WARN, "the fixes of gps err 2.0 times as far as stated"),
+        (positions(0.3, gps="cannot_tell"), WARN, "the fixes of gps err 0.5 times as far as stated"),
+        (positions("?", gps="consistent"), PASS, "gps consistent"),
         (store(), PASS, "5000 rows of 3 machines, 100 archived; snapshot of row 4000, 90 s ago"),
         (store(None, checkpoints=3, checkpoint_bytes=2 * 10**8), PASS, "ago; 3 checkpoints of the past, 0.2 GB"),
         (store(None, snapshot_row=0, snapshot_age_s=math.inf), PASS, "no snapshot"),
