@@ -122,7 +122,8 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
     message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
     named = ("no_sample", "spool_problem", "calibration_problem", "spool_damage")
-    problems = [uplink.get("problem"), *map(values.get, named)]
+    faults = _table_of(_table_of(values, "pipeline"), "faults").items()
+    problems = [uplink.get("problem"), *map(values.get, named), *(f"{name} {fault}" for name, fault in faults)]
     advice = "; ".join(str(problem) for problem in problems if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""
     lost = any(spool.get(key) for key in ("dropped", "put_aside", "gone"))
