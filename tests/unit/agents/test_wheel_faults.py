@@ -23,20 +23,22 @@ from agents.stream_order import by_stamp
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, GpsVelocity, Imu, Odometry, Reading
-from tests.unit.agents.drives import LEVER_M, PROJECTION, SITE, START_NS, Drive, Leg, drive, noisy, simulated, thinned
-from tests.unit.agents.test_receiver_faults import Faults as ReceiverFaults
-from tests.unit.agents.test_receiver_faults import machine as usual_machine
+from tests.unit.agents.drives import LEVER_M, PROJECTION, SITE, Drive, Leg, drive, noisy, seconds, simulated, thinned
+from tests.unit.agents.test_receiver_faults import FAULTS as RECEIVER_FAULTS
+from tests.unit.agents.test_receiver_faults import RECEIVER, SLOW_S, SLOW_SHARE, STD_M, shifted
 from tests.unit.agents.test_receiver_faults import measured as usual_drive
 
-STD_M, SLOW_SHARE, SLOW_S = 1.2, 0.75, 45.0
+pytestmark = pytest.mark.slow
 SEED = 1
 STOP_S, REVERSE_S = 74.0, 82.0  # when the machine stands, and backs up
-GPS = SensorConfig("gps", "gps", Mount(LEVER_M), drift_share=SLOW_SHARE, drift_time_s=SLOW_S)
+GPS = SensorConfig("gps-1", "gps", Mount(LEVER_M), drift_share=SLOW_SHARE, drift_time_s=SLOW_S)
 IMU = SensorConfig("imu", "imu")
-LEFT, RIGHT = (SensorConfig(n, "odometry", Mount((0.0, y, 0.0)), ("speed",)) for n, y in (("left", 0.9), ("right", -0.9)))
+LEFT, RIGHT = (
+    SensorConfig(n, "odometry", Mount((0.0, y, 0.0)), ("speed",)) for n, y in (("left", 0.9), ("right", -0.9))
+)
 ODOMETRY = SensorConfig("wheels", "odometry", measures=("speed",))
 ENCODER = SensorConfig("wheels", "encoder")
-Change = Callable[[float], float]  # of a speed
+Read = Callable[[float, float], float]  # seconds and a true speed -> what the sensor shows
 
 
 def legs(speed_mps: float) -> tuple[Leg, ...]:
@@ -56,11 +58,11 @@ def truth(speed_mps: float) -> Drive:
 
 
 @dataclass(frozen=True)
-class Fault_:
+class Case:
     """What wheel sensors read. ends_s: when they are right again; begin_s: from when on what is named can be seen."""
 
     expected: Fault
-    read: Callable[[float, float], float]  # seconds, speed -> what the sensor shows
+    read: Read
     begin_s: float
     wheels: tuple[SensorConfig, ...] = (ODOMETRY,)
     speed_mps: float = 3.0
@@ -68,18 +70,18 @@ class Fault_:
     half: bool = False  # one channel of an encoder alone
 
 
-def stands(begin_s: float, end_s: float = math.inf) -> Callable[[float, float], float]:
+def stands(begin_s: float, end_s: float = math.inf) -> Read:
     return lambda s, v: 0.0 if begin_s <= s < end_s else v
 
 
-def repeats(begin_s: float) -> Callable[[float, float], float]:
-    return lambda s, v: 3.0 if s >= begin_s else v
+def sound(_: float, v: float) -> float:
+    return v
 
 
-DEAD = Fault_(Fault.DEAD, stands(40.0), 40.0)
-CARRIED = Fault_(Fault.CARRIED, stands(STOP_S + 2, STOP_S + 62), REVERSE_S + 4, ends_s=STOP_S + 62)
-UNSIGNED = Fault_(Fault.UNSIGNED, lambda _, v: abs(v), REVERSE_S)
-REVERSED = Fault_(Fault.REVERSED, lambda _, v: -v, 3.0)
+DEAD = Case(Fault.DEAD, stands(40.0), 40.0)
+CARRIED = Case(Fault.CARRIED, stands(STOP_S + 2, STOP_S + 62), REVERSE_S + 4, ends_s=STOP_S + 62)
+UNSIGNED = Case(Fault.UNSIGNED, lambda _, v: abs(v), REVERSE_S)
+REVERSED = Case(Fault.REVERSED, lambda _, v: -v, 3.0)
 CASES = {
     "dead": DEAD,
     "dead, encoder, recovers": replace(DEAD, wheels=(ENCODER,), read=stands(40.0, 100.0), ends_s=106.0),
@@ -90,40 +92,40 @@ CASES = {
     "unsigned, encoder": replace(UNSIGNED, wheels=(ENCODER,)),
     "reversed": REVERSED,
     "reversed, encoder": replace(REVERSED, wheels=(ENCODER,)),
-    "reversed later": Fault_(Fault.REVERSED, lambda s, v: -v if s > 45 else v, 45.0),
-    "half": Fault_(Fault.HALF, stands(40.0), 40.0, (ENCODER,), half=True),
-    "stuck": Fault_(Fault.STUCK, repeats(60.0), STOP_S),
-    "spinning": Fault_(Fault.SLIPS, lambda s, v: v + 4 * np.clip(s - 40, 0, 1) * (s < 60), 40.0, ends_s=60.0),
+    "reversed later": Case(Fault.REVERSED, lambda s, v: -v if s > 45 else v, 45.0),
+    "half": Case(Fault.HALF, stands(40.0), 40.0, (ENCODER,), half=True),
+    "stuck": Case(Fault.STUCK, lambda s, v: v if s < 60 else 3.0, STOP_S),
+    "spinning": Case(Fault.SLIPS, lambda s, v: v + 4 * np.clip(s - 40, 0, 1) * (s < 60), 40.0, ends_s=60.0),
 }
 LOCATED = ("dead", "dead, encoder, recovers", "one of two dead", "carried", "unsigned", "reversed")
 
 
-def shown(fault: Fault_, seed: int) -> list[Reading]:
-    """Readings of the drive with a fault; a quarter of the fast ones are enough here, and save time."""
-    made, rng = truth(fault.speed_mps), np.random.default_rng(seed)
-    slow_m = math.sqrt(SLOW_SHARE) * STD_M
-    error, kept = slow_m * rng.standard_normal(2), math.exp(-0.2 / SLOW_S)
-    readings: list[Reading] = []
-    for r in noisy(thinned(made.readings, 40), seed):
+@cache
+def unmoved(speed_mps: float, seed: int) -> list[Reading]:
+    """Readings of the drive but those of wheels; a quarter of the fast ones are enough here, and save time."""
+    rng, slow_m, kept = np.random.default_rng(seed), math.sqrt(SLOW_SHARE) * STD_M, math.exp(-0.2 / SLOW_S)
+    error, readings = slow_m * rng.standard_normal(2), []
+    for r in noisy(thinned(truth(speed_mps).readings, 40), seed):
         if isinstance(r, Gps):
             error = kept * error + slow_m * math.sqrt(1 - kept**2) * rng.standard_normal(2)
-            e, n = error + math.sqrt(1 - SLOW_SHARE) * STD_M * rng.standard_normal(2)
-            x, y, z = PROJECTION.to_map(r.lat_deg, r.lon_deg, r.height_m)
-            lat, lon, _ = PROJECTION.to_geodetic(x + e, y + n, z)
-            r = replace(r, lat_deg=lat, lon_deg=lon, var_e_m2=STD_M**2, var_n_m2=STD_M**2)
+            r = shifted(r, *(error + math.sqrt(1 - SLOW_SHARE) * STD_M * rng.standard_normal(2)).tolist())
         readings.append(r)
-    for index, sensor in enumerate(fault.wheels):
-        readings += rolled(fault, made, sensor, faulty=index == 0)
-    return sorted(readings, key=lambda r: r.stamp_ns)
+    return readings
 
 
-def rolled(fault: Fault_, made: Drive, sensor: SensorConfig, *, faulty: bool) -> list[Reading]:
+def shown(case: Case, seed: int = SEED) -> list[Reading]:
+    """All readings of a drive."""
+    wheels = [rolled(case, truth(case.speed_mps), sensor, faulty=not i) for i, sensor in enumerate(case.wheels)]
+    return sorted([*unmoved(case.speed_mps, seed), *sum(wheels, [])], key=lambda r: r.stamp_ns)
+
+
+def rolled(case: Case, made: Drive, sensor: SensorConfig, *, faulty: bool) -> list[Reading]:
     """What one wheel sensor reads, 20 times a second."""
     speeds = made.speed_mps - sensor.mount.xyz_m[1] * np.gradient(made.heading_rad, 0.01)
-    seconds = np.arange(1, len(speeds) + 1) * 0.01
-    wrong = np.array([fault.read(s, v) for s, v in zip(seconds.tolist(), speeds.tolist(), strict=True)])
+    times_s = np.arange(1, len(speeds) + 1) * 0.01
+    wrong = np.array([case.read(s, v) for s, v in zip(times_s.tolist(), speeds.tolist(), strict=True)])
     ticks_per_m = sensor.ticks_per_rev / (2 * math.pi * cart().wheel_radius_m)
-    left, right = (np.floor(np.cumsum(v) * 0.01 * ticks_per_m) for v in (wrong, speeds if fault.half else wrong))
+    left, right = (np.floor(np.cumsum(v) * 0.01 * ticks_per_m) for v in (wrong, speeds if case.half else wrong))
     values = wrong if faulty else speeds
     every = range(4, len(speeds), 5)
     if sensor.kind == "encoder":
@@ -140,18 +142,18 @@ def verdicts(vehicle: MachineConfig, readings: Sequence[Reading]) -> list[tuple[
         for reading, sensor in judge.heard([(r, vehicle.sensor(r.sensor)) for r in group], reckoned):
             reckoned.update(reading, sensor)
         if judge.problems != said[-1][1]:
-            said.append(((stamp_ns - START_NS) * 1e-9, judge.problems))
+            said.append((seconds(group[0]), judge.problems))
     return said[1:]
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_fault_is_named_within_ten_seconds_and_until_it_ends(name: str) -> None:
-    fault = CASES[name]
-    (at_s, said), *later = verdicts(cart(*fault.wheels), shown(fault, SEED))
-    assert said == {fault.wheels[0].name: fault.expected.value}
-    assert fault.begin_s <= at_s <= fault.begin_s + 10, at_s
-    assert [problems for _, problems in later] == [{}] * (fault.ends_s < math.inf)
-    assert all(fault.ends_s <= s <= fault.ends_s + 15 for s, _ in later)
+    case = CASES[name]
+    (at_s, said), *later = verdicts(cart(*case.wheels), shown(case))
+    assert said == {case.wheels[0].name: case.expected.value}
+    assert case.begin_s <= at_s <= case.begin_s + 10, at_s
+    assert [problems for _, problems in later] == [{}] * (case.ends_s < math.inf)
+    assert all(case.ends_s <= s <= case.ends_s + 15 for s, _ in later)
 
 
 @dataclass(frozen=True)
@@ -164,30 +166,28 @@ class Outcome:
     faults: dict[str, str]
 
 
-def located(fault: Fault_, readings: Sequence[Reading]) -> Outcome:
+def located(case: Case, readings: Sequence[Reading]) -> Outcome:
     config = PipelineConfig(LocalisationConfig("ekf", slip=0.0, slip_soft=0.0))
-    pipeline, poses, made = Pipeline(SITE, cart(*fault.wheels), config), [], truth(fault.speed_mps)
+    pipeline, poses, made = Pipeline(SITE, cart(*case.wheels), config), [], truth(case.speed_mps)
     for _, group in groupby(readings, key=lambda r: r.stamp_ns - r.stamp_ns % 200_000_000):
         pipeline.step(list(group))
         poses += [pipeline.pose] if pipeline.pose else []
     errors = np.array([(p.x_m, p.y_m) for p in poses]) - [made.at(p.stamp_ns)[:2] for p in poses]
     nees = np.array([e @ np.linalg.solve(p.covariance_m2, e) for e, p in zip(errors, poses, strict=True)])
-    seconds = (np.array([p.stamp_ns for p in poses]) - START_NS) * 1e-9
-    return Outcome(seconds, np.hypot(*errors.T), nees, pipeline.health()["faults"])
+    return Outcome(np.array([seconds(p) for p in poses]), np.hypot(*errors.T), nees, pipeline.health()["faults"])
 
 
 @cache
 def passing(wheels: tuple[SensorConfig, ...]) -> Outcome:
-    sound = replace(DEAD, wheels=wheels, read=lambda _, v: v)
-    return located(sound, shown(sound, SEED))
+    case = replace(DEAD, wheels=wheels, read=sound)
+    return located(case, shown(case))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", LOCATED)
 def test_positions_are_nearly_as_good_as_without_the_fault(name: str) -> None:
-    fault = CASES[name]
-    outcome, without = located(fault, shown(fault, SEED)), passing(fault.wheels)
-    later, beside = (one.seconds > fault.begin_s + 15 for one in (outcome, without))
+    case = CASES[name]
+    outcome, without = located(case, shown(case)), passing(case.wheels)
+    later, beside = (one.seconds > case.begin_s + 15 for one in (outcome, without))
     off_m, nees, sound_m = outcome.off_m[later], outcome.nees[later], without.off_m[beside]
     rms_m, sound_rms_m = (float(np.sqrt(np.mean(np.square(values)))) for values in (off_m, sound_m))
     figures = f"seed={SEED} rms {rms_m:.2f} of {sound_rms_m:.2f} nees {nees.mean():.2f} in {(nees < 5.99).mean():.2f}"
@@ -195,51 +195,47 @@ def test_positions_are_nearly_as_good_as_without_the_fault(name: str) -> None:
     assert off_m.max() <= max(2 * sound_m.max(), 4.0), figures
     assert nees.mean() <= 4.0, figures
     assert (nees < 5.99).mean() >= 0.9, figures
-    assert bool(outcome.faults) == (fault.ends_s == math.inf)
+    assert bool(outcome.faults) == (case.ends_s == math.inf)
     assert without.faults == {}
 
 
-def scaled(by: float) -> Callable[[float, float], float]:
-    return lambda _, v: by * v
-
-
-SOUND = {  # what wheels and receivers do without a fault of the wheels
-    "passing": lambda _, v: v,
-    "another radius": scaled(0.75),
-    "km/h": scaled(3.6),
-    "mm/s": scaled(0.1),
-    "slip uphill": lambda s, v: v * (1.25 if 40 < s < 60 else 1.0),
+SOUND: dict[str, tuple[Read, tuple[SensorConfig, ...]]] = {  # what wheels do without a fault
+    "passing": (sound, (ODOMETRY,)),
+    "passing, encoder": (sound, (ENCODER,)),
+    "passing, two": (sound, (LEFT, RIGHT)),
+    "another radius": (lambda _, v: 0.75 * v, (ENCODER,)),
+    "km/h": (lambda _, v: 3.6 * v, (ODOMETRY,)),
+    "too few ticks": (lambda _, v: 0.1 * v, (ENCODER,)),
+    "slip uphill": (lambda s, v: v * (1.25 if 40 < s < 60 else 1.0), (LEFT, RIGHT)),
 }
 
 
 @pytest.mark.parametrize("name", SOUND)
-@pytest.mark.parametrize("wheels", [(ODOMETRY,), (ENCODER,), (LEFT, RIGHT)], ids=["odometry", "encoder", "two"])
-def test_sound_wheels_are_not_condemned(name: str, wheels: tuple[SensorConfig, ...]) -> None:
-    sound = replace(DEAD, wheels=wheels, read=SOUND[name])
-    assert verdicts(cart(*wheels), shown(sound, SEED)) == []
+def test_sound_wheels_are_not_condemned(name: str) -> None:
+    read, wheels = SOUND[name]
+    assert verdicts(cart(*wheels), shown(replace(DEAD, wheels=wheels, read=read))) == []
 
 
-@pytest.mark.parametrize("fault", ReceiverFaults, ids=lambda fault: fault.name.lower())
-def test_faults_of_receivers_are_not_the_wheels(fault: ReceiverFaults) -> None:
-    assert verdicts(usual_machine(), fault.value.changed(usual_drive(SEED))) == []
+@pytest.mark.parametrize("name", RECEIVER_FAULTS)
+def test_faults_of_receivers_are_not_the_wheels(name: str) -> None:
+    assert verdicts(RECEIVER, RECEIVER_FAULTS[name][0](usual_drive())) == []
 
 
 def test_a_receiver_that_drifts_beside_a_parked_machine_condemns_no_wheels() -> None:
-    made = noisy(drive([Leg(60)], usual_machine()).readings, SEED)
-    away = [replace(r, lat_deg=r.lat_deg + (r.stamp_ns - START_NS) * 1e-9 / 111_200) if isinstance(r, Gps) else r for r in made]
-    assert verdicts(usual_machine(), away) == []
+    parked = noisy(thinned(drive([Leg(60)], RECEIVER).readings, 40), SEED)
+    assert verdicts(RECEIVER, [shifted(r, seconds(r), 0.0) if isinstance(r, Gps) else r for r in parked]) == []
 
 
 def test_clocks_apart_are_not_the_wheels() -> None:
-    sound = replace(DEAD, read=lambda _, v: v)
-    late = [replace(r, stamp_ns=r.stamp_ns + 18 * 10**9) if isinstance(r, Gps) else r for r in shown(sound, SEED)]
+    made = shown(replace(DEAD, read=sound))
+    late = [replace(r, stamp_ns=r.stamp_ns + 18 * 10**9) if isinstance(r, Gps) else r for r in made]
     assert verdicts(cart(ODOMETRY), late) == []
 
 
 def test_an_accelerometer_that_faces_back_is_named_in_place_of_the_wheels() -> None:
     turned = [
         replace(r, force_x_mps2=-r.force_x_mps2, gyro_y_radps=-r.gyro_y_radps) if isinstance(r, Imu) else r
-        for r in shown(replace(DEAD, read=lambda _, v: v), SEED)
+        for r in shown(replace(DEAD, read=sound))
     ]
     said = verdicts(cart(ODOMETRY), turned)
     assert said
@@ -255,13 +251,12 @@ def test_doppler_velocities_judge_wheels_too() -> None:
         GpsVelocity("doppler", made.stamps_ns[i], *(velocities[i] + 0.1 * rng.standard_normal(2)).tolist(), 0.01, 0.01)
         for i in range(0, len(velocities), 50)
     ]
-    readings = [r for r in shown(DEAD, SEED) if not isinstance(r, Gps)] + seen
+    readings = [r for r in shown(DEAD) if not isinstance(r, Gps)] + seen
     ((at_s, said),) = verdicts(vehicle, readings)
     assert said == {"wheels": Fault.DEAD.value}
     assert at_s <= DEAD.begin_s + 10
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_simulated_drives_have_no_fault(seed: int) -> None:
     _, vehicle, readings, _ = simulated(seed, 120.0)
