@@ -123,7 +123,7 @@ class Stretches:
         self.begin = now
         if not (agrees or self._usual) and now.way_m - begin.way_m > STANDS**2 * far_m:
             return None  # the wheels may have another unit
-        return self._continue(agrees, begin, now, by_fixes, off_m)
+        return self._continue(begin, now, by_fixes, off_m, agrees=agrees)
 
     def _off_m(self, by_fixes: complex, by_wheels: complex, now_ns: int) -> float:
         """How far both are apart; of wheels whose unit is not known yet only whether they stand."""
@@ -142,7 +142,7 @@ class Stretches:
         ratio = (turn * self._turn.conjugate()).real
         self._usual += LEARNS * (ratio - self._usual) if self._usual else ratio
 
-    def _continue(self, agrees: bool, begin: Place, now: Place, by_fixes: complex, off_m: float) -> Run:
+    def _continue(self, begin: Place, now: Place, by_fixes: complex, off_m: float, *, agrees: bool) -> Run:
         """The run with one more stretch; fixes that jump to and fro are no way that a machine goes."""
         by_wheels, run, unit = now.wheel_m - begin.wheel_m, self._run, self._usual or 1.0
         goes_back = (by_fixes * self._last_m.conjugate()).real < 0

@@ -6,7 +6,7 @@ those of the accelerometer the other way round needs no fixes to be judged. One 
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -76,8 +76,9 @@ class _Felt(TravelSign):
 class _Wheel:
     """A wheel sensor. place_m: where it says the machine is, in the dead-reckoned frame.
 
-    way_m, rolled_m, back_m: rolled, up in reverse too, down in it, and in reverse alone. moved_ns,
-    moved_rad: when it last rolled, and where the machine faced; changed_ns: when it last read another speed. felt: what the IMU had felt by then.
+    felt: what the IMU had felt by its newest reading. moved_ns, moved_rad: when it last rolled, and where the machine
+    faced; changed_ns: when it last read another speed. way_m, rolled_m, back_m: rolled, up in reverse too, down in it,
+    and in reverse alone.
     """
 
     reading: WheelReading
@@ -123,7 +124,7 @@ class WheelJudge:
         imu = {self._imu: OTHER_WAY} if self._other_way else {}
         return {name: fault.value for name, fault in self.faults.items()} | imu
 
-    def heard(self, readings: Sequence[Sensed], reckoned: DeadReckoning) -> Sequence[Sensed]:
+    def heard(self, readings: list[Sensed], reckoned: DeadReckoning) -> list[Sensed]:
         """Judge by the readings of one stamp, before dead reckoning takes them; returns those that count."""
         self._angle_rad = angle_rad = self._before_rad + reckoned.angle_rad
         for reading, sensor in readings:
@@ -250,9 +251,9 @@ class WheelJudge:
         wheel, fault, kind = self._wheels[name], self.faults.get(name), run.kind
         if kind == Kind.STANDS:
             self._moves_ns = now.stamp_ns
-        if kind == Kind.AGREES and run.count >= NEEDED and fault and fault not in OF_SIGN:
-            if fault != Fault.STUCK or not _repeats(wheel, run):
-                self._acquit(name)
+        may_recover = fault and fault not in OF_SIGN and not (fault == Fault.STUCK and _repeats(wheel, run))
+        if may_recover and kind == Kind.AGREES and run.count >= NEEDED:
+            self._acquit(name)
         needed = NEEDED if self._imu else 2 * NEEDED
         if kind in (Kind.AGREES, Kind.UNCLEAR) or run.count < needed or fault or not self._is_felt(wheel, run, now):
             return

@@ -115,8 +115,9 @@ def unmoved(speed_mps: float, seed: int) -> list[Reading]:
 
 def shown(case: Case, seed: int = SEED) -> list[Reading]:
     """All readings of a drive."""
-    wheels = [rolled(case, truth(case.speed_mps), sensor, faulty=not i) for i, sensor in enumerate(case.wheels)]
-    return sorted([*unmoved(case.speed_mps, seed), *sum(wheels, [])], key=lambda r: r.stamp_ns)
+    made = truth(case.speed_mps)
+    wheels = [r for i, sensor in enumerate(case.wheels) for r in rolled(case, made, sensor, faulty=not i)]
+    return sorted([*unmoved(case.speed_mps, seed), *wheels], key=lambda r: r.stamp_ns)
 
 
 def rolled(case: Case, made: Drive, sensor: SensorConfig, *, faulty: bool) -> list[Reading]:
@@ -137,7 +138,7 @@ def verdicts(vehicle: MachineConfig, readings: Sequence[Reading]) -> list[tuple[
     """What the judge says, whenever that changes: seconds since the begin, and a sentence by sensor."""
     judge, reckoned = WheelJudge(vehicle, PROJECTION), DeadReckoning(vehicle, 0.0)
     said: list[tuple[float, dict[str, str]]] = [(0.0, {})]
-    for stamp_ns, same in groupby(sorted(readings, key=lambda r: r.stamp_ns), key=lambda r: r.stamp_ns):
+    for _, same in groupby(sorted(readings, key=lambda r: r.stamp_ns), key=lambda r: r.stamp_ns):
         (group,) = by_stamp(same)
         for reading, sensor in judge.heard([(r, vehicle.sensor(r.sensor)) for r in group], reckoned):
             reckoned.update(reading, sensor)
