@@ -12,7 +12,7 @@ from agents.localisation.filters.belief import DivergedError, PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.imu_steps import Sensed
 from agents.localisation.localiser import HeadingRefutedError, LocalisationConfig, Localiser
-from agents.localisation.wheel_judge import WheelJudge
+from agents.localisation.wheels.judge import WheelJudge
 from agents.sampling import PoseHistory
 from agents.stream_order import Decision, StreamOrder, by_stamp
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig

@@ -8,7 +8,7 @@ from itertools import groupby
 from operator import attrgetter
 
 from agents.dead_reckoning import DeadReckoning
-from agents.localisation.wheel_judge import WheelJudge
+from agents.localisation.wheels.judge import WheelJudge
 from agents.stream_order import by_stamp
 from protocol.machine.log_folder import LogFolder
 from protocol.machine.readings import Reading

@@ -16,7 +16,7 @@ import pytest
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.localiser import LocalisationConfig
-from agents.localisation.wheel_judge import OTHER_WAY, Fault, WheelJudge
+from agents.localisation.wheels.judge import OTHER_WAY, Fault, WheelJudge
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.stream_order import by_stamp
@@ -78,15 +78,15 @@ def sound(_: float, v: float) -> float:
     return v
 
 
-DEAD = Case(Fault.DEAD, stands(40.0), 40.0)
+DIED = Case(Fault.DIED, stands(40.0), 40.0)
 CARRIED = Case(Fault.CARRIED, stands(STOP_S + 2, STOP_S + 62), REVERSE_S + 4, ends_s=STOP_S + 62)
 UNSIGNED = Case(Fault.UNSIGNED, lambda _, v: abs(v), REVERSE_S)
 REVERSED = Case(Fault.REVERSED, lambda _, v: -v, 3.0)
 CASES = {
-    "dead": DEAD,
-    "dead, encoder, recovers": replace(DEAD, wheels=(ENCODER,), read=stands(40.0, 100.0), ends_s=106.0),
-    "dead, in a bend, faster": replace(DEAD, read=stands(30.0), begin_s=30.0, speed_mps=8.0),
-    "one of two dead": replace(DEAD, wheels=(LEFT, RIGHT)),
+    "dead": DIED,
+    "dead, encoder, recovers": replace(DIED, wheels=(ENCODER,), read=stands(40.0, 100.0), ends_s=106.0),
+    "dead, in a bend, faster": replace(DIED, read=stands(30.0), begin_s=30.0, speed_mps=8.0),
+    "one of two dead": replace(DIED, wheels=(LEFT, RIGHT)),
     "carried": CARRIED,
     "unsigned": UNSIGNED,
     "unsigned, encoder": replace(UNSIGNED, wheels=(ENCODER,)),
@@ -180,7 +180,7 @@ def located(case: Case, readings: Sequence[Reading]) -> Outcome:
 
 @cache
 def passing(wheels: tuple[SensorConfig, ...]) -> Outcome:
-    case = replace(DEAD, wheels=wheels, read=sound)
+    case = replace(DIED, wheels=wheels, read=sound)
     return located(case, shown(case))
 
 
@@ -214,7 +214,7 @@ SOUND: dict[str, tuple[Read, tuple[SensorConfig, ...]]] = {  # what wheels do wi
 @pytest.mark.parametrize("name", SOUND)
 def test_sound_wheels_are_not_condemned(name: str) -> None:
     read, wheels = SOUND[name]
-    assert verdicts(cart(*wheels), shown(replace(DEAD, wheels=wheels, read=read))) == []
+    assert verdicts(cart(*wheels), shown(replace(DIED, wheels=wheels, read=read))) == []
 
 
 @pytest.mark.parametrize("name", RECEIVER_FAULTS)
@@ -228,7 +228,7 @@ def test_a_receiver_that_drifts_beside_a_parked_machine_condemns_no_wheels() -> 
 
 
 def test_clocks_apart_are_not_the_wheels() -> None:
-    made = shown(replace(DEAD, read=sound))
+    made = shown(replace(DIED, read=sound))
     late = [replace(r, stamp_ns=r.stamp_ns + 18 * 10**9) if isinstance(r, Gps) else r for r in made]
     assert verdicts(cart(ODOMETRY), late) == []
 
@@ -236,7 +236,7 @@ def test_clocks_apart_are_not_the_wheels() -> None:
 def test_an_accelerometer_that_faces_back_is_named_in_place_of_the_wheels() -> None:
     turned = [
         replace(r, force_x_mps2=-r.force_x_mps2, gyro_y_radps=-r.gyro_y_radps) if isinstance(r, Imu) else r
-        for r in shown(replace(DEAD, read=sound))
+        for r in shown(replace(DIED, read=sound))
     ]
     said = verdicts(cart(ODOMETRY), turned)
     assert said
@@ -252,10 +252,10 @@ def test_doppler_velocities_judge_wheels_too() -> None:
         GpsVelocity("doppler", made.stamps_ns[i], *(velocities[i] + 0.1 * rng.standard_normal(2)).tolist(), 0.01, 0.01)
         for i in range(0, len(velocities), 50)
     ]
-    readings = [r for r in shown(DEAD) if not isinstance(r, Gps)] + seen
+    readings = [r for r in shown(DIED) if not isinstance(r, Gps)] + seen
     ((at_s, said),) = verdicts(vehicle, readings)
-    assert said == {"wheels": Fault.DEAD.value}
-    assert at_s <= DEAD.begin_s + 10
+    assert said == {"wheels": Fault.DIED.value}
+    assert at_s <= DIED.begin_s + 10
 
 
 @pytest.mark.parametrize("seed", range(2))

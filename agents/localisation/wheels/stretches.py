@@ -16,7 +16,7 @@ SURE = 4.0  # of a stretch's way, and of what contradicts: least size over the s
 NEAR, FAR = 0.3, 0.4  # of the longer way, what both differ by at most if they agree, at least if they contradict
 STANDS = 0.1  # of the way by fixes: wheels that roll less stand
 HALF = 0.625  # ratio of ways, or its inverse, beyond which they differ by more than slip and tyres make
-ASIDE = 0.5  # cosine of an angle: beyond its negative, directions are opposite
+OPPOSED = 0.5  # cosine of an angle: beyond its negative, directions are opposite
 LEARNS = 0.2  # share of a stretch in the usual ratio
 TINY = 1e-9
 HEADED_NS = 60 * 10**9  # for so long a gyro keeps a direction to half a radian, even one off by 0.5 degrees per second
@@ -37,14 +37,14 @@ class Kind(Enum):
 class Place:
     """Where the machine is [m], as complex numbers: by a receiver in `map`, by wheels in the dead-reckoned frame.
 
-    way_m: what the wheels have rolled, up in reverse too; rolled_m: down in reverse. angle_rad: dead-reckoned. lever_m:
-    where the antenna sits, ahead + i left.
+    distance_m: what the wheels have rolled, up in reverse too; rolled_m: down in reverse. angle_rad: dead-reckoned.
+    lever_m: where the antenna sits, ahead + i left.
     """
 
     stamp_ns: int
     fix_m: complex
     wheel_m: complex
-    way_m: float
+    distance_m: float
     rolled_m: float
     angle_rad: float
     lever_m: complex
@@ -79,7 +79,7 @@ class Run:
             return Kind.AGREES
         if self.stands:
             return Kind.STANDS
-        if self.along_m2 < -ASIDE * self.fixes_m * self.wheels_m / self.count:
+        if self.along_m2 < -OPPOSED * self.fixes_m * self.wheels_m / self.count:
             return Kind.OPPOSITE
         ratio = self.fixes_m / max(self.wheels_m, TINY)
         return Kind.SLIPS if ratio < HALF else Kind.LAGS if ratio > 1 / HALF else Kind.UNCLEAR
@@ -121,7 +121,7 @@ class Stretches:
         elif off_m < max(FAR * far_m, SURE * std_m):
             return None
         self.begin = now
-        if not (agrees or self._usual) and now.way_m - begin.way_m > STANDS**2 * far_m:
+        if not (agrees or self._usual) and now.distance_m - begin.distance_m > STANDS**2 * far_m:
             return None  # the wheels may have another unit
         return self._continue(begin, now, by_fixes, off_m, agrees=agrees)
 
@@ -152,7 +152,7 @@ class Stretches:
         self._ended_ns, is_headed = now.stamp_ns, self._is_headed(now.stamp_ns)
         along_m2 = is_headed * unit * (by_fixes * (self._turn * by_wheels).conjugate()).real
         sums = run.off_m + off_m, run.fixes_m + abs(by_fixes), run.wheels_m + unit * abs(by_wheels)
-        stands = unit * (now.way_m - begin.way_m) < STANDS * abs(by_fixes)
+        stands = unit * (now.distance_m - begin.distance_m) < STANDS * abs(by_fixes)
         self._last_m = by_fixes
         self._run = Run(agrees, run.begin, stands, run.count + 1, *sums, run.along_m2 + along_m2)
         return self._run

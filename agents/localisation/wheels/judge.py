@@ -13,8 +13,8 @@ from enum import Enum
 from agents.dead_reckoning import PAUSE_NS, PAUSE_S, DeadReckoning, WheelTracker, rolled_between
 from agents.ground_speed import moved_variance, velocity_variances
 from agents.localisation.imu_steps import Sensed
-from agents.localisation.stretches import Kind, Place, Run, Stretches
 from agents.localisation.travel_sign import TravelSign
+from agents.localisation.wheels.stretches import Kind, Place, Run, Stretches
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity, Imu, Odometry, WheelReading
 from protocol.site.site_config import Projection
@@ -31,7 +31,7 @@ BACK_M = 0.5  # rolled back: no counter without direction does that
 class Fault(Enum):
     """What is wrong with a wheel sensor, and what to do."""
 
-    DEAD = "stopped while the machine drove on: look at its plug, its cable and its gap"
+    DIED = "stopped while the machine drove on: look at its plug, its cable and its gap"
     CARRIED = "stands while the machine moves: it is carried, or the sensor is dead"
     HALF = "rolls far less than the machine drives: one of its wheels is not counted, or locked"
     SLIPS = "rolls far more than the machine drives: its wheels spin"
@@ -56,7 +56,7 @@ class Fall:
     is_headed: bool
 
 
-class _Felt(TravelSign):
+class _ForcedSign(TravelSign):
     """The sign of a wheel sensor's speed; and when speed and force last changed without each other."""
 
     unfelt_ns = 0
@@ -76,23 +76,23 @@ class _Felt(TravelSign):
 class _Wheel:
     """A wheel sensor. place_m: where it says the machine is, in the dead-reckoned frame.
 
-    felt: what the IMU had felt by its newest reading. moved_ns, moved_rad: when it last rolled, and where the machine
-    faced; changed_ns: when it last read another speed. way_m, rolled_m, back_m: rolled, up in reverse too, down in it,
+    sums: those of the IMU at its newest reading. moved_ns, moved_rad: when it last rolled, and where the machine faced;
+    changed_ns: when it last read another speed. distance_m, rolled_m, back_m: rolled, up in reverse too, down in it,
     and in reverse alone.
     """
 
     reading: WheelReading
     angle_rad: float
-    felt: tuple[float, float, float]
+    sums: tuple[float, float, float]
     moved_ns: int
     moved_rad: float
     changed_ns: int
     place_m: complex = 0j
-    way_m: float = 0.0
+    distance_m: float = 0.0
     rolled_m: float = 0.0
     back_m: float = 0.0
     tracker: WheelTracker = field(default_factory=WheelTracker)
-    sign: _Felt = field(default_factory=_Felt)
+    sign: _ForcedSign = field(default_factory=_ForcedSign)
 
 
 class WheelJudge:
@@ -110,7 +110,7 @@ class WheelJudge:
         self._stretches: dict[tuple[str, str], Stretches] = {}
         self._placed: dict[str, tuple[int, complex]] = {}  # by velocities
         self._pinned: dict[str, tuple[float, float]] = {}  # the last fix of each receiver
-        self._felt, self._imu_ns = (0.0, 0.0, 0.0), 0  # integrals of force ahead and pitch rate, and their time
+        self._sums, self._imu_ns = (0.0, 0.0, 0.0), 0  # integrals of force ahead and pitch rate, and their time
         self._angle_rad = self._before_rad = 0.0  # turned so far, and until dead reckoning began anew
         self._turned, self._moves_ns = (0, 0.0), -PAUSE_NS
 
@@ -156,15 +156,15 @@ class WheelJudge:
             (x, y, z), (u, v, w), _ = self._base_from_imu
             ahead_mps2 = x * imu.force_x_mps2 + y * imu.force_y_mps2 + z * imu.force_z_mps2
             nose_down_radps = u * imu.gyro_x_radps + v * imu.gyro_y_radps + w * imu.gyro_z_radps
-            force_mps, pitch_rad, seconds = self._felt
-            self._felt = force_mps + dt_s * ahead_mps2, pitch_rad - dt_s * nose_down_radps, seconds + dt_s
+            force_mps, pitch_rad, seconds = self._sums
+            self._sums = force_mps + dt_s * ahead_mps2, pitch_rad - dt_s * nose_down_radps, seconds + dt_s
 
     def _roll(self, now: WheelReading, sensor: SensorConfig, angle_rad: float) -> None:
         """Move a wheel sensor's own place."""
         name, stamp_ns = now.sensor, now.stamp_ns
         wheel = self._wheels.get(name)
         if wheel is None or abs(stamp_ns - wheel.reading.stamp_ns) > PAUSE_NS:
-            self._wheels[name] = _Wheel(now, angle_rad, self._felt, stamp_ns, angle_rad, stamp_ns)
+            self._wheels[name] = _Wheel(now, angle_rad, self._sums, stamp_ns, angle_rad, stamp_ns)
             self._interrupt(name)
             return
         last, speed_mps = wheel.reading, now.speed_x_mps if isinstance(now, Odometry) else None
@@ -174,7 +174,7 @@ class WheelJudge:
         middle_rad = (wheel.angle_rad + angle_rad) / 2
         travel_m = rolled_m + sensor.mount.xyz_m[1] * (angle_rad - wheel.angle_rad)
         wheel.place_m += travel_m * complex(math.cos(middle_rad), math.sin(middle_rad))
-        wheel.way_m, wheel.rolled_m = wheel.way_m + abs(rolled_m), wheel.rolled_m + rolled_m
+        wheel.distance_m, wheel.rolled_m = wheel.distance_m + abs(rolled_m), wheel.rolled_m + rolled_m
         wheel.back_m -= min(rolled_m, 0.0)
         if rolled_m:
             wheel.moved_ns, wheel.moved_rad = stamp_ns, angle_rad
@@ -185,10 +185,10 @@ class WheelJudge:
     def _weigh_sign(self, wheel: _Wheel) -> None:
         """Compare changes of a wheel sensor's speed with the force ahead."""
         sign, name, now_ns = wheel.sign, wheel.reading.sensor, wheel.reading.stamp_ns
-        force_mps, pitch_rad, felt_s = (now - before for now, before in zip(self._felt, wheel.felt, strict=True))
-        wheel.felt = self._felt
-        if felt_s:
-            sign.add_force(force_mps / felt_s, pitch_rad / felt_s, felt_s)
+        force_mps, pitch_rad, seconds = (now - before for now, before in zip(self._sums, wheel.sums, strict=True))
+        wheel.sums = self._sums
+        if seconds:
+            sign.add_force(force_mps / seconds, pitch_rad / seconds, seconds)
         if wheel.tracker.is_settled:
             sign.add_speed(now_ns, wheel.tracker.speed_mps)
         fault = self.faults.get(name)
@@ -200,7 +200,7 @@ class WheelJudge:
         if fault == Fault.REVERSED and sign.sign > 0:
             self._acquit(name)
         elif fault is None and (shown := sign.sign):
-            self._other_way = shown < 0 and wheel.back_m < wheel.way_m / 2  # machines drive ahead more than back
+            self._other_way = shown < 0 and wheel.back_m < wheel.distance_m / 2  # machines drive ahead more than back
             if shown < 0 and not self._other_way:
                 self._condemn(name, Fault.REVERSED, Fall(0.0, 0.0, is_headed=False))
 
@@ -216,7 +216,7 @@ class WheelJudge:
                 stretches.interrupt()
                 continue
             lever_m = complex(ahead_m, left_m)
-            now = Place(now_ns, fix_m, wheel.place_m, wheel.way_m, wheel.rolled_m, angle_rad, lever_m)
+            now = Place(now_ns, fix_m, wheel.place_m, wheel.distance_m, wheel.rolled_m, angle_rad, lever_m)
             begin = stretches.begin or now
             if run := stretches.add(now, _std_m(reading, sensor, (now_ns - begin.stamp_ns) * 1e-9)):
                 self._note(name, run, now)
@@ -255,7 +255,7 @@ class WheelJudge:
         if may_recover and kind == Kind.AGREES and run.count >= NEEDED:
             self._acquit(name)
         needed = NEEDED if self._imu else 2 * NEEDED
-        if kind in (Kind.AGREES, Kind.UNCLEAR) or run.count < needed or fault or not self._is_felt(wheel, run, now):
+        if kind in (Kind.AGREES, Kind.UNCLEAR) or run.count < needed or fault or not self._is_doubtful(wheel, run, now):
             return
         if not any(other.agreed_ns > run.begin.stamp_ns for other in self._beside(name)):
             seconds = (now.stamp_ns - run.begin.stamp_ns) * 1e-9
@@ -264,7 +264,7 @@ class WheelJudge:
     def _beside(self, name: str) -> Iterator[Stretches]:
         return (stretches for (_, wheels), stretches in self._stretches.items() if wheels == name)
 
-    def _is_felt(self, wheel: _Wheel, run: Run, now: Place) -> bool:
+    def _is_doubtful(self, wheel: _Wheel, run: Run, now: Place) -> bool:
         """Whether the IMU contradicts the wheels too, or there is none."""
         turned_rad = abs(now.angle_rad - wheel.moved_rad) if run.kind == Kind.STANDS else 0.0
         return not self._imu or wheel.sign.unfelt_ns > run.begin.stamp_ns - BEFORE_NS or turned_rad > TURNED_RAD
@@ -280,7 +280,7 @@ class WheelJudge:
 
 def _fault(wheel: _Wheel, run: Run, now: Place) -> Fault:
     if run.kind == Kind.STANDS:
-        return Fault.DEAD if abs(wheel.sign.unfelt_ns - wheel.moved_ns) < STOP_NS else Fault.CARRIED
+        return Fault.DIED if abs(wheel.sign.unfelt_ns - wheel.moved_ns) < STOP_NS else Fault.CARRIED
     if run.kind != Kind.OPPOSITE:
         slips = Fault.SLIPS if run.kind == Kind.SLIPS else Fault.HALF
         return Fault.STUCK if _repeats(wheel, run) else slips
