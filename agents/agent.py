@@ -73,6 +73,7 @@ class Agent:
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
         self._unsaved, self._spool_problem = WriteBuffer(), ""
         self._first_sample = FirstSample(machine)
+        self._faults: dict[str, str] = {}  # of sensors, as they were last told
         self._readings = 0
         self._samples = 0
         self._newest_ns = 0
@@ -102,6 +103,7 @@ class Agent:
                 self._calibration_file.write(self._pipeline.calibration)
                 self._yield_name()
                 self._tell_what_is_missing()
+                self._tell_faults()
                 self._presence.show_health(self._newest_ns, self.report(driver))
         driver.close()
         self._take(self._pipeline.finish())
@@ -166,6 +168,14 @@ class Agent:
     def _tell_what_is_missing(self) -> None:
         if why := self._first_sample.judge(self._pipeline.health):
             log.warning("samples are missing why=%r", why)
+
+    def _tell_faults(self) -> None:
+        """Log what is wrong with sensors, as it begins and as it ends."""
+        before, self._faults = self._faults, self._pipeline.faults
+        for name, fault in self._faults.items() - before.items():
+            log.warning("a sensor does not count sensor=%s why=%r", name, fault)
+        for name in before.keys() - self._faults.keys():
+            log.info("a sensor counts again sensor=%s", name)
 
     def _write(self) -> None:
         """Write to the spool; while the disk is full or fails samples wait in memory, and the machine goes on."""

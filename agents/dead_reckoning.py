@@ -234,6 +234,14 @@ class DeadReckoning:
             return 0.0
         return (self.ground.stamp_ns - self._stands_since_ns) * 1e-9
 
+    def show_motion(self, stamp_ns: int) -> None:
+        """Let the machine not stand, as something else than its wheels shows."""
+        self._stands_since_ns = stamp_ns
+
+    def face(self, heading_rad: float) -> None:
+        """Take this heading for the machine's own, where wheels have led speed over ground astray."""
+        self._ground_tracker.face(heading_rad - self.angle_rad)
+
     def turn_round(self) -> None:
         """Take the first motion over ground for one in reverse."""
         self._ground_tracker.turn_round()
@@ -265,22 +273,13 @@ class DeadReckoning:
         others = [w for w in self._wheels.values() if w is not wheel and _speaks(w.reading.stamp_ns, stamp_ns)]
         is_new = not _speaks(wheel.reading.stamp_ns, stamp_ns) or wheel.reading is reading
         is_counted = bool(others) or (self.is_silent(stamp_ns) and self.ground is not None)  # by what moved meanwhile
-        rolled_m = 0.0 if is_new and is_counted else self._rolled_between(wheel.reading, reading, sensor)
+        rolled_m = 0.0 if is_new and is_counted else rolled_between(wheel.reading, reading, sensor, self._machine)
         if rolled_m or is_new:
             self._stands_since_ns = stamp_ns
         wheel.reading, wheel.rolled_m = reading, wheel.rolled_m + rolled_m
         wheel.tracker.update(stamp_ns, wheel.rolled_m, reading.speed_x_mps if isinstance(reading, Odometry) else None)
         self.wheels, self.wheels_ns = _mean_speed([wheel, *others]), stamp_ns
         self._advance(wheel, rolled_m, 1 + len(others))
-
-    def _rolled_between(self, last: WheelReading, now: WheelReading, sensor: SensorConfig) -> float:
-        dt_s = (now.stamp_ns - last.stamp_ns) * 1e-9
-        if isinstance(now, Odometry):
-            return now.speed_x_mps * min(dt_s, PAUSE_S)
-        assert isinstance(last, Encoder)
-        ticks = (now.left_ticks - last.left_ticks + now.right_ticks - last.right_ticks) / 2
-        rolled_m = ticks * 2 * math.pi * self._machine.wheel_radius_m / sensor.ticks_per_rev
-        return rolled_m if abs(rolled_m) <= MAX_WHEEL_MPS * dt_s else 0.0
 
     def _advance(self, wheel: _Wheel, rolled_m: float, wheels: int) -> None:
         """Move `base_link` as one of so many wheels rolled; one on the left rolls less in a bend to the left."""
@@ -322,6 +321,17 @@ class DeadReckoning:
         self._x_m += travel_m * math.cos(middle_rad)
         self._y_m += travel_m * math.sin(middle_rad)
         self.stamp_ns = max(self.stamp_ns, stamp_ns)
+
+
+def rolled_between(last: WheelReading, now: WheelReading, sensor: SensorConfig, machine: MachineConfig) -> float:
+    """How far a wheel sensor rolled between two readings, down in reverse [m]."""
+    dt_s = (now.stamp_ns - last.stamp_ns) * 1e-9
+    if isinstance(now, Odometry):
+        return now.speed_x_mps * min(dt_s, PAUSE_S)
+    assert isinstance(last, Encoder)
+    ticks = (now.left_ticks - last.left_ticks + now.right_ticks - last.right_ticks) / 2
+    rolled_m = ticks * 2 * math.pi * machine.wheel_radius_m / sensor.ticks_per_rev
+    return rolled_m if abs(rolled_m) <= MAX_WHEEL_MPS * dt_s else 0.0
 
 
 def narrowing(curvature: float, offset_m: float) -> float:

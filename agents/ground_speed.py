@@ -105,6 +105,10 @@ class GroundTracker:
         self._last_rad = angle_rad + turned_rad
         return self._last
 
+    def face(self, offset_rad: float) -> None:
+        """Correct the heading in `map` less the angle of dead reckoning."""
+        self._offset_rad = offset_rad
+
     def turn_round(self) -> None:
         """Take the first motion for one in reverse."""
         self._offset_rad += math.pi
@@ -136,7 +140,7 @@ class GroundTracker:
         self._newest[sensor.name] = place
         if span_s < MIN_SPAN_S or is_repeated:
             return None
-        std_m = math.sqrt(_moved_variance(fix, sensor, span_s))
+        std_m = math.sqrt(moved_variance(fix, sensor, span_s))
         if abs(place - begin) <= MOVED_SIGMA * std_m and span_s < MAX_SPAN_S:
             return None
         self._anchors[sensor.name] = fix.stamp_ns, place
@@ -151,7 +155,7 @@ def velocity_variances(reading: GpsVelocity, sensor: SensorConfig) -> tuple[floa
     return max(reading.var_e_m2ps2, MIN_VELOCITY_STD_MPS**2), max(reading.var_n_m2ps2, MIN_VELOCITY_STD_MPS**2)
 
 
-def _moved_variance(fix: Gps, sensor: SensorConfig, span_s: float) -> float:
+def moved_variance(fix: Gps, sensor: SensorConfig, span_s: float) -> float:
     """Variance per axis of the way between two fixes [m2]: white noise of both, and how the slow error changes."""
     stated = max((fix.var_e_m2 + fix.var_n_m2) / 2, MIN_FIX_STD_M**2)
     variance = sensor.std["position"] ** 2 if "position" in sensor.std else stated

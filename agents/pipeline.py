@@ -102,6 +102,7 @@ class Pipeline:
             "heading_proven": localiser.is_proven,
             "repeating": localiser.repeating,
             "wheel_scale": localiser.wheel_scale,
+            "faults": self.faults,
             "position_std_m": std_m,
             "counters": dict(self._counters + self._positioning.counters),
             "withheld": dict(self._sampler.withheld),
@@ -111,6 +112,11 @@ class Pipeline:
             "machine_share": localiser.machine_share,
             "base": localiser.base_report(),
         }
+
+    @property
+    def faults(self) -> dict[str, str]:
+        """What is wrong with sensors: a sentence by sensor."""
+        return self._positioning.faults
 
     def _take(self, stamps: Iterable[Accepted]) -> list[Samples]:
         return [samples for accepted in stamps for samples in self._take_one(accepted)]

@@ -12,6 +12,7 @@ from agents.localisation.filters.belief import DivergedError, PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.imu_steps import Sensed
 from agents.localisation.localiser import HeadingRefutedError, LocalisationConfig, Localiser
+from agents.localisation.wheels.judge import WheelJudge
 from agents.sampling import PoseHistory
 from agents.stream_order import Decision, StreamOrder, by_stamp
 from protocol.arrays import Floats
@@ -54,6 +55,8 @@ class Positioning:
         self._sensors = {s.name: s for s in machine.sensors if s.use}
         self._order = StreamOrder()
         self._counters: Counter[str] = Counter()
+        is_default = config.localisation.profile == "default"  # the paper's method judges no wheels
+        self.judge = WheelJudge(self._machine, self._projection) if is_default else None
         self._start()
 
     @property
@@ -73,6 +76,11 @@ class Positioning:
     def counters(self) -> Counter[str]:
         """What was used and refused, before restarts too."""
         return self._counters + self._order.counters + self.localiser.counters
+
+    @property
+    def faults(self) -> dict[str, str]:
+        """What is wrong with sensors that do not count, or contradict others: a sentence by sensor."""
+        return self.judge.problems if self.judge else {}
 
     def step(self, readings: Sequence[Reading]) -> list[SmoothedPose]:
         """Take in readings in the order of their stamps; returns the smoothed poses that became final."""
@@ -145,17 +153,28 @@ class Positioning:
             taken.append((reading, self._sensors[reading.sensor]))
         if not taken:
             return None
-        for reading, sensor in taken:
+        heard = self.judge.heard(taken, self.dead_reckoning) if self.judge else taken
+        if self.judge and (fall := self.judge.fall):
+            self.judge.fall = None
+            if self.localiser.is_proven and fall.is_headed:
+                self.dead_reckoning.face(self.localiser.doubt(fall.off_m, fall.off_mps))
+            else:
+                concluded += self.conclude()
+                smoothed += self._restart()
+                restarts, off_m = True, fall.off_m
+        if not heard and not restarts:
+            return None
+        for reading, sensor in heard:
             self.dead_reckoning.update(reading, sensor)
         try:
-            poses = self.localiser.update(taken, self.dead_reckoning)
+            poses = self.localiser.update(heard, self.dead_reckoning) if heard else []
         except (DivergedError, HeadingRefutedError) as error:
             self._counters["heading_refuted" if isinstance(error, HeadingRefutedError) else "filter_restarts"] += 1
             off_m = getattr(error, "off_m", 0.0)
             concluded += self.conclude()
             smoothed += self._restart()
             poses, restarts = [], True
-        return Accepted(taken, poses, smoothed + self.localiser.take_smoothed(), restarts, off_m, concluded)
+        return Accepted(heard or taken, poses, smoothed + self.localiser.take_smoothed(), restarts, off_m, concluded)
 
     def _restart(self) -> list[SmoothedPose]:
         """Start again, and keep the counts; returns the smoothed poses that remained."""
@@ -172,6 +191,8 @@ class Positioning:
         self.dead_reckoning = DeadReckoning(self._machine, self._config.slip, weighs=weighs)
         self.localiser = Localiser(self._machine, self._projection, self._config, is_weighed=self._is_weighed())
         self.poses = PoseHistory()
+        if self.judge:
+            self.judge.restart()
 
     def _is_weighed(self) -> bool:
         """Whether the load is known; a machine whose data have no place for one carries none."""

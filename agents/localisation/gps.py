@@ -87,6 +87,11 @@ class Receivers(ModalSensors[Fix]):
         """The slow error of each receiver that has states for it; what they share is a source of the machine."""
         return tuple(self._error(name) for name in self._states)
 
+    def forgotten(self) -> tuple[GpsError, ...]:
+        """The same, once no jump counts any more: what seemed to be one was none."""
+        self._jumps.clear()
+        return self.errors
+
     def errors_beside(self, base: GpsError, site_share: float) -> tuple[GpsError, ...]:
         """The same, and behind them that of a base station, which has a share of each machine's variance too."""
         machine = tuple(self._error(name, site_share) for name in self._states)

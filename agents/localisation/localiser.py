@@ -186,6 +186,10 @@ class Localiser:
         fusion = self._tracker.fusion
         return self._smoothed + fusion.remaining() if fusion else []
 
+    def doubt(self, off_m: float, off_mps: float) -> float:
+        """Be less sure of place and speed, as wheels that count no longer have led both astray; returns the heading."""
+        return self._tracker.doubt(off_m, off_mps)
+
     def take(self, correction: Correction) -> None:
         """Keep a correction of a base station until it is due, with a later reading."""
         self._tracker.correct(correction)

@@ -15,16 +15,16 @@ from agents.ground_speed import velocity_variances
 from agents.localisation import measurements
 from agents.localisation.alignment import Alignment, start_belief
 from agents.localisation.corrections import Corrections, not_used
-from agents.localisation.filters.belief import Belief, Filter, Measurement
+from agents.localisation.filters.belief import Belief, Change, Filter, Measurement, open_states, reset_states
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import GpsError, MotionModel
 from agents.localisation.filters.smoother import nothing_past
-from agents.localisation.filters.state import YAW, Layout, X, Y, Z
+from agents.localisation.filters.state import SPEED, YAW, Layout, X, Y, Z
 from agents.localisation.fix import GPS_GATE_SIGMA, Fix
 from agents.localisation.gps import Receivers, drifting
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep
-from agents.localisation.measurements import STANDSTILL
+from agents.localisation.measurements import PLACE, STANDSTILL
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.arrays import Floats
@@ -88,6 +88,7 @@ class Tracker:
         self._model = MotionModel(
             layout, on_plane, self._gps_errors(), turn_error_radps=turn_error, turns_unseen=unseen
         )
+        self._doubt: Change | None = None
         self._placed_ns = 0  # stamp of the newest fix or velocity by GPS that was accepted
 
     @property
@@ -123,6 +124,23 @@ class Tracker:
         """Keep a correction of a base station until it is due, with a later reading."""
         if self._corrections and self.belief:
             self._corrections.take(correction, self.belief.stamp_ns)
+
+    def doubt(self, off_m: float, off_mps: float) -> float:
+        """Be less sure of place and speed, from the next step on; returns the heading [rad].
+
+        What receivers seemed to be off is forgotten: it was the wheels.
+        """
+        errors, layout = self.receivers.forgotten(), self._model.layout
+
+        def opened(belief: Belief) -> Belief:
+            for i, error in enumerate(errors):
+                belief = reset_states(belief, layout.gps_error(i), error.variance_m2)
+            belief = open_states(belief, PLACE, np.eye(2) * off_m**2)
+            return open_states(belief, slice(SPEED, SPEED + 1), np.eye(1) * off_mps**2)
+
+        self._doubt = opened
+        assert self.belief is not None, "doubt before start"
+        return float(self.belief.x[YAW])
 
     def start(self, engine: Filter, alignment: Alignment, first: FilterStep) -> Belief:
         """Begin to filter, with the belief at the first step."""
@@ -173,6 +191,8 @@ class Tracker:
         elif scale:
             wheels = [_considering(m, scale) for m in wheels]
         shown = [*inertial, *absolute, *turn, *wheels]
+        if self._doubt and shown:
+            shown[0], self._doubt = replace(shown[0], change=self._doubt), None
         return beliefs + (fusion.add(shown) if shown else [])
 
     def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:

@@ -20,6 +20,7 @@ from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from sitegrid.doctor import Finding, Level
+from sitegrid.health import faults_of
 
 FREE_FAIL, FREE_WARN = 64 * 2**20, 2**30
 WAITING_S = 3600.0  # samples that are older have not been taken for long
@@ -122,7 +123,7 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
     message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
     named = ("no_sample", "spool_problem", "calibration_problem", "spool_damage")
-    problems = [uplink.get("problem"), *map(values.get, named)]
+    problems = [uplink.get("problem"), *map(values.get, named), *faults_of(values)]
     advice = "; ".join(str(problem) for problem in problems if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""
     lost = any(spool.get(key) for key in ("dropped", "put_aside", "gone"))

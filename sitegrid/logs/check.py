@@ -26,13 +26,14 @@ from protocol.machine.readings import Gps, Imu, Reading, Torque
 from sitegrid.doctor import Finding, Level
 from sitegrid.logs.log_truth import SIDE_FILE, KnownArea, LogTruth, read_known_ground, read_log_truth, require_overlap
 from sitegrid.logs.speeds import Agreement, compare_speeds, places, wheel_distance
+from sitegrid.logs.wheels import check_wheels
 from sitegrid.proof.figures import Row, rounded
 
 PAGE = "docs/log-folders.md"
 PAUSE = 5.0  # intervals: a longer one is a gap, if it lasts LEAST_GAP_S
 LEAST_GAP_S = 1.0
 REPEATS, HELD_S = 0.2, 10.0  # share of fixes that repeat the one before, and time at one place, of a sound receiver
-LAG_S, STUCK_S = 0.5, 10.0  # offset between two clocks, and standstill of moving wheels, above which they are named
+LAG_S = 0.5  # offset between two clocks above which it is named
 ADVICE = {
     "below_least": "rows that the receiver itself calls bad; no harm if they are few",
     "not_finite": "rows without a fix; no harm if they are few",
@@ -89,6 +90,7 @@ def examine(manifest: Path, data: Path | None = None) -> Examined:
         *(finding for one in read for finding in check_sensor(one)),
         *barring,
         *(check_speeds(log, read) if not is_barred else ()),
+        *(check_wheels(log, [one.readings for one in read]) if not is_barred else ()),
         check_positions(read, is_barred=is_barred),
         *_compared(log, folder, start_ns, last_ns),
     ]
@@ -142,7 +144,7 @@ def check_places(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding
 
 
 def check_speeds(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding]:
-    """Wheels against fixes: clocks that are apart, units, wheels that stand while the machine moves."""
+    """Wheels against fixes: clocks that are apart, units."""
     fixes = next((one for one in data if len(one.readings) > 1 and _is_receiver(one.sensor)), None)
     for one in data:
         if fixes and len(one.readings) > 1 and one.sensor.kind in WHEELS:
@@ -158,9 +160,6 @@ def _judge(agreement: Agreement, receiver: str, name: str) -> Iterator[Finding]:
         where = "ahead of" if lag_s > 0 else "behind"
         what = f"its stamps are {abs(lag_s):.1f} s {where} those of {name}, by the speed"
         yield Finding(Level.WARN, receiver, what, "bring both to one clock: GPS time is 18 s ahead of UTC")
-    elif agreement.stuck_s > STUCK_S:
-        what = f"the wheels stand for {agreement.stuck_s:.0f} s while {receiver} moves"
-        yield Finding(Level.WARN, name, what, "a dead sensor, or the machine was carried: cut that out")
     elif not 1 / UNIT < share < UNIT and share >= 0:  # NaN of a machine that stands
         what = f"the wheels turn {share:.2g} times as far as {receiver} goes"
         yield Finding(Level.WARN, name, what, "look at the unit of the speed, `wheel_radius_m`, `ticks_per_rev`")

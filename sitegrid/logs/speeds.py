@@ -27,13 +27,11 @@ class Agreement:
     """How wheels compare with fixes.
 
     lag_s: by how much the stamps of the fixes are ahead of those of the wheels, None where the drive does not show it.
-    wheel_share: distance by the wheels over distance by the fixes, NaN of a machine that stands. stuck_s: for how long
-    the wheels stand while the fixes move.
+    wheel_share: distance by the wheels over distance by the fixes, NaN where either stands.
     """
 
     lag_s: float | None
     wheel_share: float
-    stuck_s: float
 
 
 def compare_speeds(fixes: tuple[Floats, Floats], wheels: tuple[Floats, Floats]) -> Agreement | None:
@@ -43,11 +41,9 @@ def compare_speeds(fixes: tuple[Floats, Floats], wheels: tuple[Floats, Floats]) 
     if len(times) * STEP_S < 2 * WINDOW_S:
         return None
     by_fixes, by_wheels = _speed(times, *fixes), _speed(times, wheels[0], wheels[1][:, None])
-    moves = by_fixes > DRIVES_MPS
+    moves = (by_fixes > DRIVES_MPS) & (by_wheels > STANDS_MPS)  # those that stand say nothing of their unit
     share = float(by_wheels[moves].sum() / by_fixes[moves].sum()) if moves.any() else math.nan
-    return Agreement(
-        _lag_s(_capped(by_fixes), _capped(by_wheels)), share, float((by_wheels[moves] < STANDS_MPS).sum()) * STEP_S
-    )
+    return Agreement(_lag_s(_capped(by_fixes), _capped(by_wheels)), share)
 
 
 def places(readings: Sequence[Reading], site: SiteConfig) -> tuple[Floats, Floats]:

@@ -16,15 +16,16 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from protocol.errors import LinkError, MessageError, QueryError
+from protocol.errors import LinkError, MessageError, QueryError, Refusal
 from protocol.queries.answers import MapInfo, MapVersion
 from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
 from protocol.site.site_config import MAX_EXTENT_M, Projection, SiteConfig
 from protocol.wire import keys
-from protocol.wire.codec import receive_pose
-from protocol.wire.messages import Pose
+from protocol.wire.codec import decode_health, receive_pose
+from protocol.wire.messages import Health, Pose
 from sitegrid.asking import is_answered
 from sitegrid.client import Client
+from sitegrid.health import faults_of
 from sitegrid.listener import Listener
 from sitegrid.web.values import plain
 
@@ -60,7 +61,9 @@ class SiteFeed:
         self._poses: dict[str, tuple[Pose, float]] = {}
         self._tracks: dict[str, deque[Pose]] = {}
         self._poses_lock = threading.Lock()
+        self._faults: dict[str, list[str]] = {}  # of machines' sensors
         self._listener: Listener[Pose] | None = None
+        self._health: Listener[Health] | None = None
         self._info: tuple[float, MapInfo] | None = None
         self._projection: Projection | None = None
         self._past: OrderedDict[tuple[int, str, int], TilesAnswer] = OrderedDict()
@@ -111,8 +114,11 @@ class SiteFeed:
         now_s = time.monotonic()
         with self._poses_lock:
             self._poses = {name: item for name, item in self._poses.items() if now_s - item[1] < SILENT_S}
-            poses = list(self._poses.values())
-        return [plain({**asdict(pose), "age_s": round(now_s - came_s, 3)}) for pose, came_s in poses]
+            poses, faults = list(self._poses.values()), self._faults
+        return [
+            plain({**asdict(pose), "age_s": round(now_s - came_s, 3), "faults": faults.get(pose.machine, [])})
+            for pose, came_s in poses
+        ]
 
     async def heard(self) -> None:
         """Wait until a machine says where it is, for a moment."""
@@ -143,8 +149,9 @@ class SiteFeed:
         await asyncio.get_running_loop().run_in_executor(None, self._close)
 
     def _close(self) -> None:
-        if self._listener:
-            self._listener.close()
+        for listener in (self._listener, self._health):
+            if listener:
+                listener.close()
         self.client.close()
         self._threads.shutdown(wait=False, cancel_futures=True)
 
@@ -153,6 +160,8 @@ class SiteFeed:
         if self._listener is None:
             key = keys.poses_all(self.name)
             self._listener = await self.ask(Listener, self.client.session, key, self._pose, self._on_pose)
+            key = keys.health_all(self.name)
+            self._health = await self.ask(Listener, self.client.session, key, receive_health, self._on_health)
             self._looking = asyncio.create_task(self._look_for_server())
         next_state_s = 0.0
         idle_s = 0.0
@@ -215,12 +224,25 @@ class SiteFeed:
     def _pose(self, key: str, data: bytes) -> Pose:
         return receive_pose(key, data, self._info[1].site.extent_m if self._info else MAX_EXTENT_M)
 
+    def _on_health(self, health: Health) -> None:
+        with self._poses_lock:
+            if health.machine in self._poses:
+                self._faults[health.machine] = faults_of(health.values)
+
     def _on_pose(self, pose: Pose) -> None:
         with self._poses_lock:
             self._poses[pose.machine] = pose, time.monotonic()
             track = self._tracks.setdefault(pose.machine, deque(maxlen=MOST_POSES))
             if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
                 track.append(pose)
+
+
+def receive_health(key: str, data: bytes) -> Health:
+    """The health report of the machine that its key names."""
+    health = decode_health(data)
+    if not key.endswith(f"/machine/{health.machine}/health"):
+        raise MessageError(Refusal.WRONG_MACHINE, f"{health.machine!r} sends under {key}", field="machine")
+    return health
 
 
 def frame(answer: TilesAnswer) -> bytes:

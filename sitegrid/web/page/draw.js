@@ -81,7 +81,7 @@ export function drawMachine(context, view, machine, now_s, shows, ink, labels) {
   context.fillStyle = grey ? ink.faint : ink.text;
   context.fill();
   context.restore();
-  const state = machine.trusted === false ? " · not used" : silent ? ` · silent ${span(now_s - machine.seen_s)}` : "";
+  const state = machine.trusted === false ? " · not used" : silent ? ` · silent ${span(now_s - machine.seen_s)}` : (machine.faults ?? []).map((fault) => ` · ${fault.split(":")[0]}`).join("");
   drawLabel(context, machine.machine + state, x, y, ink, grey, labels, view.margins[0] - 16);
 }
 

@@ -80,7 +80,7 @@ WRONG = {  # a file, what is changed in it, the sensor, and what is said of it
     ),
     "another origin": ("gps.csv", replaced(1, lambda _: 30000), "gps-1", "FAIL.*100% of its fixes are more than 20 km"),
     "km/h": ("odom.csv", replaced(1, lambda v: 3.6 * float(v)), "wheels", "WARN.*turn 3.[567] times as far as gps-1"),
-    "dead wheels": ("odom.csv", replaced(1, lambda _: 0), "wheels", "WARN.*stand for .* s while gps-1 moves"),
+    "dead wheels": ("odom.csv", replaced(1, lambda _: 0), "wheels", "WARN.*stands while .* from .* to .* s; it is"),
 }
 
 
@@ -197,14 +197,12 @@ def test_the_scale_of_wheels_is_that_of_their_distance(scale: float) -> None:
     agreement = compare_speeds((TIMES, fixes(driven())), (TIMES, scale * driven()))
     assert agreement
     assert agreement.wheel_share == pytest.approx(scale, rel=0.05)
-    assert agreement.stuck_s < 3
 
 
 def test_a_machine_that_stands_and_a_short_log_show_nothing() -> None:
     agreement = compare_speeds((TIMES, fixes(0 * TIMES, noise_m=0.05)), (TIMES, 0 * TIMES))
     assert agreement
     assert math.isnan(agreement.wheel_share)
-    assert agreement.stuck_s == 0
     assert compare_speeds((TIMES[:40], fixes(driven()[:40])), (TIMES[:40], driven()[:40])) is None
 
 

@@ -1,0 +1,1 @@
+"""Wheel sensors on trial: stretches beside receivers, and verdicts."""
