@@ -1,4 +1,4 @@
-"""How fast a machine was by its fixes and by its wheels: where they disagree, a clock or a wheel sensor is wrong.
+"""How fast a machine was by its fixes and by its wheels: where they disagree, a wheel sensor is wrong.
 
 Both speeds are the distance over WINDOW_S, so that the noise of fixes averages out and stops count in both.
 """
@@ -17,8 +17,6 @@ from protocol.machine.readings import Encoder, Gps, Odometry, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 STEP_S, WINDOW_S = 0.2, 3.0
-MAX_LAG_S = 60.0  # a larger offset between two clocks is looked for by their first and last stamps
-SURE, GAIN = 0.5, 0.05  # least correlation of the best lag, and by how much it must exceed that of lag 0
 STANDS_MPS, DRIVES_MPS = 0.05, 0.7  # wheels that stand; fixes that move by more than their noise
 
 
@@ -26,12 +24,10 @@ STANDS_MPS, DRIVES_MPS = 0.05, 0.7  # wheels that stand; fixes that move by more
 class Agreement:
     """How wheels compare with fixes.
 
-    lag_s: by how much the stamps of the fixes are ahead of those of the wheels, None where the drive does not show it.
     wheel_share: distance by the wheels over distance by the fixes, NaN of a machine that stands. stuck_s: for how long
     the wheels stand while the fixes move.
     """
 
-    lag_s: float | None
     wheel_share: float
     stuck_s: float
 
@@ -45,9 +41,7 @@ def compare_speeds(fixes: tuple[Floats, Floats], wheels: tuple[Floats, Floats]) 
     by_fixes, by_wheels = _speed(times, *fixes), _speed(times, wheels[0], wheels[1][:, None])
     moves = by_fixes > DRIVES_MPS
     share = float(by_wheels[moves].sum() / by_fixes[moves].sum()) if moves.any() else math.nan
-    return Agreement(
-        _lag_s(_capped(by_fixes), _capped(by_wheels)), share, float((by_wheels[moves] < STANDS_MPS).sum()) * STEP_S
-    )
+    return Agreement(share, float((by_wheels[moves] < STANDS_MPS).sum()) * STEP_S)
 
 
 def places(readings: Sequence[Reading], site: SiteConfig) -> tuple[Floats, Floats]:
@@ -80,30 +74,3 @@ def _speed(times: Floats, known_s: Floats, places: Floats) -> Floats:
     ways = [np.interp(times + half, known_s, c) - np.interp(times - half, known_s, c) for c in places.T]
     speeds: Floats = np.linalg.norm(ways, axis=0) / WINDOW_S
     return speeds
-
-
-def _capped(speeds: Floats) -> Floats:
-    """Without peaks, which a jump of fixes makes."""
-    return np.minimum(speeds, np.percentile(speeds, 95))
-
-
-def _lag_s(fixes: Floats, wheels: Floats) -> float | None:
-    """The lag of two speeds that correlates best, 0 where that is hardly better than none; None where none does.
-
-    It is looked for up to half of the time that both have; one at the end of that is none.
-    """
-    most = min(round(MAX_LAG_S / STEP_S), len(fixes) // 2)
-    lags = range(-most, most + 1)
-    correlations = np.array(
-        [_correlation(fixes[max(k, 0) : len(fixes) + min(k, 0)], wheels[max(-k, 0) :]) for k in lags]
-    )
-    best = int(correlations.argmax())
-    if correlations[best] < SURE or best in (0, len(lags) - 1):
-        return None
-    return float(lags[best] * STEP_S) if correlations[best] > correlations[most] + GAIN else 0.0
-
-
-def _correlation(a: Floats, b: Floats) -> float:
-    a, b = a - a.mean(), b[: len(a)] - b[: len(a)].mean()
-    size = math.sqrt(float(a @ a) * float(b @ b))
-    return float(a @ b) / size if size else 0.0
