@@ -72,7 +72,7 @@ class Agent:
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
         self._unsaved, self._spool_problem = WriteBuffer(), ""
-        self._first_sample = FirstSample(machine)
+        self._first_sample, self._clocks = FirstSample(machine), ""
         self._faults: dict[str, str] = {}  # of sensors, as they were last told
         self._readings = 0
         self._samples = 0
@@ -124,6 +124,7 @@ class Agent:
             "readings": self._readings,
             "samples": self._samples,
             "no_sample": self._first_sample.why_not,
+            "clocks": self._clocks,
             "driver": dict(driver.counters()),
             "pipeline": self._pipeline.health(),
             "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._unsaved.given_up},
@@ -166,8 +167,11 @@ class Agent:
             self._first_sample.sampled()
 
     def _tell_what_is_missing(self) -> None:
-        if why := self._first_sample.judge(self._pipeline.health):
+        before, self._clocks = self._clocks, self._pipeline.clocks()
+        if why := self._first_sample.judge(self._pipeline.health, self._clocks):
             log.warning("samples are missing why=%r", why)
+        if self._clocks and not before:
+            log.warning("clocks are apart why=%r", self._clocks)
 
     def _tell_faults(self) -> None:
         """Log what is wrong with sensors, as it begins and as it ends."""

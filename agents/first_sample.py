@@ -6,7 +6,7 @@ from typing import Any
 from agents.localisation.alignment import DISTANCE_M
 from agents.localisation.localiser import PROVEN_S
 from agents.sampling import MAX_STD_M
-from agents.stream_order import GAP_NS
+from protocol.machine.clock_watch import GAP_NS
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction, Encoder, Gps, Odometry, Reading, Torque
 
@@ -23,8 +23,8 @@ class FirstSample:
         self.why_not = ""
         self._sensors = {sensor.name: sensor.kind for sensor in machine.sensors if sensor.use}
         self._kinds: set[str] = set()
-        self._first_ns = self._newest_ns = 0
-        self._is_sampled = self._is_judged = False
+        self._spans_ns: dict[str, tuple[int, int]] = {}  # of each sensor's readings, by its own clock, since a gap
+        self._is_sampled = self._is_judged = self._knew_clocks = False
 
     def take(self, readings: Sequence[Reading]) -> None:
         """Take in readings. The time counts from the first one behind a gap, as localisation starts anew there."""
@@ -32,23 +32,26 @@ class FirstSample:
         if self._is_judged or not own:
             return
         self._kinds.update(r.kind for r in own if self._sensors.get(r.sensor) == r.kind)
-        if abs(own[0].stamp_ns - self._newest_ns) > GAP_NS:
-            self._first_ns = own[0].stamp_ns
-        self._newest_ns = own[-1].stamp_ns
+        for reading in own:
+            first_ns, newest_ns = self._spans_ns.get(reading.sensor, (reading.stamp_ns, reading.stamp_ns))
+            is_on = abs(reading.stamp_ns - newest_ns) <= GAP_NS
+            self._spans_ns[reading.sensor] = (first_ns if is_on else reading.stamp_ns), reading.stamp_ns
 
     def sampled(self) -> None:
         """Note that there is a sample, pending or final."""
         self._is_sampled, self.why_not = True, ""
 
-    def judge(self, health: Callable[[], Mapping[str, Any]]) -> str:
-        """What is missing, in one sentence, once: WAIT_NS after the first reading. health: of the pipeline.
+    def judge(self, health: Callable[[], Mapping[str, Any]], clocks: str = "") -> str:
+        """What is missing, in one sentence, once: WAIT_NS after the first reading. health, clocks: of the pipeline.
 
-        Where samples wait for the proof of the heading, that has PROVEN_S more.
+        Where samples wait for the proof of the heading, that has PROVEN_S more. Clocks that are apart may show later.
         """
-        waited_ns = self._newest_ns - self._first_ns
-        if self._is_judged or waited_ns < WAIT_NS:
+        waited_ns = max((newest_ns - first_ns for first_ns, newest_ns in self._spans_ns.values()), default=0)
+        if waited_ns < WAIT_NS or (self._is_judged and not self.why_not):
             return ""
-        state = health()
+        if self._is_judged and (self._knew_clocks or not clocks):
+            return ""
+        self._knew_clocks, state = bool(clocks), health()
         waits_for_proof = not self._is_sampled and state["aligned"] and not state["heading_proven"]
         if waits_for_proof and waited_ns < WAIT_NS + PROVEN_S * 1e9:
             return ""
@@ -56,7 +59,7 @@ class FirstSample:
         lacks = [what for what, kinds in FOR_RESISTANCE.items() if not kinds & self._kinds]
         if self._is_sampled:
             return f"samples have no rolling resistance: {', '.join(lacks)}" if lacks else ""
-        causes = missing(self._kinds, state) + lacks
+        causes = ([clocks] if clocks else missing(self._kinds, state)) + lacks
         self.why_not = f"no sample after {waited_ns // 10**9} s of readings: {', '.join(causes)}"
         return self.why_not
 

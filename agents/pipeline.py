@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from agents.clock_offsets import ClockOffsets, Offset
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import GroundEstimator
 from agents.localisation.filters.belief import PoseBelief
@@ -33,6 +34,8 @@ from protocol.rotations import wrap_angle
 from protocol.site.site_config import SiteConfig
 
 KEPT_NS = 30_000_000_000  # a pose is corrected as soon as its nodes are there; it comes at most some seconds after them
+CLOCKS_S = 600.0  # of motion in which offsets of clocks are looked for
+LOOK_NS = 60_000_000_000  # between two such looks
 _stamp = attrgetter("stamp_ns")
 
 
@@ -47,7 +50,8 @@ class Pipeline:
         self._config, self._smooths = config, config.localisation.smoothing_s > 0
         self._positioning = Positioning(site, machine, config)
         self._counters: Counter[str] = Counter()
-        self._newest_ns = 0
+        self._newest_ns = self._looked_ns = 0
+        self._clocks, self._offsets = ClockOffsets(machine, site, CLOCKS_S), list[Offset]()
         self._start(calibration)
 
     @property
@@ -70,6 +74,7 @@ class Pipeline:
 
     def step(self, readings: Sequence[Reading]) -> Samples:
         """Take in readings in the order of their stamps; returns the samples that they made possible."""
+        self._clocks.take(readings)
         return joined([made for reading in readings for made in self._take(self._positioning.accept(reading))])
 
     def settle(self) -> Samples:
@@ -117,6 +122,15 @@ class Pipeline:
     def faults(self) -> dict[str, str]:
         """What is wrong with sensors: a sentence by sensor."""
         return self._positioning.faults
+
+    def clocks(self) -> str:
+        """Which sensors' clocks are apart, and what to do; empty where none is known to be."""
+        if abs(self._newest_ns - self._looked_ns) > LOOK_NS:
+            self._looked_ns, self._offsets = self._newest_ns, self._clocks.find()
+        refused = self._clocks.named({name: (ahead_s, 0.0) for name, ahead_s in self._positioning.clocks_s.items()})
+        named = {offset.sensor for offset in refused}
+        sentences = [offset.sentence(is_refused=True) for offset in refused]
+        return "; ".join(sentences + [o.sentence() for o in self._offsets if o.sensor not in named])
 
     def _take(self, stamps: Iterable[Accepted]) -> list[Samples]:
         return [samples for accepted in stamps for samples in self._take_one(accepted)]

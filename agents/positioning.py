@@ -82,6 +82,11 @@ class Positioning:
         """What is wrong with sensors that do not count, or contradict others: a sentence by sensor."""
         return self.judge.problems if self.judge else {}
 
+    @property
+    def clocks_s(self) -> dict[str, float]:
+        """By how much sensors are ahead of those that count [s], where some are refused for that; else empty."""
+        return self._order.clocks_s
+
     def step(self, readings: Sequence[Reading]) -> list[SmoothedPose]:
         """Take in readings in the order of their stamps; returns the smoothed poses that became final."""
         smoothed: list[SmoothedPose] = []

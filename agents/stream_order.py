@@ -1,4 +1,4 @@
-"""Order of readings by their stamps: those of one stamp belong together, late ones are refused, clock jumps noticed."""
+"""Order of readings by their stamps: those of one stamp belong together, late and astray ones are refused."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -6,11 +6,11 @@ from enum import Enum
 from itertools import groupby
 from operator import attrgetter
 
+from protocol.machine.clock_watch import ClockWatch
 from protocol.machine.readings import Reading
 
-GAP_NS = 5_000_000_000  # a longer pause in all readings ends dead reckoning: the machine may be anywhere after it
 LATE_NS = 500_000_000  # how far behind the newest reading one of another sensor may come
-LATE_LIMIT = 200  # so many late readings in a row are a clock that was set back, not a late sensor
+APART = 10  # refused readings in a row of one sensor: its clock is not that of the others
 WHEELS = ("encoder", "odometry")
 _stamp = attrgetter("stamp_ns")
 
@@ -39,9 +39,9 @@ class StreamOrder:
         self.counters: Counter[str] = Counter()
         self._held: dict[str, Reading] = {}  # of one time, by sensor
         self._held_ns = 0
-        self._newest_ns = 0
+        self._clock = ClockWatch[None](LATE_NS)
         self._by_sensor: dict[str, int] = {}
-        self._late_in_a_row = 0
+        self._refused: dict[str, tuple[int, int]] = {}  # of sensors whose last reading was: how many, and its lead
 
     def gather(self, reading: Reading, known_ns: int) -> list[Reading]:
         """Hold a reading until one of another time comes: only then all of its time are there. Returns those.
@@ -62,24 +62,32 @@ class StreamOrder:
         held, self._held, self._held_ns = list(self._held.values()), {}, 0
         return held
 
+    @property
+    def clocks_s(self) -> dict[str, float]:
+        """By how much sensors are ahead of those that count [s], where some are refused for that; else empty."""
+        apart = {name: ahead_ns * 1e-9 for name, (n, ahead_ns) in self._refused.items() if n > APART}
+        return {**dict.fromkeys(self._by_sensor, 0.0), **apart} if apart else {}
+
     def decide(self, reading: Reading) -> Decision:
-        """Decide on one reading, and count it if it is not simply accepted."""
+        """Decide on one reading, and count it if it is not simply accepted.
+
+        A pause of all sensors ends dead reckoning, as a clock that was set does: the machine may be anywhere after it.
+        """
         stamp, last = reading.stamp_ns, self._by_sensor.get(reading.sensor, 0)
-        if self._newest_ns and stamp > self._newest_ns + GAP_NS:
-            return self._restart(reading, "gap_restarts")
-        if stamp <= last or stamp < self._newest_ns - LATE_NS:
-            self._late_in_a_row += 1
-            if self._late_in_a_row > LATE_LIMIT:
-                return self._restart(reading, "clock_back_restarts")
+        ahead_ns = stamp - self._clock.newest_ns
+        if not self._clock.goes_on(stamp):
+            if self._clock.doubt(stamp, None)[0]:
+                self.counters["gap_restarts" if ahead_ns > 0 else "clock_back_restarts"] += 1
+                self._by_sensor, self._refused = {reading.sensor: stamp}, {}
+                return Decision.RESTART
+            self._refused[reading.sensor] = self._refused.get(reading.sensor, (0, 0))[0] + 1, ahead_ns
+            self.counters["reading_ahead" if ahead_ns > 0 else "reading_late"] += 1
+            return Decision.REFUSE
+        if stamp <= last:
             self.counters["reading_duplicate" if stamp == last else "reading_late"] += 1
             return Decision.REFUSE
-        self._late_in_a_row = 0
+        self._clock.count(stamp)
         self._by_sensor[reading.sensor] = stamp
-        self._newest_ns = max(self._newest_ns, stamp)
+        if self._refused:
+            self._refused.pop(reading.sensor, None)
         return Decision.ACCEPT
-
-    def _restart(self, reading: Reading, reason: str) -> Decision:
-        self.counters[reason] += 1
-        self._by_sensor = {reading.sensor: reading.stamp_ns}
-        self._newest_ns, self._late_in_a_row = reading.stamp_ns, 0
-        return Decision.RESTART

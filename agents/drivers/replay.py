@@ -18,12 +18,12 @@ class Replay:
         self, log: LogFolder, speed: float, clock: Callable[[], float], wait: Callable[[float], object]
     ) -> None:
         self._log = log
-        self._readings = iter(log.readings())
+        self._readings = log.timed()
         self._speed = speed
         self._clock = clock
         self._wait = wait
         self._next = next(self._readings, None)
-        self._first_ns = log.known_ns(self._next) if self._next else 0
+        self._first_ns = self._next[0] if self._next else 0
         self._began_s = clock()
 
     def read(self, timeout_s: float) -> Sequence[Reading] | None:
@@ -31,12 +31,12 @@ class Replay:
         if self._next is None:
             return None
         if self._speed > 0:
-            due_s = self._began_s + (self._log.known_ns(self._next) - self._first_ns) * 1e-9 / self._speed
+            due_s = self._began_s + (self._next[0] - self._first_ns) * 1e-9 / self._speed
             if (early_s := due_s - self._clock()) > 0:
                 self._wait(min(early_s, timeout_s))
                 if early_s > timeout_s:
                     return ()
-        return self._next_span(self._log.known_ns(self._next) + SPAN_NS)
+        return self._next_span(self._next[0] + SPAN_NS)
 
     def counters(self) -> Mapping[str, int]:
         """Rows of the log that were refused, by reason."""
@@ -47,7 +47,7 @@ class Replay:
 
     def _next_span(self, end_ns: int) -> list[Reading]:
         span: list[Reading] = []
-        while self._next is not None and self._log.known_ns(self._next) < end_ns:
-            span.append(self._next)
+        while self._next is not None and self._next[0] < end_ns:
+            span.append(self._next[1])
             self._next = next(self._readings, None)
         return span

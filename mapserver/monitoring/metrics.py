@@ -203,6 +203,7 @@ def _problems(agents: Mapping[str, ReceivedHealth]) -> Metric:
         uplink = health.values.get("uplink")
         parts = {
             "uplink": uplink.get("problem") if isinstance(uplink, Mapping) else None,
+            "clocks": health.values.get("clocks"),
             "spool": health.values.get("spool_problem"),
             "disk": health.values.get("spool_damage"),
             "calibration": health.values.get("calibration_problem"),

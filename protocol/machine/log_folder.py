@@ -5,16 +5,18 @@ The manifest may lie apart from the data, so that logs of others are described w
 
 import csv
 import heapq
+import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from protocol.config import from_table, section, toml_lines
 from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal, RowError
 from protocol.files import load_toml
+from protocol.machine.clock_watch import LATE_LIMIT, LONG_NS, ClockWatch
 from protocol.machine.csv_file import (
     Column,
     CsvFile,
@@ -27,21 +29,34 @@ from protocol.machine.csv_file import (
     take_file,
 )
 from protocol.machine.log_columns import ReadingColumns, reading_columns
-from protocol.machine.machine_config import MachineConfig, SensorConfig, parse_machine, plain_lines, sensor_lines
+from protocol.machine.machine_config import (
+    MAX_DELAY_S,
+    MAX_EARLY_S,
+    MachineConfig,
+    SensorConfig,
+    parse_machine,
+    plain_lines,
+    sensor_lines,
+)
 from protocol.machine.readings import Reading, columns, parse_reading
 from protocol.site.site_config import SiteConfig, site_toml
 
 MANIFEST = "log.toml"
+_Numbered = tuple[int, Reading]  # the line of a row, and what it holds
 
 
 @dataclass(frozen=True)
 class SensorFile:
-    """The CSV file of one sensor: its time column, and the columns of its readings."""
+    """The CSV file of one sensor: its time column, and the columns of its readings.
+
+    ahead_s: of its clock, taken off each stamp: a `delay_s` that no reading can have that comes in time.
+    """
 
     sensor: SensorConfig
     file: CsvFile
     stamp: Column
     columns: ReadingColumns
+    ahead_s: float = 0.0
 
 
 @dataclass
@@ -61,40 +76,78 @@ class LogFolder:
     first_refused: dict[str, str] = field(default_factory=dict)
 
     def readings(self) -> Iterator[Reading]:
-        """All readings of the sensors in use, in the order of `known_ns`; counts `refused` anew."""
+        """All readings of the sensors in use, as `timed` has them."""
+        return map(itemgetter(1), self.timed())
+
+    def timed(self) -> Iterator[tuple[int, Reading]]:
+        """All readings of the sensors in use, in the order in which the machine had them; counts `refused` anew.
+
+        Each with the time [ns] at which the machine had it: at its stamp, but never before it was true (a negative
+        delay). That time goes on where a clock was set back.
+        """
         self.refused.clear()
         self.first_refused.clear()
         streams = [self._read(source) for source in self.sources if source.sensor.use]
-        return heapq.merge(*streams, key=self.known_ns)
+        return heapq.merge(*streams, key=itemgetter(0))
 
-    def known_ns(self, reading: Reading) -> int:
-        """When a machine had a reading: at its stamp, but never before it was true (a negative delay)."""
-        return reading.stamp_ns + self._early_ns.get(reading.sensor, 0)
+    def _read(self, source: SensorFile) -> Iterator[tuple[int, Reading]]:
+        """Readings of a file. Rows are held until enough go on from them: the first may be of another clock."""
+        watch, held, newest_ns = ClockWatch[_Numbered](), list[_Numbered](), 0
+        later_ns = max(0, source.sensor.true_ns(0))
+        for row in self._rows(source):
+            if watch.goes_on(row[1].stamp_ns):
+                astray = watch.count(row[1].stamp_ns)
+                held.append(row)
+            else:
+                rows, astray = watch.doubt(row[1].stamp_ns, row)
+                first_ns = rows[0][1].stamp_ns if rows else watch.newest_ns
+                astray = [*astray, *(one for one in held if one[1].stamp_ns > first_ns)]
+                held = [*(one for one in held if one[1].stamp_ns <= first_ns), *rows]
+                later_ns += max(0, newest_ns - first_ns)
+            if astray:
+                self._refuse_astray(source, astray, watch.newest_ns)
+            if watch.counted > LATE_LIMIT:
+                for _, reading in self._settled(source, held):
+                    yield reading.stamp_ns + later_ns, reading
+                newest_ns, held = watch.newest_ns, []
+        rows, astray = watch.end()
+        self._refuse_astray(source, astray, watch.newest_ns)
+        yield from ((reading.stamp_ns + later_ns, reading) for _, reading in self._settled(source, [*held, *rows]))
 
-    @cached_property
-    def _early_ns(self) -> dict[str, int]:
-        """How much too early the stamps of some sensors are."""
-        return {s.name: s.true_ns(0) for s in (source.sensor for source in self.sources) if s.delay_s < 0}
+    def _settled(self, source: SensorFile, rows: Sequence[_Numbered]) -> Sequence[_Numbered]:
+        """Rows that go on, without a shorter part before a break of LONG_NS: its clock was not set yet."""
+        for i in range(len(rows) // 2, 0, -1):
+            if rows[i][1].stamp_ns - rows[i - 1][1].stamp_ns > LONG_NS:
+                self._refuse_astray(source, rows[:i], rows[i][1].stamp_ns)
+                return rows[i:]
+        return rows
 
-    def _read(self, source: SensorFile) -> Iterator[Reading]:
+    def _refuse_astray(self, source: SensorFile, rows: Sequence[_Numbered], newest_ns: int) -> None:
+        for line, reading in rows:
+            ahead_s = (reading.stamp_ns - newest_ns) * 1e-9
+            reason, where = ("stamp_ahead", "ahead of") if ahead_s > 0 else ("stamp_goes_back", "behind")
+            self.refused[reason] += 1
+            problem = f"it is {abs(ahead_s):.1f} s {where} the rows around it"
+            self.first_refused.setdefault(reason, f"{source.file.file} line {line}: {problem}")
+
+    def _rows(self, source: SensorFile) -> Iterator[_Numbered]:
+        """The rows of a file that are readings, each with its line."""
         path, parse = self.data / source.file.file, self._parser(source)
         with opened_rows(source.file, self.data) as rows:
             for column in (source.stamp, *source.columns.described.values()):
                 require(column.columns, rows, path)
-            newest, problem = 0, ""
+            is_usable, problem = False, ""
             for row in rows:
                 try:
                     reading = parse(row)
-                    if reading.stamp_ns < newest:  # the merge of the files needs each of them in order
-                        raise RowError("stamp_goes_back", "it is older than the row before it")
                 except RowError as error:
                     problem = problem or f"line {rows.line_num}: {error}"
                     self.refused[error.reason] += 1
                     self.first_refused.setdefault(error.reason, f"{path.name} line {rows.line_num}: {error}")
                 else:
-                    newest = reading.stamp_ns
-                    yield reading
-        if problem and not newest:
+                    is_usable = True
+                    yield rows.line_num, reading
+        if problem and not is_usable:
             raise LogFolderError(path, f"none of its rows can be used; {problem}")
 
     def _parser(self, source: SensorFile) -> Callable[[Row], Reading]:
@@ -102,11 +155,12 @@ class LogFolder:
         sensor, stamp, values = source.sensor, stamp_reader(source.stamp), source.columns.reader(self.site)
         described = (source.stamp, *source.columns.described.values())
         numbers = [*source.file.at_least, *(name for column in described for name in column.columns)]
+        start_ns = self.start_ns - round(source.ahead_s * 1e9)
 
         def parse(row: Row) -> Reading:
             try:
                 source.file.check(row)
-                return parse_reading(sensor.kind, sensor.name, self.start_ns + stamp(row), values(row))
+                return parse_reading(sensor.kind, sensor.name, start_ns + stamp(row), values(row))
             except MessageError as error:
                 raise RowError(error.reason, str(error)) from None
             except (ValueError, TypeError, OverflowError):
@@ -155,13 +209,21 @@ def _parse_source(table: Any, site: SiteConfig, where: str) -> SensorFile:
     if not isinstance(table, dict):
         raise ConfigError(where, "a table is expected")
     table = dict(table)
-    mapping, file = section(table, "columns", where), take_file(table, where)
+    mapping, file, ahead_s = section(table, "columns", where), take_file(table, where), _take_ahead_s(table)
     sensor = from_table(SensorConfig, table, where)
     described = {name: parse_column(value, name, f"{where} columns.{name}") for name, value in mapping.items()}
     if "stamp" not in described:
         raise ConfigError(where, "column `stamp` is not described")
     stamp = described.pop("stamp")
-    return SensorFile(sensor, file, stamp, reading_columns(sensor, described, site, where))
+    return SensorFile(sensor, file, stamp, reading_columns(sensor, described, site, where), ahead_s)
+
+
+def _take_ahead_s(table: dict[str, Any]) -> float:
+    """Take a `delay_s` out of a sensor's table that is an offset of its clock: in a recording nothing comes late."""
+    delay_s = table.get("delay_s")
+    if isinstance(delay_s, int | float) and math.isfinite(delay_s) and not -MAX_EARLY_S <= delay_s <= MAX_DELAY_S:
+        return float(table.pop("delay_s"))
+    return 0.0
 
 
 def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig, readings: Iterable[Reading]) -> None:

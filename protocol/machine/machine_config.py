@@ -41,7 +41,7 @@ NOT_NEGATIVE = (
     "drive_friction_n",
 )
 MOST_KG = 500_000.0  # of a machine, and of what it carries: a sample states the sum
-MAX_EARLY_S = 10.0  # a stamp that is further ahead of its reading is no delay, but another clock
+MAX_EARLY_S = 10.0  # a stamp that is further behind its reading is no delay, but another clock
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,8 @@ class SensorConfig:
         if self.frame not in (BASE, FRONT):
             raise ValueError(f"frame: {self.frame!r} is neither {BASE} nor {FRONT}")
         if not (-MAX_EARLY_S <= self.delay_s <= MAX_DELAY_S and 0 <= self.gate_sigma <= 1000):
-            limits = (
-                f"delay_s must be between -{MAX_EARLY_S:g} and {MAX_DELAY_S:g}: readings that are later are refused"
-            )
+            why = "a live agent cannot wait for what comes later (a log folder takes any)"
+            limits = f"delay_s must be between -{MAX_EARLY_S:g} and {MAX_DELAY_S:g}: {why}"
             raise ValueError(f"{self.name}: {limits}; gate_sigma between 0 and 1000")
         if not 0 <= self.drift_share <= 1:
             raise ValueError(f"drift_share: {self.drift_share} is not between 0 and 1")

@@ -122,7 +122,7 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
     message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
-    named = ("no_sample", "spool_problem", "calibration_problem", "spool_damage")
+    named = ("no_sample", "clocks", "spool_problem", "calibration_problem", "spool_damage")
     problems = [uplink.get("problem"), *map(values.get, named), *faults_of(values)]
     advice = "; ".join(str(problem) for problem in problems if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -17,15 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from agents.first_sample import UNIT, WHEELS
-from agents.stream_order import GAP_NS
 from protocol.arrays import Floats, Ints
 from protocol.errors import ConfigError, LogFolderError
+from protocol.machine.clock_watch import GAP_NS
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.machine_config import ABSOLUTE, QUANTITIES, MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu, Reading, Torque
 from sitegrid.doctor import Finding, Level
+from sitegrid.logs.clocks import check_clocks, time_of
 from sitegrid.logs.log_truth import SIDE_FILE, KnownArea, LogTruth, read_known_ground, read_log_truth, require_overlap
-from sitegrid.logs.speeds import Agreement, compare_speeds, places, wheel_distance
+from sitegrid.logs.speeds import places, wheel_distance, wheel_share
 from sitegrid.logs.wheels import check_wheels
 from sitegrid.proof.figures import Row, rounded
 
@@ -33,12 +33,12 @@ PAGE = "docs/log-folders.md"
 PAUSE = 5.0  # intervals: a longer one is a gap, if it lasts LEAST_GAP_S
 LEAST_GAP_S = 1.0
 REPEATS, HELD_S = 0.2, 10.0  # share of fixes that repeat the one before, and time at one place, of a sound receiver
-LAG_S = 0.5  # offset between two clocks above which it is named
 ADVICE = {
     "below_least": "rows that the receiver itself calls bad; no harm if they are few",
     "not_finite": "rows without a fix; no harm if they are few",
     "out_of_range": "look at the unit of that column; variances of 0 mean unknown: give `std`, and no such columns",
-    "stamp_goes_back": "delete the row before it, if that has a stamp from the future; else sort the file by time",
+    "stamp_ahead": "no harm if they are few: the clock was not set yet, or a message was damaged",
+    "stamp_goes_back": "no harm if they are few; else sort the file by time",
     "wrong_type": "numbers are expected; of dates and times, seconds",
 }
 
@@ -84,7 +84,7 @@ def examine(manifest: Path, data: Path | None = None) -> Examined:
     start_ns = min((int(one.stamps_ns[0]) for one in read if one.readings), default=0)
     last_ns = max((int(one.stamps_ns[-1]) for one in read if one.readings), default=0)
     rows = [_row(one, start_ns) for one in read] + [{**_row(one, 0), "usable": "use = false"} for one in unused]
-    barring = [*check_clocks(read), *check_places(log, read)]
+    barring = [*check_clocks(log, {one.sensor.name: one.readings for one in read}), *check_places(log, read)]
     is_barred = any(finding.level == Level.FAIL for finding in barring)
     findings = [
         *(finding for one in read for finding in check_sensor(one)),
@@ -94,7 +94,7 @@ def examine(manifest: Path, data: Path | None = None) -> Examined:
         check_positions(read, is_barred=is_barred),
         *_compared(log, folder, start_ns, last_ns),
     ]
-    return Examined(_time(start_ns) if start_ns else "", rows, findings)
+    return Examined(time_of(start_ns) if start_ns else "", rows, findings)
 
 
 def check_sensor(data: SensorData) -> Iterator[Finding]:
@@ -122,16 +122,6 @@ def check_sensor(data: SensorData) -> Iterator[Finding]:
         yield Finding(Level.WARN, name, what, "keep one row per fix; a receiver that freezes is of no use meanwhile")
 
 
-def check_clocks(data: Sequence[SensorData]) -> Iterator[Finding]:
-    """Sensors whose time is not that of any other."""
-    spans = {one.sensor.name: one.stamps_ns[[0, -1]] for one in data if one.readings}
-    for name, (begin, end) in spans.items():
-        others = [span for other, span in spans.items() if other != name]
-        if others and not any(begin <= last and first <= end for first, last in others):
-            what = f"its stamps are from {_time(begin)} to {_time(end)}, when no other sensor has any"
-            yield Finding(Level.FAIL, name, what, "look at the unit of its stamp, and at `start_ns`, which is for all")
-
-
 def check_places(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding]:
     """Fixes that are not on the site."""
     for one in data:
@@ -144,25 +134,15 @@ def check_places(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding
 
 
 def check_speeds(log: LogFolder, data: Sequence[SensorData]) -> Iterator[Finding]:
-    """Wheels against fixes: clocks that are apart, units."""
+    """Wheels against fixes: units."""
     fixes = next((one for one in data if len(one.readings) > 1 and _is_receiver(one.sensor)), None)
     for one in data:
         if fixes and len(one.readings) > 1 and one.sensor.kind in WHEELS:
-            pair = places(fixes.readings, log.site), wheel_distance(one.readings, log.machine)
-            if agreement := compare_speeds(*pair):
-                yield from _judge(agreement, fixes.sensor.name, one.sensor.name)
-
-
-def _judge(agreement: Agreement, receiver: str, name: str) -> Iterator[Finding]:
-    """What is wrong with wheels of this name, or with the clock of the receiver."""
-    lag_s, share = agreement.lag_s, agreement.wheel_share
-    if lag_s and abs(lag_s) > LAG_S:
-        where = "ahead of" if lag_s > 0 else "behind"
-        what = f"its stamps are {abs(lag_s):.1f} s {where} those of {name}, by the speed"
-        yield Finding(Level.WARN, receiver, what, "bring both to one clock: GPS time is 18 s ahead of UTC")
-    elif not 1 / UNIT < share < UNIT and share >= 0:  # NaN of a machine that stands
-        what = f"the wheels turn {share:.2g} times as far as {receiver} goes"
-        yield Finding(Level.WARN, name, what, "look at the unit of the speed, `wheel_radius_m`, `ticks_per_rev`")
+            share = wheel_share(places(fixes.readings, log.site), wheel_distance(one.readings, log.machine))
+            if not 1 / UNIT < share < UNIT and share >= 0:  # NaN of a machine that stands
+                what = f"the wheels turn {share:.2g} times as far as {fixes.sensor.name} goes"
+                advice = "look at the unit of the speed, `wheel_radius_m`, `ticks_per_rev`"
+                yield Finding(Level.WARN, one.sensor.name, what, advice)
 
 
 def check_positions(data: Sequence[SensorData], *, is_barred: bool) -> Finding:
@@ -268,7 +248,3 @@ def _repeated(readings: Sequence[Reading]) -> tuple[float, float]:
 
 def _is_receiver(sensor: SensorConfig) -> bool:
     return sensor.kind == Gps.kind and sensor.mode == ABSOLUTE
-
-
-def _time(stamp_ns: int) -> str:
-    return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"

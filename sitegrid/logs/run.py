@@ -17,6 +17,7 @@ from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from sitegrid.logs.check import missing_for_ground, missing_for_truth
+from sitegrid.logs.clocks import check_clocks
 from sitegrid.logs.ground import compare, samples_of
 from sitegrid.logs.log_truth import KnownArea, LogTruth, read_known_ground, read_log_truth, require_overlap
 from sitegrid.logs.outages import WITHHOLD, Outage, Pattern
@@ -77,13 +78,16 @@ def run(
     """Replay a log once per pattern of withheld GPS, and once more for its ground where some is known.
 
     draw: is given the trace of the first pattern. refused: readings by reason, and where the first of each stands.
-    missing: what cannot be compared, and why not.
+    missing: what cannot be compared, and why not. clocks: which are apart, a sentence each.
     """
     log = recording.log
     require_place(log.machine, options)
     _require_time(recording, patterns)
     rows: list[Row] = []
-    report = {**_described(recording, options), "rows": rows}
+    clocks = _clocks(recording)
+    report = {**_described(recording, options), "clocks": clocks, "rows": rows}
+    for problem in clocks:
+        on_progress(f"{log.name}: {problem}")
     for pattern in patterns:
         on_progress(f"{log.name}: {pattern or 'none'}")
         row, trace = _row(recording, options, pattern)
@@ -91,7 +95,7 @@ def run(
             draw(recording, pattern, trace)
         rows.append(row)
         if not row["covered"]:
-            on_progress(f"{log.name}: {NO_POSE}")
+            on_progress(f"{log.name}: {'no pose, as clocks are apart' if clocks else NO_POSE}")
     missing = {
         "truth": missing_for_truth(recording.truth),
         "ground": missing_for_ground(log.machine, recording.areas),
@@ -100,6 +104,15 @@ def run(
         on_progress(f"{log.name}: ground")
         report["ground"] = compare(samples_of(log, options, recording.readings), recording.areas)
     return {**report, "missing": {name: why for name, why in missing.items() if why}}
+
+
+def _clocks(recording: Recording) -> list[str]:
+    """Which clocks are apart, a sentence each."""
+    readings: dict[str, list[Reading]] = {}
+    for reading in recording.readings:
+        readings.setdefault(reading.sensor, []).append(reading)
+    findings = check_clocks(recording.log, readings)
+    return [f"{finding.check}: {finding.message}; {finding.advice}" for finding in findings]
 
 
 def _described(recording: Recording, options: LocalisationConfig) -> Report:

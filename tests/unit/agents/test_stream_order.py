@@ -1,6 +1,7 @@
 import pytest
 
-from agents.stream_order import LATE_LIMIT, Decision, StreamOrder, by_stamp
+from agents.stream_order import Decision, StreamOrder, by_stamp
+from protocol.machine.clock_watch import LATE_LIMIT
 from protocol.machine.readings import Articulation, Encoder, Odometry, Reading
 
 MS = 1_000_000
@@ -28,7 +29,10 @@ ACCEPT, REFUSE, RESTART = Decision.ACCEPT, Decision.REFUSE, Decision.RESTART
         ([(0, "a", REFUSE), (0, "b", ACCEPT)], {"reading_duplicate": 1}),
         ([(100, "a", ACCEPT), (99, "a", REFUSE)], {"reading_late": 1}),  # a sensor's own never go back
         ([(1000, "a", ACCEPT), (499, "b", REFUSE), (500, "b", ACCEPT), (400, "c", REFUSE)], {"reading_late": 2}),
-        ([(5000, "a", ACCEPT), (10_001, "a", RESTART), (10_002, "a", ACCEPT)], {"gap_restarts": 1}),
+        (
+            [*((ms, "a", ACCEPT) for ms in (3000, 4000, 5000)), (10_001, "a", REFUSE), (11_002, "a", RESTART)],
+            {"gap_restarts": 1, "reading_ahead": 1},  # once the clock has gone on for a second
+        ),
         ([*((ms, "b", ACCEPT) for ms in range(100, 9000, 100)), (9000, "a", ACCEPT)], {}),  # a pause is one of all
     ],
 )
@@ -38,9 +42,9 @@ def test_what_is_accepted(order: StreamOrder, rows: list[tuple[int, str, Decisio
 
 
 def test_clock_that_was_set_back_restarts_after_a_while(order: StreamOrder) -> None:
-    order.decide(at(100_000_000))
-    order.counters.clear()
-    decisions = [order.decide(at(i)) for i in range(1, LATE_LIMIT + 20)]
+    for i in range(LATE_LIMIT):
+        order.decide(at(100 + i))
+    decisions = [order.decide(at(i - 3_600_000)) for i in range(1, LATE_LIMIT + 20)]
     assert decisions.count(Decision.RESTART) == 1
     assert decisions.index(Decision.RESTART) == LATE_LIMIT
     assert decisions[-1] is Decision.ACCEPT

@@ -244,5 +244,5 @@ def test_the_first_bad_row_of_each_reason_is_named_with_its_line(tmp_path: Path)
     assert log.first_refused == {
         "wrong_type": "it.csv line 3: v: 'x' is not a number",
         "out_of_range": "it.csv line 6: it.speed_x_mps: 500.0 is not between -100 and 100",
-        "stamp_goes_back": "it.csv line 8: it is older than the row before it",
+        "stamp_goes_back": "it.csv line 8: it is 1.0 s behind the rows around it",
     }

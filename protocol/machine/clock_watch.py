@@ -1,0 +1,94 @@
+"""Stamps that do not go on from those before them: astray, or of a clock that was set. One rule for files and streams.
+
+A stamp that is far off does not count at first. Where others go on from it, and few go on from those before, the clock
+was set: then they count.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+GAP_NS = 5_000_000_000  # a stamp that is further ahead is a pause, a clock that was set, or astray
+STEADY_NS = 1_000_000_000  # stamps ahead that go on for longer, with none of before among them, are no error of one row
+LATE_LIMIT = 200  # so many more stamps behind than in order are a clock that was set back, not a late sensor
+LONG_NS = 12 * 3600 * 10**9  # no recording pauses for longer: the rows at one side of such a break are astray
+MOST_RUNS = 8  # that are weighed at a time: a file without any order has no end of them
+
+Item = TypeVar("Item")
+
+
+@dataclass(eq=False)
+class _Run(Generic[Item]):
+    """Stamps that go on from one another alone. steady_ns: since when none of before came. excess: over those."""
+
+    is_ahead: bool
+    newest_ns: int
+    steady_ns: int = 0
+    excess: int = 0
+    items: list[Item] = field(default_factory=list)
+
+
+class ClockWatch(Generic[Item]):
+    """Tells stamps that count from those that do not.
+
+    late_ns: how far one may be behind the newest. newest_ns, counted: of those that count, since the clock was set.
+    """
+
+    def __init__(self, late_ns: int = 0) -> None:
+        self.newest_ns = 0
+        self.counted = 0
+        self._late_ns = late_ns
+        self._runs: list[_Run[Item]] = []
+
+    def goes_on(self, stamp_ns: int) -> bool:
+        """Whether a stamp goes on from those that count."""
+        return not self.newest_ns or self.newest_ns - self._late_ns <= stamp_ns <= self.newest_ns + GAP_NS
+
+    def count(self, stamp_ns: int) -> Sequence[Item]:
+        """Note a stamp that goes on; returns the items that are known to be astray thereby."""
+        self.newest_ns = max(self.newest_ns, stamp_ns)
+        self.counted += 1
+        return self._weigh() if self._runs else ()
+
+    def doubt(self, stamp_ns: int, item: Item) -> tuple[Sequence[Item], Sequence[Item]]:
+        """Note one that does not go on; returns the items that count once the clock was set, and those astray then."""
+        is_ahead = stamp_ns > self.newest_ns
+        fitting = [r for r in self._runs if r.is_ahead == is_ahead and r.newest_ns - self._late_ns <= stamp_ns]
+        run = max(fitting, key=lambda r: r.newest_ns, default=None)
+        if run is None:
+            run = _Run(is_ahead, stamp_ns)
+            self._runs.append(run)
+        run.newest_ns, run.steady_ns = max(run.newest_ns, stamp_ns), run.steady_ns or stamp_ns
+        run.excess += 1
+        run.items.append(item)
+        if not self._is_set(run):
+            return (), self._give_up(self._runs[:-MOST_RUNS])
+        self._runs.remove(run)
+        self.newest_ns, self.counted = run.newest_ns, len(run.items)
+        return run.items, self._give_up(self._runs)
+
+    def end(self) -> tuple[Sequence[Item], Sequence[Item]]:
+        """The same, as the stream ends: what is behind a pause counts."""
+        paused = [r for r in self._runs if r.is_ahead and r.newest_ns < self.newest_ns + LONG_NS][:1]
+        counting = [item for run in paused for item in run.items]
+        return counting, self._give_up([r for r in self._runs if r not in paused])
+
+    def _is_set(self, run: _Run[Item]) -> bool:
+        """Whether a clock was set to the time of a run. Few stamps of before are outvoted by as many of far away."""
+        if run.is_ahead and run.newest_ns - run.steady_ns > STEADY_NS:
+            return True
+        return run.excess > (LATE_LIMIT if self._is_near(run) else min(LATE_LIMIT, self.counted))
+
+    def _is_near(self, run: _Run[Item]) -> bool:
+        return abs(run.newest_ns - self.newest_ns) <= GAP_NS + self._late_ns
+
+    def _weigh(self) -> Sequence[Item]:
+        """Weigh a stamp that counts against the runs. Those nearby are of a late sensor: it outweighs all of them."""
+        for run in self._runs:
+            run.steady_ns = 0
+            run.excess = 0 if self._is_near(run) else run.excess - 1
+        return self._give_up([run for run in self._runs if run.excess <= 0])
+
+    def _give_up(self, runs: Sequence[_Run[Item]]) -> Sequence[Item]:
+        self._runs = [run for run in self._runs if run not in runs]
+        return [item for run in runs for item in run.items]

@@ -1,0 +1,61 @@
+"""Clocks of a log's sensors that are apart: by how much, and what to write into its manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+
+from agents.clock_offsets import ClockOffsets, Offset
+from protocol.machine.log_folder import LogFolder
+from protocol.machine.readings import Reading
+from sitegrid.doctor import Finding, Level
+
+
+def check_clocks(log: LogFolder, readings: Mapping[str, Sequence[Reading]]) -> Iterator[Finding]:
+    """Sensors whose clock is not that of the others. readings: by sensor, in the order of their file.
+
+    FAIL where a sensor's stamps overlap with those of no other: nothing can be made of it.
+    """
+    spans = {name: (rows[0].stamp_ns, rows[-1].stamp_ns) for name, rows in readings.items() if rows}
+    offsets = _offsets(log, readings, spans)
+    for name, span in spans.items():
+        offset = offsets.get(name)
+        if not any(_overlap(span, other) for sensor, other in spans.items() if sensor != name) and len(spans) > 1:
+            what = f"its stamps are from {time_of(span[0])} to {time_of(span[1])}, when no other sensor has any"
+            unknown = "look at the unit of its stamp, and at `start_ns`, which is for all"
+            yield Finding(Level.FAIL, name, what, _proposal(offset) if offset else unknown)
+        elif offset:
+            others = ", ".join(offset.others)
+            what = f"its stamps are {abs(offset.ahead_s):.1f} s {offset.where} those of {others}, by the motion"
+            yield Finding(Level.WARN, name, what, _proposal(offset))
+
+
+def _offsets(
+    log: LogFolder, readings: Mapping[str, Sequence[Reading]], spans: Mapping[str, tuple[int, int]]
+) -> dict[str, Offset]:
+    """Offsets by sensor; one that shows no motion has that of the sensor whose clock it seems to share."""
+    clocks = ClockOffsets(log.machine, log.site)
+    for rows in readings.values():
+        clocks.take(rows)
+    of_manifest_s = {source.sensor.name: source.ahead_s for source in log.sources}
+    offsets = {o.sensor: replace(o, delay_s=o.delay_s + of_manifest_s[o.sensor]) for o in clocks.find()}
+    right = {name for offset in offsets.values() for name in offset.others}
+    for name in spans.keys() - offsets.keys() - right if offsets else ():
+        like = [o for o in offsets.values() if _overlap(spans[name], spans[o.sensor])]
+        if like and not any(_overlap(spans[name], spans[other]) for other in right):
+            offsets[name] = replace(like[0], sensor=name)
+    return offsets
+
+
+def time_of(stamp_ns: int) -> str:
+    """A stamp as people read it."""
+    return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _overlap(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    return one[0] <= other[1] and other[0] <= one[1]
+
+
+def _proposal(offset: Offset) -> str:
+    return f"write `delay_s = {offset.delay_s:.1f}` under its name (+- {2 * offset.std_s:.1f} s)"

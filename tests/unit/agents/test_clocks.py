@@ -1,0 +1,116 @@
+"""Stamps that are far off, and clocks that are apart, as a live agent meets them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agents.first_sample import FirstSample
+from agents.localisation.localiser import LocalisationConfig
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig, Positioning
+from protocol.machine.machine_config import SensorConfig
+from protocol.machine.readings import Reading
+from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, drive, thinned
+
+SECOND, DAY, YEARS = 10**9, 86_400, 20 * 365 * 86_400
+EKF = PipelineConfig(LocalisationConfig("ekf"))
+MADE = drive([Leg(4, 0.5), Leg(8), Leg(4, 0, 0.25), Leg(8), Leg(4, 0, -0.3), Leg(32)], VEHICLE)
+READINGS = thinned(MADE.readings)
+
+
+def shifted(readings: list[Reading], ahead_s: float, *sensors: str) -> list[Reading]:
+    """These sensors' stamps are ahead; readings come when they came."""
+    by_ns = round(ahead_s * SECOND)
+    return [replace(r, stamp_ns=r.stamp_ns + by_ns) if r.sensor in sensors else r for r in readings]
+
+
+def astray(sensor: str, after_s: float, off_s: float, rows: int = 1) -> list[Reading]:
+    """One sensor has rows that are far off."""
+    late = [i for i, r in enumerate(READINGS) if r.sensor == sensor and r.stamp_ns >= START_NS + after_s * SECOND]
+    readings = list(READINGS)
+    for i in late[:rows]:
+        readings[i] = replace(readings[i], stamp_ns=readings[i].stamp_ns + round(off_s * SECOND))
+    return readings
+
+
+def off_m(readings: list[Reading]) -> tuple[np.ndarray, Positioning]:
+    """How far poses are off from 15 s on."""
+    located, off = Positioning(SITE, VEHICLE, EKF), []
+    for i in range(0, len(readings), 15):
+        located.step(readings[i : i + 15])
+        if (pose := located.pose) and pose.stamp_ns >= START_NS + 15 * SECOND:
+            x_m, y_m, _ = MADE.at(pose.stamp_ns)
+            off.append(np.hypot(pose.x_m - x_m, pose.y_m - y_m))
+    return np.array(off), located
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sensor", "after_s", "off_s", "rows"),
+    [
+        ("gps-1", 0, YEARS, 1),
+        ("imu", 30, DAY, 1),
+        ("imu", 30, -DAY, 3),
+        ("wheels", 20, 3600, 2),
+        ("gps-1", 25, -YEARS, 1),
+    ],
+)
+def test_a_stamp_far_off_is_refused_alone_and_the_track_goes_on(
+    sensor: str, after_s: float, off_s: float, rows: int
+) -> None:
+    sound, located = off_m(READINGS)
+    off, met = off_m(astray(sensor, after_s, off_s, rows))
+    assert len(off) > 0.95 * len(sound)
+    assert off.max() <= max(2 * sound.max(), 4.0)
+    assert located.counters["reading_ahead"] + located.counters["reading_late"] == 0
+    assert met.counters["reading_ahead"] + met.counters["reading_late"] <= rows
+    assert met.counters["gap_restarts"] + met.counters["clock_back_restarts"] == 0
+
+
+def said(readings: list[Reading]) -> tuple[str, str]:
+    """What health and the sentence about missing samples say in the end."""
+    pipeline, first = Pipeline(SITE, VEHICLE, EKF), FirstSample(VEHICLE)
+    for i in range(0, len(readings), 15):
+        first.take(readings[i : i + 15])
+        pipeline.step(readings[i : i + 15])
+        first.judge(pipeline.health, pipeline.clocks())
+    return pipeline.clocks(), first.why_not
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sensors", "ahead_s", "sentence"),
+    [
+        (("gps-1",), 18.0, "gps-1 is 18.0 s ahead of imu, torque, wheels: readings are refused, set its clock"),
+        (("gps-1",), 2.0, "gps-1 is 1.8 s ahead of imu, torque, wheels: readings are refused, set its clock"),
+        (("gps-1",), -2.0, "gps-1 is 2.0 s behind imu, torque, wheels: readings are refused, set its clock, or"),
+        (("imu", "wheels", "torque"), -1.7e9, "gps-1 is 1700000000.0 s ahead of imu, torque, wheels: readings"),
+        (("wheels",), 3600.0, "wheels is 3600.0 s ahead of gps-1, imu, torque: readings are refused, set its"),
+    ],
+)
+def test_clocks_that_are_apart_are_why_there_is_no_sample(
+    sensors: tuple[str, ...], ahead_s: float, sentence: str
+) -> None:
+    clocks, no_sample = said(shifted(READINGS, ahead_s, *sensors))
+    assert clocks.startswith(sentence)
+    assert no_sample.startswith(f"no sample after 30 s of readings: {sentence}")
+
+
+@pytest.mark.slow
+def test_an_offset_that_refuses_nothing_is_named_by_the_motion() -> None:
+    """Fixes come in the order of their stamps, and tell where the machine was two seconds before."""
+    legs = [Leg(5, 0.6), Leg(6, 0, 0.2), Leg(3, -1.0), Leg(4), Leg(7, 0.4, -0.2), Leg(5), Leg(7, -0.4), Leg(3)]
+    readings = thinned(drive(legs * 2, VEHICLE).readings)
+    late = sorted(shifted(readings, 2.0, "gps-1"), key=lambda r: r.stamp_ns)
+    for stream, clocks in ((late, "gps-1 is 2.0 s ahead of imu, wheels: set its clock"), (readings, "")):
+        pipeline = Pipeline(SITE, VEHICLE, EKF)
+        pipeline.step([r for r in stream if r.sensor != "torque"])
+        assert pipeline.clocks() == clocks
+
+
+def test_a_live_agent_says_why_it_takes_no_larger_delay() -> None:
+    with pytest.raises(ValueError, match=r"gps-1: delay_s must be between -10 and 0\.4: a live agent cannot wait"):
+        SensorConfig("gps-1", "gps", delay_s=18.0)
