@@ -302,6 +302,8 @@ class DeadReckoning:
         if not shown:
             return
         self.ground = shown
+        if not shown.stands and stamp_ns - self.wheels_ns > PAUSE_NS:
+            self._stands_since_ns = stamp_ns
         if is_silent:
             since_ns = max(self._moved_ns, self.wheels_ns) if before else stamp_ns
             travel_m = shown.speed_mps * min((stamp_ns - since_ns) * 1e-9, MAX_REACH_S)
@@ -309,8 +311,6 @@ class DeadReckoning:
             self.angle_rad += shown.turned_rad + travel_m * curvature
             self._move(stamp_ns, travel_m, self._ground_rad, counts=shown.moves)
             self._moved_ns = stamp_ns
-            if not shown.stands:
-                self._stands_since_ns = stamp_ns
         self._ground_rad = self.angle_rad
 
     def _move(self, stamp_ns: int, travel_m: float, from_rad: float, *, counts: bool = True) -> None:

@@ -5,8 +5,8 @@ its axles stand on two slopes; and sensors fail: they fall silent, freeze (stuck
 in the wrong unit.
 
 Brakes that neither the torque sensor nor a reading shows make the ground seem rough: downhill at constant speed and
-without torque, c_rr would be just the grade. So a machine that rolls without torque shows nothing, unless its brakes
-are read, or its torque has braked before: then that sees them.
+without torque, c_rr would be just the grade. So a machine that rolls without torque on ground that seems rougher than
+where it pulled shows nothing, unless its brakes are read, or its torque has braked before: then that sees them.
 """
 
 import math
@@ -42,6 +42,7 @@ APPLIED = 0.01  # of a brake: less is its play
 # Drive force over weight in the direction of travel: below the first, the machine rolls without torque, but for noise
 # and zero; below the second the torque brakes it, as no engine's own drag does.
 ROLLS_SHARE, BRAKES_SHARE = 0.015, -0.06
+ROUGHER = 0.02  # c_rr as it rolls, above that of before: more than noise and zero make of it
 MAX_C_RR = 0.45  # no ground that a machine drives on resists more: the bucket digs
 MIN_C_RR = -0.08  # the ground pushes: the torque that does it is missing, and no accelerometer's zero is so far off
 MAX_SLIP_MPS2 = 1.0  # the wheels' acceleration is this far from the body's: they spin or lock
@@ -74,6 +75,7 @@ class Plausibility:
         self._gain = _Gain()
         self._resisted = 0.0  # resistance, low-passed
         self._braked = 0.0  # drive force over weight in the direction of travel, low-passed
+        self._pulled = self._rolled = 0.0  # resistance as it pulled, and as it rolls without torque, low-passed
         self._torque_brakes = False  # whether the torque was seen to brake
 
     @property
@@ -129,7 +131,7 @@ class Plausibility:
 
     def _unsteady(self, balance: Balance, resistance: float, *, skids: bool) -> str:
         """Whether forces that the balance does not include act, or acted a moment ago."""
-        may_brake = self._may_brake_unseen(balance)
+        may_brake = self._may_brake_unseen(balance, resistance)
         difference = balance.accel_mps2 - balance.body_mps2
         self._mismatch_mps2 += min(balance.dt_s / MEAN_S, 1.0) * (difference - self._mismatch_mps2)
         if abs(self._mismatch_mps2) > MAX_SLIP_MPS2 + self._shaking.margin(MEAN_S):
@@ -146,12 +148,18 @@ class Plausibility:
         self._hold = reason, left_s - balance.dt_s
         return reason if left_s > 0 else ""
 
-    def _may_brake_unseen(self, balance: Balance) -> bool:
-        """Whether the machine rolls without torque, and nothing has shown its brakes."""
+    def _may_brake_unseen(self, balance: Balance, resistance: float) -> bool:
+        """Whether the machine rolls without torque on ground that seems rougher, and nothing has shown its brakes."""
         pulls = balance.direction * balance.share
+        if pulls > ROLLS_SHARE:
+            self._pulled += min(balance.dt_s / SMOOTH_S, 1.0) * (resistance - self._pulled)
+            self._rolled = self._pulled
+        else:
+            self._rolled += min(balance.dt_s / MEAN_S, 1.0) * (resistance - self._rolled)
         self._braked += min(balance.dt_s / SMOOTH_S, 1.0) * (pulls - self._braked)
         self._torque_brakes |= self._braked < BRAKES_SHARE
-        return not self._torque_brakes and math.isnan(balance.brake) and pulls < ROLLS_SHARE
+        is_shown = self._torque_brakes or not math.isnan(balance.brake)
+        return not is_shown and pulls <= ROLLS_SHARE and self._rolled > self._pulled + ROUGHER
 
 
 def _rolls(balance: Balance) -> bool:

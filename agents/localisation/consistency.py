@@ -69,12 +69,18 @@ class Consistency:
 
 
 class InnovationMonitor:
-    """Remembers the last innovations of one receiver."""
+    """Remembers the last innovations of one receiver. adapts: whether its variance follows them."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, adapts: bool = False) -> None:
+        self._factor = VarianceFactor() if adapts else None
         self._gated: deque[bool] = deque(maxlen=REMEMBERED)
         self._last: deque[tuple[float, ...]] = deque(maxlen=REMEMBERED)
         self._slow_error, self._slow_ns = 1.0, 0
+
+    @property
+    def variance_factor(self) -> float:
+        """What the variance that the receiver states is taken times [-]."""
+        return self._factor.factor if self._factor else 1.0
 
     def note(self, result: Conditioned, slow_error: float | None = None) -> None:
         """Remember a result of the filter; one without a finite innovation shows nothing.
@@ -83,6 +89,8 @@ class InnovationMonitor:
         """
         if not math.isfinite(result.nis):
             return
+        if self._factor:
+            self._factor.note(result)
         self._gated.append(not result.accepted)
         std = np.sqrt(np.diag(result.innovation_covariance))
         self._last.append(tuple((result.innovation / std).tolist()))
@@ -99,7 +107,8 @@ class InnovationMonitor:
         normalised = np.array(self._last)
         square = float((normalised**2).mean())
         correlation = float((normalised[1:] * normalised[:-1]).mean()) / max(square, 1e-12)
-        return Consistency(sum(self._gated) / len(self._gated), square, correlation, self._slow_error, is_checked)
+        gated = sum(self._gated) / len(self._gated)
+        return Consistency(gated, square, correlation, self._slow_error, is_checked, self.variance_factor)
 
 
 @dataclass

@@ -16,7 +16,7 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.ground_speed import MIN_FIX_STD_M
 from agents.localisation import measurements
-from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor, VarianceFactor
+from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor
 from agents.localisation.filters.belief import (
     Belief,
     Change,
@@ -73,8 +73,7 @@ class Receivers(ModalSensors[Fix]):
         self._compared = {name: i for i, name in enumerate(absolute)} if slow and machine_share is None else {}
         self._estimator = ShareEstimator(len(absolute))
         self._configured = machine_share
-        self._monitors = {name: InnovationMonitor() for name in self._sensors}
-        self._factors = {name: VarianceFactor() for name in self._sensors}
+        self._monitors = {name: InnovationMonitor(adapts=slow and not layout.base) for name in self._sensors}
         self._judged: dict[str, tuple[int, bool]] = {}  # stamp of the last fix of each, and whether it was accepted
         self._refused: Counter[str] = Counter()  # in a row
         self._off_m: dict[str, list[Floats]] = {}  # innovations of these, since the last relock
@@ -115,15 +114,15 @@ class Receivers(ModalSensors[Fix]):
         share = self.machine_share
         checks = share is not None and share <= MAX_SHARE and sum(n in self._states for n in speaking) > 1
         judged = {n: self._monitors[n].consistency(is_checked=checks and n in self._states) for n in speaking}
-        return {n: replace(c, variance_factor=self._factors[n].factor) for n, c in judged.items() if c}
+        return {name: value for name, value in judged.items() if value}
 
     def fix(self, gps: Gps, reckoned: DeadReckonedPose) -> Fix:
-        """A reading in `map`, with the variances that are configured, else with its own."""
-        sensor = self._sensors[gps.sensor]
+        """A reading in `map`, with the variances that are configured, else its own, as its innovations correct them."""
+        sensor, factor = self._sensors[gps.sensor], self._monitors[gps.sensor].variance_factor
         x, y, _ = self._projection.to_map(gps.lat_deg, gps.lon_deg, gps.height_m)
         stated = (gps.var_e_m2, gps.var_n_m2)
         variance = np.array([sensor.std["position"] ** 2] * 2 if "position" in sensor.std else stated)
-        return Fix(gps.stamp_ns, sensor, np.array([x, y]), self._factors[gps.sensor].factor * variance, reckoned)
+        return Fix(gps.stamp_ns, sensor, np.array([x, y]), factor * variance, reckoned)
 
     def expected(self, fix: Fix) -> tuple[float, GpsError]:
         """What a fix is off: variance of its white noise, per axis [m2], and the slow error of its receiver."""
@@ -146,8 +145,6 @@ class Receivers(ModalSensors[Fix]):
         if name in self._states and (name not in self._stated_m2 or self._is_restated(name)):
             self._stated_m2[name] = self._drift_m2[name]
         self._monitors[name].note(result, self._believed_error(name, result.belief))
-        if self._slow:
-            self._factors[name].note(result)
         if fix.sensor.mode == DIFFERENTIAL or not math.isfinite(result.nis):
             return  # a velocity says nothing of the place
         self._judged[name] = (fix.stamp_ns, result.accepted)

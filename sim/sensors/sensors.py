@@ -60,18 +60,10 @@ class TorqueGroup(SensorGroup):
         draws = self._draws.next_rows(len(steps))
         scale = self._scale * np.where(self.faulty(steps), self._fault, 1.0)
         torque = self.pick(states.torque_nm, rows)
-        torque = np.where(self._sees_brakes, torque, torque + self._braking_nm(rows, states))
+        brakes = torque * self.pick(states.speed_mps, rows) < 0
+        torque = np.where(brakes & ~self._sees_brakes, 0.0, torque)
         values: Floats = scale * torque + self._slow.run(draws[:1]) + self._white_nm * draws[1]
         return values
-
-    def _braking_nm(self, rows: Ints, states: FleetState) -> Floats:
-        """Torque against the motion at all wheels, signed ahead."""
-        return braking_nm(self.pick(states.torque_nm, rows), self.pick(states.speed_mps, rows))
-
-
-def braking_nm(torque_nm: Floats, speed_mps: Floats) -> Floats:
-    """What brakes must add to a torque against the motion, so that the drive has none of it; 0 where it drives."""
-    return np.where(torque_nm * speed_mps < 0, -torque_nm, 0.0)
 
 
 class BrakeGroup(SensorGroup):
@@ -88,8 +80,8 @@ class BrakeGroup(SensorGroup):
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """The force, or how much of the most is applied; a switch closes at a fiftieth of it."""
-        braking = braking_nm(self.pick(states.torque_nm, rows), self.pick(states.speed_mps, rows))
-        force = np.abs(braking) / self._radius_m
+        torque = self.pick(states.torque_nm, rows)
+        force = np.abs(torque) * (torque * self.pick(states.speed_mps, rows) < 0) / self._radius_m
         noise = self._white_n * self._draws.next_rows(len(steps)) * (force > 0)  # also gives the axis of the values
         if self._reads_force:
             return np.maximum(force + noise, 0.0)

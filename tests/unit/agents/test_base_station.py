@@ -100,7 +100,7 @@ def test_receiver_that_holds_its_place_is_left_out_and_reported() -> None:
     assert len(made) == PINNED
     assert base.counters["fix_pinned"] == PINNED - 1
     assert "static hold" in base.problem
-    assert base.step([fix((1.1, 1.0), 3 * PINNED)])
+    assert base.step([fix((1.1, 1.0), 2 * PINNED)])
     assert not base.problem
 
 

@@ -48,9 +48,10 @@ def test_files_name_every_option() -> None:
     named = table("agent.toml")
     assert unnamed(AgentConfig(), named) == []
     assert {f.name for f in fields(SiteConfig)} == set(table("site.toml"))
-    estimated = "machine_share"  # without it; so it is in a comment
-    assert {f.name for f in fields(MachineConfig)} - {"sensors", estimated} == set(named["machine"])
-    assert f"\n# {estimated} = " in (CONFIG / "agent.toml").read_text()
+    estimated = "machine_share", "skid_steers"  # without it; so it is in a comment
+    assert {f.name for f in fields(MachineConfig)} - {"sensors", *estimated} == set(named["machine"])
+    for name in estimated:
+        assert f"\n# {name} = " in (CONFIG / "agent.toml").read_text()
     assert {f.name for f in fields(SensorConfig)} == {key for sensor in named["sensor"] for key in sensor}
     assert {f.name for f in fields(Mount)} == set(named["sensor"][0]["mount"])
 

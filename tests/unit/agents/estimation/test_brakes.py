@@ -60,7 +60,7 @@ def test_a_torque_that_brakes_is_believed_when_it_is_zero() -> None:
 def test_drag_and_friction_of_the_drive_are_no_resistance_of_the_ground(body: dict[str, float]) -> None:
     vehicle = machine()
     made = drive([Leg(2), Leg(10, 1.2), Leg(8)], vehicle, ground=Ground(C_RR)).readings
-    plain, told = (EstimatorRun(v).feed(made).last for v in (vehicle, replace(vehicle, **body)))
+    plain, stated = (EstimatorRun(v).feed(made).last for v in (vehicle, replace(vehicle, **body)))
     speed_mps = 12.0
     held_n = body.get("drive_friction_n") or AIR_KGPM3 * body["drag_area_m2"] * speed_mps**2 / 2
-    assert plain.c_rr - told.c_rr == pytest.approx(held_n / (vehicle.mass_kg * GRAVITY_MPS2), rel=0.05)
+    assert plain.c_rr - stated.c_rr == pytest.approx(held_n / (vehicle.mass_kg * GRAVITY_MPS2), rel=0.05)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agents.localisation.consistency import VarianceFactor
 from agents.localisation.corrections import MAX_AGE_S, MAX_AHEAD_S, REFUSALS, REPEATS, Corrections
 from agents.localisation.filters.belief import Belief
 from agents.localisation.filters.motion import GpsError
@@ -104,9 +105,15 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SiteShareEstimator, "share", 0.95)
 
 
+@pytest.fixture
+def stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What receivers state of their errors holds, as it does beside a base."""
+    monkeypatch.setattr(VarianceFactor, "note", lambda *_: None)
+
+
 @pytest.mark.slow
-def test_base_that_is_not_heard_changes_nothing(readings: list[Reading]) -> None:
-    alone, beside = usual("alone"), locate(with_base(machine()), readings)
+def test_base_that_is_not_heard_changes_nothing(readings: list[Reading], stated: None) -> None:
+    alone, beside = locate(machine(), readings), locate(with_base(machine()), readings)
     assert beside.pose.x_m == pytest.approx(alone.pose.x_m, abs=1e-6)
     assert np.allclose(beside.pose.covariance_m2, alone.pose.covariance_m2, rtol=1e-6)
     assert beside.localiser.base_report() == {
@@ -137,12 +144,12 @@ def test_base_that_errs_as_the_machine_does_takes_most_of_the_error(
 
 @pytest.mark.slow
 def test_base_with_another_error_does_no_harm_where_nothing_is_shared(
-    made: Drive, readings: list[Reading], monkeypatch: pytest.MonkeyPatch
+    made: Drive, readings: list[Reading], monkeypatch: pytest.MonkeyPatch, stated: None
 ) -> None:
     monkeypatch.setattr(SiteShareEstimator, "share", 0.0)
     wild = corrections(lambda t: (5 * math.cos(t / 5), -4.0), 60)
     located = locate(with_base(machine()), mixed(readings, wild))
-    assert error_m(located, made) == pytest.approx(error_m(usual("alone"), made), rel=1e-6)
+    assert error_m(located, made) == pytest.approx(error_m(locate(machine(), readings), made), rel=1e-6)
     assert located.localiser.base_report()["why_not"].startswith("its errors are not those of this machine")
 
 
