@@ -151,6 +151,8 @@ def check_positions(data: Sequence[SensorData], *, is_barred: bool) -> Finding:
     kinds, problem, advice = {sensor.kind for sensor in there}, "", ""
     if not any(_is_receiver(sensor) for sensor in there):
         problem, advice = "no usable GPS fixes", "add a receiver, or `sitegrid log run --set start=[x,y,heading]`"
+    elif unread := [one.sensor.name for one in data if one.problem]:
+        problem, advice = f"{unread[0]} cannot be read", "mend its file, or leave it out by `use = false`"
     elif is_barred or any(_stands(one) for one in data):
         problem, advice = "readings do not fit together", "mend the stamps and places that are named above"
     if problem:
