@@ -84,7 +84,7 @@ BAD = {
     '[[fleet]]\nname = "a"\nroutes = ["north"]': r"\[\[fleet\]\] \"a\": routes: there is no 'north'; there are west",
     '[[fleet]]\nname = "A b"\nroutes = ["west"]': "name: 'A b' is not a name",
     '[[fleet]]\nname = "a"\nroutes = ["west"]\ncount = 0': "count: 0 is not between 1 and 1000",
-    '[[fleet]]\nname = "a"\nroutes = ["west"]\nmodel = "tank"': "\"a\": .*there is no 'tank'; known: dump_truck, skid_loader, wheel",
+    '[[fleet]]\nname = "a"\nroutes = ["west"]\nmodel = "tank"': "\"a\": .*there is no 'tank'; known: dump_truck, skid",
     '[[fleet]]\nname = "a"\nroutes = ["west"]\ngps = [4]': '"a": .*gps.*4',
     '[[fleet]]\nname = "a"\nroutes = ["west"]\n[[fleet]]\nname = "a"\nroutes = ["east"]': "two machines are named 'a'",
     '[[fault]]\nmachine = "loader-9"': "fault: there is no machine 'loader-9'; there are loader-1",
