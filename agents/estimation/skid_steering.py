@@ -11,9 +11,7 @@ from agents.estimation.plausibility import AXLES_M
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Odometry, Reading, WheelReading
 
-ON_SPOT_RAD = (
-    1.5  # so much of a turn on the spot, without a pause, shows it; a loader that bends at a stand turns by 0.6
-)
+ON_SPOT_RAD = 1.5  # of a turn on the spot, without a pause, shows it; a loader that bends at a stand turns by 0.6
 SPOT_SHARE = 0.25  # of the wheelbase: a turn of a smaller radius is on the spot
 # Angle between an axle's wheels and its way, in a turn. A tyre resists by about ten times its square: 0.01 of the load.
 MAX_SIDE_RAD = 0.03

@@ -119,8 +119,8 @@ class VarianceFactor:
     _stamp_ns: int = field(default=0, repr=False)
 
     def note(self, result: Conditioned) -> None:
-        """Follow an innovation (k,) that the filter accepted: others may be the filter's fault, or outliers."""
-        if not (result.accepted and math.isfinite(result.nis)):
+        """Follow a finite innovation (k,) that was accepted: others may be the filter's fault, or outliers."""
+        if not result.accepted:
             return
         stamp_ns = result.belief.stamp_ns
         passed_s = min(max(stamp_ns - (self._stamp_ns or stamp_ns), 0) * 1e-9, PAUSE_S)
