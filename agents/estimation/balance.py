@@ -24,19 +24,11 @@ from agents.estimation.attitude import SlopeFilter
 from agents.ground_speed import GroundSpeed
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import (
-    Articulation,
-    Brake,
-    BrakeForce,
-    Imu,
-    Payload,
-    Reading,
-    Torque,
-)
+from protocol.machine.readings import Articulation, Brake, BrakeForce, Imu, Payload, Reading, Torque
 from protocol.units import GRAVITY_MPS2
 
 STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
-MAX_PAUSE_S = 1.0  # of the IMU, or of the wheels' readings, before their last values no longer count
+MAX_PAUSE_S = 1.0  # of the IMU, or of readings of wheels and brakes, before their last values no longer count
 MAX_GROUND_NS = 2_000_000_000  # and so of a speed over ground, of which there may be one a second
 SLOW_MPS = 2.0  # a slower machine pitches by its own forces rather than by the ground
 MOVES_MPS = 0.2  # a slower machine is held by friction and brakes, nobody knows which way
@@ -229,7 +221,7 @@ class Balancer:
             torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
             wheels_s=self._wheels_s() if dead_reckoning.wheels.is_known else math.inf,
             mass_kg=self.mass_kg,
-            brake=max([brake.applied for brake in self._brakes.values()] or [0.0 if self._brake_forces else math.nan]),
+            brake=self._brake(),
         )
 
     def _unseen_n(self, speed_mps: float) -> float:
@@ -237,8 +229,17 @@ class Balancer:
         if abs(speed_mps) < MOVES_MPS:
             return 0.0
         drag_n = AIR_KGPM3 * self._machine.drag_area_m2 * speed_mps**2 / 2
-        brakes_n = sum(brake.force_n for brake in self._brake_forces.values())
+        brakes_n = sum(brake.force_n for brake in self._brake_forces.values() if self._is_fresh(brake))
         return math.copysign(drag_n + self._machine.drive_friction_n + brakes_n, speed_mps)
+
+    def _brake(self) -> float:
+        """How much of a brake is applied; NaN where no sensor of brakes speaks any more."""
+        applied = [brake.applied for brake in self._brakes.values() if self._is_fresh(brake)]
+        reads_force = any(map(self._is_fresh, self._brake_forces.values()))
+        return max(applied, default=0.0 if reads_force else math.nan)
+
+    def _is_fresh(self, reading: Reading) -> bool:
+        return self._imu_ns - reading.stamp_ns < MAX_PAUSE_S * 1e9
 
     def _fresh(self, ground: GroundSpeed | None) -> GroundSpeed | None:
         return ground if ground and self._imu_ns - ground.stamp_ns < MAX_GROUND_NS else None

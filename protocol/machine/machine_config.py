@@ -210,7 +210,7 @@ def sensor_lines(sensor: SensorConfig) -> list[str]:
 
 
 def machine_toml(machine: MachineConfig) -> str:
-    """A machine and its sensors as TOML, as an agent's configuration has them; drag and friction where they are known."""
+    """A machine and its sensors as TOML, as an agent's configuration has them; drag and friction where known."""
     unknown = {name for name in ("drag_area_m2", "drive_friction_n") if not getattr(machine, name)}
     known = [line for line in plain_lines(machine) if line.partition(" ")[0] not in unknown]
     lines = ["[machine]", *known]

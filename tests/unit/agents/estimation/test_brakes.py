@@ -64,3 +64,12 @@ def test_drag_and_friction_of_the_drive_are_no_resistance_of_the_ground(body: di
     speed_mps = 12.0
     held_n = body.get("drive_friction_n") or AIR_KGPM3 * body["drag_area_m2"] * speed_mps**2 / 2
     assert plain.c_rr - stated.c_rr == pytest.approx(held_n / (vehicle.mass_kg * GRAVITY_MPS2), rel=0.05)
+
+
+def test_a_brake_sensor_that_falls_silent_holds_the_machine_back_no_longer() -> None:
+    vehicle = machine()
+    vehicle = replace(vehicle, sensors=(*vehicle.sensors, BRAKES[1]))
+    made = drive([Leg(2), Leg(4, 0.5), Leg(12)], vehicle, ground=Ground(C_RR)).readings
+    seen = BrakeForce("retarder", made[len(made) // 2].stamp_ns, 3_000.0)
+    readings = sorted([*made, seen], key=lambda reading: reading.stamp_ns)
+    assert EstimatorRun(vehicle).feed(readings).last.c_rr == pytest.approx(C_RR, abs=0.005)
