@@ -13,7 +13,6 @@ from lab.benchmark.entries import CONFIDENCE, VALUES, is_samples, read_map, read
 from lab.benchmark.recordings import SAMPLES_FILE, BenchDrive, Edition, require_made
 from lab.calibration.drives import Scene, scene
 from lab.calibration.solving import served
-from lab.campaign.figures import half_width
 from lab.campaign.true_maps import region_of, true_layers, window_of
 from lab.campaign.workers import each
 from lab.maps.cases import CELL_M
@@ -24,7 +23,7 @@ from mapserver.layers.gap_filling import AREA_LAYERS, Area
 from protocol.arrays import Bools
 from protocol.errors import ConfigError
 from protocol.site.ground_classes import UNKNOWN, resistance_class
-from sitegrid.proof.figures import Report, Row, root_mean_square, rounded
+from sitegrid.proof.figures import Report, Row, half_width, root_mean_square, rounded
 from sitegrid.proof.map_score import border_distance, driven_cells, score_driven
 
 # The map server with its own calibration of machines: what is known, and with its gaps filled.

@@ -2,24 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from scipy import stats
-
-from protocol.arrays import Floats
-from sitegrid.proof.figures import CONFIDENCE, Row
-
-
-def half_width(sample: Floats) -> float | None:
-    """Half-width of the 95 % interval of a mean, by Student's t; None of a single value."""
-    n = len(sample)
-    if n < 2:
-        return None
-    quantile = float(stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1))
-    return quantile * float(sample.std(ddof=1)) / math.sqrt(n)
+from sitegrid.proof.figures import Row
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from lab.calibration import drives as fleet_drives
 from lab.campaign.experiment import Runner, replay_task
-from lab.campaign.figures import half_width, judge
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.campaign.summary import column, mean, median, strict, summary
 from lab.cooperation import live, scores
@@ -20,7 +20,7 @@ from lab.cooperation.maps import central_tasks
 from lab.cooperation.network import FIGURES, SHARE_PCT
 from lab.cooperation.scores import ROUNDS, Judging, Scored, minutes_until
 from protocol.errors import SitegridError
-from sitegrid.proof.figures import Report, Row, rounded
+from sitegrid.proof.figures import Report, Row, half_width, rounded
 
 WHOLE_S, LEAST_S = 1200.0, 300.0  # of a lone machine's recording
 ALONE = "one"

@@ -21,14 +21,14 @@ from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import LAG_S
 from lab.campaign.experiment import Experiment, Runner, Task, replay_task
-from lab.campaign.figures import half_width, judge
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.campaign.recordings import PlannedDrive, Setup, track_file
 from lab.ground.comparison import Comparison, compare, pool
 from lab.ground.figures import by_border, c_rr_bias, figures, soils
 from lab.ground.truth import TrueGround, true_ground
 from protocol.arrays import Table
-from sitegrid.proof.figures import Report, Row, rounded
+from sitegrid.proof.figures import Report, Row, half_width, rounded
 from sitegrid.proof.tracks import LoadTrack, read_load_track
 
 LOADING = Setup("loading", ("west", "east", "middle", "yard"), gps=(1, 2), imu=(3,))

@@ -14,7 +14,7 @@ import numpy as np
 from lab.calibration import drives
 from lab.calibration.drives import scene
 from lab.campaign.experiment import Runner
-from lab.campaign.figures import half_width, judge
+from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.campaign.recordings import PAPER, PlannedDrive
 from lab.campaign.true_maps import pooled_by_border, region_of, true_layers
@@ -31,7 +31,7 @@ from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from protocol.errors import SitegridError
 from protocol.site.ground_classes import resistance_class
 from sitegrid.logs.replay import Score
-from sitegrid.proof.figures import Report, Row, rounded
+from sitegrid.proof.figures import Report, Row, half_width, rounded
 from sitegrid.proof.map_score import driven_cells, score, score_driven
 
 LEAST_S = 60.0  # of a recording: a heading is known after some seconds, calibration needs ground that is driven again

@@ -16,7 +16,6 @@ import numpy as np
 
 from agents.positioning import Positioning
 from lab.campaign.experiment import Experiment, Runner, Task, replay_task
-from lab.campaign.figures import half_width
 from lab.campaign.recordings import PAPER, PlannedDrive, RecordedDrive, Setup
 from lab.positions.configurations import Configuration
 from lab.positions.substitution import gps_errors, true_motion, with_gps_errors
@@ -25,7 +24,7 @@ from protocol.machine.machine_config import MachineConfig
 from sim.sensors.presets import GpsNoise
 from sitegrid.logs.replay import Score, replay, score
 from sitegrid.logs.sensors import UnsupportedError, select
-from sitegrid.proof.figures import Report, Row, rounded
+from sitegrid.proof.figures import Report, Row, half_width, rounded
 
 Scores = Mapping[Configuration, Sequence[Score]]  # of each row those of its drives
 MEANS = (

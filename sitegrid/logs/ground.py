@@ -19,8 +19,9 @@ from protocol.machine.readings import Reading
 from protocol.machine.samples import joined
 from sitegrid.logs.log_truth import KnownArea
 from sitegrid.logs.replay import spans
-from sitegrid.proof.figures import Row, root_mean_square, rounded
+from sitegrid.proof.figures import Row, half_width, root_mean_square, rounded
 
+AWAY_NS = 5 * 10**9  # without a sample inside: the next one begins another pass
 # What is compared: the columns of a sample, and of its variance.
 FIGURES = {
     "c_rr": ("c_rr", "c_rr_var"),
@@ -39,8 +40,10 @@ def samples_of(log: LogFolder, options: LocalisationConfig, readings: Sequence[R
 def compare(samples: Table, areas: Sequence[KnownArea]) -> list[Row]:
     """A row per area and figure that is known of it.
 
-    mean: weighted by metres driven; off: mean minus known; rms: of the samples' errors; std: rms of the standard
-    deviations that they state. Samples count that lie inside by more than the standard deviation of their position.
+    mean: weighted by metres driven; off: mean minus known; spread: standard deviation of the samples; mean_95: half
+    the 95 % interval of the mean, by how far single passes are apart, None of one pass; rms: of the samples' errors;
+    std: rms of the standard deviations that they state. Samples count that lie inside by more than the standard
+    deviation of their position.
     """
     rows = []
     for area in areas:
@@ -59,12 +62,16 @@ def _row(area: str, figure: str, known: float, inside: Table) -> Row:
     column, variance = FIGURES[figure]
     measured = inside[np.isfinite(inside[column])]
     values, metres = measured[column].astype(float), measured["distance_m"].astype(float)
+    passes = np.split(np.arange(len(measured)), np.flatnonzero(np.diff(measured["stamp_ns"]) > AWAY_NS) + 1)
+    passes = [one for one in passes if metres[one].sum()]
     mean = float(np.average(values, weights=metres)) if metres.sum() else None
     figures = {
         "mean": mean,
         "off": mean - known if mean is not None else None,
+        "spread": float(values.std()) if len(values) else None,
+        "mean_95": half_width(np.array([np.average(values[one], weights=metres[one]) for one in passes])),
         "rms": root_mean_square(values - known),
         "std": root_mean_square(np.sqrt(measured[variance].astype(float))),
     }
-    counted = {"samples": len(measured), "metres": round(float(metres.sum()), 1)}
+    counted = {"samples": len(measured), "passes": len(passes), "metres": round(float(metres.sum()), 1)}
     return {"area": area, "figure": figure, "known": known, **rounded(figures, 4), **counted}

@@ -9,6 +9,7 @@ import math
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy import stats
 
 from protocol.arrays import Floats
 
@@ -21,6 +22,15 @@ Report = dict[str, Any]  # the same, and lists of rows
 def root_mean_square(values: Floats) -> float:
     """Root mean square, NaN of nothing."""
     return float(np.sqrt((values**2).mean())) if len(values) else math.nan
+
+
+def half_width(sample: Floats) -> float | None:
+    """Half-width of the 95 % interval of a mean, by Student's t; None of a single value."""
+    n = len(sample)
+    if n < 2:
+        return None
+    quantile = float(stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1))
+    return quantile * float(sample.std(ddof=1)) / math.sqrt(n)
 
 
 def rounded(value: Value, digits: int, **other_digits: int) -> Value:

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from lab.campaign.figures import Goal, half_width, judge
+from lab.campaign.figures import Goal, judge
+from sitegrid.proof.figures import half_width
 
 
 def test_interval_of_a_mean_holds_it_19_times_in_20():

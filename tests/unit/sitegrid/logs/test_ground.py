@@ -30,13 +30,20 @@ def samples(*places: tuple[float, float]):
 
 
 def test_samples_that_are_surely_inside_are_compared_with_what_is_known_of_an_area() -> None:
-    """The third is inside by less than its standard deviation of 0.5 m, the fourth outside."""
+    """The third is inside by less than its standard deviation of 0.5 m, the fourth outside; the second is a second pass."""
     rows = samples((5, 5), (2, 8), (0.4, 5), (12, 5))
-    rows["c_rr"][1], rows["distance_m"][1] = 0.06, 1.0
+    rows["c_rr"][1], rows["distance_m"][1], rows["stamp_ns"][1] = 0.06, 1.0, 60 * 10**9
     resistance, gradient = compare(rows, [PAD])
     named = {"area": "pad", "figure": "c_rr", "known": 0.02}
-    figures = {"mean": 0.05, "off": 0.03, "rms": round(math.sqrt((0.01**2 + 0.04**2) / 2), 4), "std": 0.01}
-    assert resistance == {**named, **figures, "samples": 2, "metres": 1.5}
+    figures = {
+        "mean": 0.05,
+        "off": 0.03,
+        "spread": 0.015,
+        "mean_95": round(12.7062 * 0.015, 4),
+        "rms": round(math.sqrt((0.01**2 + 0.04**2) / 2), 4),
+        "std": 0.01,
+    }
+    assert resistance == {**named, **figures, "samples": 2, "passes": 2, "metres": 1.5}
     assert (gradient["figure"], gradient["mean"], gradient["off"], gradient["std"]) == ("grade_east", 0.1, 0.0, 0.001)
 
 
