@@ -158,7 +158,7 @@ class Positioning:
             taken.append((reading, self._sensors[reading.sensor]))
         if not taken:
             return None
-        heard = self.judge.heard(taken, self.dead_reckoning) if self.judge else taken
+        heard = self.judge.heard(taken, self.dead_reckoning, self.localiser.variance_factor) if self.judge else taken
         if self.judge and (fall := self.judge.fall):
             self.judge.fall = None
             if self.localiser.is_proven and fall.is_headed:

@@ -100,6 +100,11 @@ class Receivers(ModalSensors[Fix]):
         """States of the slow error of a receiver; None where the filter has none."""
         return self._layout.gps_error(self._states[receiver]) if receiver in self._states else None
 
+    def variance_factor(self, receiver: str) -> float:
+        """What the variance that a receiver states is taken times [-]."""
+        monitor = self._monitors.get(receiver)
+        return monitor.variance_factor if monitor else 1.0
+
     @property
     def machine_share(self) -> float | None:
         """Share of the slow variance that all receivers of the machine have in common; None of fewer than two."""
@@ -118,7 +123,7 @@ class Receivers(ModalSensors[Fix]):
 
     def fix(self, gps: Gps, reckoned: DeadReckonedPose) -> Fix:
         """A reading in `map`, with the variances that are configured, else its own, as its innovations correct them."""
-        sensor, factor = self._sensors[gps.sensor], self._monitors[gps.sensor].variance_factor
+        sensor, factor = self._sensors[gps.sensor], self.variance_factor(gps.sensor)
         x, y, _ = self._projection.to_map(gps.lat_deg, gps.lon_deg, gps.height_m)
         stated = (gps.var_e_m2, gps.var_n_m2)
         variance = np.array([sensor.std["position"] ** 2] * 2 if "position" in sensor.std else stated)

@@ -146,6 +146,10 @@ class Localiser:
         """How consistent the filter is with each GPS receiver, of those with enough fixes."""
         return self._tracker.receivers.consistency
 
+    def variance_factor(self, receiver: str) -> float:
+        """What the variance that a receiver states is taken times [-]."""
+        return self._tracker.receivers.variance_factor(receiver)
+
     def slow_error_m(self, receiver: str) -> Floats:
         """The believed slow error of a receiver (2,), east and north [m]; zeros where it is no state."""
         return self._tracker.slow_error_m(receiver)

@@ -6,7 +6,7 @@ those of the accelerometer the other way round needs no fixes to be judged. One 
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -124,8 +124,11 @@ class WheelJudge:
         imu = {self._imu: OTHER_WAY} if self._other_way else {}
         return {name: fault.value for name, fault in self.faults.items()} | imu
 
-    def heard(self, readings: list[Sensed], reckoned: DeadReckoning) -> list[Sensed]:
-        """Judge by the readings of one stamp, before dead reckoning takes them; returns those that count."""
+    def heard(self, readings: list[Sensed], reckoned: DeadReckoning, factor_of: Callable[[str], float]) -> list[Sensed]:
+        """Judge by the readings of one stamp, before dead reckoning takes them; returns those that count.
+
+        factor_of: what the variance that a receiver states is to be taken times [-], where that is more than it says.
+        """
         self._angle_rad = angle_rad = self._before_rad + reckoned.angle_rad
         for reading, sensor in readings:
             if isinstance(reading, Imu):
@@ -135,7 +138,7 @@ class WheelJudge:
                 if sensor.provides("speed"):
                     self._roll(reading, sensor, angle_rad)
             elif isinstance(reading, Gps | GpsVelocity):
-                self._place(reading, sensor, angle_rad)
+                self._place(reading, sensor, angle_rad, math.sqrt(max(factor_of(reading.sensor), 1.0)))
         self._stand(readings[0][0].stamp_ns, reckoned)
         return [one for one in readings if one[0].sensor not in self.faults] if self.faults else readings
 
@@ -204,8 +207,8 @@ class WheelJudge:
             if shown < 0 and not self._other_way:
                 self._condemn(name, Fault.REVERSED, Fall(0.0, 0.0, is_headed=False))
 
-    def _place(self, reading: Gps | GpsVelocity, sensor: SensorConfig, angle_rad: float) -> None:
-        """Compare each wheel sensor with a receiver."""
+    def _place(self, reading: Gps | GpsVelocity, sensor: SensorConfig, angle_rad: float, worse: float) -> None:
+        """Compare each wheel sensor with a receiver, whose standard deviation is so many times worse than it says."""
         now_ns, (ahead_m, left_m, _) = reading.stamp_ns, sensor.mount.xyz_m
         fix_m = self._integrated(reading) if isinstance(reading, GpsVelocity) else self._fixed(reading)
         if fix_m is None:
@@ -218,7 +221,7 @@ class WheelJudge:
             lever_m = complex(ahead_m, left_m)
             now = Place(now_ns, fix_m, wheel.place_m, wheel.distance_m, wheel.rolled_m, angle_rad, lever_m)
             begin = stretches.begin or now
-            if run := stretches.add(now, _std_m(reading, sensor, (now_ns - begin.stamp_ns) * 1e-9)):
+            if run := stretches.add(now, worse * _std_m(reading, sensor, (now_ns - begin.stamp_ns) * 1e-9)):
                 self._note(name, run, now)
 
     def _fixed(self, fix: Gps) -> complex | None:

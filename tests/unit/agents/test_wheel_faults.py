@@ -140,7 +140,7 @@ def verdicts(vehicle: MachineConfig, readings: Sequence[Reading]) -> list[tuple[
     said: list[tuple[float, dict[str, str]]] = [(0.0, {})]
     for _, same in groupby(sorted(readings, key=lambda r: r.stamp_ns), key=lambda r: r.stamp_ns):
         (group,) = by_stamp(same)
-        for reading, sensor in judge.heard([(r, vehicle.sensor(r.sensor)) for r in group], reckoned):
+        for reading, sensor in judge.heard([(r, vehicle.sensor(r.sensor)) for r in group], reckoned, lambda _: 1.0):
             reckoned.update(reading, sensor)
         if judge.problems != said[-1][1]:
             said.append((seconds(group[0]), judge.problems))
