@@ -7,7 +7,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy starts them: small matrices, and tests side by side
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each process that a test starts compiles all sources
 
-import fcntl
 import signal
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -39,21 +38,10 @@ def root() -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_kernels() -> None:
-    """Compile Numba's kernels, or read them from their cache: once on a fresh clone, and no single test pays for it."""
-    from mapserver.change.detection import ChangeConfig, cuts
-    from mapserver.config import ServerConfig
-    from mapserver.server import warm_up
-    from sim.worlds.fast import FastWorld
-    from tests.unit.mapserver.data import NOW_NS, folded, samples
-    from tests.unit.sim.planes import LOADER, idle, placed, plane
+    """Compile Numba's kernels, or read them from their cache: no single test pays for it."""
+    from tests.kernels import compile_all
 
-    with (ROOT / "pyproject.toml").open("rb") as locked:
-        fcntl.flock(locked, fcntl.LOCK_EX)  # of several processes of tests, one compiles and the others wait
-        warm_up(ServerConfig())
-        (pages,) = folded(samples(2, stamp_ns=[NOW_NS, NOW_NS + 10**12], c_rr=[0.01, 0.3])).pages([(0, 0)])
-        cuts(pages, ChangeConfig())
-        with placed(FastWorld, plane(0), LOADER) as world:
-            idle(world, 0.01)
+    compile_all(from_the_end=os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0")
 
 
 @pytest.fixture(scope="session")

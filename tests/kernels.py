@@ -1,0 +1,75 @@
+"""Numba's kernels, compiled once on a fresh clone, though several processes of tests begin at the same time.
+
+One begins with roads and the other with the simulator's world; whoever comes second to a part reads it from the cache.
+"""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from mapserver.change import detection
+from mapserver.config import ServerConfig
+from mapserver.evidence import fold_kernels, grid
+from mapserver.fleet import stays
+from mapserver.ingest import batches, block_credit
+from mapserver.journal import records
+from mapserver.query import road_maps, routes
+from sim.worlds import fast
+from tests.unit.mapserver.data import NOW_NS, folded, samples
+from tests.unit.sim.planes import LOADER, idle, placed, plane
+
+FOLD = ServerConfig().fold
+TWO = samples(2, stamp_ns=[NOW_NS, NOW_NS + 10**12], c_rr=[0.01, 0.3])
+
+
+def pages() -> Any:
+    """Of a fold, which all parts of the first half begin with."""
+    (folded_pages,) = folded(TWO).pages([(0, 0)])
+    return folded_pages
+
+
+def changes() -> None:
+    detection.cuts(pages(), detection.ChangeConfig())
+    detection.known(pages())
+
+
+def corrections() -> None:
+    stays.stays(samples(2, applied_zero=0.01), 1.0)
+
+
+def world() -> None:
+    with placed(fast.FastWorld, plane(0), LOADER) as placed_world:
+        idle(placed_world, 0.01)
+
+
+# The module whose kernels they are, and whether they begin with a fold.
+PARTS: tuple[tuple[ModuleType, bool, Callable[[], object]], ...] = (
+    (road_maps, True, lambda: road_maps.warm_up(FOLD)),
+    (grid, True, lambda: grid.warm_up(FOLD)),
+    (block_credit, True, lambda: block_credit.warm_up(FOLD)),
+    (detection, True, changes),
+    (stays, False, corrections),
+    (batches, False, batches.warm_up),
+    (records, False, records.warm_up),
+    (routes, False, routes.warm_up),
+    (fast, False, world),
+)
+
+
+def compile_all(*, from_the_end: bool) -> None:
+    """Compile all kernels that a process of tests calls, or read them."""
+    for module, folds, compile_part in reversed(PARTS) if from_the_end else PARTS:
+        if folds:
+            _alone(fold_kernels, pages)
+        _alone(module, compile_part)
+
+
+def _alone(module: ModuleType, compile_part: Callable[[], object]) -> None:
+    """While no other process compiles the same."""
+    with Path(str(module.__file__)).open("rb") as locked:
+        fcntl.flock(locked, fcntl.LOCK_EX)
+        compile_part()
