@@ -132,7 +132,7 @@ def address(cluster: distributed.LocalCluster) -> str:
     return str(cluster.scheduler_address).replace("tcp://", "dask://")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_makes_the_same_store(archive: Path, expected: dict[str, str], tmp_path: Path, dask) -> None:
     with distributed.Client(dask) as client:
         pids = set(client.run(os.getpid).values())

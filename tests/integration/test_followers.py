@@ -121,6 +121,7 @@ def version_of(client: Client, sender: Sender, run: Followed, follower: str) -> 
     return decode_tiles(sender.ask(keys.follower_query(run.site, follower, "tiles"), "").payload.to_bytes()).version
 
 
+@pytest.mark.nightly
 def test_two_followers_have_the_map_of_the_server_through_distrust_and_correction(run: Followed, sender: Sender):
     server = run.serve()
     for machine in "abcabc":

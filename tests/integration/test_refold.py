@@ -27,14 +27,15 @@ from tests.unit.mapserver.data import same
 
 pytestmark = pytest.mark.processes
 
-ROWS = 3000  # of 100 samples: their fold takes a good part of a second
+ROWS, FEW_ROWS = 3000, 500  # of 100 samples: a fold of the many takes a good part of a second
 
 
 @pytest.fixture
-def site(site: SiteRun) -> SiteRun:
+def site(site: SiteRun, request: pytest.FixtureRequest) -> SiteRun:
     """A site whose store has samples of ten machines, and no snapshot."""
     (site.folder / "server.toml").write_text("[store]\narchive_after_h = 0.0\n[calibration]\nautomatic = false\n")
-    write_store(site.folder / "store", load_site(site.site_file), ROWS, tail_rows=ROWS)
+    rows = getattr(request, "param", ROWS)
+    write_store(site.folder / "store", load_site(site.site_file), rows, tail_rows=rows)
     site.start_router()
     return site
 
@@ -113,6 +114,7 @@ def given(client: Client, machine: str, wait_s: float = 0.0) -> None:
         assert error.reason == Refusal.AFTER_TIMEOUT  # noqa: PT017 # where there is none it is as good
 
 
+@pytest.mark.parametrize("site", [FEW_ROWS], indirect=True)
 def test_a_server_killed_between_decision_and_map_comes_back_without_the_machine(site: SiteRun):
     server = serve(site)
     with site.connect() as client:

@@ -19,6 +19,7 @@ from tests.takeover.site import FENCED, SITE, TakeOverSite, kill, round_of, stop
 pytestmark = pytest.mark.processes
 
 
+@pytest.mark.nightly
 def test_a_standby_takes_over_and_nothing_is_lost_double_or_acknowledged_under_an_old_epoch(
     tmp_path: Path, database: Database
 ) -> None:

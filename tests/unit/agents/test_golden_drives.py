@@ -181,6 +181,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "base": with_base,
 }
 ROWS, DIGITS = 6, 8
+AT_NIGHT = ("loader, paper ekf", "modes, paper")  # the profile has another drive by day, and modes have one
 
 
 def figures(case: Case) -> dict[str, Any]:
@@ -221,7 +222,9 @@ def differs(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in AT_NIGHT)) for name in CASES]
+)
 def test_a_drive_gives_the_figures_that_it_gave(name: str) -> None:
     expected, given = json.loads(FIGURES.read_text(encoding="utf-8"))[name], figures(CASES[name]())
     assert given.keys() == expected.keys()

@@ -9,7 +9,7 @@ from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity, Reading
-from tests.unit.agents.drives import S_BEND, SITE, Drive, changed_sensor, drive, fix, machine
+from tests.unit.agents.drives import S_BEND, SITE, Drive, changed_sensor, drive, fix, machine, thinned
 
 CONFIG, SETTLE_S = HoldoutConfig(period_s=5.0, off_s=1.0), 10.0
 CHEAP = PipelineConfig(LocalisationConfig(filter="ekf"))
@@ -22,7 +22,8 @@ def vehicle() -> MachineConfig:
 
 @pytest.fixture(scope="module")
 def made(vehicle: MachineConfig) -> Drive:
-    return drive(S_BEND, vehicle)
+    made = drive(S_BEND, vehicle)
+    return replace(made, readings=thinned(made.readings))
 
 
 def run(

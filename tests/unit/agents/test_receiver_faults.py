@@ -89,6 +89,7 @@ FAULTS: dict[str, tuple[Fault, float]] = {  # of public reports by users of rece
     "frozen from the start": (frozen(2.0, 25.0), 25.0),
     "held": (held, 0.0),
 }
+AT_NIGHT = ("off, and sure", "converging", "frozen from the start")
 
 
 @cache
@@ -140,7 +141,9 @@ def replayed(fault: str = "") -> Outcome:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault", [pytest.param(name, marks=[pytest.mark.nightly] * (name in AT_NIGHT)) for name in FAULTS]
+)
 def test_positions_recover_and_no_sample_is_far_off(fault: str) -> None:
     outcome, without, good_s = replayed(fault), replayed(), FAULTS[fault][1]
     later = outcome.seconds > good_s + SETTLED_S

@@ -43,7 +43,7 @@ SCENARIOS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", ["paper_site", pytest.param("haul_road", marks=pytest.mark.nightly)])
 def test_recordings_in_pybullet_keep_their_bytes(name: str) -> None:
     """The wheel loaders' tours, and a cycle with stops, payloads and reversing."""
     known = SCENARIOS[name]

@@ -20,8 +20,8 @@ def paper(world: str) -> Driven:
 
 @pytest.fixture(scope="module")
 def quarry() -> Driven:
-    """Trucks and a loader at work for eight minutes."""
-    return drive(SimConfig(scenario="haul_road", world="fast", seed=1), 480.0)
+    """Trucks and a loader at work for five minutes."""
+    return drive(SimConfig(scenario="haul_road", world="fast", seed=1), 300.0)
 
 
 @pytest.mark.parametrize("steer", [0.1, -0.4, 0.6])
@@ -76,7 +76,7 @@ def test_work_cycles_load_reverse_dump_and_wait_on_their_routes(quarry: Driven) 
         assert np.ptp(mass) < 1.0
     still = (abs(speed[:, loader]) < 0.02).sum() * 0.1
     cycles = (np.diff((payload[:, loader] > 2000).astype(int)) == 1).sum()
-    assert cycles >= 4
+    assert cycles >= 2
     assert still > (cycles - 1) * 10.0  # 6 s at the pile and 4 s at the hopper
 
 
