@@ -9,8 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import zenoh
 
 from protocol.queries.answers import MapInfo, Region
+from protocol.wire import keys
+from protocol.wire.codec import decode_pose
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.client import Client
@@ -61,11 +64,29 @@ def shift(tmp_path_factory: pytest.TempPathFactory) -> Shift:
                 "agent": killed(client, agent, lambda: run.start_agent(run.configs[0]), agent.name),
                 "router": killed(client, router, run.start_router),
             }
+            drive_on(client, run)
             driving.send(signal.SIGTERM)  # machines end with it
             run.delivered()
             info, region = client.info(), client.region((0, 0, 200, 150), ["resistance", "visits"])
         assert run.server.stop() == 0
         return Shift(pids, during, kills, info, region, run.audit())
+
+
+def drive_on(client: Client, run: SiteRun) -> None:
+    """Until all machines hear the simulator again: that it ends it says once."""
+    first_ns, newest_ns = dict[str, int](), dict[str, int]()
+
+    def note(sample: zenoh.Sample) -> None:
+        machine = keys.machine_of(str(sample.key_expr))
+        newest_ns[machine] = decode_pose(sample.payload.to_bytes()).stamp_ns
+        first_ns.setdefault(machine, newest_ns[machine])
+
+    subscriber = client.session.declare_subscriber(keys.poses_all(run.site), note)
+    until(
+        lambda: len(first_ns) == 3 and all(newest_ns[name] > ns + 10**10 for name, ns in first_ns.items()),
+        "poses of all machines",
+    )
+    subscriber.undeclare()
 
 
 def killed(client: Client, victim: Child, start: Callable[[], Child], machine: str = "") -> Kill:
