@@ -102,8 +102,7 @@ class Receivers(ModalSensors[Fix]):
 
     def variance_factor(self, receiver: str) -> float:
         """What the variance that a receiver states is taken times [-]."""
-        monitor = self._monitors.get(receiver)
-        return monitor.variance_factor if monitor else 1.0
+        return self._monitors[receiver].variance_factor if receiver in self._monitors else 1.0
 
     @property
     def machine_share(self) -> float | None:

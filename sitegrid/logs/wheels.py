@@ -28,7 +28,8 @@ def check_wheels(log: LogFolder, readings: Sequence[Sequence[Reading]]) -> Itera
     for stamp_ns, same in groupby(merge(*readings, key=stamped), key=stamped):
         first_ns = first_ns or stamp_ns
         (group,) = by_stamp(same)
-        for reading, sensor in judge.heard([(reading, sensors[reading.sensor]) for reading in group], reckoned):
+        heard = judge.heard([(reading, sensors[reading.sensor]) for reading in group], reckoned, lambda _: 1.0)
+        for reading, sensor in heard:
             reckoned.update(reading, sensor)
         judge.fall = None
         if stamp_ns - looked_ns >= LOOK_NS:
