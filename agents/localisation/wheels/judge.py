@@ -125,7 +125,7 @@ class WheelJudge:
         return {name: fault.value for name, fault in self.faults.items()} | imu
 
     def heard(self, readings: list[Sensed], reckoned: DeadReckoning, factor_of: Callable[[str], float]) -> list[Sensed]:
-        """Judge by readings of one stamp before dead reckoning has them; those that count. factor_of: of variances [-]."""
+        """Judge by readings of one stamp before dead reckoning has them; those that count. factor_of: of variances."""
         self._angle_rad = angle_rad = self._before_rad + reckoned.angle_rad
         for reading, sensor in readings:
             if isinstance(reading, Imu):
