@@ -5,19 +5,21 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import struct
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import zenoh
 
 from protocol.errors import LinkError, MessageError, QueryError, Refusal
-from protocol.queries.answers import MapInfo, MapVersion
+from protocol.queries.answers import GroundChange, MachineState, MapInfo, MapVersion
 from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
 from protocol.site.site_config import MAX_EXTENT_M, Projection, SiteConfig
 from protocol.wire import keys
@@ -27,6 +29,7 @@ from sitegrid.asking import is_answered
 from sitegrid.client import Client
 from sitegrid.health import faults_of
 from sitegrid.listener import Listener
+from sitegrid.web.encoding import Cache
 from sitegrid.web.values import plain
 
 T = TypeVar("T")
@@ -37,7 +40,8 @@ HEARD_S = 1.5  # machines publish their poses several times a second
 MOST_POSES, TRACK_STEP_NS = 600, 10**9  # of a track: ten minutes of site time
 SILENT_S = 120.0  # a machine that said nothing for so long is left out
 THREADS = 8  # questions at once: more visitors wait for each other, not on the map server
-PAST_KEPT = 128  # maps of the past that are kept ready: a day by minutes has more, a slider moves by fewer
+PATIENT_THREADS = 4  # questions at once that may take seconds: these keep no other visitor waiting
+PAST_BYTES = 2**26  # of maps of the past that are kept ready: a hundred of a usual site, so that a slider moves
 
 
 class SiteFeed:
@@ -50,11 +54,11 @@ class SiteFeed:
         self.client, self.name = client, client.site
         self.tiles: dict[tuple[int, int], MapTile] = {}
         self.answer: TilesAnswer | None = None
-        self.state: dict[str, Any] = {}
-        self.state_text = "{}"
+        self.state_text = ""  # what pages are told; empty until the map server has answered
         self.is_away = False
         self.moved = asyncio.Condition()  # notified when tiles, poses or the state may be others
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=f"ask-{client.site}")
+        self._patient = ThreadPoolExecutor(PATIENT_THREADS, thread_name_prefix=f"much-{client.site}")
         self.watchers = 0
         self._task: asyncio.Task[None] | None = None
         self._looking: asyncio.Task[None] | None = None
@@ -66,12 +70,16 @@ class SiteFeed:
         self._health: Listener[Health] | None = None
         self._info: tuple[float, MapInfo] | None = None
         self._projection: Projection | None = None
-        self._past: OrderedDict[tuple[int, str, int], TilesAnswer] = OrderedDict()
+        self._poses_text: tuple[float, str] = -math.inf, ""
+        self._past: Cache[TilesAnswer] = Cache(PAST_BYTES, _tiles_bytes)
 
     async def ask(self, question: Callable[..., T], *arguments: Any, **named: Any) -> T:
         """Ask the map server from a thread: the client waits for its answer."""
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._threads, lambda: question(*arguments, **named))
+        return await _run(self._threads, question, *arguments, **named)
+
+    async def ask_for_much(self, question: Callable[..., T], *arguments: Any, **named: Any) -> T:
+        """As `ask`, for what takes the map server long: large areas, routes, the past."""
+        return await _run(self._patient, question, *arguments, **named)
 
     async def info(self, most_s: float = STATE_S) -> MapInfo:
         """State of the map, at most so old."""
@@ -93,11 +101,9 @@ class SiteFeed:
         if key in self._past:
             self._past.move_to_end(key)
             return self._past[key]
-        answer = await self.ask(self.client.tiles, as_of_ns=as_of_ns)
+        answer = await self.ask_for_much(self.client.tiles, as_of_ns=as_of_ns)
         if as_of_ns < info.stamp_ns - 60 * 10**9:  # samples that are a minute late are rare, and show after a while
-            self._past[key] = answer
-            while len(self._past) > PAST_KEPT:
-                self._past.popitem(last=False)
+            self._past.keep(key, answer)
         return answer
 
     def since(self, version: MapVersion | None) -> TilesAnswer | None:
@@ -119,6 +125,14 @@ class SiteFeed:
             plain({**asdict(pose), "age_s": round(now_s - came_s, 3), "faults": faults.get(pose.machine, [])})
             for pose, came_s in poses
         ]
+
+    def poses_text(self) -> str:
+        """The poses as pages are told of them, made once for all; empty for none."""
+        now_s = time.monotonic()
+        if now_s - self._poses_text[0] >= PERIOD_S:
+            poses = self.poses()
+            self._poses_text = now_s, json.dumps({"poses": poses}) if poses else ""
+        return self._poses_text[1]
 
     async def heard(self) -> None:
         """Wait until a machine says where it is, for a moment."""
@@ -153,7 +167,8 @@ class SiteFeed:
             if listener:
                 listener.close()
         self.client.close()
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for threads in (self._threads, self._patient):
+            threads.shutdown(wait=False, cancel_futures=True)
 
     async def _follow(self) -> None:
         """Ask again and again while somebody looks; ends when nobody does."""
@@ -172,8 +187,7 @@ class SiteFeed:
                 await self._notify()  # the map first
                 if began_s >= next_state_s:
                     next_state_s = began_s + STATE_S
-                    self.state = await self._ask_state()
-                    self.state_text = json.dumps(self.state)
+                    self.state_text = await self.ask(_live_text, self.name, *await self._ask_state())
                 self.is_away = False
             except (LinkError, QueryError, MessageError):
                 self.is_away, next_state_s = True, 0.0
@@ -199,17 +213,8 @@ class SiteFeed:
         self.tiles |= {(tile.x, tile.y): tile for tile in answer.tiles}
         self.answer = replace(answer, tiles=())
 
-    async def _ask_state(self) -> dict[str, Any]:
-        info = await self.info(0.0)
-        machines, changes = await self.ask(self.client.machines), await self.ask(self.client.changes)
-        return {
-            "name": self.name,
-            "stamp_ns": info.stamp_ns,
-            "first_ns": info.first_ns,
-            "boundaries": list(info.boundaries),
-            "trusted": {machine.name: machine.trusted for machine in machines},
-            "changes": [plain(change) for change in changes],
-        }
+    async def _ask_state(self) -> tuple[MapInfo, Any, Any]:
+        return await self.info(0.0), await self.ask(self.client.machines), await self.ask(self.client.changes)
 
     def tracks(self) -> dict[str, list[Pose]]:
         """Where each machine was while somebody looked, oldest first: some MOST_POSES poses."""
@@ -235,6 +240,27 @@ class SiteFeed:
             track = self._tracks.setdefault(pose.machine, deque(maxlen=MOST_POSES))
             if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
                 track.append(pose)
+
+
+async def _run(threads: ThreadPoolExecutor, question: Callable[..., T], *arguments: Any, **named: Any) -> T:
+    return await asyncio.get_running_loop().run_in_executor(threads, partial(question, *arguments, **named))
+
+
+def _live_text(name: str, info: MapInfo, machines: Iterable[MachineState], changes: Iterable[GroundChange]) -> str:
+    """What pages are told of a site whose map server answers."""
+    site = {
+        "name": name,
+        "stamp_ns": info.stamp_ns,
+        "first_ns": info.first_ns,
+        "boundaries": list(info.boundaries),
+        "trusted": {machine.name: machine.trusted for machine in machines},
+        "changes": [plain(change) for change in changes],
+    }
+    return json.dumps({"state": "live", "site": site})
+
+
+def _tiles_bytes(answer: TilesAnswer) -> int:
+    return sum(len(tile.planes) for tile in answer.tiles)
 
 
 def receive_health(key: str, data: bytes) -> Health:
@@ -274,8 +300,3 @@ def _is_newer(tile: MapTile, version: MapVersion) -> bool:
 def _site_of(info: MapInfo) -> SiteConfig:
     site = info.site
     return SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m, site.cell_m)
-
-
-def names(feeds: Iterable[SiteFeed]) -> list[str]:
-    """Names of sites."""
-    return [feed.name for feed in feeds]

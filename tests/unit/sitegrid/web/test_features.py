@@ -1,3 +1,4 @@
+import json
 from zlib import compress
 
 import numpy as np
@@ -9,6 +10,7 @@ from protocol.site.ground_classes import BOUNDARIES
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire.messages import Pose
 from sitegrid.web import features
+from sitegrid.web.encoding import pieces
 
 SITE = SiteConfig("pit", 49.01, 8.4)
 PROJECTION = Projection(SITE)
@@ -31,7 +33,7 @@ def test_areas_follow_the_edges_of_cells_with_their_holes():
     ground = np.full((64, 64), np.nan)
     ground[10:30, 20:40] = 0.02
     ground[15:20, 25:30] = 0.25
-    zones = features.zones(answer(ground, -1, 2), BOUNDARIES, PROJECTION)["features"]
+    zones = json.loads(b"".join(pieces(features.zones(answer(ground, -1, 2), BOUNDARIES, PROJECTION))))["features"]
     assert [zone["properties"]["name"] for zone in zones] == ["gravel", "sand"]
     gravel, sand = (zone["geometry"]["coordinates"] for zone in zones)
     assert len(gravel) == 2, "an outline and a hole"
