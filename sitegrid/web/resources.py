@@ -32,8 +32,9 @@ from sitegrid.web.resource import (
 from sitegrid.web.site import SiteFeed, frame
 from sitegrid.web.values import Parameters, bad
 
-MAX_VALUES = {"json": 6_000_000, "npz": 16_000_000}  # of a region, cells times layers: some 64 MB
-ROOM = Room(2 * MAX_VALUES["npz"])  # for regions of all visitors, values
+MAX_CELLS = {"json": 250_000, "npz": 4_000_000}  # of a region; 2 MB of text a layer
+MAX_VALUES = 16_000_000  # of a region, cells times layers: 64 MB
+ROOM = Room(2 * MAX_VALUES)  # for regions of all visitors, values
 TIMES = ("as_of", "minus")
 AGES = ("age_s", "changed_s")  # layers that change with the site's now
 
@@ -76,21 +77,19 @@ async def why(feed: SiteFeed, parameters: Parameters) -> Response:
 async def region(feed: SiteFeed, parameters: Parameters) -> Response:
     """Layers of the cells that a rectangle touches, or that lie in a polygon; or of larger cells."""
     kind = parameters.get("format", "json")
-    if kind not in MAX_VALUES:
+    if kind not in MAX_CELLS:
         raise bad(Refusal.OUT_OF_RANGE, "parameter `format`: json or npz")
     rest = {name: text for name, text in parameters.items() if name != "format"}
     query = parsed("region", rest, TIMES, ("polygon",))
     assert isinstance(query, RegionQuery)
     info_now, (west, south, east, north) = await feed.info(), vars(query.bounds).values()
     cell_m, layers = query.resolution_m or info_now.site.cell_m, len(query.layers) or len(info_now.layers)
-    number = round(layers * (east - west + cell_m) * (north - south + cell_m) / cell_m**2)
-    if number > (most := MAX_VALUES[kind]):
-        problem = f"a region of about {number} values; at most {most} as {kind}"
-        raise bad(
-            Refusal.TOO_LARGE, f"{problem}: ask for less, for fewer `layers` or for larger cells with `resolution`"
-        )
+    cells = round((east - west + cell_m) * (north - south + cell_m) / cell_m**2)
+    if cells > (most := min(MAX_CELLS[kind], MAX_VALUES // layers)):
+        problem = f"a region of about {cells} cells; at most {most} with {layers} layers as {kind}"
+        raise bad(Refusal.TOO_LARGE, f"{problem}: ask for less, fewer `layers`, or larger cells with `resolution`")
     asked = {"resolution_m": query.resolution_m, **vars(query.when)}
-    done = ROOM.take(number)
+    done = ROOM.take(cells * layers)
     try:
         answer = await feed.ask_for_much(feed.client.region, query.area, query.layers, **asked)
         parts = await beside(_archive, answer) if kind == "npz" else pieces(_table(answer))
