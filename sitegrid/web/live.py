@@ -16,7 +16,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from protocol.queries.answers import MapVersion
 from sitegrid.web.encoding import beside
-from sitegrid.web.site import SiteFeed, frame
+from sitegrid.web.site import POSES_S, SiteFeed, frame
 
 TAKEN_S = 30.0  # a page that has not taken a map in for so long is disconnected; it comes back by itself
 QUIET_S = 1.0  # poses are sent at least so often
@@ -46,6 +46,7 @@ class _Page:
         self._may_stay: Callable[[], bool] = socket.scope.get("may_stay", lambda: True)  # see Guard
         self._sent: MapVersion | None = None  # on its way
         self._sent_s = 0.0
+        self._taken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._state = ""
         self._poses_s = -QUIET_S
 
@@ -61,8 +62,7 @@ class _Page:
                 return
             if self._sent and said == (self._sent.row, self._sent.fact):
                 self._version, self._sent = self._sent, None
-            async with self._door.moved:
-                self._door.moved.notify_all()
+                self._taken.set_result(None)
 
     async def send(self) -> None:
         """Send what is new, whenever there is anything."""
@@ -75,10 +75,9 @@ class _Page:
             if not self._may_stay():
                 await self._socket.close(NO_PERMISSION, "the token no longer counts")
                 return
+            moved, self._taken = feed.moved, loop.create_future()  # before: what comes meanwhile is news too
             await self._send_news(now_s)
-            async with feed.moved:
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(feed.moved.wait(), QUIET_S)
+            await asyncio.wait([moved, self._taken], timeout=QUIET_S, return_when=asyncio.FIRST_COMPLETED)
 
     async def _send_news(self, now_s: float) -> None:
         feed, socket = self._door, self._socket
@@ -92,7 +91,7 @@ class _Page:
                 await self._timely(socket.send_bytes(await beside(frame, answer)))
             else:
                 self._version = answer.version  # nothing that the page shows is another one
-        if now_s - self._poses_s >= 0.2 and (poses := feed.poses_text()):
+        if now_s - self._poses_s >= 0.9 * POSES_S and (poses := feed.poses_text()):
             self._poses_s = now_s
             await self._timely(socket.send_text(poses))
 

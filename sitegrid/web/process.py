@@ -6,6 +6,7 @@ import asyncio
 import socket
 import threading
 from argparse import Namespace
+from asyncio import sslproto
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -31,6 +32,7 @@ MESSAGE_BYTES = 4096  # of what a page says
 ADDRESS_BYTES = 2**18  # that are read, to be refused by name: a line of 10,000 places; beyond, the connection ends
 REQUEST_S = 10.0  # for a request to come in whole, from its first byte or the connection's begin
 TLS_S = 5.0  # for a handshake
+TLS_BYTES = 2**15  # that each connection keeps to receive in: a record of TLS has half of it
 
 
 def serve(
@@ -46,7 +48,8 @@ def serve(
     clients = [connect(endpoint, name, keys=arguments.keys) for name, endpoint in sites]
 
     async def run() -> None:
-        if arguments.tls:  # uvicorn cannot be told how long a handshake may take
+        if arguments.tls:  # uvicorn cannot be told how long a handshake may take, nor how much it may keep
+            sslproto.SSLProtocol.max_size = TLS_BYTES
             loop: Any = asyncio.get_running_loop()
             loop.create_server = partial(loop.create_server, ssl_handshake_timeout=TLS_S, ssl_shutdown_timeout=TLS_S)
         web = WebApp([SiteFeed(client) for client in clients], person, listening.counts)
@@ -150,9 +153,15 @@ class PatientProtocol(H11Protocol):
         self._deadline = self._deadline or self.loop.call_later(REQUEST_S, self._give_up)
 
     def _give_up(self) -> None:
-        if self.transport.get_protocol() is self and not self.transport.is_closing():  # it may be a WebSocket's by now
+        if not self._connection.is_live:
             self._listening.counts["refused_slow"] += 1
             self.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The end of a connection."""
+        if self._deadline:
+            self._deadline.cancel()
+        super().connection_lost(exc)
 
     def _should_upgrade(self) -> bool:
         """WebSockets are connections too; what is not upgraded is told that there are too many."""

@@ -34,6 +34,7 @@ from sitegrid.web.values import plain
 
 T = TypeVar("T")
 PERIOD_S = 0.1  # between two questions for what changed, while somebody looks: what did not change costs little
+POSES_S = 0.2  # between two times that pages are told where machines are
 STATE_S = 2.0  # between two questions for machines, changes and times
 LINGER_S = 10.0  # the map is followed so much longer than somebody looks: GIS ask every few seconds
 HEARD_S = 1.5  # machines publish their poses several times a second
@@ -56,7 +57,9 @@ class SiteFeed:
         self.answer: TilesAnswer | None = None
         self.state_text = ""  # what pages are told; empty until the map server has answered
         self.is_away = False
-        self.moved = asyncio.Condition()  # notified when tiles, poses or the state may be others
+        self._moved: asyncio.Future[None] | None = None
+        self._told: tuple[Any, ...] = (None, False, "", 0)  # when pages were woken last, at this time
+        self._told_s, self._heard = 0.0, 0  # how many poses were heard
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=f"ask-{client.site}")
         self._patient = ThreadPoolExecutor(PATIENT_THREADS, thread_name_prefix=f"much-{client.site}")
         self.watchers = 0
@@ -106,12 +109,21 @@ class SiteFeed:
             self._past.keep(key, answer)
         return answer
 
+    @property
+    def moved(self) -> asyncio.Future[None]:
+        """Done when tiles, poses or the state are others: what does not change wakes no page."""
+        if self._moved is None or self._moved.done():
+            self._moved = asyncio.get_running_loop().create_future()
+        return self._moved
+
     def since(self, version: MapVersion | None) -> TilesAnswer | None:
         """What a page that has a version needs to have the newest one; None while no map is known."""
         if self.answer is None:
             return None
         now = self.answer.version
         whole = version is None or version.store != now.store or version.row > now.row or version.fact > now.fact
+        if version == now:
+            return self.answer if not self.answer.whole else replace(self.answer, whole=False)
         tiles = [tile for tile in self.tiles.values() if version is None or whole or _is_newer(tile, version)]
         return replace(self.answer, whole=whole, tiles=tuple(tiles))
 
@@ -139,9 +151,7 @@ class SiteFeed:
         loop = asyncio.get_running_loop()
         end_s = loop.time() + HEARD_S
         while not self._poses and (left_s := end_s - loop.time()) > 0:
-            async with self.moved:
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(self.moved.wait(), left_s)
+            await asyncio.wait([self.moved], timeout=left_s)
 
     @contextlib.asynccontextmanager
     async def watched(self) -> Any:
@@ -184,14 +194,14 @@ class SiteFeed:
             began_s = time.monotonic()
             try:
                 self._take(await self.ask(self.client.tiles, self.answer.version if self.answer else None))
-                await self._notify()  # the map first
+                self._notify()  # the map first
                 if began_s >= next_state_s:
                     next_state_s = began_s + STATE_S
                     self.state_text = await self.ask(_live_text, self.name, *await self._ask_state())
                 self.is_away = False
             except (LinkError, QueryError, MessageError):
                 self.is_away, next_state_s = True, 0.0
-            await self._notify()
+            self._notify()
             await asyncio.sleep(max(0.05, PERIOD_S - (time.monotonic() - began_s)))
             idle_s = 0.0 if self.watchers else idle_s + PERIOD_S
         self._task = None
@@ -201,11 +211,15 @@ class SiteFeed:
         with contextlib.suppress(zenoh.ZError):  # the session was closed meanwhile
             is_there = await self.ask(is_answered, self.client.session, keys.map_query(self.name, "tiles"))
             self.is_away |= not is_there and self.answer is None
-            await self._notify()
+            self._notify()
 
-    async def _notify(self) -> None:
-        async with self.moved:
-            self.moved.notify_all()
+    def _notify(self) -> None:
+        """Wake the pages where there is anything new to show; for poses five times a second."""
+        now_s, version = time.monotonic(), self.answer.version if self.answer else None
+        heard = self._heard if now_s - self._told_s >= POSES_S else self._told[-1]
+        if (news := (version, self.is_away, self.state_text, heard)) != self._told:
+            self._told, self._told_s = news, now_s
+            self.moved.set_result(None)
 
     def _take(self, answer: TilesAnswer) -> None:
         if answer.whole:
@@ -237,6 +251,7 @@ class SiteFeed:
     def _on_pose(self, pose: Pose) -> None:
         with self._poses_lock:
             self._poses[pose.machine] = pose, time.monotonic()
+            self._heard += 1
             track = self._tracks.setdefault(pose.machine, deque(maxlen=MOST_POSES))
             if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
                 track.append(pose)
