@@ -148,7 +148,11 @@ class BlockLayers:
         ages, owner = (state.ages, state.grid.grid) if isinstance(state, StillMap) else ({}, ref(state.grid))
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
-        _check_work(blocks := grid.blocks_in(_cells_of(wide)), squares, cell_names, only)
+        blocks = grid.blocks_in(_cells_of(wide))
+        of_cells = blocks if only is None else _near(dict.fromkeys(blocks, 0), only, wide, self._reach)
+        of_squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} & squares if squares else set[Block]()
+        work = (len(of_cells) if cell_names else 0) + SQUARE**2 * len(of_squares)
+        check_blocks(work, "ask for less ground, or for fewer places, at once")
         own = dict(zip(blocks, grid.last_turns(blocks), strict=True))
         cell_turns, area_turns = _newest(own, wide, self._reach, margin, squares)
         if isinstance(state, StillMap) and ages:
@@ -471,16 +475,6 @@ def _all_of(rect: Rect) -> Iterable[Block]:
 
 def _within(states: Mapping[Block, State], rect: Rect) -> dict[Block, State]:
     return {block: state for block, state in states.items() if _is_in(block, rect)}
-
-
-def _check_work(
-    blocks: Sequence[Block], squares: Set[Block], cell_names: tuple[str, ...], only: Set[Block] | None
-) -> None:
-    """Refuse what reads too much of these blocks, all that there are around: layers of cells, and of squares."""
-    of_squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} & squares if squares else ()
-    of_cells = len(blocks) if only is None else len(only & set(blocks))
-    instead = "ask for less ground, or for fewer places, at once"
-    check_blocks((of_cells if cell_names else 0) + SQUARE**2 * len(of_squares), instead)
 
 
 def _newest(
