@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
+from mapserver.evidence.fold_kernels import BUCKET_BITS
 from mapserver.evidence.sample_kernels import SIGMAS, block_key, survey
 from mapserver.evidence.timeline import Block
 from protocol.arrays import Table
@@ -33,6 +34,7 @@ STAY_S = 30.0  # of the server's clock for as many pages as a sample needs: a ma
 # there are no keys.
 NEWCOMER = 1 / 64
 MOST_ACCOUNTS = 4096
+MOST_PAIRS = 2048  # of blocks and buckets that are remembered of a machine: 300 s at 25 m/s over new ground enter 1400
 
 
 class Credit(NamedTuple):
@@ -45,7 +47,7 @@ class Credit(NamedTuple):
 
 @dataclass(frozen=True)
 class Account:
-    """What a machine has, where it is, whether it has jumped there, and the blocks that it entered in its time bucket.
+    """What a machine has, where it is, whether it has jumped there, and which blocks it entered in which time bucket.
 
     seen_ns: when the server heard of it last.
     """
@@ -93,12 +95,10 @@ class BlockCredit:
             self._entered = np.empty((used, 2), np.int64)
             survey(rows, self._limits, self._bucket_ns, place, steps, self._entered)
         keys, numbers = self._entered[:used].T
-        buckets, bucket = rows["stamp_ns"][numbers] // self._bucket_ns, before.stamp_ns // self._bucket_ns
+        pairs = keys << BUCKET_BITS | rows["stamp_ns"][numbers] // self._bucket_ns % 2**BUCKET_BITS
         credit, counted_m, new, entered, known = before.credit, 0.0, set[int](), set[int](), before.entered
-        for key, row, its_bucket in zip(keys.tolist(), numbers.tolist(), buckets.tolist(), strict=True):
-            if its_bucket != bucket:
-                bucket, entered, known = its_bucket, set[int](), set[int]()
-            if key in entered or key in known:
+        for key, row, pair in zip(keys.tolist(), numbers.tolist(), pairs.tolist(), strict=True):
+            if pair in entered or pair in known:
                 continue
             until_m, by_jump = steps[row].tolist()
             credit, counted_m = self._earned(credit, until_m - counted_m), until_m
@@ -108,13 +108,15 @@ class BlockCredit:
             credit = credit._replace(**{pays: getattr(credit, pays) - 1})
             if min(credit) < 0:
                 if len(rows) == 1:
-                    left = replace(before, credit=self._earned(before.credit, until_m), entered=known)
+                    left = replace(before, credit=self._earned(before.credit, until_m))
                     self._move(machine, left, rows, has_jumped=bool(by_jump))
                 problem = f"{rows['x_m'][row]:.0f}, {rows['y_m'][row]:.0f} m is ground for which the machine has not"
                 problem += " driven far enough: look at its positions"
                 raise MessageError(Refusal.SCATTERED, problem, field="x_m", row=row + trimmed)
             new.add(key)
-            entered.add(key)
+            entered.add(pair)
+        if len(known) > MOST_PAIRS:
+            known.clear()
         known |= entered
         credit = self._earned(credit, steps.item(len(rows) - 1, 0) - counted_m)
         self._move(machine, replace(before, credit=credit, entered=known), rows, has_jumped=has_jumped)

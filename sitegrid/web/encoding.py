@@ -96,7 +96,8 @@ def _parts(value: Any) -> Iterator[Iterator[str]]:
     if isinstance(value, Iterator) or (len(value) and not isinstance(value, np.ndarray) and _holds_more(value[0])):
         yield from map(_texts, value)
         return
-    step = max(1, AT_ONCE // max(1, value[0].size)) if isinstance(value, np.ndarray) and value.ndim > 1 else AT_ONCE
+    width = value.size // max(1, len(value)) if isinstance(value, np.ndarray) else 1
+    step = max(1, AT_ONCE // max(1, width))
     for first in range(0, len(value), step):
         yield iter([json.dumps(plain(value[first : first + step]), allow_nan=False)[1:-1]])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 import threading
 from argparse import Namespace
@@ -18,9 +19,9 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, LinkError
 from protocol.wire.credentials import CERTIFICATE_FILE, KEY_FILE
-from sitegrid.client import connect
+from sitegrid.client import Client, connect
 from sitegrid.process.lifetime import say
 from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
@@ -30,9 +31,12 @@ from sitegrid.web.values import Problem, problem_response
 
 MESSAGE_BYTES = 4096  # of what a page says
 ADDRESS_BYTES = 2**18  # that are read, to be refused by name: a line of 10,000 places; beyond, the connection ends
+ROUTER_S = 1.0  # between two attempts to reach a router
 REQUEST_S = 10.0  # for a request to come in whole, from its first byte or the connection's begin
 TLS_S = 5.0  # for a handshake
 TLS_BYTES = 2**15  # that each connection keeps to receive in: a record of TLS has half of it
+
+log = logging.getLogger("sitegrid.web.process")
 
 
 def serve(
@@ -45,7 +49,11 @@ def serve(
     """Serve sites, each a name (see `connect` for None) and an endpoint, until `stop` is set."""
     listening = opened.enter_context(listen(address))
     person = TokenFile(arguments.tokens).person if arguments.tokens else None
-    clients = [connect(endpoint, name, keys=arguments.keys) for name, endpoint in sites]
+    clients: list[Client] = []
+    for name, endpoint in sites:
+        if (client := _connected(endpoint, name, arguments.keys, stop)) is None:
+            return 0
+        clients.append(client)
 
     async def run() -> None:
         if arguments.tls:  # uvicorn cannot be told how long a handshake may take, nor how much it may keep
@@ -77,6 +85,20 @@ def serve(
 
     asyncio.run(run())
     return 0
+
+
+def _connected(endpoint: str, name: str | None, keys: Path | None, stop: threading.Event) -> Client | None:
+    """A client of a site, as soon as its router is there; None where `stop` is set before."""
+    problem = ""
+    while not stop.is_set():
+        try:
+            return connect(endpoint, name, keys=keys)
+        except LinkError as error:
+            if str(error) != problem:
+                problem = str(error)
+                log.warning("waiting for the router problem=%r", problem)
+            stop.wait(ROUTER_S)
+    return None
 
 
 async def _stop_with(server: uvicorn.Server, stop: threading.Event) -> None:
