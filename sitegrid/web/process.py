@@ -26,7 +26,7 @@ from sitegrid.process.lifetime import say
 from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
 from sitegrid.web.site import SiteFeed
-from sitegrid.web.sockets import OF_ADDRESS, Listening, listen
+from sitegrid.web.sockets import AT_ONCE, OF_ADDRESS, Listening, listen
 from sitegrid.web.values import Problem, problem_response
 
 MESSAGE_BYTES = 4096  # of what a page says
@@ -67,6 +67,7 @@ def serve(
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
             h11_max_incomplete_event_size=ADDRESS_BYTES,
+            backlog=AT_ONCE,
             log_config=None,
             log_level="error",  # a line for each bad request would fill disks
             access_log=False,

@@ -19,11 +19,13 @@ from typing import Any
 from protocol.errors import ConfigError
 
 CONNECTIONS = 500
-# 28 browsers behind one NAT that load the page at the same time (six sockets each, and the live one), or 150 pages that
+# 28 browsers behind one NAT that load the page at the same time (six sockets each, and the live one), or 100 pages that
 # are open behind a proxy; two such addresses leave places to others.
 OF_ADDRESS = 200
-LIVE = 0.75  # of the places, for WebSockets: the others are for requests, which come and go
+LIVE = 0.5  # of the places, for WebSockets: the others are for requests, which come and go
 SPARE = 50  # more of an address and in all, who are told that there are too many: beyond, a socket is closed at once
+QUEUE = 256  # of connections that the system holds until they are accepted
+AT_ONCE = 32  # accepted before requests are read again: none makes room before its request could be read
 FILES = 4096  # that are asked of the system
 OTHER_FILES = 100  # beside sockets of visitors: libraries, the log, links to routers
 STALLED_S = 30.0  # until a socket that takes nothing is closed
@@ -55,6 +57,10 @@ class Listening(socket.socket):
         self._most = most
         self._files: dict[int, Connection] = {}
         self._origins: dict[str, dict[Connection, None]] = {}  # those that began to wait first come first
+
+    def listen(self, backlog: int = QUEUE) -> None:
+        """As a socket's own; what the event loop says is how many it accepts at once."""
+        super().listen(max(backlog, QUEUE))
 
     def accept(self) -> tuple[socket.socket, Any]:
         """As a socket's own; ConnectionAbortedError, which the event loop passes over, where there is no room.
@@ -153,7 +159,7 @@ def listen(address: tuple[str, int]) -> Listening:
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((host, port))
-        listening.listen(256)
+        listening.listen()
     except OSError as error:
         listening.close()
         raise ConfigError("--listen", f"cannot listen on {host}:{port}: {error.strerror}") from None

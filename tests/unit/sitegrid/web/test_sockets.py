@@ -30,7 +30,7 @@ PATIENCE_S = 0.4
 @pytest.fixture(autouse=True)
 def _short_times_and_few_places(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "REQUEST_S", PATIENCE_S)
-    for name, value in {"OF_ADDRESS": 4, "SPARE": 2}.items():
+    for name, value in {"OF_ADDRESS": 4, "LIVE": 0.75, "SPARE": 2}.items():
         monkeypatch.setattr(sockets, name, value)
 
 
