@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import struct
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from functools import partial
 from itertools import chain
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from protocol.errors import QueryError, Refusal
+from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
 from sitegrid.web.values import plain, with_times
 
 T = TypeVar("T")
@@ -104,6 +106,28 @@ def _parts(value: Any) -> Iterator[Iterator[str]]:
 
 def _holds_more(item: Any) -> bool:
     return isinstance(item, Mapping | list | tuple | np.ndarray | Iterator) or is_dataclass(item)
+
+
+def frame(answer: TilesAnswer) -> bytes:
+    """Tiles for a page: length of a JSON head (4 bytes, big-endian), the head, the deflated planes end to end."""
+    head = {
+        "store": answer.version.store,
+        "row": answer.version.row,
+        "fact": answer.version.fact,
+        "stamp_ns": answer.stamp_ns,
+        "cell_m": answer.cell_m,
+        "whole": answer.whole,
+        "planes": list(PLANES),
+        "scales": {name: asdict(scale) for name, scale in PLANES.items()},
+        "tiles": [_head(tile) for tile in answer.tiles],
+    }
+    text = json.dumps(head, separators=(",", ":")).encode()
+    return b"".join([struct.pack(">I", len(text)), text, *(tile.planes for tile in answer.tiles)])
+
+
+def _head(tile: MapTile) -> dict[str, Any]:
+    numbers = {"x": tile.x, "y": tile.y, "row": tile.row, "fact": tile.fact, "newest_ns": tile.newest_ns}
+    return {**numbers, "bytes": len(tile.planes)}
 
 
 class Room:

@@ -15,8 +15,8 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from protocol.queries.answers import MapVersion
-from sitegrid.web.encoding import beside
-from sitegrid.web.site import POSES_S, SiteFeed, frame
+from sitegrid.web.encoding import beside, frame
+from sitegrid.web.site import POSES_S, SiteFeed
 
 TAKEN_S = 30.0  # a page that has not taken a map in for so long is disconnected; it comes back by itself
 QUIET_S = 1.0  # poses are sent at least so often

@@ -14,7 +14,7 @@ from protocol.queries.answers import MapVersion, Region
 from protocol.queries.parameters import text_of
 from protocol.queries.requests import NOW, PointQuery, PointsQuery, RegionQuery, WhyQuery
 from sitegrid.web import features, roads, values
-from sitegrid.web.encoding import PIECE, Room, answered, as_json, beside, pieces
+from sitegrid.web.encoding import PIECE, Room, answered, as_json, beside, frame, pieces
 from sitegrid.web.resource import (
     AS_OF,
     BOUNDS,
@@ -29,7 +29,7 @@ from sitegrid.web.resource import (
     parsed,
     version_of,
 )
-from sitegrid.web.site import SiteFeed, frame
+from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters, bad
 
 MAX_CELLS = {"json": 250_000, "npz": 4_000_000}  # of a region; 2 MB of text a layer

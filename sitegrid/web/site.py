@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import json
 import math
-import struct
 import threading
 import time
 from collections import deque
@@ -20,7 +19,7 @@ import zenoh
 
 from protocol.errors import LinkError, MessageError, QueryError, Refusal
 from protocol.queries.answers import GroundChange, MachineState, MapInfo, MapVersion
-from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
+from protocol.queries.map_tiles import MapTile, TilesAnswer
 from protocol.site.site_config import MAX_EXTENT_M, Projection, SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, receive_pose
@@ -58,8 +57,8 @@ class SiteFeed:
         self.state_text = ""  # what pages are told; empty until the map server has answered
         self.is_away = False
         self._moved: asyncio.Future[None] | None = None
-        self._told: tuple[Any, ...] = (None, False, "", 0)  # when pages were woken last, at this time
-        self._told_s, self._heard = 0.0, 0  # how many poses were heard
+        self._woken: tuple[Any, ...] = (None, False, "", 0)  # when pages were woken last, at this time
+        self._woken_s, self._heard = 0.0, 0  # how many poses were heard
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=f"ask-{client.site}")
         self._patient = ThreadPoolExecutor(PATIENT_THREADS, thread_name_prefix=f"much-{client.site}")
         self.watchers = 0
@@ -216,9 +215,9 @@ class SiteFeed:
     def _notify(self) -> None:
         """Wake the pages where there is anything new to show; for poses five times a second."""
         now_s, version = time.monotonic(), self.answer.version if self.answer else None
-        heard = self._heard if now_s - self._told_s >= POSES_S else self._told[-1]
-        if (news := (version, self.is_away, self.state_text, heard)) != self._told:
-            self._told, self._told_s = news, now_s
+        heard = self._heard if now_s - self._woken_s >= POSES_S else self._woken[-1]
+        if (news := (version, self.is_away, self.state_text, heard)) != self._woken:
+            self._woken, self._woken_s = news, now_s
             self.moved.set_result(None)
 
     def _take(self, answer: TilesAnswer) -> None:
@@ -284,28 +283,6 @@ def receive_health(key: str, data: bytes) -> Health:
     if not key.endswith(f"/machine/{health.machine}/health"):
         raise MessageError(Refusal.WRONG_MACHINE, f"{health.machine!r} sends under {key}", field="machine")
     return health
-
-
-def frame(answer: TilesAnswer) -> bytes:
-    """Tiles for a page: length of a JSON head (4 bytes, big-endian), the head, the deflated planes end to end."""
-    head = {
-        "store": answer.version.store,
-        "row": answer.version.row,
-        "fact": answer.version.fact,
-        "stamp_ns": answer.stamp_ns,
-        "cell_m": answer.cell_m,
-        "whole": answer.whole,
-        "planes": list(PLANES),
-        "scales": {name: asdict(scale) for name, scale in PLANES.items()},
-        "tiles": [_head(tile) for tile in answer.tiles],
-    }
-    text = json.dumps(head, separators=(",", ":")).encode()
-    return b"".join([struct.pack(">I", len(text)), text, *(tile.planes for tile in answer.tiles)])
-
-
-def _head(tile: MapTile) -> dict[str, Any]:
-    numbers = {"x": tile.x, "y": tile.y, "row": tile.row, "fact": tile.fact, "newest_ns": tile.newest_ns}
-    return {**numbers, "bytes": len(tile.planes)}
 
 
 def _is_newer(tile: MapTile, version: MapVersion) -> bool:
