@@ -28,6 +28,7 @@ from sitegrid.web.values import plain, with_times
 T = TypeVar("T")
 THREADS = 2  # more would only wait for each other
 PIECE = 2**16  # characters of text, made in some 2 ms
+WHOLE = 2**22  # bytes: what is shorter is sent with its length, which some programs want (GDAL)
 AT_ONCE = 2000  # numbers, made into text in 1 ms
 LARGE_S = 300.0  # for a large answer to be taken: 64 MB at 2 Mbit/s
 _pool = ThreadPoolExecutor(THREADS, thread_name_prefix="encode")
@@ -49,11 +50,19 @@ async def as_json(value: Any, media: str = "application/json", done: Callable[[]
 
 async def answered(parts: Iterator[bytes], media: str, done: Callable[[], None] = _nothing) -> Response:
     """An answer in parts, at least one; what is long is made while it is sent. done: called once it needs no room."""
-    first, second = await beside(lambda: (next(parts), next(parts, None)))
-    if second is not None:
-        return Large(chain((first, second), parts), media, done)
+    first = await beside(_begin, parts)
+    if len(first) >= WHOLE:
+        return Large(chain((first,), parts), media, done)
     done()
     return Response(first, media_type=media)
+
+
+def _begin(parts: Iterator[bytes]) -> bytes:
+    """An answer, or WHOLE of it."""
+    first = bytearray()
+    while len(first) < WHOLE and (part := next(parts, b"")):
+        first += part
+    return bytes(first)
 
 
 async def _made(texts: Iterator[bytes]) -> AsyncIterator[bytes]:

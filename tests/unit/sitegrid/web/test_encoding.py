@@ -45,6 +45,7 @@ def test_pieces_are_the_json_of_the_whole_and_small(value: Any):
 
 def test_a_large_answer_has_its_room_until_it_is_sent_or_not_taken(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(encoding, "LARGE_S", 0.05)
+    monkeypatch.setattr(encoding, "WHOLE", 2)
     room = Room(10)
 
     async def serve(parts: list[bytes], *, takes: bool) -> None:
