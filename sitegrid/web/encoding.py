@@ -49,12 +49,16 @@ async def as_json(value: Any, media: str = "application/json", done: Callable[[]
 
 
 async def answered(parts: Iterator[bytes], media: str, done: Callable[[], None] = _nothing) -> Response:
-    """An answer in parts, at least one; what is long is made while it is sent. done: called once it needs no room."""
+    """An answer in parts; what is long is made while it is sent. done: gives back its room, without it taken here."""
     first = await beside(_begin, parts)
-    if len(first) >= WHOLE:
-        return Large(chain((first,), parts), media, done)
-    done()
-    return Response(first, media_type=media)
+    if done is _nothing:
+        if len(first) <= PIECE:
+            return Response(first, media_type=media)
+        done = ROOM.take(len(first))
+    response = Large(chain((first,), parts), media, done)
+    if len(first) < WHOLE:
+        response.headers["Content-Length"] = str(len(first))
+    return response
 
 
 def _begin(parts: Iterator[bytes]) -> bytes:
@@ -155,6 +159,9 @@ class Room:
             self._free += size
 
         return give_back
+
+
+ROOM = Room(2**27)  # bytes, for all visitors
 
 
 class Large(StreamingResponse):

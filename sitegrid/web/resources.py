@@ -14,7 +14,7 @@ from protocol.queries.answers import MapVersion, Region
 from protocol.queries.parameters import text_of
 from protocol.queries.requests import NOW, PointQuery, PointsQuery, RegionQuery, WhyQuery
 from sitegrid.web import features, roads, values
-from sitegrid.web.encoding import PIECE, Room, answered, as_json, beside, frame, pieces
+from sitegrid.web.encoding import PIECE, ROOM, answered, as_json, beside, frame, pieces
 from sitegrid.web.resource import (
     AS_OF,
     BOUNDS,
@@ -34,7 +34,6 @@ from sitegrid.web.values import Parameters, bad
 
 MAX_CELLS = {"json": 250_000, "npz": 4_000_000}  # of a region; 2 MB of text a layer
 MAX_VALUES = 16_000_000  # of a region, cells times layers: 64 MB
-ROOM = Room(2 * MAX_VALUES)  # for regions of all visitors, values
 TIMES = ("as_of", "minus")
 AGES = ("age_s", "changed_s")  # layers that change with the site's now
 
@@ -89,7 +88,7 @@ async def region(feed: SiteFeed, parameters: Parameters) -> Response:
         problem = f"a region of about {cells} cells; at most {most} with {layers} layers as {kind}"
         raise bad(Refusal.TOO_LARGE, f"{problem}: ask for less, fewer `layers`, or larger cells with `resolution`")
     asked = {"resolution_m": query.resolution_m, **vars(query.when)}
-    done = ROOM.take(cells * layers)
+    done = ROOM.take(4 * cells * layers)
     try:
         answer = await feed.ask_for_much(feed.client.region, query.area, query.layers, **asked)
         parts = await beside(_archive, answer) if kind == "npz" else pieces(_table(answer))
