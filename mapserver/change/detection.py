@@ -74,11 +74,18 @@ class Cuts:
         return bool(self.first.any())
 
 
+def _unchanged() -> Cuts:
+    return Cuts(np.zeros(ev.CELLS, np.int64), *(np.full(ev.CELLS, np.nan) for _ in range(3)))
+
+
+UNCHANGED = _unchanged()  # one for all blocks without a change, which are most: 8 KB each, kept with their pages
+
+
 def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
     """Find the last change in every cell of a block."""
-    last = Cuts(np.zeros(ev.CELLS, np.int64), *(np.full(ev.CELLS, np.nan) for _ in range(3)))
     if len(pages) < 2 or not config.detect:
-        return last
+        return UNCHANGED
+    last = _unchanged()
     votes_of_pages, ends = packed_votes(pages)
     least, most = 0.1 * WEIGHT_M * ev.WEIGHT_UNITS_PER_M, min(ALIKE_BINS, BINS / 2)
     for part, centres, least_step in _PARTS:
@@ -95,13 +102,14 @@ def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
             last.kind[cells[left]] = kind if part == ev.RESISTANCE else np.nan
             if not len(left):
                 break
-    if last.has_change:
-        index, begins_ns = np.arange(len(pages))[:, None], _begins_ns(pages)
-        knows = weights(votes_of_pages, ends, ev.RESISTANCE.start, ev.RESISTANCE.stop) > 0
-        old = np.where(knows & (index < last.first), index, 0).max(axis=0)
-        new = np.where(knows & (index >= last.first), index, len(pages) - 1).min(axis=0)
-        for times_ns, page in ((last.old_ns, old), (last.new_ns, new)):
-            times_ns[:] = np.where(last.first > 0, begins_ns[page], np.nan)
+    if not last.has_change:
+        return UNCHANGED
+    index, begins_ns = np.arange(len(pages))[:, None], _begins_ns(pages)
+    knows = weights(votes_of_pages, ends, ev.RESISTANCE.start, ev.RESISTANCE.stop) > 0
+    old = np.where(knows & (index < last.first), index, 0).max(axis=0)
+    new = np.where(knows & (index >= last.first), index, len(pages) - 1).min(axis=0)
+    for times_ns, page in ((last.old_ns, old), (last.new_ns, new)):
+        times_ns[:] = np.where(last.first > 0, begins_ns[page], np.nan)
     return last
 
 

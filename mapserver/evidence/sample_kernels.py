@@ -29,7 +29,8 @@ _SECTOR_RAD, _SECTORS = 2 * np.pi / ev.SECTORS, ev.SECTORS
 _UNITS, _ONE = ev.WEIGHT_UNITS_PER_M, ev.SHARE_ONE
 _HASH = np.uint64(HASH)
 SIGMAS = 3.0  # that a position may be off
-MOST_STEP_M = 2.0  # that one sample counts as driven: agents make one every 0.5 m
+MOST_STEP_M = 2.0  # that one sample counts as driven, whatever its stamp: agents make one every 0.5 m
+MOST_MPS = 30.0  # that a machine drives: what its stamps allow counts as driven, up to NEAR_M
 NEAR_M = 5.0  # what is so near is no jump, whatever the distance: wheels read 5 times a second, at 25 m/s
 _TABLE = TABLE.astype(np.uint32)
 
@@ -114,15 +115,21 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def survey(
-    rows: Any, limits: tuple[float, float, float], before: tuple[float, float, bool], steps: Any, entered: Any
+    rows: Any,
+    limits: tuple[float, float, float],
+    bucket_ns: int,
+    before: tuple[float, float, bool, int],
+    steps: Any,
+    entered: Any,
 ) -> tuple[int, bool]:
     """How far a machine drove, where it jumped, and into which blocks its rows vote where the row before did not.
 
-    limits: as of `locate`. before: where the machine was, NaN where that is not known, and whether it had jumped there.
+    A row of another time bucket votes anew. limits: as of `locate`. before: where the machine was, NaN where that is
+    not known, whether it had jumped there, and its stamp.
     Fills steps (n, 2): metres until each row, and 1 where it jumped and had no vote since; and, as long as there is
     room, entered: key of each block and number of the row. Returns how many of these, and whether it ends with a jump.
     """
-    x, y, has_jumped = before
+    x, y, has_jumped, stamp_ns = before
     used, driven_m, place = 0, 0.0, np.empty(5)
     west, east, south, north = 0, -1, 0, -1  # blocks of the last row that votes
     for k in range(len(rows)):
@@ -131,10 +138,13 @@ def survey(
         variance_m2 = _largest(np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2))
         off_m = SIGMAS * np.sqrt(min(variance_m2, limits[2]) + limits[1])
         if shift_m <= max(distance_m, NEAR_M) + off_m:
-            driven_m += min(distance_m, shift_m, MOST_STEP_M)
+            fast_m = min(MOST_MPS * 1e-9 * (row.stamp_ns - stamp_ns), NEAR_M)
+            driven_m += min(distance_m, shift_m, max(fast_m, MOST_STEP_M))
         else:
             has_jumped = True
-        x, y, steps[k, 0], steps[k, 1] = row.x_m, row.y_m, driven_m, has_jumped
+        if row.stamp_ns // bucket_ns != stamp_ns // bucket_ns:
+            west, east = 0, -1
+        x, y, stamp_ns, steps[k, 0], steps[k, 1] = row.x_m, row.y_m, row.stamp_ns, driven_m, has_jumped
         reach = _place(row, limits, place) if distance_m > 0 else -1
         if reach < 0:
             continue

@@ -1,19 +1,22 @@
-"""Credit for new ground: a machine may open as many blocks of the grid as it has driven for. No files, no clock.
+"""Credit for ground: a machine may open as much of the map as it has driven for. No files, no clock.
 
 A block costs memory for as long as the map lives, and a sample of 80 bytes opens up to four: scattered over a site,
-each would cost 14 kB. What is refused is never journalled, so the map stays a function of the journal. Credit is not
-kept: after a start of the server each machine has that of a new one (docs/decisions/0011-credit-for-new-ground.md).
+each would cost 14 kB. So would one on ground that others have opened: its block gets one more page for the time bucket.
+What is refused is never journalled, so the map stays a function of the journal. Credit is not kept: after a start of
+the server each machine has that of a new one (docs/decisions/0011-credit-for-new-ground.md).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
+from mapserver.evidence.fold_kernels import BUCKET_BITS
 from mapserver.evidence.sample_kernels import SIGMAS, block_key, survey
 from mapserver.evidence.timeline import Block
 from protocol.arrays import Table
@@ -25,14 +28,37 @@ JUMPS = 50  # to new ground, each of as many blocks as a sample can open: 200 bl
 JUMP_M = 200.0  # driven for each further one
 
 
-class Account(NamedTuple):
-    """Blocks that a machine may open by jumps and as it drives on, where it is, and whether it has jumped there."""
+PAGES, FIRST_PAGES = 4000.0, 500.0  # blocks of opened ground, each of up to 11 kB: at most, and of a new machine
+STAY_S = 30.0  # of the server's clock for as many pages as a sample needs: a machine that stays has one bucket in 300 s
+# Of the credit of a new machine, what the next one has less, and what all have more in a minute: names are free where
+# there are no keys.
+NEWCOMER = 1 / 64
+MOST_ACCOUNTS = 4096
+MOST_PAIRS = 2048  # of blocks and buckets that are remembered of a machine: 300 s at 25 m/s over new ground enter 1400
+
+
+class Credit(NamedTuple):
+    """Blocks that a machine may enter: by jumps and as it drives on; pages: of ground that is opened."""
 
     jumps: float
-    driven: float = 0.0
+    driven: float
+    pages: float
+
+
+@dataclass(frozen=True)
+class Account:
+    """What a machine has, where it is, whether it has jumped there, and which blocks it entered in which time bucket.
+
+    seen_ns: when the server heard of it last.
+    """
+
+    credit: Credit
+    seen_ns: int
     x_m: float = math.nan
     y_m: float = math.nan
     has_jumped: bool = True
+    stamp_ns: int = 0
+    entered: set[int] = field(default_factory=set)
 
 
 class BlockCredit:
@@ -52,43 +78,74 @@ class BlockCredit:
         self.per_m = math.sqrt(2) * swept / (BLOCK_CELLS**2 * cell_m)
         blocks = (2 + (edge - 2) // BLOCK_CELLS) ** 2
         self.most, self.jumps_per_m = float(JUMPS * blocks), blocks / JUMP_M
+        self._bucket_ns, self._blocks = config.bucket_ns, blocks
+        self._newcomers, self._newcomer_ns = 1.0, 0
 
-    def spend(self, machine: str, rows: Table, trimmed: int = 0) -> None:
+    def spend(self, machine: str, rows: Table, trimmed: int = 0, now_ns: int = 0) -> None:
         """Open the blocks of a machine's new samples; trimmed: samples of their batch before them.
 
-        MessageError names the first sample without credit; then nothing is opened. The sender gives up a sample that is
-        refused alone, so the machine is there from then on, and what it drove since counts.
+        now_ns: the server's clock. MessageError names the first sample without credit; then nothing is opened. The
+        sender gives up a sample that is refused alone, so the machine is there from then on, and what it drove since
+        counts.
         """
-        before, steps = self._accounts.get(machine) or Account(self.most), np.empty((len(rows), 2))
-        used, has_jumped = survey(rows, self._limits, before[2:], steps, self._entered)
+        before, steps = self._account(machine, now_ns), np.empty((len(rows), 2))
+        place = (before.x_m, before.y_m, before.has_jumped, before.stamp_ns)
+        used, has_jumped = survey(rows, self._limits, self._bucket_ns, place, steps, self._entered)
         if used > len(self._entered):
             self._entered = np.empty((used, 2), np.int64)
-            survey(rows, self._limits, before[2:], steps, self._entered)
-        credit, counted_m, new = before[:2], 0.0, set[int]()
-        for key, row in self._entered[:used].tolist():
-            if key in self.opened or key in new:
+            survey(rows, self._limits, self._bucket_ns, place, steps, self._entered)
+        keys, numbers = self._entered[:used].T
+        pairs = keys << BUCKET_BITS | rows["stamp_ns"][numbers] // self._bucket_ns % 2**BUCKET_BITS
+        credit, counted_m, new, entered, known = before.credit, 0.0, set[int](), set[int](), before.entered
+        for key, row, pair in zip(keys.tolist(), numbers.tolist(), pairs.tolist(), strict=True):
+            if pair in entered or pair in known:
                 continue
             until_m, by_jump = steps[row].tolist()
-            jumps, driven = self._earned(credit, until_m - counted_m)
-            pays = not by_jump and driven >= 1
-            credit, counted_m = (jumps - (not pays), driven - pays), until_m
-            if credit[0] < 0:
+            credit, counted_m = self._earned(credit, until_m - counted_m), until_m
+            pays = "pages" if key in self.opened or key in new else "jumps"
+            if not by_jump and credit.driven >= 1:
+                pays = "driven"
+            credit = credit._replace(**{pays: getattr(credit, pays) - 1})
+            if min(credit) < 0:
                 if len(rows) == 1:
-                    self._move(machine, rows, self._earned(before[:2], until_m), has_jumped=bool(by_jump))
-                problem = f"{rows['x_m'][row]:.0f}, {rows['y_m'][row]:.0f} m is new ground, and the machine has not"
-                problem += " driven far enough to open more: look at its positions"
+                    left = replace(before, credit=self._earned(before.credit, until_m))
+                    self._move(machine, left, rows, has_jumped=bool(by_jump))
+                problem = f"{rows['x_m'][row]:.0f}, {rows['y_m'][row]:.0f} m is ground for which the machine has not"
+                problem += " driven far enough: look at its positions"
                 raise MessageError(Refusal.SCATTERED, problem, field="x_m", row=row + trimmed)
             new.add(key)
+            entered.add(pair)
+        if len(known) > MOST_PAIRS:
+            known.clear()
+        known |= entered
         credit = self._earned(credit, steps.item(len(rows) - 1, 0) - counted_m)
-        self._move(machine, rows, credit, has_jumped=has_jumped)
+        self._move(machine, replace(before, credit=credit, entered=known), rows, has_jumped=has_jumped)
         self.opened |= new
 
-    def _earned(self, credit: tuple[float, float], driven_m: float) -> tuple[float, float]:
-        jumps, driven = credit
-        return min(jumps + self.jumps_per_m * driven_m, self.most), min(driven + self.per_m * driven_m, self.most)
+    def _account(self, machine: str, now_ns: int) -> Account:
+        """That of a machine, with what time has brought."""
+        known = self._accounts.pop(machine, None)
+        if known is None:
+            self._newcomers = min(1.0, self._newcomers + NEWCOMER * max(0, now_ns - self._newcomer_ns) / 60e9)
+            self._newcomer_ns = now_ns
+            credit = Credit(self.most * self._newcomers, 0.0, FIRST_PAGES * self._newcomers)
+            self._newcomers -= NEWCOMER * self._newcomers
+            if len(self._accounts) >= MOST_ACCOUNTS:
+                del self._accounts[next(iter(self._accounts))]
+            known = Account(credit, now_ns)
+        stayed = self._blocks * max(0, now_ns - known.seen_ns) / (1e9 * STAY_S)
+        credit = known.credit._replace(pages=min(known.credit.pages + stayed, PAGES))
+        self._accounts[machine] = account = replace(known, credit=credit, seen_ns=max(now_ns, known.seen_ns))
+        return account
 
-    def _move(self, machine: str, rows: Table, credit: tuple[float, float], *, has_jumped: bool) -> None:
-        self._accounts[machine] = Account(*credit, rows["x_m"].item(-1), rows["y_m"].item(-1), has_jumped)
+    def _earned(self, credit: Credit, driven_m: float) -> Credit:
+        by_jumps = self.jumps_per_m * driven_m
+        jumps, driven = min(credit.jumps + by_jumps, self.most), min(credit.driven + self.per_m * driven_m, self.most)
+        return Credit(jumps, driven, min(credit.pages + by_jumps, PAGES))
+
+    def _move(self, machine: str, account: Account, rows: Table, *, has_jumped: bool) -> None:
+        x_m, y_m, stamp_ns = (rows[name].item(-1) for name in ("x_m", "y_m", "stamp_ns"))
+        self._accounts[machine] = replace(account, x_m=x_m, y_m=y_m, stamp_ns=stamp_ns, has_jumped=has_jumped)
 
 
 def warm_up(config: FoldConfig) -> None:

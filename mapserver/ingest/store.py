@@ -240,7 +240,7 @@ class Store:
             replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
             if new := len(admission.batch.rows) > 0:
-                self._credit.spend(batch.machine, admission.batch.rows, admission.trimmed)
+                self._credit.spend(batch.machine, admission.batch.rows, admission.trimmed, self.now_ns())
         except MessageError as error:
             expected = error.expected if isinstance(error, GapError) else 0
             return Refused(error.reason, str(error), expected), None

@@ -25,7 +25,7 @@ from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, R
 from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource, MapState
-from mapserver.query.views import PastMaps, StillMap, View, view_now, widened
+from mapserver.query.views import PastMaps, StillMap, View, check_past, view_now, widened
 from mapserver.query.why import reasons
 from protocol.arrays import Floats32, Ints
 from protocol.errors import QueryError, Refusal
@@ -89,6 +89,12 @@ class Answers:
     @property
     def _past(self) -> PastMaps:
         return PastMaps(self._source.location, self._source.past, self._config)
+
+    def is_large(self, query: MapQuery) -> bool:
+        """Whether an answer may be made of far more than it holds, and keeps a thread for long."""
+        return isinstance(query, RouteQuery | WayQuery | PointsQuery) or (
+            isinstance(query, RegionQuery) and query.resolution_m is not None
+        )
 
     def size(self, query: MapQuery) -> int:
         """About how many bytes the answer has."""
@@ -197,7 +203,7 @@ class Answers:
         (window, count), names = self._window(query), _names(query)
         requests.check_size(window.columns * count, window.rows * count)
         outline = () if isinstance(query.area, Bounds) else query.area
-        pieces = PieceGrid.of_layers(window, len(names))
+        pieces = PieceGrid.of_layers(window, len(names), count)
         if pieces.count > 1:
             self._open.make_room()
         reading = replace(self._reading(finer(window, count), names, query.when), window=window)
@@ -337,6 +343,7 @@ class Answers:
     def _view(self, window: CellWindow, as_of_ns: int | None) -> View:
         if as_of_ns is None:
             return self._source.run(lambda state: view_now(state, window))
+        self._source.run(lambda state: check_past(state, window, self._reach))
         return self._past.view(window, as_of_ns, self._source.run(lambda state: state.facts))
 
     def _spans(self, past: CellHistory, names: tuple[str, ...]) -> tuple[HistorySpan, ...]:

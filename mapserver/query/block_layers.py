@@ -32,7 +32,7 @@ from mapserver.evidence.timeline import Block, evidence
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.source import MapState
-from mapserver.query.views import StillMap, View, place
+from mapserver.query.views import StillMap, View, check_blocks, place
 from protocol.arrays import AnyArray, Floats, Floats32, Ints
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -40,6 +40,8 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 MOST_KEPT = 98_304  # layers of blocks, 1 KB each: seven layers of a site of 1.9 x 1.9 km that is driven all over
 SQUARE = 4  # blocks to a side: larger squares cost less in all, and more where little came in
 SQUARE_CELLS = SQUARE * BLOCK_CELLS
+SQUARES_AT_ONCE = 64  # of which layers of cells are held: 1000 blocks, some 20 MB
+MOST_IMAGE = 2**20  # blocks, 8 MB: 16 x 16 km with cells of 1 m
 NEVER = -1  # turn of a block without evidence
 # These follow from stamps and the site's now; the stamps are kept.
 TIMED = {"age_s": "newest_ns", "changed_s": "changed_ns"}
@@ -146,11 +148,13 @@ class BlockLayers:
         ages, owner = (state.ages, state.grid.grid) if isinstance(state, StillMap) else ({}, ref(state.grid))
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
-        own = dict(zip(blocks := grid.blocks_in(_cells_of(wide)), grid.last_turns(blocks), strict=True))
-        at, turns = _image(own, wide)
-        turns = _spread(turns, self._reach)
-        cell_turns: dict[Block, int] = dict(zip(blocks, turns[at].astype(int).tolist(), strict=True))
-        area_turns = _by_square(_spread(turns, margin), wide, squares) if squares else {}
+        blocks = grid.blocks_in(_cells_of(wide))
+        of_cells = blocks if only is None else _near(dict.fromkeys(blocks, 0), only, wide, self._reach)
+        of_squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} & squares if squares else set[Block]()
+        work = (len(of_cells) if cell_names else 0) + SQUARE**2 * len(of_squares)
+        check_blocks(work, "ask for less ground, or for fewer places, at once")
+        own = dict(zip(blocks, grid.last_turns(blocks), strict=True))
+        cell_turns, area_turns = _newest(own, wide, self._reach, margin, squares)
         if isinstance(state, StillMap) and ages:
             cell_states = _marked(cell_turns, state, None, lambda block: [block])
             area_states = _marked(area_turns, state, margin, lambda square: self._around([square], area_names))
@@ -171,7 +175,7 @@ class BlockLayers:
             cells = _valid(self._cells, wanted, needed_names)
             missing = wanted.keys() - cells.keys()
             cells |= _some(self._cells, missing)
-        near = sorted({one for block in missing for one in around(block, self._reach) if one in own})
+        near = _near(own, missing, wide, self._reach)
         pages = dict(zip(near, grid.pages(near), strict=True))
         return Look(state.version, state.newest_ns, cells, areas, cell_states, area_states, own, pages, owner, ages)
 
@@ -202,6 +206,15 @@ class BlockLayers:
 
     def at_cells(self, look: Look, cells: Ints, names: Sequence[str]) -> dict[str, Floats32]:
         """Layers (n,) of cells (n, 2), columns and rows, among those of the look."""
+        out: dict[str, Floats32] = {name: np.full(len(cells), np.nan, np.float32) for name in names}
+        parts = [at for _, at in _by_part(cells, SQUARE_CELLS)]
+        for first in range(0, len(parts), SQUARES_AT_ONCE):
+            at = np.concatenate(parts[first : first + SQUARES_AT_ONCE])
+            for name, values in self._at_few_cells(look, cells[at], names).items():
+                out[name][at] = values
+        return out
+
+    def _at_few_cells(self, look: Look, cells: Ints, names: Sequence[str]) -> dict[str, Floats32]:
         cell_names, area_names, asked = _stored(names), _areas_of(names), _blocks_with(cells)
         states = {block: look.cell_states[block] for block in asked if block in look.cell_states}
         blocks = self._cells_of(look, states, cell_names) if cell_names else {}
@@ -228,17 +241,19 @@ class BlockLayers:
         """Layers (SQUARE_CELLS, SQUARE_CELLS) of those of these squares that have or are near any evidence."""
         wanted = {square: state for square, state in look.area_states.items() if square in squares}
         areas = _valid(look.areas, wanted, names)
-        stale = wanted.keys() - areas.keys()
-        needed = self._around(stale, names)
-        blocks = {block: state for block, state in look.cell_states.items() if block in needed}
-        cells = self._cells_of(look, blocks, cell_layers.required(names))
+        stale = sorted(wanted.keys() - areas.keys())
         made, derived = dict[Block, Kept](), 0
-        for square in sorted(stale):
-            old, origin = look.areas.get(square), self._origin_of(square, cells, names)
-            layers = old.layers if old and old.origin == origin else {}
-            if any(name not in layers for name in names):
-                layers, derived = {**layers, **self._derive(square, cells, names)}, derived + 1
-            made[square] = Kept(wanted[square], layers, origin)
+        for first in range(0, len(stale), SQUARES_AT_ONCE):
+            some = stale[first : first + SQUARES_AT_ONCE]
+            needed = self._around(some, names)
+            blocks = {block: look.cell_states[block] for block in needed if block in look.cell_states}
+            cells = self._cells_of(look, blocks, cell_layers.required(names))
+            for square in some:
+                old, origin = look.areas.get(square), self._origin_of(square, cells, names)
+                layers = old.layers if old and old.origin == origin else {}
+                if any(name not in layers for name in names):
+                    layers, derived = {**layers, **self._derive(square, cells, names)}, derived + 1
+                made[square] = Kept(wanted[square], layers, origin)
         self._keep(self._areas, look, made)
         self._note(len(wanted) - derived, derived)
         return {square: kept.layers for square, kept in (areas | made).items()}
@@ -254,14 +269,18 @@ class BlockLayers:
 
     def _cells_of(self, look: Look, blocks: Mapping[Block, State], names: Sequence[str]) -> dict[Block, Kept]:
         """Layers of the cells of these blocks, kept or derived."""
-        cells = _valid(look.cells, blocks, names)
+        known = {**look.cells}
+        with self._lock:
+            if look.grid is not None and look.grid is self._grid:  # what was kept since, by others or another piece
+                known |= _some(self._cells, blocks)
+        cells = _valid(known, blocks, names)
         missing = [block for block in blocks if block not in cells]
         near = {one for block in missing for one in around(block, self._reach) if one in look.pages}
         pages = {block: look.pages[block] for block in sorted(near)}
         first = valid_pages(pages, self._cell_m, self._config.change, look.ages)
         made: dict[Block, Kept] = {}
         for block in missing:
-            old, origin = look.cells.get(block), (look.turns[block], *_beginning(first[block]))
+            old, origin = known.get(block), (look.turns[block], *_beginning(first[block]))
             same = old if old and old.origin == origin else Kept(blocks[block], {}, origin, next(self._numbers))
             made[block] = replace(same, state=blocks[block])
         lacking = [block for block in missing if any(name not in made[block].layers for name in names)]
@@ -456,6 +475,36 @@ def _all_of(rect: Rect) -> Iterable[Block]:
 
 def _within(states: Mapping[Block, State], rect: Rect) -> dict[Block, State]:
     return {block: state for block, state in states.items() if _is_in(block, rect)}
+
+
+def _newest(
+    own: Mapping[Block, int], wide: Rect, reach: int, margin: int, squares: Set[Block]
+) -> tuple[dict[Block, int], dict[Block, int]]:
+    """The newest turn of each block and those around it; in and around each of these squares, where there is any."""
+    if _is_sparse(wide):
+        cells = {block: max(own.get(one, NEVER) for one in around(block, reach)) for block in own}
+        of_squares = ((square, _all_of(_grown(_of_squares((*square, 1, 1)), margin + reach))) for square in squares)
+        areas = {square: max(own.get(block, NEVER) for block in near) for square, near in of_squares}
+        return cells, {square: turn for square, turn in areas.items() if turn > NEVER}
+    at, image = _image(own, wide)
+    image = _spread(image, reach)
+    cells = dict(zip(own, image[at].astype(int).tolist(), strict=True))
+    return cells, _by_square(_spread(image, margin), wide, squares) if squares else {}
+
+
+def _near(own: Mapping[Block, int], missing: Set[Block], wide: Rect, reach: int) -> list[Block]:
+    """Those of its own blocks that are among missing ones, or around them."""
+    if _is_sparse(wide):
+        return sorted({one for block in missing for one in around(block, reach)} & own.keys())
+    _, image = _image(dict.fromkeys(missing, 0), wide)
+    at, _ = _image(own, wide)
+    is_near = _spread(image, reach)[at] > NEVER
+    return [block for block, near in zip(own, is_near.tolist(), strict=True) if near]
+
+
+def _is_sparse(rect: Rect) -> bool:
+    """Whether an image of a rectangle costs more than looking at its blocks one by one: places that lie far apart."""
+    return rect[2] * rect[3] > MOST_IMAGE
 
 
 def _image(turns: Mapping[Block, int], rect: Rect) -> tuple[tuple[Ints, Ints], Floats]:

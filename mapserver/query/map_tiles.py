@@ -116,7 +116,7 @@ class Tiles:
         folded, self._turn = grid.folded_since(-1 if whole else self._turn)
         self._grid = ref(grid)
         blocks = folded if whole else sorted({*aged, *(near for one in folded for near in around(one, self._reach))})
-        wide = sorted({near for block in blocks for near in around(block, self._reach)})
+        wide = blocks if whole else sorted({near for block in blocks for near in around(block, self._reach)})
         pages = {block: pages for block, pages in zip(wide, grid.pages(wide), strict=True) if pages}
         known = [block for block in blocks if block in pages]
         return known, set(folded), pages, whole, state.version, state.newest_ns

@@ -153,6 +153,8 @@ class MapQueryable:
         self._now = AnswerPool("query", source.config.query_threads, ANSWER_BYTES)
         # Another one: a fold of the past must not keep the map as it is from answering.
         self._past = AnswerPool("past", 1, MOST_PAST)
+        # And what takes much memory to make, one after the other.
+        self._large = AnswerPool("large", 1, ANSWER_BYTES)
         self._queryable = session.declare_queryable(key, self._on_query)
 
     def stop(self) -> None:
@@ -161,15 +163,17 @@ class MapQueryable:
 
     def close(self) -> None:
         """Drop what waits, and let what is in work end; after `stop`."""
-        self._now.close()
-        self._past.close()
+        for pool in (self._now, self._past, self._large):
+            pool.close()
 
     def _on_query(self, asked: zenoh.Query) -> None:
         """Parse a query and let it wait, without a thread, for the journal row that it asks for; then for a thread."""
         try:
             name, parameters = question(asked)
             query = parse_query(name, parameters)
-            pool, size = (self._past, 1) if reads_past(query) else (self._now, self._answers.size(query))
+            pool, size = self._large if self._answers.is_large(query) else self._now, self._answers.size(query)
+            if reads_past(query):
+                pool, size = self._past, 1
         except QueryError as error:
             self._replies.refuse(asked, error)
             return

@@ -16,12 +16,15 @@ from functools import cached_property
 from itertools import pairwise
 
 from mapserver.query.block_layers import Look
+from mapserver.query.views import MOST_BLOCKS
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import Piece
 from protocol.queries.places import Place
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 PIECE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
+READ_BYTES = 2**24  # layers of cells that one answer is made of, where larger cells are their means
+STEP = BLOCK_CELLS
 MOST_OPEN = 16  # regions that are read at the same time
 IDLE_S = 30.0  # a region of which nobody takes a piece for so long makes room; one piece takes 20 s at 300 kbit/s
 OPEN_S = 600.0  # ... and one that is open for so long, since its pages leave the grid one by one
@@ -41,30 +44,46 @@ class Reading:
     count: int = 1
     outline: tuple[Place, ...] = ()
 
+    @property
+    def past_blocks(self) -> int:
+        """Blocks of maps of the past, whose pages nobody else has."""
+        return sum(len(look.pages) for look in self.looks if look.grid is None)
+
 
 @dataclass(frozen=True)
 class PieceGrid:
     """Pieces of a window, row by row from its south-western corner; edges lie between blocks, where they can.
 
-    width, height: of a piece [cells].
+    width, height: of a piece [cells]; step: between the places where edges may lie.
     """
 
     window: CellWindow
     width: int
     height: int
+    step: int = STEP
 
     @classmethod
-    def of_layers(cls, window: CellWindow, layers: int) -> PieceGrid:
-        """Pieces with at most PIECE_BYTES each: square, unless the window is narrow."""
-        cells = PIECE_BYTES // (4 * layers)
+    def of_layers(cls, window: CellWindow, layers: int, count: int = 1) -> PieceGrid:
+        """Pieces with at most PIECE_BYTES each, made of READ_BYTES at most: square, unless the window is narrow.
+
+        count: cells of the map to a side of one of the window. QueryError where one alone is made of more.
+        """
+        cells, step = min(PIECE_BYTES // (4 * layers), READ_BYTES // (4 * layers * count**2)), 1 if count > 1 else STEP
+        if not cells:
+            most = math.isqrt(READ_BYTES // (4 * layers))
+            problem = f"cells of {count} x {count} cells of the map, with {layers} layers"
+            raise QueryError(
+                Refusal.TOO_LARGE,
+                f"{problem}: at most {most} x {most}; ask for fewer `layers`, or a finer `resolution`",
+            )
         if window.columns * window.rows <= cells:
-            return cls(window, window.columns + BLOCK_CELLS, window.rows + BLOCK_CELLS)
+            return cls(window, window.columns + step, window.rows + step, step)
         side = math.isqrt(cells)
         if window.rows < side:
-            return cls(window, _whole_blocks(cells // window.rows), window.rows + BLOCK_CELLS)
+            return cls(window, _whole(cells // window.rows, step), window.rows + step, step)
         if window.columns < side:
-            return cls(window, window.columns + BLOCK_CELLS, _whole_blocks(cells // window.columns))
-        return cls(window, _whole_blocks(side), _whole_blocks(side))
+            return cls(window, window.columns + step, _whole(cells // window.columns, step), step)
+        return cls(window, _whole(side, step), _whole(side, step), step)
 
     @property
     def count(self) -> int:
@@ -85,20 +104,20 @@ class PieceGrid:
 
     @cached_property
     def _columns(self) -> list[tuple[int, int]]:
-        return _cut(self.window.column, self.window.columns, self.width)
+        return _cut(self.window.column, self.window.columns, self.width, self.step)
 
     @cached_property
     def _rows(self) -> list[tuple[int, int]]:
-        return _cut(self.window.row, self.window.rows, self.height)
+        return _cut(self.window.row, self.window.rows, self.height, self.step)
 
 
-def _whole_blocks(cells: int) -> int:
-    return max(BLOCK_CELLS, cells // BLOCK_CELLS * BLOCK_CELLS)
+def _whole(cells: int, step: int) -> int:
+    return max(step, cells // step * step)
 
 
-def _cut(first: int, count: int, length: int) -> list[tuple[int, int]]:
+def _cut(first: int, count: int, length: int, step: int) -> list[tuple[int, int]]:
     """Begin and end of each piece of an axis."""
-    edges = [first, *range(first // BLOCK_CELLS * BLOCK_CELLS + length, first + count, length), first + count]
+    edges = [first, *range(first // step * step + length, first + count, length), first + count]
     return list(pairwise(edges))
 
 
@@ -117,20 +136,24 @@ class OpenRegions:
         self._lock = threading.Lock()
         self._open: dict[int, _Open] = {}
 
-    def make_room(self) -> None:
-        """Forget what is read or left; QueryError while too many regions are being read."""
+    def make_room(self, past_blocks: int = 0) -> None:
+        """Forget what is read or left; QueryError while too many regions are being read, or too much of the past."""
         with self._lock:
             self._forget()
-            read = [cursor for cursor, one in self._open.items() if one.is_read]
-            for cursor in read[: max(0, len(self._open) + 1 - MOST_OPEN)]:
-                del self._open[cursor]
-            if len(self._open) >= MOST_OPEN:
-                problem = f"{MOST_OPEN} large regions are being read; ask again later, or for a smaller one"
-                raise QueryError(Refusal.OVERLOADED, problem, RETRY_AFTER_S)
+            while self._is_full(past_blocks):
+                read = next((cursor for cursor, one in self._open.items() if one.is_read), None)
+                if read is None:
+                    problem = f"{len(self._open)} large regions are being read; ask again later, or for a smaller one"
+                    raise QueryError(Refusal.OVERLOADED, problem, RETRY_AFTER_S)
+                del self._open[read]
+
+    def _is_full(self, past_blocks: int) -> bool:
+        kept = sum(one.reading.past_blocks for one in self._open.values())
+        return len(self._open) >= MOST_OPEN or bool(past_blocks and kept and kept + past_blocks > MOST_BLOCKS)
 
     def open(self, reading: Reading) -> int:
         """Keep what a region is read from; returns its cursor. QueryError as `make_room`."""
-        self.make_room()
+        self.make_room(reading.past_blocks)
         cursor, now_s = 1 + secrets.randbelow(2**48), time.monotonic()
         with self._lock:
             self._open[cursor] = _Open(reading, now_s, now_s)
@@ -143,7 +166,7 @@ class OpenRegions:
             one = self._open.get(cursor)
             if one is None:
                 raise QueryError(Refusal.EXPIRED, f"no region is open under cursor {cursor}: ask for it again")
-            pieces = PieceGrid.of_layers(one.reading.window, len(one.reading.layers))
+            pieces = PieceGrid.of_layers(one.reading.window, len(one.reading.layers), one.reading.count)
             if number >= pieces.count:
                 raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `number`: {number} of {pieces.count} pieces, from 0")
             one.used_s, one.is_read = time.monotonic(), one.is_read or number == pieces.count - 1

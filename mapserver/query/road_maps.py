@@ -27,7 +27,7 @@ from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.rows import Selection
 from mapserver.query.source import MapSource, MapState
-from mapserver.query.views import StillGrid, StillMap, View, surroundings
+from mapserver.query.views import StillGrid, StillMap, View, check_past, surroundings
 from mapserver.roads.ledger import Ledger, Ledgers
 from mapserver.roads.network import network
 from mapserver.roads.passes import PassTally
@@ -293,6 +293,7 @@ class RoadMaps:
         return roads
 
     def _as_of(self, as_of_ns: int, machine: str) -> RoadMap:
+        self._source.run(lambda state: check_past(state, None, 0))
         version, facts = self._source.run(lambda state: (state.version, state.facts))
         traffic = Traffic()
         with self._source.location.reader() as reader:

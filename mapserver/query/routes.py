@@ -32,6 +32,9 @@ EDGE_M = 20.0  # so far beyond the known ground a way may lead: around its corne
 DETOUR = 0.5
 LEAST_DETOUR_M = 60.0
 MAX_CELLS = 1_000_000  # of the window of a way: 1 x 1 km, searched in about a second, with 300 MB
+MOST_SQUARES = (
+    768  # of 64 x 64 cells with known ground: 49 km straight on; 120 KB each, and as much while they are read
+)
 GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled", "visits")
 
 
@@ -162,6 +165,9 @@ class Routes:
 
     def _read_once(self, squares: Set[Block], query: RouteQuery | WayQuery) -> tuple[Look, Squares]:
         look = self._look(squares, LAYERS, query.as_of_ns, repairs=query.repairs)
+        if (count := len(look.area_states)) > MOST_SQUARES:
+            problem = f"{count} squares of {SQUARE_CELLS} cells with known ground along the line, over {MOST_SQUARES}"
+            raise QueryError(Refusal.TOO_LARGE, f"{problem}: ask for it in parts, from place to place")
         layers = self._layers.squares(look, squares, LAYERS)
         nothing = {min(squares): {name: np.full((SQUARE_CELLS, SQUARE_CELLS), np.nan, np.float32) for name in LAYERS}}
         return look, Squares.stacked(self._site.cell_m, SQUARE_CELLS, layers or nothing)

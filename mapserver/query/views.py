@@ -30,6 +30,26 @@ from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
+# Of known ground that one question may read, 4 km2 with cells of 1 m: looking at them takes whoever owns the map 0.2 s,
+# and pages of the past up to 190 MB.
+MOST_BLOCKS = 16_384
+
+
+def check_past(state: MapState, window: CellWindow | None, reach: int) -> None:
+    """Refuse a map of the past of too much known ground; window: None for all of it. On the thread that has the map."""
+    west, south, east, north = state.grid.bounds() or (0, 0, 1, 1)
+    area = CellWindow(west, south, east - west, north - south) if window is None else surroundings(window, reach)
+    instead = "of the past ask for a `region` of a part, with `bounds` and `as_of`; or ask for the map as it is"
+    check_blocks(len(state.grid.blocks_in(area)), instead)
+
+
+def check_blocks(count: int, instead: str) -> None:
+    """Refuse a question that reads too much known ground, and say what to ask instead."""
+    if count > MOST_BLOCKS:
+        n = BLOCK_CELLS
+        problem = f"it reads {count} blocks ({n} x {n} cells) of known ground, over {MOST_BLOCKS}"
+        raise QueryError(Refusal.TOO_LARGE, f"{problem}: {instead}")
+
 
 @dataclass(frozen=True)
 class View:

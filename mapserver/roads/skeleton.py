@@ -22,7 +22,7 @@ import numpy as np
 from mapserver.evidence.cells import CELLS, HEADING
 from mapserver.evidence.timeline import Block, TimedPage, TimedPages, plane_counts
 from mapserver.roads.ridges import AXES, Blur, ridges
-from protocol.arrays import Bools, Ints
+from protocol.arrays import AnyArray, Bools, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
 ROUNDS = 8  # ridges are five cells wide, and where several cross some more
@@ -231,15 +231,17 @@ class Skeletons:
         return codes, metres, ends, np.array(blocks, np.int64).reshape(-1, 2) * BLOCK_CELLS, self._join, row, column
 
 
-def axis_metres(pages: Sequence[TimedPage]) -> tuple[Ints, Ints]:
+def axis_metres(pages: Sequence[TimedPage]) -> tuple[AnyArray, AnyArray]:
     """Where in a block machines drove: cell * AXES + axis (n,), and metres (n,) in 1/4096 m, of all pages."""
     if isinstance(pages, TimedPages) and axis_metres in pages.derived:
-        known: tuple[Ints, Ints] = pages.derived[axis_metres]
+        known: tuple[AnyArray, AnyArray] = pages.derived[axis_metres]
         return known
-    metres = _driven(plane_counts(pages, HEADING))
+    codes, metres = _driven(plane_counts(pages, HEADING))
+    small = np.uint32 if metres.max(initial=0) < 2**32 else np.int64
+    driven = codes.astype(np.uint16), metres.astype(small)
     if isinstance(pages, TimedPages):
-        pages.derived[axis_metres] = metres  # few cells of a block are on a road
-    return metres
+        pages.derived[axis_metres] = driven  # few cells of a block are on a road; all, where nothing is a road
+    return driven
 
 
 @numba.njit(cache=True, nogil=True)

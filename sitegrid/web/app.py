@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import json
 import logging
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Sequence
 from http import HTTPStatus
 from pathlib import Path
@@ -27,6 +27,7 @@ from protocol.errors import Refusal
 from protocol.queries.answers import MapInfo, MapVersion
 from protocol.site.geometry import Bounds
 from sitegrid.web import live, mercator, values
+from sitegrid.web.encoding import Cache, as_json, beside
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
 from sitegrid.web.resource import tag_of
@@ -36,7 +37,7 @@ from sitegrid.web.values import Problem, bad, problem_response
 
 PAGE = Path(__file__).parent / "page"
 FRESH_S = 1.0  # how old the version may be that a tile, or a copy that the asker has, is compared with
-PNG_KEPT = 4000  # some 20 MB
+PNG_BYTES = 2**25  # of tiles that are kept: some 4000
 SMALL_ALREADY = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/x-npz")  # deflated inside
 MARGIN_M = 100.0  # around the map's bounds, which are of what is folded: a tile shows samples that still wait for it
 log = logging.getLogger("sitegrid.web")
@@ -50,7 +51,7 @@ class WebApp:
         self, feeds: Sequence[SiteFeed], person: Callable[[str], str | None] | None, counts: Counter[str]
     ) -> None:
         self._feeds = {feed.name: feed for feed in feeds}
-        self._pngs: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
+        self._pngs: Cache[bytes] = Cache(PNG_BYTES, len)
         site = f"{PREFIX}/sites/{{site}}"
         routes = [
             Route(f"{PREFIX}/sites", self._sites),
@@ -85,7 +86,7 @@ class WebApp:
         return _json({"sites": [{"name": name, "href": f"{PREFIX}/sites/{name}/info"} for name in self._feeds]})
 
     async def _openapi(self, _: Request) -> Response:
-        return _json(description())
+        return await as_json(description())
 
     async def _resource(self, request: Request) -> Response:
         """One resource; a copy that the asker has is confirmed where the map is still that one."""
@@ -158,11 +159,9 @@ class WebApp:
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
         key = (feed.name, kind, layer, z, x, y, tag)
-        if key not in self._pngs:
-            self._pngs[key] = await _png(feed, info, kind, layer, (z, x, y))
-            while len(self._pngs) > PNG_KEPT:
-                self._pngs.popitem(last=False)
-        return Response(self._pngs[key], headers=headers, media_type="image/png")
+        if (png := self._pngs.get(key)) is None:
+            self._pngs.keep(key, png := await _png(feed, info, kind, layer, (z, x, y)))
+        return Response(png, headers=headers, media_type="image/png")
 
     async def _healthz(self, _: Request) -> Response:
         """Whether the web server answers; whether map servers do is in /metrics."""
@@ -184,7 +183,7 @@ class WebApp:
 
 async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tuple[int, int, int]) -> bytes:
     """An XYZ tile: the map's cells below its pixels."""
-    pixels = mercator.pixels_of(*place, await feed.projection())
+    pixels = await beside(mercator.pixels_of, *place, await feed.projection())
     cell_m = info.site.cell_m
     bounds = pixels.bounds(_known(info), cell_m) if info.merged else None
     if bounds is None:
@@ -193,8 +192,8 @@ async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tupl
         raise bad(Refusal.TOO_LARGE, "too many cells in one tile; zoom in")
     region = await feed.ask(feed.client.region, bounds, (layer,))
     edges = region.bounds
-    values_px = pixels.sample(region[layer], edges.west_m, edges.south_m, cell_m)
-    return mercator.value_png(values_px, layer) if kind == "value" else mercator.colour_png(values_px, layer)
+    png = mercator.value_png if kind == "value" else mercator.colour_png
+    return await beside(lambda: png(pixels.sample(region[layer], edges.west_m, edges.south_m, cell_m), layer))
 
 
 def _known(info: MapInfo) -> Bounds:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import product
 from typing import Any
 
 import cv2
 import numpy as np
 
-from protocol.arrays import AnyArray, Floats
+from protocol.arrays import AnyArray, Floats, Ints
 from protocol.queries.answers import GroundChange
-from protocol.queries.map_tiles import PLANES, TILE_CELLS, TilesAnswer
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer
 from protocol.queries.roads import Line, RoadChange, RoadSegment, WorklistRow
 from protocol.site.ground_classes import ZONES
 from protocol.site.site_config import Projection
@@ -19,22 +21,26 @@ from protocol.wire.messages import Pose
 from sitegrid.web.values import iso
 
 LEAST_CELLS = 4  # smaller areas of one kind are noise to the eye
-Corner = tuple[float, float]
+# A picture's side: 17 MB while its areas are followed. An area that is wider than 2 km is cut there.
+MOST_TILES = 32
+UNKNOWN = 255  # in place of a class
 
 
 def zones(answer: TilesAnswer, boundaries: Sequence[float], projection: Projection) -> dict[str, Any]:
-    """Areas of cells of the same class of resistance, as polygons with holes."""
-    if not answer.tiles:
-        return _collection([])
-    image, column, row = _resistance(answer)
-    classes = np.where(np.isnan(image), -1, np.digitize(image, boundaries))
-    areas = []
-    for kind in range(len(boundaries) + 1):
-        for rings in _polygons(classes == kind):
-            outline = [[_corner(x + column, y + row, answer.cell_m, projection) for x, y in ring] for ring in rings]
-            name = ZONES[kind].name if len(boundaries) + 1 == len(ZONES) else str(kind)
-            areas.append(_feature("Polygon", [[*ring, ring[0]] for ring in outline], {"class": kind, "name": name}))
-    return _collection(areas)
+    """Areas of cells of the same class of resistance, as polygons with holes; made as they are iterated over."""
+    classes = np.digitize(PLANES["resistance"].values(), boundaries).astype(np.uint8)
+    classes[0] = UNKNOWN
+    return {"type": "FeatureCollection", "features": _zones(answer, classes, len(boundaries) + 1, projection)}
+
+
+def _zones(answer: TilesAnswer, classes: AnyArray, count: int, projection: Projection) -> Iterator[dict[str, Any]]:
+    for tiles in _pictures(answer.tiles):
+        image, corner = _classes(tiles, classes)
+        for kind in range(count):
+            name = ZONES[kind].name if count == len(ZONES) else str(kind)
+            for rings in _polygons(image == kind):
+                outline = [_ring((ring + corner) * answer.cell_m, projection) for ring in rings]
+                yield _feature("Polygon", outline, {"class": kind, "name": name})
 
 
 def changes(ground_changes: Iterable[GroundChange], projection: Projection) -> dict[str, Any]:
@@ -111,21 +117,36 @@ def repairs(road_changes: Iterable[RoadChange], projection: Projection) -> dict[
     return _collection(out)
 
 
-def _resistance(answer: TilesAnswer) -> tuple[Floats, int, int]:
-    """The whole map (rows, columns), and its first column and row."""
-    xs, ys = [tile.x for tile in answer.tiles], [tile.y for tile in answer.tiles]
-    left, bottom = min(xs), min(ys)
-    shape = ((max(ys) - bottom + 1) * TILE_CELLS, (max(xs) - left + 1) * TILE_CELLS)
-    image = np.full(shape, np.nan)
-    steps = PLANES["resistance"].values()
-    for tile in answer.tiles:
-        row, column = (tile.y - bottom) * TILE_CELLS, (tile.x - left) * TILE_CELLS
-        image[row : row + TILE_CELLS, column : column + TILE_CELLS] = steps[tile.unpacked()["resistance"]]
-    return image, left * TILE_CELLS, bottom * TILE_CELLS
+def _pictures(tiles: Iterable[MapTile]) -> Iterator[list[MapTile]]:
+    """Tiles that touch, MOST_TILES to a side at most: what lies far away costs its own picture alone."""
+    left = {(tile.x, tile.y): tile for tile in tiles}
+    while left:
+        group, edge = dict[tuple[int, int], MapTile](), [next(iter(left))]
+        while edge:
+            x, y = place = edge.pop()
+            if place in left:
+                group[place] = left.pop(place)
+                edge += [(x + right, y + up) for right, up in product((-1, 0, 1), repeat=2)]
+        west, south = (min(place[axis] for place in group) for axis in (0, 1))
+        parts = defaultdict[tuple[int, int], list[MapTile]](list)
+        for (x, y), tile in group.items():
+            parts[(x - west) // MOST_TILES, (y - south) // MOST_TILES].append(tile)
+        yield from parts.values()
 
 
-def _polygons(mask: AnyArray) -> Iterable[list[list[Corner]]]:
-    """Areas of a mask as lists of rings along the cells' edges: the outline, then holes.
+def _classes(tiles: Sequence[MapTile], classes: AnyArray) -> tuple[AnyArray, Ints]:
+    """Classes of a picture's cells (rows, columns), and its first column and row."""
+    first, last = (end([(tile.x, tile.y) for tile in tiles], axis=0) for end in (np.min, np.max))
+    columns, rows = (last - first + 1) * TILE_CELLS
+    image = np.full((rows, columns), UNKNOWN, np.uint8)
+    for tile in tiles:
+        column, row = (np.array([tile.x, tile.y]) - first) * TILE_CELLS
+        image[row : row + TILE_CELLS, column : column + TILE_CELLS] = classes[tile.unpacked()["resistance"]]
+    return image, first * TILE_CELLS
+
+
+def _polygons(mask: AnyArray) -> Iterator[list[Floats]]:
+    """Areas of a mask as lists of rings (n, 2) along the cells' edges: the outline, then holes.
 
     OpenCV follows the centres of pixels; of a mask twice as fine, one pixel wider, these are the cells' edges. It cuts
     the corners of holes.
@@ -143,7 +164,7 @@ def _polygons(mask: AnyArray) -> Iterable[list[list[Corner]]]:
         while hole >= 0:
             rings.append(contours[hole])
             hole = order[0][hole][0]
-        yield [[(float(x) / 2, float(y) / 2) for x, y in ring[:, 0].tolist()] for ring in rings if len(ring) >= 3]
+        yield [ring[:, 0] / 2 for ring in rings if len(ring) >= 3]
 
 
 def _road(road: RoadSegment, more: dict[str, Any], projection: Projection) -> dict[str, Any]:
@@ -161,6 +182,13 @@ def _line(line: Line, projection: Projection) -> list[list[float]]:
 def _corner(x: float, y: float, scale: float, projection: Projection) -> list[float]:
     lat_deg, lon_deg, _ = projection.to_geodetic(x * scale, y * scale)
     return [round(lon_deg, 8), round(lat_deg, 8)]
+
+
+def _ring(corners_m: Floats, projection: Projection) -> Floats:
+    """A closed ring (n + 1, 2) of longitudes and latitudes."""
+    x_m, y_m = np.concatenate([corners_m, corners_m[:1]]).T
+    lat_deg, lon_deg, _ = projection.to_geodetic_many(x_m, y_m, np.zeros(len(x_m)))
+    return np.stack([lon_deg, lat_deg], axis=1).round(8)
 
 
 def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:

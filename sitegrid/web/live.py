@@ -15,11 +15,13 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from protocol.queries.answers import MapVersion
-from sitegrid.web.site import SiteFeed, frame
+from sitegrid.web.encoding import beside, frame
+from sitegrid.web.site import POSES_S, SiteFeed
 
 TAKEN_S = 30.0  # a page that has not taken a map in for so long is disconnected; it comes back by itself
 QUIET_S = 1.0  # poses are sent at least so often
 NO_PERMISSION, TOO_SLOW = 4401, 4408
+AWAY = json.dumps({"state": "away"})
 
 
 async def serve(socket: WebSocket, feed: SiteFeed) -> None:
@@ -44,7 +46,8 @@ class _Page:
         self._may_stay: Callable[[], bool] = socket.scope.get("may_stay", lambda: True)  # see Guard
         self._sent: MapVersion | None = None  # on its way
         self._sent_s = 0.0
-        self._state: Any = None
+        self._taken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._state = ""
         self._poses_s = -QUIET_S
 
     async def receive(self) -> None:
@@ -59,8 +62,7 @@ class _Page:
                 return
             if self._sent and said == (self._sent.row, self._sent.fact):
                 self._version, self._sent = self._sent, None
-            async with self._door.moved:
-                self._door.moved.notify_all()
+                self._taken.set_result(None)
 
     async def send(self) -> None:
         """Send what is new, whenever there is anything."""
@@ -73,27 +75,25 @@ class _Page:
             if not self._may_stay():
                 await self._socket.close(NO_PERMISSION, "the token no longer counts")
                 return
+            moved, self._taken = feed.moved, loop.create_future()  # before: what comes meanwhile is news too
             await self._send_news(now_s)
-            async with feed.moved:
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(feed.moved.wait(), QUIET_S)
+            await asyncio.wait([moved, self._taken], timeout=QUIET_S, return_when=asyncio.FIRST_COMPLETED)
 
     async def _send_news(self, now_s: float) -> None:
         feed, socket = self._door, self._socket
-        state = (feed.is_away, feed.state_text)
+        state = AWAY if feed.is_away else feed.state_text or "{}"
         if state != self._state:
             self._state = state
-            news = {"state": "away"} if feed.is_away else {"state": "live", "site": feed.state}
-            await self._timely(socket.send_text(json.dumps(news if feed.state or feed.is_away else {})))
+            await self._timely(socket.send_text(state))
         if self._sent is None and not feed.is_away and (answer := feed.since(self._version)):
             if answer.tiles or answer.whole:
                 self._sent, self._sent_s = answer.version, now_s
-                await self._timely(socket.send_bytes(frame(answer)))
+                await self._timely(socket.send_bytes(await beside(frame, answer)))
             else:
                 self._version = answer.version  # nothing that the page shows is another one
-        if now_s - self._poses_s >= 0.2 and (poses := feed.poses()):
+        if now_s - self._poses_s >= 0.9 * POSES_S and (poses := feed.poses_text()):
             self._poses_s = now_s
-            await self._timely(socket.send_text(json.dumps({"poses": poses})))
+            await self._timely(socket.send_text(poses))
 
     async def _timely(self, sending: Any) -> None:
         """Send; a page whose link takes nothing for long is given up."""

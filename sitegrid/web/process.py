@@ -1,8 +1,4 @@
-"""The web server's process: its address, TLS, event loop and sockets, and how long each may keep others waiting.
-
-A socket is counted when it is accepted, before TLS, and until it is closed, whatever it becomes: a handshake that never
-begins, half a request, a WebSocket.
-"""
+"""The web server's process: TLS, event loop, and how long a request may keep others waiting."""
 
 from __future__ import annotations
 
@@ -11,12 +7,11 @@ import logging
 import socket
 import threading
 from argparse import Namespace
-from collections import Counter
+from asyncio import sslproto
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from http import HTTPStatus
-from ipaddress import ip_address, ip_network
 from pathlib import Path
 from typing import Any
 
@@ -24,25 +19,23 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, LinkError
 from protocol.wire.credentials import CERTIFICATE_FILE, KEY_FILE
-from sitegrid.client import connect
+from sitegrid.client import Client, connect
 from sitegrid.process.lifetime import say
 from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
 from sitegrid.web.site import SiteFeed
+from sitegrid.web.sockets import AT_ONCE, OF_ADDRESS, Listening, listen
 from sitegrid.web.values import Problem, problem_response
 
 MESSAGE_BYTES = 4096  # of what a page says
 ADDRESS_BYTES = 2**18  # that are read, to be refused by name: a line of 10,000 places; beyond, the connection ends
-CONNECTIONS = 500
-# 28 browsers behind one NAT that load the page at the same time (six sockets each, and the live one), or 200 pages that
-# are open behind a proxy; two such addresses leave places to others.
-OF_ADDRESS = 200
-SPARE = 50  # more of an address and in all, who are told that there are too many: beyond, a socket is closed at once
+ROUTER_S = 1.0  # between two attempts to reach a router
 REQUEST_S = 10.0  # for a request to come in whole, from its first byte or the connection's begin
 TLS_S = 5.0  # for a handshake
-STALLED_S = 30.0  # until a socket that takes nothing is closed
+TLS_BYTES = 2**15  # that each connection keeps to receive in: a record of TLS has half of it
+
 log = logging.getLogger("sitegrid.web.process")
 
 
@@ -54,12 +47,17 @@ def serve(
     stop: threading.Event,
 ) -> int:
     """Serve sites, each a name (see `connect` for None) and an endpoint, until `stop` is set."""
-    listening = opened.enter_context(_listen(address))
+    listening = opened.enter_context(listen(address))
     person = TokenFile(arguments.tokens).person if arguments.tokens else None
-    clients = [connect(endpoint, name, keys=arguments.keys) for name, endpoint in sites]
+    clients: list[Client] = []
+    for name, endpoint in sites:
+        if (client := _connected(endpoint, name, arguments.keys, stop)) is None:
+            return 0
+        clients.append(client)
 
     async def run() -> None:
-        if arguments.tls:  # uvicorn cannot be told how long a handshake may take
+        if arguments.tls:  # uvicorn cannot be told how long a handshake may take, nor how much it may keep
+            sslproto.SSLProtocol.max_size = TLS_BYTES
             loop: Any = asyncio.get_running_loop()
             loop.create_server = partial(loop.create_server, ssl_handshake_timeout=TLS_S, ssl_shutdown_timeout=TLS_S)
         web = WebApp([SiteFeed(client) for client in clients], person, listening.counts)
@@ -69,8 +67,9 @@ def serve(
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
             h11_max_incomplete_event_size=ADDRESS_BYTES,
-            limit_concurrency=CONNECTIONS,
+            backlog=AT_ONCE,
             log_config=None,
+            log_level="error",  # a line for each bad request would fill disks
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=1,
@@ -89,23 +88,24 @@ def serve(
     return 0
 
 
+def _connected(endpoint: str, name: str | None, keys: Path | None, stop: threading.Event) -> Client | None:
+    """A client of a site, as soon as its router is there; None where `stop` is set before."""
+    problem = ""
+    while not stop.is_set():
+        try:
+            return connect(endpoint, name, keys=keys)
+        except LinkError as error:
+            if str(error) != problem:
+                problem = str(error)
+                log.warning("waiting for the router problem=%r", problem)
+            stop.wait(ROUTER_S)
+    return None
+
+
 async def _stop_with(server: uvicorn.Server, stop: threading.Event) -> None:
     while not stop.is_set():
         await asyncio.sleep(0.2)
     server.should_exit = True
-
-
-def _listen(address: tuple[str, int]) -> Listening:
-    host, port = address[0].strip("[]"), address[1]
-    listening = Listening(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind((host, port))
-        listening.listen(256)
-    except OSError as error:
-        listening.close()
-        raise ConfigError("--listen", f"cannot listen on {host}:{port}: {error.strerror}") from None
-    return listening
 
 
 def _tls(folder: Path | None) -> dict[str, Any]:
@@ -117,66 +117,27 @@ def _tls(folder: Path | None) -> dict[str, Any]:
     return {"ssl_certfile": str(folder / CERTIFICATE_FILE), "ssl_keyfile": str(folder / KEY_FILE)}
 
 
-class Listening(socket.socket):
-    """A listening socket that closes at once what it has no room for. counts: of what was refused."""
-
-    def __init__(self, family: socket.AddressFamily) -> None:
-        super().__init__(family)
-        self.counts: Counter[str] = Counter()
-        self._accepted: list[tuple[str, socket.socket]] = []
-
-    def accept(self) -> tuple[socket.socket, Any]:
-        """As a socket's own; ConnectionAbortedError, which the event loop passes over, where there is no room."""
-        connection, address = super().accept()
-        origin = origin_of(address[0])
-        if len(self.open_of(origin)) >= OF_ADDRESS + SPARE or len(self._accepted) >= CONNECTIONS + SPARE:
-            connection.close()
-            self.refuse(origin)
-            raise ConnectionAbortedError
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # of Linux: nothing else ends a peer that answers and takes nothing
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED_S * 1e3))
-        self._accepted.append((origin, connection))
-        return connection, address
-
-    def open_of(self, origin: str) -> list[int]:
-        """Numbers of the files of an origin's open sockets, in the order in which they came."""
-        self._accepted = [one for one in self._accepted if one[1].fileno() >= 0]
-        return [connection.fileno() for name, connection in self._accepted if name == origin]
-
-    def refuse(self, origin: str) -> None:
-        """Count a socket that is refused, and name where it comes from."""
-        self.counts["refused_connections"] += 1
-        if self.counts["refused_connections"].bit_count() == 1:  # the first, second, fourth...
-            own, every = len(self.open_of(origin)), len(self._accepted)
-            log.warning("too many connections address=%s open=%d of_all=%d", origin, own, every)
-
-
-def origin_of(host: str) -> str:
-    """Whose address it is: a host has all of an IPv6 network of 64 bits."""
-    address = ip_address(host.partition("%")[0])
-    is_alone = address.version == 4 or address.ipv4_mapped
-    return host if is_alone else str(ip_network((int(address), 64), strict=False))
-
-
 class PatientProtocol(H11Protocol):
     """HTTP/1.1 with an end to patience: a connection whose next request does not come in whole in time is closed."""
 
     def __init__(self, listening: Listening, **given: Any) -> None:
         super().__init__(**given)
-        self._listening, self._has_place = listening, True
+        self._listening = listening
         self._deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
         """Begin a connection, and the time that its first request has."""
         super().connection_made(transport)
-        origin = origin_of(transport.get_extra_info("peername")[0])
-        own = self._listening.open_of(origin)
-        self._has_place = transport.get_extra_info("socket").fileno() in own[:OF_ADDRESS]
-        if not self._has_place:
-            self._listening.refuse(origin)
-            detail, close = f"more than {OF_ADDRESS} connections of one address; close some", {"Connection": "close"}
-            self.app = problem_response(Problem(HTTPStatus.TOO_MANY_REQUESTS, "too_many", detail, close))
+        self._connection = self._listening.connection(transport.get_extra_info("socket").fileno())
+        if not self._connection.has_place:
+            self._refuse()
         self._wait()
+
+    def _refuse(self) -> None:
+        self._listening.refuse(self._connection.origin)
+        detail = f"too many connections; an address may have {OF_ADDRESS}: close some"
+        close = {"Connection": "close"}
+        self.app = problem_response(Problem(HTTPStatus.TOO_MANY_REQUESTS, "too_many", detail, close))
 
     def data_received(self, data: bytes) -> None:
         """Go on with a request, or begin one, and the time that it has."""
@@ -184,6 +145,7 @@ class PatientProtocol(H11Protocol):
         if self.conn.their_state in (h11.IDLE, h11.SEND_BODY):
             self._wait()
             return
+        self._listening.waits(self._connection, now=False)
         self._cork(1)
         if self._deadline:
             self._deadline.cancel()
@@ -192,7 +154,18 @@ class PatientProtocol(H11Protocol):
     def on_response_complete(self) -> None:
         """Send what is left of an answer."""
         self._cork(0)
+        self._listening.waits(self._connection, now=True)
         super().on_response_complete()
+
+    def pause_writing(self) -> None:
+        """Wait until the peer takes more of an answer."""
+        self._listening.waits(self._connection, now=True)
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """Go on with an answer."""
+        self._listening.waits(self._connection, now=False)
+        super().resume_writing()
 
     def _cork(self, on: int) -> None:
         """Have head and body of an answer leave together, where the system can: a small one comes in one piece."""
@@ -203,10 +176,22 @@ class PatientProtocol(H11Protocol):
         self._deadline = self._deadline or self.loop.call_later(REQUEST_S, self._give_up)
 
     def _give_up(self) -> None:
-        if self.transport.get_protocol() is self and not self.transport.is_closing():  # it may be a WebSocket's by now
+        if not self._connection.is_live:
             self._listening.counts["refused_slow"] += 1
             self.transport.abort()
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The end of a connection."""
+        if self._deadline:
+            self._deadline.cancel()
+        super().connection_lost(exc)
+
     def _should_upgrade(self) -> bool:
         """WebSockets are connections too; what is not upgraded is told that there are too many."""
-        return self._has_place and len(self.connections) < CONNECTIONS and super()._should_upgrade()
+        if not super()._should_upgrade():
+            return False
+        self._connection.is_live = self._listening.has_room_for_live(self._connection)
+        if not self._connection.is_live:
+            self._refuse()
+        self._listening.waits(self._connection, now=False)
+        return self._connection.is_live

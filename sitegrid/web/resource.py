@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,7 @@ from starlette.responses import Response
 from protocol.queries import requests
 from protocol.queries.answers import MapVersion
 from sitegrid.web import values
+from sitegrid.web.encoding import as_json, beside
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters
 
@@ -38,14 +38,9 @@ class Resource:
     follows_now: bool = False  # whether it changes with the site's now, not with the map alone
 
 
-def as_json(value: Any) -> Response:
-    """Records, arrays and tables as JSON."""
-    return Response(json.dumps(values.plain(value), allow_nan=False), media_type="application/json")
-
-
-def as_geojson(value: Any) -> Response:
-    """A collection of features."""
-    return Response(json.dumps(value, allow_nan=False), media_type=GEOJSON[0])
+async def as_geojson(make: Callable[..., Any], *arguments: Any) -> Response:
+    """A collection of features, as `make` makes it of these arguments."""
+    return await as_json(await beside(make, *arguments), GEOJSON[0])
 
 
 def of_version(response: Response, version: MapVersion) -> Response:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from starlette.responses import Response
 
 from protocol.errors import Refusal
-from protocol.queries.answers import MapVersion
+from protocol.queries.answers import MapVersion, Region
 from protocol.queries.parameters import text_of
-from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, WhyQuery
+from protocol.queries.requests import NOW, PointQuery, PointsQuery, RegionQuery, WhyQuery
 from sitegrid.web import features, roads, values
+from sitegrid.web.encoding import PIECE, ROOM, answered, as_json, beside, frame, pieces
 from sitegrid.web.resource import (
     AS_OF,
     BOUNDS,
@@ -22,16 +25,15 @@ from sitegrid.web.resource import (
     WHEN,
     Resource,
     as_geojson,
-    as_json,
     of_version,
     parsed,
     version_of,
 )
-from sitegrid.web.site import SiteFeed, frame
+from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters, bad
 
-MAX_CELLS_JSON = 250_000  # of a region as text: 2 MB a layer
-MAX_CELLS_NPZ = 4_000_000
+MAX_CELLS = {"json": 250_000, "npz": 4_000_000}  # of a region; 2 MB of text a layer
+MAX_VALUES = 16_000_000  # of a region, cells times layers: 64 MB
 TIMES = ("as_of", "minus")
 AGES = ("age_s", "changed_s")  # layers that change with the site's now
 
@@ -42,21 +44,22 @@ async def point(feed: SiteFeed, parameters: Parameters) -> Response:
     rest = {name: text for name, text in parameters.items() if name not in PLACE}
     query = parsed("point", {**rest, "x": text_of(x_m), "y": text_of(y_m)}, TIMES)
     assert isinstance(query, PointQuery)
-    answer = await feed.ask(feed.client.point, query.x_m, query.y_m, query.layers, **vars(query.when))
+    ask = feed.ask if query.when == NOW else feed.ask_for_much
+    answer = await ask(feed.client.point, query.x_m, query.y_m, query.layers, **vars(query.when))
     lat_deg, lon_deg, _ = (await feed.projection()).to_geodetic(answer.x_m, answer.y_m)
     place = {"x_m": answer.x_m, "y_m": answer.y_m, "lat_deg": lat_deg, "lon_deg": lon_deg}
     table = {**place, "values": answer.values, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
-    return of_version(as_json(table), answer.version)
+    return of_version(await as_json(table), answer.version)
 
 
 async def points(feed: SiteFeed, parameters: Parameters) -> Response:
     """Layers of the cells at many positions, in their order."""
     query = parsed("points", parameters, TIMES, ("places",))
     assert isinstance(query, PointsQuery)
-    answer = await feed.ask(feed.client.points, query.places, query.layers, **vars(query.when))
+    answer = await feed.ask_for_much(feed.client.points, query.places, query.layers, **vars(query.when))
     columns = {"x_m": answer.x_m, "y_m": answer.y_m, "layers": answer.layers}
     table = {**columns, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
-    return of_version(as_json(table), answer.version)
+    return of_version(await as_json(table), answer.version)
 
 
 async def why(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -65,35 +68,50 @@ async def why(feed: SiteFeed, parameters: Parameters) -> Response:
     rest = {name: text for name, text in parameters.items() if name not in PLACE}
     query = parsed("why", {**rest, "x": text_of(x_m), "y": text_of(y_m)}, TIMES)
     assert isinstance(query, WhyQuery)
-    answer = await feed.ask(feed.client.why, query.x_m, query.y_m, as_of_ns=query.as_of_ns, repairs=query.repairs)
-    return of_version(as_json(answer), MapVersion(answer.store, answer.merged, answer.fact))
+    ask = feed.ask_for_much if query.as_of_ns or query.repairs else feed.ask
+    answer = await ask(feed.client.why, query.x_m, query.y_m, as_of_ns=query.as_of_ns, repairs=query.repairs)
+    return of_version(await as_json(answer), MapVersion(answer.store, answer.merged, answer.fact))
 
 
 async def region(feed: SiteFeed, parameters: Parameters) -> Response:
     """Layers of the cells that a rectangle touches, or that lie in a polygon; or of larger cells."""
-    as_npz = parameters.get("format", "json") == "npz"
-    if parameters.get("format", "json") not in ("json", "npz"):
+    kind = parameters.get("format", "json")
+    if kind not in MAX_CELLS:
         raise bad(Refusal.OUT_OF_RANGE, "parameter `format`: json or npz")
     rest = {name: text for name, text in parameters.items() if name != "format"}
     query = parsed("region", rest, TIMES, ("polygon",))
     assert isinstance(query, RegionQuery)
-    cell_m = query.resolution_m or (await feed.info()).site.cell_m
-    bounds = query.bounds
-    cells = (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) / cell_m**2
-    if cells > (most := MAX_CELLS_NPZ if as_npz else MAX_CELLS_JSON):
-        problem = f"a region of about {cells:.0f} cells; at most {most} as {'npz' if as_npz else 'json'}"
-        raise bad(Refusal.TOO_LARGE, f"{problem}: ask for less, or for larger cells with `resolution`")
+    info_now, (west, south, east, north) = await feed.info(), vars(query.bounds).values()
+    cell_m, layers = query.resolution_m or info_now.site.cell_m, len(query.layers) or len(info_now.layers)
+    cells = round((east - west + cell_m) * (north - south + cell_m) / cell_m**2)
+    if cells > (most := min(MAX_CELLS[kind], MAX_VALUES // layers)):
+        problem = f"a region of about {cells} cells; at most {most} with {layers} layers as {kind}"
+        raise bad(Refusal.TOO_LARGE, f"{problem}: ask for less, fewer `layers`, or larger cells with `resolution`")
     asked = {"resolution_m": query.resolution_m, **vars(query.when)}
-    answer = await feed.ask(feed.client.region, query.area, query.layers, **asked)
-    layers = dict(answer.layers)
-    if as_npz:
-        file = io.BytesIO()
-        version = np.array([answer.version.row, answer.version.fact])
-        np.savez_compressed(file, x_m=answer.x_m, y_m=answer.y_m, version=version, **layers)  # type: ignore[arg-type]
-        return of_version(Response(file.getvalue(), media_type="application/x-npz"), answer.version)
+    done = ROOM.take(4 * cells * layers)
+    try:
+        answer = await feed.ask_for_much(feed.client.region, query.area, query.layers, **asked)
+        parts = await beside(_archive, answer) if kind == "npz" else pieces(_table(answer))
+        return of_version(await answered(parts, REGION_MEDIA[kind], done), answer.version)
+    except BaseException:
+        done()
+        raise
+
+
+REGION_MEDIA = {"json": "application/json", "npz": "application/x-npz"}
+
+
+def _table(answer: Region) -> dict[str, Any]:
     axes = {"x_m": answer.x_m, "y_m": answer.y_m, "cell_m": answer.cell_m}
-    table = {**axes, "layers": layers, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
-    return of_version(as_json(table), answer.version)
+    return {**axes, "layers": answer.layers, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
+
+
+def _archive(answer: Region) -> Iterator[bytes]:
+    """An NPZ file, in pieces."""
+    file, version = io.BytesIO(), np.array([answer.version.row, answer.version.fact])
+    np.savez_compressed(file, x_m=answer.x_m, y_m=answer.y_m, version=version, **answer.layers)  # type: ignore[arg-type]
+    file.seek(0)
+    return iter(lambda: file.read(PIECE), b"")
 
 
 async def history(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -101,23 +119,23 @@ async def history(feed: SiteFeed, parameters: Parameters) -> Response:
     x_m, y_m = values.place(parameters, await feed.projection())
     times = {"from_ns": values.stamp(parameters, "from"), "to_ns": values.stamp(parameters, "to")}
     span_s = values.number(parameters, "span") if "span" in parameters else None
-    spans = await feed.ask(feed.client.history, x_m, y_m, values.layers(parameters), **times, span_s=span_s)
-    return as_json({"spans": spans})
+    spans = await feed.ask_for_much(feed.client.history, x_m, y_m, values.layers(parameters), **times, span_s=span_s)
+    return await as_json({"spans": spans})
 
 
 async def info(feed: SiteFeed, _: Parameters) -> Response:
     """State of the map and of its server."""
-    return as_json(await feed.info(0.0))
+    return await as_json(await feed.info(0.0))
 
 
 async def machines(feed: SiteFeed, _: Parameters) -> Response:
     """What the map server knows of each machine."""
-    return as_json({"machines": await feed.ask(feed.client.machines)})
+    return await as_json({"machines": await feed.ask(feed.client.machines)})
 
 
 async def calibration(feed: SiteFeed, _: Parameters) -> Response:
     """What is taken off the samples of each machine, and what is known of its calibration."""
-    return as_json(await feed.ask(feed.client.calibration))
+    return await as_json(await feed.ask(feed.client.calibration))
 
 
 async def changes(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -125,7 +143,7 @@ async def changes(feed: SiteFeed, parameters: Parameters) -> Response:
     after = values.number(parameters, "after", 0.0)
     if after < 0 or after != int(after):
         raise bad(Refusal.OUT_OF_RANGE, f"parameter `after`: {after:g} is no whole number from 0 on")
-    return as_json({"changes": await feed.ask(feed.client.changes, int(after))})
+    return await as_json({"changes": await feed.ask(feed.client.changes, int(after))})
 
 
 async def tiles(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -138,34 +156,34 @@ async def tiles(feed: SiteFeed, parameters: Parameters) -> Response:
         numbers = (int(values.number(parameters, name, -1.0)) for name in ("row", "fact"))
         since = MapVersion(parameters.get("store", ""), *numbers) if known else None
         answer = await feed.ask(feed.client.tiles, since)
-    return Response(frame(answer), media_type="application/octet-stream")
+    return Response(await beside(frame, answer), media_type="application/octet-stream")
 
 
 async def zones(feed: SiteFeed, _: Parameters) -> Response:
     """Areas of one kind of ground, as features."""
     info_now = await feed.info()
     answer = await feed.ask(feed.client.tiles)
-    return as_geojson(features.zones(answer, info_now.boundaries, await feed.projection()))
+    return await as_geojson(features.zones, answer, info_now.boundaries, await feed.projection())
 
 
 async def change_features(feed: SiteFeed, _: Parameters) -> Response:
     """Changes of the ground, as features."""
     ground_changes = await feed.ask(feed.client.changes)
-    return as_geojson(features.changes(ground_changes, await feed.projection()))
+    return await as_geojson(features.changes, ground_changes, await feed.projection())
 
 
 async def machine_features(feed: SiteFeed, _: Parameters) -> Response:
     """Where machines are, as features: those that said so while somebody looks."""
     async with feed.watched():
         await feed.heard()
-        return as_geojson(features.machines(feed.poses(), await feed.projection()))
+        return await as_geojson(features.machines, feed.poses(), await feed.projection())
 
 
 async def track_features(feed: SiteFeed, _: Parameters) -> Response:
     """Where machines drove while somebody looked, as features."""
     async with feed.watched():
         await feed.heard()
-        return as_geojson(features.tracks(feed.tracks(), await feed.projection()))
+        return await as_geojson(features.tracks, feed.tracks(), await feed.projection())
 
 
 RESOURCES: dict[str, Resource] = {
@@ -186,7 +204,7 @@ RESOURCES: dict[str, Resource] = {
             **WHEN,
             "format": "json or npz",
         },
-        ("application/json", "application/x-npz"),
+        tuple(REGION_MEDIA.values()),
     ),
     "history": Resource(
         history,

@@ -16,7 +16,8 @@ from protocol.queries.roads import Segments, SegmentsQuery, Worklist, WorklistQu
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
 from sitegrid.web import features
-from sitegrid.web.resource import AS_OF, BOUNDS, GEOJSON, Resource, as_geojson, as_json, of_version, parsed, version_of
+from sitegrid.web.encoding import as_json
+from sitegrid.web.resource import AS_OF, BOUNDS, GEOJSON, Resource, as_geojson, of_version, parsed, version_of
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters
 
@@ -60,34 +61,31 @@ CHEAPEST = {
 async def segments(feed: SiteFeed, parameters: Parameters) -> Response:
     """Roads, segment by segment."""
     answer = await _segments(feed, parameters)
-    return _of_map(as_json(answer), answer)
+    return _of_map(await as_json(answer), answer)
 
 
 async def segment_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Roads as lines."""
     answer = await _segments(feed, parameters)
-    lines = features.segments(answer.segments, await feed.projection())
-    return _of_map(as_geojson(lines), answer)
+    return _of_map(await as_geojson(features.segments, answer.segments, await feed.projection()), answer)
 
 
 async def worklist(feed: SiteFeed, parameters: Parameters) -> Response:
     """Stretches where work pays."""
     answer = await _worklist(feed, parameters)
-    return _of_map(as_json(answer), answer)
+    return _of_map(await as_json(answer), answer)
 
 
 async def worklist_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Stretches where work pays, as lines."""
     answer = await _worklist(feed, parameters)
-    lines = features.worklist(answer.rows, await feed.projection())
-    return _of_map(as_geojson(lines), answer)
+    return _of_map(await as_geojson(features.worklist, answer.rows, await feed.projection()), answer)
 
 
 async def repair_features(feed: SiteFeed, parameters: Parameters) -> Response:
     """Stretches whose ground changed, as lines."""
     answer = await _worklist(feed, parameters)
-    lines = features.repairs(answer.changes, await feed.projection())
-    return _of_map(as_geojson(lines), answer)
+    return _of_map(await as_geojson(features.repairs, answer.changes, await feed.projection()), answer)
 
 
 async def route(feed: SiteFeed, parameters: Parameters) -> Response:
@@ -120,23 +118,23 @@ RESOURCES: dict[str, Resource] = {
 async def _segments(feed: SiteFeed, parameters: Parameters) -> Segments:
     query = parsed("segments", parameters, TIMES)
     assert isinstance(query, SegmentsQuery)
-    return await feed.ask(feed.client.segments, **_named(query))
+    return await feed.ask_for_much(feed.client.segments, **_named(query))
 
 
 async def _worklist(feed: SiteFeed, parameters: Parameters) -> Worklist:
     query = parsed("worklist", parameters, TIMES)
     assert isinstance(query, WorklistQuery)
-    return await feed.ask(feed.client.worklist, **_named(query))
+    return await feed.ask_for_much(feed.client.worklist, **_named(query))
 
 
 async def _drive(feed: SiteFeed, name: str, parameters: Parameters, places: Sequence[str]) -> Response:
     query = parsed(name, parameters, places=places)
     assert isinstance(query, RouteQuery | WayQuery)
-    answer = await feed.ask(feed.client.drive, query)
+    answer = await feed.ask_for_much(feed.client.drive, query)
     totals = {**asdict(answer.totals), "litres": answer.totals.litres}
     ground = {"line": answer.line_m, "totals": totals, "steps": vars(answer.steps), "machine": asdict(answer.machine)}
     table = {**ground, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
-    return of_version(as_json(table), answer.version)
+    return of_version(await as_json(table), answer.version)
 
 
 def _of_map(response: Response, answer: Segments | Worklist) -> Response:

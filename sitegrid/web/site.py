@@ -5,20 +5,21 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import struct
+import math
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import zenoh
 
 from protocol.errors import LinkError, MessageError, QueryError, Refusal
-from protocol.queries.answers import MapInfo, MapVersion
-from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
+from protocol.queries.answers import GroundChange, MachineState, MapInfo, MapVersion
+from protocol.queries.map_tiles import MapTile, TilesAnswer
 from protocol.site.site_config import MAX_EXTENT_M, Projection, SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, receive_pose
@@ -27,17 +28,20 @@ from sitegrid.asking import is_answered
 from sitegrid.client import Client
 from sitegrid.health import faults_of
 from sitegrid.listener import Listener
+from sitegrid.web.encoding import Cache
 from sitegrid.web.values import plain
 
 T = TypeVar("T")
 PERIOD_S = 0.1  # between two questions for what changed, while somebody looks: what did not change costs little
+POSES_S = 0.2  # between two times that pages are told where machines are
 STATE_S = 2.0  # between two questions for machines, changes and times
 LINGER_S = 10.0  # the map is followed so much longer than somebody looks: GIS ask every few seconds
 HEARD_S = 1.5  # machines publish their poses several times a second
 MOST_POSES, TRACK_STEP_NS = 600, 10**9  # of a track: ten minutes of site time
 SILENT_S = 120.0  # a machine that said nothing for so long is left out
 THREADS = 8  # questions at once: more visitors wait for each other, not on the map server
-PAST_KEPT = 128  # maps of the past that are kept ready: a day by minutes has more, a slider moves by fewer
+PATIENT_THREADS = 4  # questions at once that may take seconds: these keep no other visitor waiting
+PAST_BYTES = 2**26  # of maps of the past that are kept ready: a hundred of a usual site, so that a slider moves
 
 
 class SiteFeed:
@@ -50,11 +54,13 @@ class SiteFeed:
         self.client, self.name = client, client.site
         self.tiles: dict[tuple[int, int], MapTile] = {}
         self.answer: TilesAnswer | None = None
-        self.state: dict[str, Any] = {}
-        self.state_text = "{}"
+        self.state_text = ""  # what pages are told; empty until the map server has answered
         self.is_away = False
-        self.moved = asyncio.Condition()  # notified when tiles, poses or the state may be others
+        self._moved: asyncio.Future[None] | None = None
+        self._woken: tuple[Any, ...] = (None, False, "", 0)  # when pages were woken last, at this time
+        self._woken_s, self._heard = 0.0, 0  # how many poses were heard
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=f"ask-{client.site}")
+        self._patient = ThreadPoolExecutor(PATIENT_THREADS, thread_name_prefix=f"much-{client.site}")
         self.watchers = 0
         self._task: asyncio.Task[None] | None = None
         self._looking: asyncio.Task[None] | None = None
@@ -66,12 +72,16 @@ class SiteFeed:
         self._health: Listener[Health] | None = None
         self._info: tuple[float, MapInfo] | None = None
         self._projection: Projection | None = None
-        self._past: OrderedDict[tuple[int, str, int], TilesAnswer] = OrderedDict()
+        self._poses_text: tuple[float, str] = -math.inf, ""
+        self._past: Cache[TilesAnswer] = Cache(PAST_BYTES, _tiles_bytes)
 
     async def ask(self, question: Callable[..., T], *arguments: Any, **named: Any) -> T:
         """Ask the map server from a thread: the client waits for its answer."""
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._threads, lambda: question(*arguments, **named))
+        return await _run(self._threads, question, *arguments, **named)
+
+    async def ask_for_much(self, question: Callable[..., T], *arguments: Any, **named: Any) -> T:
+        """As `ask`, for what takes the map server long: large areas, routes, the past."""
+        return await _run(self._patient, question, *arguments, **named)
 
     async def info(self, most_s: float = STATE_S) -> MapInfo:
         """State of the map, at most so old."""
@@ -93,12 +103,17 @@ class SiteFeed:
         if key in self._past:
             self._past.move_to_end(key)
             return self._past[key]
-        answer = await self.ask(self.client.tiles, as_of_ns=as_of_ns)
+        answer = await self.ask_for_much(self.client.tiles, as_of_ns=as_of_ns)
         if as_of_ns < info.stamp_ns - 60 * 10**9:  # samples that are a minute late are rare, and show after a while
-            self._past[key] = answer
-            while len(self._past) > PAST_KEPT:
-                self._past.popitem(last=False)
+            self._past.keep(key, answer)
         return answer
+
+    @property
+    def moved(self) -> asyncio.Future[None]:
+        """Done when tiles, poses or the state are others: what does not change wakes no page."""
+        if self._moved is None or self._moved.done():
+            self._moved = asyncio.get_running_loop().create_future()
+        return self._moved
 
     def since(self, version: MapVersion | None) -> TilesAnswer | None:
         """What a page that has a version needs to have the newest one; None while no map is known."""
@@ -106,6 +121,8 @@ class SiteFeed:
             return None
         now = self.answer.version
         whole = version is None or version.store != now.store or version.row > now.row or version.fact > now.fact
+        if version == now:
+            return self.answer if not self.answer.whole else replace(self.answer, whole=False)
         tiles = [tile for tile in self.tiles.values() if version is None or whole or _is_newer(tile, version)]
         return replace(self.answer, whole=whole, tiles=tuple(tiles))
 
@@ -120,14 +137,20 @@ class SiteFeed:
             for pose, came_s in poses
         ]
 
+    def poses_text(self) -> str:
+        """The poses as pages are told of them, made once for all; empty for none."""
+        now_s = time.monotonic()
+        if now_s - self._poses_text[0] >= PERIOD_S:
+            poses = self.poses()
+            self._poses_text = now_s, json.dumps({"poses": poses}) if poses else ""
+        return self._poses_text[1]
+
     async def heard(self) -> None:
         """Wait until a machine says where it is, for a moment."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + HEARD_S
         while not self._poses and (left_s := end_s - loop.time()) > 0:
-            async with self.moved:
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(self.moved.wait(), left_s)
+            await asyncio.wait([self.moved], timeout=left_s)
 
     @contextlib.asynccontextmanager
     async def watched(self) -> Any:
@@ -153,7 +176,8 @@ class SiteFeed:
             if listener:
                 listener.close()
         self.client.close()
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for threads in (self._threads, self._patient):
+            threads.shutdown(wait=False, cancel_futures=True)
 
     async def _follow(self) -> None:
         """Ask again and again while somebody looks; ends when nobody does."""
@@ -169,15 +193,14 @@ class SiteFeed:
             began_s = time.monotonic()
             try:
                 self._take(await self.ask(self.client.tiles, self.answer.version if self.answer else None))
-                await self._notify()  # the map first
+                self._notify()  # the map first
                 if began_s >= next_state_s:
                     next_state_s = began_s + STATE_S
-                    self.state = await self._ask_state()
-                    self.state_text = json.dumps(self.state)
+                    self.state_text = await self.ask(_live_text, self.name, *await self._ask_state())
                 self.is_away = False
             except (LinkError, QueryError, MessageError):
                 self.is_away, next_state_s = True, 0.0
-            await self._notify()
+            self._notify()
             await asyncio.sleep(max(0.05, PERIOD_S - (time.monotonic() - began_s)))
             idle_s = 0.0 if self.watchers else idle_s + PERIOD_S
         self._task = None
@@ -187,11 +210,15 @@ class SiteFeed:
         with contextlib.suppress(zenoh.ZError):  # the session was closed meanwhile
             is_there = await self.ask(is_answered, self.client.session, keys.map_query(self.name, "tiles"))
             self.is_away |= not is_there and self.answer is None
-            await self._notify()
+            self._notify()
 
-    async def _notify(self) -> None:
-        async with self.moved:
-            self.moved.notify_all()
+    def _notify(self) -> None:
+        """Wake the pages where there is anything new to show; for poses five times a second."""
+        now_s, version = time.monotonic(), self.answer.version if self.answer else None
+        heard = self._heard if now_s - self._woken_s >= POSES_S else self._woken[-1]
+        if (news := (version, self.is_away, self.state_text, heard)) != self._woken:
+            self._woken, self._woken_s = news, now_s
+            self.moved.set_result(None)
 
     def _take(self, answer: TilesAnswer) -> None:
         if answer.whole:
@@ -199,17 +226,8 @@ class SiteFeed:
         self.tiles |= {(tile.x, tile.y): tile for tile in answer.tiles}
         self.answer = replace(answer, tiles=())
 
-    async def _ask_state(self) -> dict[str, Any]:
-        info = await self.info(0.0)
-        machines, changes = await self.ask(self.client.machines), await self.ask(self.client.changes)
-        return {
-            "name": self.name,
-            "stamp_ns": info.stamp_ns,
-            "first_ns": info.first_ns,
-            "boundaries": list(info.boundaries),
-            "trusted": {machine.name: machine.trusted for machine in machines},
-            "changes": [plain(change) for change in changes],
-        }
+    async def _ask_state(self) -> tuple[MapInfo, Any, Any]:
+        return await self.info(0.0), await self.ask(self.client.machines), await self.ask(self.client.changes)
 
     def tracks(self) -> dict[str, list[Pose]]:
         """Where each machine was while somebody looked, oldest first: some MOST_POSES poses."""
@@ -232,9 +250,31 @@ class SiteFeed:
     def _on_pose(self, pose: Pose) -> None:
         with self._poses_lock:
             self._poses[pose.machine] = pose, time.monotonic()
+            self._heard += 1
             track = self._tracks.setdefault(pose.machine, deque(maxlen=MOST_POSES))
             if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
                 track.append(pose)
+
+
+async def _run(threads: ThreadPoolExecutor, question: Callable[..., T], *arguments: Any, **named: Any) -> T:
+    return await asyncio.get_running_loop().run_in_executor(threads, partial(question, *arguments, **named))
+
+
+def _live_text(name: str, info: MapInfo, machines: Iterable[MachineState], changes: Iterable[GroundChange]) -> str:
+    """What pages are told of a site whose map server answers."""
+    site = {
+        "name": name,
+        "stamp_ns": info.stamp_ns,
+        "first_ns": info.first_ns,
+        "boundaries": list(info.boundaries),
+        "trusted": {machine.name: machine.trusted for machine in machines},
+        "changes": [plain(change) for change in changes],
+    }
+    return json.dumps({"state": "live", "site": site})
+
+
+def _tiles_bytes(answer: TilesAnswer) -> int:
+    return sum(len(tile.planes) for tile in answer.tiles)
 
 
 def receive_health(key: str, data: bytes) -> Health:
@@ -245,28 +285,6 @@ def receive_health(key: str, data: bytes) -> Health:
     return health
 
 
-def frame(answer: TilesAnswer) -> bytes:
-    """Tiles for a page: length of a JSON head (4 bytes, big-endian), the head, the deflated planes end to end."""
-    head = {
-        "store": answer.version.store,
-        "row": answer.version.row,
-        "fact": answer.version.fact,
-        "stamp_ns": answer.stamp_ns,
-        "cell_m": answer.cell_m,
-        "whole": answer.whole,
-        "planes": list(PLANES),
-        "scales": {name: asdict(scale) for name, scale in PLANES.items()},
-        "tiles": [_head(tile) for tile in answer.tiles],
-    }
-    text = json.dumps(head, separators=(",", ":")).encode()
-    return b"".join([struct.pack(">I", len(text)), text, *(tile.planes for tile in answer.tiles)])
-
-
-def _head(tile: MapTile) -> dict[str, Any]:
-    numbers = {"x": tile.x, "y": tile.y, "row": tile.row, "fact": tile.fact, "newest_ns": tile.newest_ns}
-    return {**numbers, "bytes": len(tile.planes)}
-
-
 def _is_newer(tile: MapTile, version: MapVersion) -> bool:
     return tile.row > version.row or tile.fact > version.fact
 
@@ -274,8 +292,3 @@ def _is_newer(tile: MapTile, version: MapVersion) -> bool:
 def _site_of(info: MapInfo) -> SiteConfig:
     site = info.site
     return SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m, site.cell_m)
-
-
-def names(feeds: Iterable[SiteFeed]) -> list[str]:
-    """Names of sites."""
-    return [feed.name for feed in feeds]

@@ -99,14 +99,21 @@ def plain(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, np.ndarray):
-        value = value.tolist()
+        if value.dtype.kind == "f" and not (known := np.isfinite(value)).all():
+            value = value.astype(object)
+            value[~known] = None
+        return value.tolist()
     if isinstance(value, Mapping):
-        table = {str(key): plain(item) for key, item in value.items()}
-        times = {f"{key.removesuffix('_ns')}_time": iso(item) for key, item in value.items() if _is_stamp(key, item)}
-        return table | times
+        return {str(key): plain(item) for key, item in with_times(value).items()}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def with_times(table: Mapping[Any, Any]) -> dict[Any, Any]:
+    """A table in which each stamp has its time beside it."""
+    times = {f"{key.removesuffix('_ns')}_time": iso(item) for key, item in table.items() if _is_stamp(key, item)}
+    return {**table, **times}
 
 
 def _is_stamp(key: object, value: object) -> bool:

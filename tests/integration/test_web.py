@@ -22,6 +22,7 @@ from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import encode_pose
 from protocol.wire.messages import Pose
+from protocol.wire.session import free_endpoint
 from sitegrid.process.children import Children
 from sitegrid.security.key_folder import issue, make_authority
 from sitegrid.web import values
@@ -219,6 +220,15 @@ def test_slow_headers_and_handshakes_do_not_hold_a_place(web: WebSite, tmp_path:
     ):
         slow.sendall(b"GET / HTTP/1.1\r\nHost: x\r\nX-Slow: ")
         assert slow.recv(1000) == silent.recv(1000) == b""
+
+
+def test_it_waits_for_a_router(tmp_path: Path):
+    with Children(tmp_path) as children:
+        endpoint = free_endpoint()
+        web = children.start("web", "web", "--endpoint", endpoint, "--listen", "0")
+        until(lambda: "waiting for the router" in (tmp_path / "web.log").read_text(), "that it says so")
+        children.start("router", "router", "--listen", endpoint).expect("ready", PATIENCE_S)
+        web.expect("ready", PATIENCE_S)
 
 
 @pytest.mark.nightly

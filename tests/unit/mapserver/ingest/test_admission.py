@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -263,7 +264,7 @@ def test_whoever_scatters_opens_what_its_metres_pay_for(stay: int, distance_m: f
     rows["distance_m"], rows["cov_xx_m2"][::2] = distance_m, std_m**2
     for part in batches(rows, draw):
         taken(credit, part)
-    driven_m = min(distance_m, 2.0) * n
+    driven_m = min(distance_m, 5.0) * n  # a sample each second
     assert len(credit.opened) <= 200 + (credit.jumps_per_m + credit.per_m) * driven_m
     assert len(credit.opened) <= 200 + 0.1 * driven_m or stay in (0, 100), "to and fro pays for no jumps"
     assert len(credit.opened) <= 200 or stay != 1, "and a jump earns nothing"
@@ -272,11 +273,13 @@ def test_whoever_scatters_opens_what_its_metres_pay_for(stay: int, distance_m: f
 @pytest.mark.parametrize("cell_m", [0.5, 1.0, 7.0])
 def test_the_grid_opens_no_block_that_is_not_paid_for(cell_m: float):
     rows = random_samples(400, seed=3, half_m=500.0, std_m=4.0)
-    credit, opened = BlockCredit(cell_m, CONFIG, ()), folded(rows, cell_m=cell_m).folded_since(-1)[0]
+    opened, paid = folded(rows, cell_m=cell_m).folded_since(-1)[0], set()
     for number in range(len(rows)):
-        credit.spend(f"machine-{number}", rows[number : number + 1])
-    assert BlockCredit(cell_m, CONFIG, opened).opened <= credit.opened
-    assert len(credit.opened) <= 1.5 * len(opened), "few more: corners where no vote falls"
+        credit = BlockCredit(cell_m, CONFIG, ())
+        credit.spend("a", rows[number : number + 1])
+        paid |= credit.opened
+    assert BlockCredit(cell_m, CONFIG, opened).opened <= paid
+    assert len(paid) <= 1.5 * len(opened), "few more: corners where no vote falls"
 
 
 def test_what_is_refused_earns_nothing_however_often_it_comes_but_driving_on_does():
@@ -285,3 +288,39 @@ def test_what_is_refused_earns_nothing_however_often_it_comes_but_driving_on_doe
     assert {taken(credit, liar) for _ in range(20)} == {first}
     rows = samples(4000, x_m=5000 + 0.5 * np.arange(4000), y_m=0.0, distance_m=0.5)  # new ground, two blocks at a time
     assert 3500 < taken(credit, rows) < 4000
+
+
+EVERYWHERE = [(x, y) for x in range(-320, 320) for y in range(-320, 320)]  # 10 x 10 km of known ground
+
+
+@pytest.mark.parametrize("names", [1, 300])
+@pytest.mark.parametrize("every_s", [0.001, 30.0])  # all in a bucket of time, or in many
+@pytest.mark.parametrize("known", [[], EVERYWHERE])
+def test_memory_goes_with_what_was_driven(known: list[tuple[int, int]], every_s: float, names: int):
+    draw, n = np.random.default_rng(5), 10_000
+    rows, credit, taken_rows = scattered(draw, n), BlockCredit(1.0, CONFIG, known), []
+    for name in ("x_m", "y_m"):
+        rows[name] /= 4
+    rows["stamp_ns"] += np.arange(n) * round(every_s * 1e9)
+    for k in range(n):
+        with contextlib.suppress(MessageError):
+            credit.spend(f"machine-{k % names}", rows[k : k + 1])
+            taken_rows.append(rows[k : k + 1])
+    bytes_of_pages = sum(pages.nbytes for *_, pages in folded(np.concatenate(taken_rows)).state().blocks)
+    assert 10**5 < bytes_of_pages < (10**7 if names == 1 else 3 * 10**8)
+
+
+@pytest.mark.parametrize(
+    ("mps", "hz", "std_m"), [(25.0, 5.0, 2.9), (8.0, 4.0, 0.8), (0.05, 0.1, 2.0), (0.0, 0.02, 8.0)]
+)
+@pytest.mark.parametrize("known", [[], EVERYWHERE])
+def test_no_honest_machine_meets_it_fast_or_slow(known: list[tuple[int, int]], mps: float, hz: float, std_m: float):
+    """The last one is parked, and its positions wander: each sample is half a metre that its wheels did not drive."""
+    draw, n = np.random.default_rng(6), 10_000
+    heading, step_m = np.cumsum(draw.normal(0, 0.02, n)), mps / hz
+    x_m, y_m = np.cumsum(step_m * np.stack([np.cos(heading), np.sin(heading)]), axis=1) + draw.normal(0, std_m, (2, n))
+    rows = samples(n, x_m=x_m, y_m=y_m, distance_m=max(step_m, 0.01), cov_xx_m2=std_m**2, cov_yy_m2=std_m**2)
+    rows["stamp_ns"] += (np.arange(n) / hz * 1e9).astype(np.int64)
+    credit = BlockCredit(1.0, CONFIG, known)
+    for part in batches(rows, draw):
+        credit.spend("a", part, now_ns=int(part["stamp_ns"][-1]))

@@ -10,9 +10,12 @@ from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.answering import Answers
+from mapserver.query.block_layers import BlockLayers
 from protocol.errors import Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
-from protocol.queries.requests import PointQuery, RegionQuery, When
+from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, TilesQuery, When
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
+from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
@@ -66,6 +69,53 @@ def test_a_region_that_no_reply_carries_is_refused(answers):
     for query in (RegionQuery(bounds), RegionQuery(bounds, resolution_m=1000.0), RegionQuery(bounds, when=When(1))):
         with refused(Refusal.TOO_LARGE, "5000 x 4000 cells"):
             answers.region(query)
+
+
+PLACES = ((-40.0, 40.0), (39.0, -39.0))
+TOO_MUCH = [
+    RegionQuery(Bounds(-45, -45, 45, 45), ("visits",)),
+    RegionQuery(Bounds(-45, -45, 45, 45), ("grade_east",), resolution_m=30.0),
+    RegionQuery(Bounds(-45, -45, 45, 45), ("resistance_filled",)),
+    RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), when=When(NOW_NS + 10**11)),
+    PointsQuery(tuple((x + 0.5, -x - 0.5) for x in range(-40, 40, 10)), ("visits",)),
+    PointsQuery(PLACES, ("resistance_filled",)),
+    RouteQuery(PLACES, repairs=False),
+    WayQuery(*PLACES, repairs=False),
+    TilesQuery(as_of_ns=NOW_NS + 10**11),
+    WorklistQuery(as_of_ns=NOW_NS + 10**11),
+    SegmentsQuery(as_of_ns=NOW_NS + 10**11),
+]
+
+
+@pytest.mark.parametrize("query", TOO_MUCH)
+def test_what_reads_too_much_known_ground_is_refused_before_it_is_read(answers, query, monkeypatch):
+    monkeypatch.setattr("mapserver.query.views.MOST_BLOCKS", 3)
+    monkeypatch.setattr("mapserver.query.block_layers.BlockLayers._cells_of", None)
+    monkeypatch.setattr("mapserver.past.past.Past.grid_as_of", None)
+    with refused(Refusal.TOO_LARGE, "blocks .* of known ground, over 3: .*ask for"):
+        answers.answer(query)
+
+
+def test_a_cell_that_is_made_of_too_many_is_refused_with_what_is_not(answers, monkeypatch):
+    monkeypatch.setattr("mapserver.query.region_pieces.READ_BYTES", 4 * 30**2)
+    asked = {"resolution_m": 31.0}
+    with refused(Refusal.TOO_LARGE, "at most 30 x 30; ask for fewer `layers`, or a finer `resolution`"):
+        answers.region(RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), **asked))
+    first = answers.region(RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), resolution_m=30.0))
+    assert (first.piece.count, first["visits"].shape) == (9 + 7, (1, 1))
+
+
+def test_places_that_lie_far_apart_are_read_as_others(answers, monkeypatch):
+    query = PointsQuery((*PLACES, (18_000.0, -18_000.0)), ("grade_east", "grade_east_filled", "visits"))
+    near = replace(query, places=PLACES)
+    for fresh in (True, False):
+        expected = answers.points(near)
+        if fresh:
+            answers._layers = BlockLayers(SITE.cell_m, CONFIG)
+        got = answers.points(query)
+        for name in query.layers:
+            np.testing.assert_array_equal(got.layers[name][:2], expected.layers[name])
+            assert np.isnan(got.layers[name][2])
 
 
 def test_answers_travel_as_bytes(answers):

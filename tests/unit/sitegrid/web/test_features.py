@@ -1,3 +1,6 @@
+import json
+from dataclasses import replace
+from typing import Any
 from zlib import compress
 
 import numpy as np
@@ -9,6 +12,7 @@ from protocol.site.ground_classes import BOUNDARIES
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire.messages import Pose
 from sitegrid.web import features
+from sitegrid.web.encoding import pieces
 
 SITE = SiteConfig("pit", 49.01, 8.4)
 PROJECTION = Projection(SITE)
@@ -31,7 +35,7 @@ def test_areas_follow_the_edges_of_cells_with_their_holes():
     ground = np.full((64, 64), np.nan)
     ground[10:30, 20:40] = 0.02
     ground[15:20, 25:30] = 0.25
-    zones = features.zones(answer(ground, -1, 2), BOUNDARIES, PROJECTION)["features"]
+    zones = json.loads(b"".join(pieces(features.zones(answer(ground, -1, 2), BOUNDARIES, PROJECTION))))["features"]
     assert [zone["properties"]["name"] for zone in zones] == ["gravel", "sand"]
     gravel, sand = (zone["geometry"]["coordinates"] for zone in zones)
     assert len(gravel) == 2, "an outline and a hole"
@@ -42,6 +46,28 @@ def test_areas_follow_the_edges_of_cells_with_their_holes():
     assert (min(xs), max(xs)) == pytest.approx((-64 + 20, -64 + 40), abs=1e-3)
     assert (min(ys), max(ys)) == pytest.approx((128 + 10, 128 + 30), abs=1e-3)
     assert gravel[0][0] == gravel[0][-1], "closed"
+
+
+@pytest.mark.parametrize("far", [[(0, 0), (9000, -9000)], [(i, i) for i in range(90)], [(0, 0), (1, 0), (40, 0)]])
+def test_zones_cost_what_is_known_wherever_it_lies(far: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch):
+    whole = answer(np.full((64, 64), 0.02)).tiles[0]
+    tiles = tuple(replace(whole, x=x, y=y) for x, y in far)
+    cells = 0
+    classes = features._classes
+
+    def counted(*given: Any) -> Any:
+        nonlocal cells
+        image, corner = classes(*given)
+        cells += image.size
+        return image, corner
+
+    monkeypatch.setattr(features, "_classes", counted)
+    made = features.zones(replace(answer(np.zeros((64, 64))), tiles=tiles), BOUNDARIES, PROJECTION)
+    zones = json.loads(b"".join(pieces(made)))["features"]
+    assert sum(area_m2(zone["geometry"]["coordinates"][0]) for zone in zones) == pytest.approx(
+        64**2 * len(far), rel=0.2
+    )
+    assert cells <= 64**2 * 32 * len(far)
 
 
 def test_a_change_is_a_rectangle_with_its_times():

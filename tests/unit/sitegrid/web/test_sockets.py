@@ -16,8 +16,9 @@ from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
 from sitegrid.process.children import wait_until
-from sitegrid.web import process
-from sitegrid.web.process import Listening, PatientProtocol, origin_of
+from sitegrid.web import process, sockets
+from sitegrid.web.process import PatientProtocol
+from sitegrid.web.sockets import Listening, origin_of
 
 WHOLE = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 BODY = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 999\r\n\r\n"
@@ -28,13 +29,19 @@ PATIENCE_S = 0.4
 
 @pytest.fixture(autouse=True)
 def _short_times_and_few_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"REQUEST_S": PATIENCE_S, "OF_ADDRESS": 3, "SPARE": 2}.items():
-        monkeypatch.setattr(process, name, value)
+    monkeypatch.setattr(process, "REQUEST_S", PATIENCE_S)
+    for name, value in {"OF_ADDRESS": 4, "LIVE": 0.75, "SPARE": 2}.items():
+        monkeypatch.setattr(sockets, name, value)
 
 
 async def app(scope: Scope, receive: Receive, send: Send) -> None:
-    """Answers a request, and takes a WebSocket until it goes."""
-    if scope["type"] == "http":
+    """Answers a request, or begins to, and takes a WebSocket until it goes."""
+    if scope["path"] == "/endless":
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b"1", "more_body": True})
+        while (await receive())["type"] != "http.disconnect":
+            pass
+    elif scope["type"] == "http":
         await PlainTextResponse("ok\n")(scope, receive, send)
     else:
         await send({"type": "websocket.accept"})
@@ -43,8 +50,8 @@ async def app(scope: Scope, receive: Receive, send: Send) -> None:
 
 
 @contextlib.contextmanager
-def serving() -> Iterator[Listening]:
-    with Listening(socket.AF_INET) as listening:
+def serving(most: int = 500) -> Iterator[Listening]:
+    with Listening(socket.AF_INET, most) as listening:
         listening.bind(("127.0.0.1", 0))
         http: Any = partial(PatientProtocol, listening)
         config = uvicorn.Config(app, http=http, ws="websockets-sansio", lifespan="off", log_config=None)
@@ -96,21 +103,32 @@ def test_a_request_that_does_not_come_in_whole_ends_its_connection(begun: bytes)
             assert asked(other) == b"200"
 
 
-def test_an_address_has_so_many_sockets_whatever_they_are(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("kind", [b"", b"GET / HT", WHOLE, UPGRADE, WHOLE + b"GET / HTTP/1.1\r\nX: "])
+@pytest.mark.parametrize("addresses", [1, 4])
+def test_sockets_that_wait_make_room_for_who_asks(kind: bytes, addresses: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(process, "REQUEST_S", 60.0)
+    with serving(most=8) as listening, contextlib.ExitStack() as stack:
+        for number in range(30):
+            visitor = stack.enter_context(opened(listening, f"127.0.0.{2 + number % addresses}"))
+            with contextlib.suppress(ConnectionError):
+                visitor.sendall(kind)
+        for address in ("127.0.0.2", "127.0.0.9"):
+            with opened(listening, address) as other:
+                assert asked(other) == b"200"
+        assert listening.counts["ended_waiting"] > 10 or kind == UPGRADE
+
+
+def test_an_address_has_so_many_sockets_that_are_answered(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(process, "REQUEST_S", 60.0)
     with serving() as listening, contextlib.ExitStack() as stack:
-        first, live, third, fourth, fifth, *more = (
-            stack.enter_context(opened(listening, "127.0.0.2")) for _ in range(9)
-        )
-        assert asked(live, UPGRADE) == b"101"
-        assert (asked(fourth), asked(fifth, UPGRADE)) == (b"429", b"429"), "a WebSocket is a socket"
-        assert b"" in map(asked, more), "to be told takes a place too"
-        assert (asked(first), asked(third)) == (b"200", b"200"), "those that came first stay"
+        live, second, third = (stack.enter_context(opened(listening, "127.0.0.2")) for _ in range(3))
+        assert (asked(live, UPGRADE), asked(second, UPGRADE), asked(third, UPGRADE)) == (b"101",) * 3
+        assert asked(stack.enter_context(opened(listening, "127.0.0.2")), UPGRADE) == b"429", "a part of the places"
+        busy = stack.enter_context(opened(listening, "127.0.0.2"))
+        assert asked(busy, WHOLE.replace(b"/", b"/endless", 1)) == b"200"
+        assert asked(stack.enter_context(opened(listening, "127.0.0.2"))) == b"429"
         assert asked(stack.enter_context(opened(listening, "127.0.0.3"))) == b"200", "another one finds a place"
-        for each in (first, third):
-            each.close()
-        wait_until(lambda: asked(stack.enter_context(opened(listening, "127.0.0.2"))) == b"200", 10, "a free place")
-        assert listening.counts["refused_connections"] >= 3
+        assert listening.counts["refused_connections"] >= 2
 
 
 def test_all_addresses_of_a_host_are_one_origin():

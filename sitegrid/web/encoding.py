@@ -1,0 +1,196 @@
+"""Answers as bytes, made beside the event loop: by a few threads, in pieces, no faster than the asker takes them.
+
+Python runs one thread at a time: what makes a long text in one go stops the event loop from any thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, fields, is_dataclass
+from functools import partial
+from itertools import chain
+from typing import Any, TypeVar
+
+import numpy as np
+from starlette.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from protocol.errors import QueryError, Refusal
+from protocol.queries.map_tiles import PLANES, MapTile, TilesAnswer
+from sitegrid.web.values import plain, with_times
+
+T = TypeVar("T")
+THREADS = 2  # more would only wait for each other
+PIECE = 2**16  # characters of text, made in some 2 ms
+WHOLE = 2**22  # bytes: what is shorter is sent with its length, which some programs want (GDAL)
+AT_ONCE = 2000  # numbers, made into text in 1 ms
+LARGE_S = 300.0  # for a large answer to be taken: 64 MB at 2 Mbit/s
+_pool = ThreadPoolExecutor(THREADS, thread_name_prefix="encode")
+
+
+def _nothing() -> None:
+    pass
+
+
+async def beside(work: Callable[..., T], *arguments: Any) -> T:
+    """Do what takes processor time on one of a few threads."""
+    return await asyncio.get_running_loop().run_in_executor(_pool, partial(work, *arguments))
+
+
+async def as_json(value: Any, media: str = "application/json", done: Callable[[], None] = _nothing) -> Response:
+    """Records, arrays, tables, lists and iterators as JSON. done: as of `answered`."""
+    return await answered(pieces(value), media, done)
+
+
+async def answered(parts: Iterator[bytes], media: str, done: Callable[[], None] = _nothing) -> Response:
+    """An answer in parts; what is long is made while it is sent. done: gives back its room, without it taken here."""
+    first = await beside(_begin, parts)
+    if done is _nothing:
+        if len(first) <= PIECE:
+            return Response(first, media_type=media)
+        done = ROOM.take(len(first))
+    response = Large(chain((first,), parts), media, done)
+    if len(first) < WHOLE:
+        response.headers["Content-Length"] = str(len(first))
+    return response
+
+
+def _begin(parts: Iterator[bytes]) -> bytes:
+    """An answer, or WHOLE of it."""
+    first = bytearray()
+    while len(first) < WHOLE and (part := next(parts, b"")):
+        first += part
+    return bytes(first)
+
+
+async def _made(texts: Iterator[bytes]) -> AsyncIterator[bytes]:
+    while (text := await beside(next, texts, None)) is not None:
+        yield text
+
+
+def pieces(value: Any) -> Iterator[bytes]:
+    """The JSON of a value as `plain` makes it, in pieces of about PIECE; at least one."""
+    texts, size = [], 0
+    for text in _texts(value):
+        texts.append(text)
+        size += len(text)
+        if size >= PIECE:
+            yield "".join(texts).encode()
+            texts, size = [], 0
+    yield "".join(texts).encode()
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """JSON in parts, none of which takes long to make."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        yield "{"
+        for i, (key, item) in enumerate(with_times(value).items()):
+            yield f"{', ' if i else ''}{json.dumps(str(key))}: "
+            yield from _texts(item)
+        yield "}"
+    elif isinstance(value, np.ndarray | list | tuple | Iterator):
+        yield "["
+        for i, part in enumerate(_parts(value)):
+            yield ", " if i else ""
+            yield from part
+        yield "]"
+    else:
+        yield json.dumps(plain(value), allow_nan=False)
+
+
+def _parts(value: Any) -> Iterator[Iterator[str]]:
+    """What stands between the brackets of a list: many numbers at once, what holds more by itself."""
+    if isinstance(value, Iterator) or (len(value) and not isinstance(value, np.ndarray) and _holds_more(value[0])):
+        yield from map(_texts, value)
+        return
+    width = value.size // max(1, len(value)) if isinstance(value, np.ndarray) else 1
+    step = max(1, AT_ONCE // max(1, width))
+    for first in range(0, len(value), step):
+        yield iter([json.dumps(plain(value[first : first + step]), allow_nan=False)[1:-1]])
+
+
+def _holds_more(item: Any) -> bool:
+    return isinstance(item, Mapping | list | tuple | np.ndarray | Iterator) or is_dataclass(item)
+
+
+def frame(answer: TilesAnswer) -> bytes:
+    """Tiles for a page: length of a JSON head (4 bytes, big-endian), the head, the deflated planes end to end."""
+    head = {
+        "store": answer.version.store,
+        "row": answer.version.row,
+        "fact": answer.version.fact,
+        "stamp_ns": answer.stamp_ns,
+        "cell_m": answer.cell_m,
+        "whole": answer.whole,
+        "planes": list(PLANES),
+        "scales": {name: asdict(scale) for name, scale in PLANES.items()},
+        "tiles": [_head(tile) for tile in answer.tiles],
+    }
+    text = json.dumps(head, separators=(",", ":")).encode()
+    return b"".join([struct.pack(">I", len(text)), text, *(tile.planes for tile in answer.tiles)])
+
+
+def _head(tile: MapTile) -> dict[str, Any]:
+    numbers = {"x": tile.x, "y": tile.y, "row": tile.row, "fact": tile.fact, "newest_ns": tile.newest_ns}
+    return {**numbers, "bytes": len(tile.planes)}
+
+
+class Room:
+    """Room for what large answers hold until they are sent, in the unit that callers choose."""
+
+    def __init__(self, most: int) -> None:
+        self._free = most
+
+    def take(self, size: int) -> Callable[[], None]:
+        """Take some of it; returns what gives it back. QueryError where there is not so much, on the loop's thread."""
+        if size > self._free:
+            raise QueryError(Refusal.OVERLOADED, "too many large answers are being taken; ask again later, or for less")
+        self._free -= size
+
+        def give_back() -> None:
+            self._free += size
+
+        return give_back
+
+
+ROOM = Room(2**27)  # bytes, for all visitors
+
+
+class Large(StreamingResponse):
+    """A large answer: whoever does not take it in time gets no more of it. done: is called in the end."""
+
+    def __init__(self, texts: Iterator[bytes], media: str, done: Callable[[], None]) -> None:
+        super().__init__(_made(texts), media_type=media)
+        self._done = done
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        try:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(super().__call__(scope, receive, send), LARGE_S)
+        finally:
+            self._done()
+
+
+class Cache(OrderedDict[Any, T]):
+    """Values that are kept ready, the newest that together have at most so many bytes."""
+
+    def __init__(self, most: int, size: Callable[[T], int]) -> None:
+        super().__init__()
+        self._most, self._size, self._used = most, size, 0
+
+    def keep(self, key: Any, value: T) -> None:
+        """Keep a value, unless it is there."""
+        if key not in self:
+            self[key] = value
+            self._used += self._size(value)
+        while self._used > self._most:
+            self._used -= self._size(self.popitem(last=False)[1])
