@@ -7,7 +7,7 @@ import contextlib
 import json
 import logging
 from collections import Counter, OrderedDict
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Sequence
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from protocol.site.geometry import Bounds
 from sitegrid.web import live, mercator, values
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
-from sitegrid.web.resource import tag_of
+from sitegrid.web.resource import has_copy, tag_of
 from sitegrid.web.resources import RESOURCES, follows_now
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Problem, bad, problem_response
@@ -44,10 +44,14 @@ MAX_TILE_CELLS = 4_000_000  # of one XYZ tile
 
 
 class WebApp:
-    """All sites, and what answers for them. person, counts: see Guard."""
+    """All sites, and what answers for them. person, counts, names: see Guard."""
 
     def __init__(
-        self, feeds: Sequence[SiteFeed], person: Callable[[str], str | None] | None, counts: Counter[str]
+        self,
+        feeds: Sequence[SiteFeed],
+        person: Callable[[str], str | None] | None,
+        counts: Counter[str],
+        names: Collection[str],
     ) -> None:
         self._feeds = {feed.name: feed for feed in feeds}
         self._pngs: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
@@ -66,7 +70,7 @@ class WebApp:
         handlers: dict[Any, Any] = {HTTPException: _not_there, Exception: _failed}
         app = Starlette(routes=routes, exception_handlers=handlers, lifespan=self._lifespan)
         app.add_middleware(GZipMiddleware, minimum_size=1000, compresslevel=5, exclude_content_types=SMALL_ALREADY)
-        self.guard = Guard(app, person, counts)
+        self.guard = Guard(app, person, counts, names)
         self.app: ASGIApp = self.guard
 
     @contextlib.asynccontextmanager
@@ -97,7 +101,7 @@ class WebApp:
             info = await feed.info(FRESH_S)
             tag = _tag(info, with_now=follows_now(resource, parameters))
             headers = {"ETag": tag, "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
-            if request.headers.get("if-none-match") == tag:
+            if has_copy(request, tag):
                 return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
             response = await resource.answer(feed, parameters)
         except Exception as error:  # whatever it was: one answer, as a problem
@@ -155,7 +159,7 @@ class WebApp:
         _check_layer(kind, layer, info)
         tag = _tag(info, with_now=layer in ("age_s", "changed_s"))
         headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-        if request.headers.get("if-none-match") == tag:
+        if has_copy(request, tag):
             return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
         key = (feed.name, kind, layer, z, x, y, tag)
         if key not in self._pngs:
