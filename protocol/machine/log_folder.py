@@ -176,6 +176,8 @@ def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
         if not manifest.exists():
             raise ConfigError(folder, f"has no {MANIFEST} that describes its files; docs/log-folders.md has examples")
     where = str(manifest)
+    if manifest.exists() and not manifest.is_file():
+        raise ConfigError(where, "is no regular file")
     table = load_toml(manifest)
     log = section(table, "log", where)
     machine = section(table, "machine", where)

@@ -47,6 +47,8 @@ def same(ours: object, theirs: float) -> bool:
 def test_a_point_has_the_clients_numbers(web: WebSite):
     x_m, y_m = driven_place(web)
     point = web.client.point(x_m, y_m)
+    assert set(web.client.point(x_m, y_m, "resistance").values) == {"resistance"}
+    assert set(web.client.points([(x_m, y_m)], "visits, grade").layers) == {"visits", "grade"}
     answer = web.get("point", {"x": x_m, "y": y_m})
     assert answer.status == 200
     assert set(answer.json["values"]) == set(point.values)
