@@ -10,9 +10,9 @@ from mapserver.ingest.writer import Writer
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.answering import Answers
-from protocol.errors import Refusal
+from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
-from protocol.queries.requests import PointQuery, RegionQuery, When
+from protocol.queries.requests import HistoryQuery, PointQuery, PointsQuery, RegionQuery, When, WhyQuery
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, open_writer, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
@@ -66,6 +66,27 @@ def test_a_region_that_no_reply_carries_is_refused(answers):
     for query in (RegionQuery(bounds), RegionQuery(bounds, resolution_m=1000.0), RegionQuery(bounds, when=When(1))):
         with refused(Refusal.TOO_LARGE, "5000 x 4000 cells"):
             answers.region(query)
+
+
+UTM = (456100.5, 5427300.5)
+
+
+@pytest.mark.parametrize(
+    ("query", "name"),
+    [
+        (PointQuery(*UTM), "x`, `y"),
+        (HistoryQuery(*UTM), "x`, `y"),
+        (WhyQuery(0.0, -20_000.5), "x`, `y"),
+        (PointsQuery(((1.0, 1.0), UTM)), "places"),
+        (RegionQuery(Bounds(456_000, 5_427_000, 456_100, 5_427_100)), "bounds"),
+        (RegionQuery((UTM, (456_200.0, 5_427_300.0), (456_200.0, 5_427_400.0))), "polygon"),
+    ],
+)
+def test_numbers_of_another_frame_are_refused_with_where_the_map_lies(answers, query, name):
+    where = r"the map lies at -?\d+\.\.\d+, -?\d+\.\.\d+ m; are these UTM or degrees\?"
+    with pytest.raises(QueryError, match=f"parameter `{name}`: .* is off the site.*: {where}") as caught:
+        answers.answer(query)
+    assert caught.value.reason == Refusal.OUTSIDE_SITE
 
 
 def test_answers_travel_as_bytes(answers):
