@@ -39,6 +39,7 @@ from protocol.queries.reasons import CellReasons, encode_why
 from protocol.queries.requests import (
     MAX_SPANS,
     NOW,
+    WITHOUT_MEAN,
     HistoryQuery,
     MapQuery,
     PointQuery,
@@ -59,7 +60,6 @@ WAY_BYTES = 2**23  # as much of the budget as a search for a way takes: four may
 LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
 ROADS_MADE, ROADS_MADE_MS = "roads_made", "roads_made_ms"  # road maps of now, and how long that took
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
-WITHOUT_MEAN = ("heading", "resistance_class", "slope_class", "resistance_class_filled")
 
 
 class Answers:

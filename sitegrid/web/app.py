@@ -26,7 +26,7 @@ from starlette.websockets import WebSocket
 from protocol.errors import Refusal
 from protocol.queries.answers import MapInfo, MapVersion
 from protocol.site.geometry import Bounds
-from sitegrid.web import live, mercator, values
+from sitegrid.web import live, mercator, overview, values
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
 from sitegrid.web.resource import has_copy, tag_of
@@ -40,7 +40,6 @@ PNG_KEPT = 4000  # some 20 MB
 SMALL_ALREADY = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/x-npz")  # deflated inside
 MARGIN_M = 100.0  # around the map's bounds, which are of what is folded: a tile shows samples that still wait for it
 log = logging.getLogger("sitegrid.web")
-MAX_TILE_CELLS = 4_000_000  # of one XYZ tile
 
 
 class WebApp:
@@ -131,7 +130,7 @@ class WebApp:
                 "tilejson": "3.0.0",
                 "name": f"{feed.name}: {layer}",
                 "tiles": [f"{base}/{{z}}/{{x}}/{{y}}.png{end}"],
-                "minzoom": 10,
+                "minzoom": 0,
                 "maxzoom": mercator.MAX_ZOOM,
             }
             if info.bounds:
@@ -188,17 +187,18 @@ class WebApp:
 
 async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tuple[int, int, int]) -> bytes:
     """An XYZ tile: the map's cells below its pixels."""
-    pixels = mercator.pixels_of(*place, await feed.projection())
-    cell_m = info.site.cell_m
+    cell_m, projection = info.site.cell_m, await feed.projection()
+    png = mercator.value_png if kind == "value" else mercator.colour_png
+    if mercator.pixel_m(place[0], info.site.origin_lat_deg) > overview.LEAST_CELLS * cell_m:
+        tiles = await feed.known_tiles()
+        return await feed.ask(lambda: png(overview.draw(feed.client, tiles, layer, place, cell_m, projection), layer))
+    pixels = mercator.pixels_of(*place, projection)
     bounds = pixels.bounds(_known(info), cell_m) if info.merged else None
     if bounds is None:
         return mercator.empty_png(kind)
-    if (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) > MAX_TILE_CELLS * cell_m**2:
-        raise bad(Refusal.TOO_LARGE, "too many cells in one tile; zoom in")
     region = await feed.ask(feed.client.region, bounds, (layer,))
     edges = region.bounds
-    values_px = pixels.sample(region[layer], edges.west_m, edges.south_m, cell_m)
-    return mercator.value_png(values_px, layer) if kind == "value" else mercator.colour_png(values_px, layer)
+    return png(pixels.sample(region[layer], edges.west_m, edges.south_m, cell_m), layer)
 
 
 def _known(info: MapInfo) -> Bounds:

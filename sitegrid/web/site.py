@@ -64,6 +64,7 @@ class SiteFeed:
         self._faults: dict[str, list[str]] = {}  # of machines' sensors
         self._listener: Listener[Pose] | None = None
         self._health: Listener[Health] | None = None
+        self._known: tuple[frozenset[tuple[int, int]], MapVersion | None] = frozenset(), None
         self._info: tuple[float, MapInfo] | None = None
         self._projection: Projection | None = None
         self._past: OrderedDict[tuple[int, str, int], TilesAnswer] = OrderedDict()
@@ -99,6 +100,14 @@ class SiteFeed:
             while len(self._past) > PAST_KEPT:
                 self._past.popitem(last=False)
         return answer
+
+    async def known_tiles(self) -> frozenset[tuple[int, int]]:
+        """Columns and rows of the map's tiles that have any ground."""
+        known, version = self._known
+        answer = await self.ask(self.client.tiles, version)
+        new = frozenset((tile.x, tile.y) for tile in answer.tiles)
+        self._known = new if answer.whole else known | new, answer.version
+        return self._known[0]
 
     def since(self, version: MapVersion | None) -> TilesAnswer | None:
         """What a page that has a version needs to have the newest one; None while no map is known."""
