@@ -6,9 +6,8 @@ import asyncio
 import contextlib
 import json
 import struct
-import threading
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
@@ -25,8 +24,8 @@ from protocol.wire.codec import decode_health, receive_pose
 from protocol.wire.messages import Health, Pose
 from sitegrid.asking import is_answered
 from sitegrid.client import Client
-from sitegrid.health import faults_of
 from sitegrid.listener import Listener
+from sitegrid.web.machines import Machines
 from sitegrid.web.values import plain
 
 T = TypeVar("T")
@@ -34,8 +33,6 @@ PERIOD_S = 0.1  # between two questions for what changed, while somebody looks: 
 STATE_S = 2.0  # between two questions for machines, changes and times
 LINGER_S = 10.0  # the map is followed so much longer than somebody looks: GIS ask every few seconds
 HEARD_S = 1.5  # machines publish their poses several times a second
-MOST_POSES, TRACK_STEP_NS = 600, 10**9  # of a track: ten minutes of site time
-SILENT_S = 120.0  # a machine that said nothing for so long is left out
 THREADS = 8  # questions at once: more visitors wait for each other, not on the map server
 PAST_KEPT = 128  # maps of the past that are kept ready: a day by minutes has more, a slider moves by fewer
 
@@ -58,10 +55,7 @@ class SiteFeed:
         self.watchers = 0
         self._task: asyncio.Task[None] | None = None
         self._looking: asyncio.Task[None] | None = None
-        self._poses: dict[str, tuple[Pose, float]] = {}
-        self._tracks: dict[str, deque[Pose]] = {}
-        self._poses_lock = threading.Lock()
-        self._faults: dict[str, list[str]] = {}  # of machines' sensors
+        self._machines = Machines()
         self._listener: Listener[Pose] | None = None
         self._health: Listener[Health] | None = None
         self._known: tuple[frozenset[tuple[int, int]], MapVersion | None] = frozenset(), None
@@ -120,20 +114,13 @@ class SiteFeed:
 
     def poses(self) -> list[dict[str, Any]]:
         """Newest pose of each machine that said anything lately, and how old it is."""
-        now_s = time.monotonic()
-        with self._poses_lock:
-            self._poses = {name: item for name, item in self._poses.items() if now_s - item[1] < SILENT_S}
-            poses, faults = list(self._poses.values()), self._faults
-        return [
-            plain({**asdict(pose), "age_s": round(now_s - came_s, 3), "faults": faults.get(pose.machine, [])})
-            for pose, came_s in poses
-        ]
+        return self._machines.poses()
 
     async def heard(self) -> None:
         """Wait until a machine says where it is, for a moment."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + HEARD_S
-        while not self._poses and (left_s := end_s - loop.time()) > 0:
+        while not self._machines and (left_s := end_s - loop.time()) > 0:
             async with self.moved:
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(self.moved.wait(), left_s)
@@ -168,9 +155,9 @@ class SiteFeed:
         """Ask again and again while somebody looks; ends when nobody does."""
         if self._listener is None:
             key = keys.poses_all(self.name)
-            self._listener = await self.ask(Listener, self.client.session, key, self._pose, self._on_pose)
+            self._listener = await self.ask(Listener, self.client.session, key, self._pose, self._machines.on_pose)
             key = keys.health_all(self.name)
-            self._health = await self.ask(Listener, self.client.session, key, receive_health, self._on_health)
+            self._health = await self.ask(Listener, self.client.session, key, receive_health, self._machines.on_health)
             self._looking = asyncio.create_task(self._look_for_server())
         next_state_s = 0.0
         idle_s = 0.0
@@ -221,9 +208,8 @@ class SiteFeed:
         }
 
     def tracks(self) -> dict[str, list[Pose]]:
-        """Where each machine was while somebody looked, oldest first: some MOST_POSES poses."""
-        with self._poses_lock:
-            return {name: list(track) for name, track in self._tracks.items()}
+        """Where each machine was while somebody looked, oldest first."""
+        return self._machines.tracks()
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -232,18 +218,6 @@ class SiteFeed:
 
     def _pose(self, key: str, data: bytes) -> Pose:
         return receive_pose(key, data, self._info[1].site.extent_m if self._info else MAX_EXTENT_M)
-
-    def _on_health(self, health: Health) -> None:
-        with self._poses_lock:
-            if health.machine in self._poses:
-                self._faults[health.machine] = faults_of(health.values)
-
-    def _on_pose(self, pose: Pose) -> None:
-        with self._poses_lock:
-            self._poses[pose.machine] = pose, time.monotonic()
-            track = self._tracks.setdefault(pose.machine, deque(maxlen=MOST_POSES))
-            if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
-                track.append(pose)
 
 
 def receive_health(key: str, data: bytes) -> Health:
