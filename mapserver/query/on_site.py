@@ -33,10 +33,8 @@ def _places(query: MapQuery) -> Mapping[str, Sequence[Place]]:
         case PointsQuery():
             return {"places": query.places}
         case RegionQuery() | SegmentsQuery() | WorklistQuery() if area := query.bounds:
-            near = (
-                max(low, min(0.0, high)) for low, high in ((area.west_m, area.east_m), (area.south_m, area.north_m))
-            )
-            return {"polygon" if getattr(query, "area", area) is not area else "bounds": (tuple(near),)}
+            x_m, y_m = max(area.west_m, min(0.0, area.east_m)), max(area.south_m, min(0.0, area.north_m))
+            return {"polygon" if getattr(query, "area", area) is not area else "bounds": ((x_m, y_m),)}
         case RouteQuery():
             return {"line": query.line}
         case WayQuery():

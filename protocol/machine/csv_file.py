@@ -153,7 +153,7 @@ def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str
     """The rows of a file in a folder; raises LogFolderError where it cannot be read, or lies elsewhere."""
     path = folder / csv_file.file
     try:
-        _check_place(path, folder)
+        check_place(path, folder)
         with open_text(path) as text:
             rows = csv.DictReader(
                 _lines(text, path, csv_file),
@@ -169,8 +169,10 @@ def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str
         raise LogFolderError(path, f"cannot be read: {error}") from None
 
 
-def _check_place(path: Path, folder: Path) -> None:
+def check_place(path: Path, folder: Path) -> None:
     """Refuse what a stranger's manifest may name: files outside of its folder, FIFOs and devices."""
+    if "\0" in str(path):
+        raise LogFolderError(path, "is no name of a file")
     place = Path(os.path.realpath(path))
     if not place.is_relative_to(os.path.realpath(folder)):
         raise LogFolderError(path, "lies outside of the data folder; copy it there, or name its folder by `--data`")

@@ -70,12 +70,12 @@ def tiles_at(lat_deg: Floats, lon_deg: Floats, z: int) -> tuple[Floats, Floats]:
 
 def pixel_m(z: int, lat_deg: float) -> float:
     """Edge of a pixel on the ground [m]."""
-    return 2 * math.pi * RADIUS_M * math.cos(math.radians(lat_deg)) / (2**z * SIDE_PX)
+    return float(2 * math.pi * RADIUS_M * math.cos(math.radians(lat_deg)) / (2**z * SIDE_PX))
 
 
 def tile_at(lat_deg: float, lon_deg: float, z: int) -> tuple[int, int]:
     """Column and row of the tile that a place lies in."""
-    column, row = tiles_at(np.float64(lat_deg), np.float64(lon_deg), z)
+    column, row = tiles_at(np.array(lat_deg), np.array(lon_deg), z)
     return int(column), int(row)
 
 

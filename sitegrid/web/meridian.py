@@ -31,7 +31,7 @@ def geometry(kind: str, coordinates: Any) -> dict[str, Any]:
 
 def _on_earth(line: Floats) -> list[list[float]]:
     east = 2 * MERIDIAN if line[:, 0].max() > MERIDIAN else 0.0
-    return (line - (east, 0.0)).round(8).tolist()
+    return [[lon, lat] for lon, lat in (line - (east, 0.0)).round(8).tolist()]
 
 
 def _cut(line: Floats) -> list[Floats]:

@@ -109,7 +109,7 @@ def test_wrong_manifest_is_refused_by_name(tmp_path, old, new, words):
         ("loop.csv", "cannot be read"),
         ("fifo.csv", "is no regular file"),
         ("sub", "is no regular file"),
-        ("a\\u0000b", "cannot be read"),
+        ("a\\u0000b", "is no name of a file"),
         ("wide.csv", "has 1001 columns, over 1000"),
     ],
 )
