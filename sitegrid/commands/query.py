@@ -162,7 +162,9 @@ def _off_map(client: Client, x_m: float, y_m: float) -> list[str]:
     info = client.info()
     west, south, east, north = (edge * info.site.cell_m for edge in info.bounds or (0, 0, 0, 0))
     is_inside = west <= x_m < east and south <= y_m < north
-    return [] if is_inside else [f"nobody was there: {where_it_lies(info.bounds, info.site.cell_m)}"]
+    if is_inside or not info.bounds:
+        return []
+    return [f"nobody was there: {where_it_lies(info.bounds, info.site.cell_m)}"]
 
 
 def _points(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:

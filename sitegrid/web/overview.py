@@ -6,6 +6,7 @@ The map is read in parts, those that somebody drove in: a tile costs what is kno
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -55,15 +56,19 @@ def _parts_in(
     tiles: Iterable[tuple[int, int]], place: Place, pixel_m: float, cell_m: float, projection: Projection
 ) -> Iterator[Bounds]:
     """Parts of the map with any ground that may lie in an XYZ tile."""
-    edge_m = PART_CELLS * cell_m
-    reach_px = SIDE_PX / 2 + edge_m / pixel_m  # from the tile's centre to that of a part
-    n = 2 ** place[0] * SIDE_PX
-    for x, y in sorted({(x // PART_TILES, y // PART_TILES) for x, y in tiles}):
-        west_m, south_m = x * edge_m, y * edge_m
-        column, row = _pixels(np.array([west_m + edge_m / 2]), np.array([south_m + edge_m / 2]), place, projection)
+    edge_m, n = TILE_CELLS * cell_m, 2 ** place[0] * SIDE_PX
+    parts = defaultdict[tuple[int, int], list[tuple[int, int]]](list)
+    for x, y in tiles:
+        parts[x // PART_TILES, y // PART_TILES].append((x, y))
+    for part in sorted(parts):
+        (west_m, south_m), (east_m, north_m) = (end(parts[part], axis=0) * edge_m for end in (np.min, np.max))
+        bounds = Bounds(float(west_m), float(south_m), float(east_m + edge_m), float(north_m + edge_m))
+        middle = np.array([[west_m + east_m], [south_m + north_m]]) / 2 + edge_m / 2
+        column, row = _pixels(*middle, place, projection)
+        reach_px = SIDE_PX / 2 + PART_CELLS * cell_m / pixel_m  # from the tile's centre to that of a part
         east_px = (float(column[0]) - SIDE_PX / 2 + n / 2) % n - n / 2
         if abs(east_px) <= reach_px and abs(float(row[0]) - SIDE_PX / 2) <= reach_px:
-            yield Bounds(west_m, south_m, west_m + edge_m, south_m + edge_m)
+            yield bounds
 
 
 def _pixels(x_m: Floats, y_m: Floats, place: Place, projection: Projection) -> tuple[Floats, Floats]:

@@ -31,8 +31,11 @@ class Map:
     def region(self, bounds: Bounds, layers: tuple[str], *, resolution_m: float | None) -> Any:
         self.asked.append(bounds)
         edge_m = resolution_m or self.cell_m
-        x_m = np.arange(bounds.west_m, bounds.east_m, edge_m) + edge_m / 2
-        y_m = np.arange(bounds.south_m, bounds.north_m, edge_m) + edge_m / 2
+        ends = (
+            (bounds.west_m, bounds.east_m),
+            (bounds.south_m, bounds.north_m),
+        )  # widened to whole cells, as a map does
+        x_m, y_m = ((np.arange(low // edge_m, -(-high // edge_m)) + 0.5) * edge_m for low, high in ends)
         values = np.full((len(y_m), len(x_m)), np.nan, np.float32)
         half = edge_m / 2
         for (w, s, e, n), value in self.known.items():
