@@ -64,7 +64,7 @@ def _parts_in(
         (west_m, south_m), (east_m, north_m) = (end(parts[part], axis=0) * edge_m for end in (np.min, np.max))
         bounds = Bounds(float(west_m), float(south_m), float(east_m + edge_m), float(north_m + edge_m))
         middle = np.array([[west_m + east_m], [south_m + north_m]]) / 2 + edge_m / 2
-        column, row = _pixels(*middle, place, projection)
+        column, row = _pixels(middle[0], middle[1], place, projection)
         reach_px = SIDE_PX / 2 + PART_CELLS * cell_m / pixel_m  # from the tile's centre to that of a part
         east_px = (float(column[0]) - SIDE_PX / 2 + n / 2) % n - n / 2
         if abs(east_px) <= reach_px and abs(float(row[0]) - SIDE_PX / 2) <= reach_px:
