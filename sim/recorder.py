@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from protocol.errors import ConfigError
-from protocol.machine.log_folder import write_log
+from protocol.machine.log_folder import MANIFEST, write_log
 from protocol.machine.readings import Reading
 from sim.config import SimConfig
 from sim.simulator import Simulator
@@ -39,8 +39,11 @@ def record(
     """Simulate into `<record_dir>/<machine>/log.toml` and its CSV files; the truth goes to truth_dir.
 
     on_progress gets the simulated time after every bundle. stop: once set, the recording ends with what it has. Returns
-    the simulator, at its end and closed.
+    the simulator, at its end and closed. ConfigError where the folder has a recording already.
     """
+    if used := sorted(record_dir.glob(f"*/{MANIFEST}")):
+        problem = f"has a recording of {used[0].parent.name} already; choose another folder, or remove that"
+        raise ConfigError(record_dir, problem)
     with contextlib.closing(Simulator(config)) as simulator:
         if simulator.bundles is None:
             raise ConfigError("seconds", "a recording needs an end: set seconds above 0")

@@ -47,6 +47,7 @@ from sitegrid.security.join import join
 
 SOLVE_S = 30.0  # likewise, that it has to calibrate a fleet for: a large one on a busy host
 REGION_ATTEMPTS = 3
+Layers = str | Sequence[str]
 
 
 class Client:
@@ -56,9 +57,10 @@ class Client:
     Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read). A
     question that nobody takes, or whose server ends, is asked again for timeout_s: a restart of router or server shows
     as an answer that comes later.
-    Arguments of several methods: layers: names, none for all. after: answer once this journal row is merged, and wait
-    for it at most wait_s [s]. as_of_ns: from samples stamped so or earlier. minus_ns: less the values as of that time.
-    repairs: cells of a road whose ground changed, as `worklist` shows it, are read from the samples since.
+    Arguments of several methods: layers: names, or a text of them with commas; none for all. after: answer once this
+    journal row is merged, and wait for it at most wait_s [s]. as_of_ns: from samples stamped so or earlier. minus_ns:
+    less the values as of that time. repairs: cells of a road whose ground changed, as `worklist` shows it, are read
+    from the samples since.
     Times are stamps, UTC in nanoseconds.
     """
 
@@ -72,7 +74,7 @@ class Client:
         self,
         x_m: float,
         y_m: float,
-        layers: Sequence[str] = (),
+        layers: Layers = (),
         *,
         as_of_ns: int | None = None,
         minus_ns: int | None = None,
@@ -82,13 +84,13 @@ class Client:
     ) -> PointAnswer:
         """Layers of the cell at a position in `map`; NaN is unknown."""
         when, fresh = requests.When(as_of_ns, minus_ns, repairs), Freshness(after, wait_s)
-        query = requests.PointQuery(float(x_m), float(y_m), tuple(layers), fresh, when)
+        query = requests.PointQuery(float(x_m), float(y_m), _names(layers), fresh, when)
         return answer_codec.decode_point(self._ask(query))
 
     def points(
         self,
         places: Sequence[Place],
-        layers: Sequence[str] = (),
+        layers: Layers = (),
         *,
         as_of_ns: int | None = None,
         minus_ns: int | None = None,
@@ -98,13 +100,13 @@ class Client:
     ) -> PointsAnswer:
         """Layers of the cells at many places (x, y) in `map`, as arrays in their order; NaN is unknown."""
         when, fresh = requests.When(as_of_ns, minus_ns, repairs), Freshness(after, wait_s)
-        query = requests.PointsQuery(tuple((float(x), float(y)) for x, y in places), tuple(layers), fresh, when)
+        query = requests.PointsQuery(tuple((float(x), float(y)) for x, y in places), _names(layers), fresh, when)
         return answer_codec.decode_points(self._ask(query))
 
     def region(
         self,
         area: Bounds | tuple[float, float, float, float] | Sequence[Place],
-        layers: Sequence[str] = (),
+        layers: Layers = (),
         *,
         resolution_m: float | None = None,
         as_of_ns: int | None = None,
@@ -122,7 +124,7 @@ class Client:
         A large region comes in pieces, all of one version of the map; progress is called with each, as (here, of all).
         """
         when, fresh = requests.When(as_of_ns, minus_ns, repairs), Freshness(after, wait_s)
-        query = requests.RegionQuery(_area(area), tuple(layers), fresh, when, resolution_m)
+        query = requests.RegionQuery(_area(area), _names(layers), fresh, when, resolution_m)
         for _ in range(REGION_ATTEMPTS - 1):
             try:
                 return joined(self._pieces(query), progress)
@@ -135,7 +137,7 @@ class Client:
         self,
         x_m: float,
         y_m: float,
-        layers: Sequence[str] = (),
+        layers: Layers = (),
         *,
         from_ns: int | None = None,
         to_ns: int | None = None,
@@ -148,7 +150,7 @@ class Client:
         from_ns, to_ns: both included; without them the newest 2000 spans until now. span_s: default one bucket.
         """
         fresh = Freshness(after, wait_s)
-        query = requests.HistoryQuery(float(x_m), float(y_m), tuple(layers), from_ns, to_ns, span_s, fresh)
+        query = requests.HistoryQuery(float(x_m), float(y_m), _names(layers), from_ns, to_ns, span_s, fresh)
         return answer_codec.decode_history(self._ask(query)).spans
 
     def tiles(self, since: MapVersion | None = None, *, as_of_ns: int | None = None) -> TilesAnswer:
@@ -412,6 +414,11 @@ def _area(area: Bounds | Sequence[float] | Sequence[Place]) -> Bounds | tuple[Pl
     if given.ndim != 2 or given.shape[1] != 2:
         raise ValueError("area: neither west, south, east, north nor corners x, y")
     return tuple(map(tuple, given.tolist()))
+
+
+def _names(layers: Layers) -> tuple[str, ...]:
+    names = layers.split(",") if isinstance(layers, str) else layers
+    return tuple(name.strip() for name in names if name.strip())
 
 
 def _goes_back(first: TilesAnswer, answer: TilesAnswer) -> bool:

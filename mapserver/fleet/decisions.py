@@ -9,8 +9,10 @@ those of which nobody knew. A zero is that of its epoch.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 from mapserver.fleet.calibration import Calibration
@@ -71,6 +73,9 @@ class CalibrationDecision:
             Correction(machine, from_ns, to_ns, zero, scale, across, tuple(map(tuple, covariance)), most_share)
             for from_ns, to_ns, zero, scale, across, most_share, covariance in body["spans"]
         )
+        numbers = [(one.zero, one.scale, one.across, one.most_share, *chain(*one.covariance)) for one in corrections]
+        if not all(map(math.isfinite, chain(*numbers))):
+            raise ValueError(f"has a correction of {machine} that is not finite")
         return cls(machine, body["by"], body["reason"], body["stamp_ns"], corrections, body["remembered"])
 
 

@@ -2,7 +2,7 @@
 
 Parquet's page checksums leave out the headers of pages and the footer, whose statistics decide what is skipped. So 12
 bytes before the footer, where readers of Parquet never look, hold the CRC-32 of all that is before them and of all that
-is behind them.
+is behind them. Anybody can make such a seal: what is decoded is checked as samples of a machine are.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import chain
@@ -24,14 +25,18 @@ from mapserver.journal.places import Place
 from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.config import from_table
-from protocol.errors import ConfigError, StoreError
-from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
-from protocol.site.site_config import SiteConfig
+from protocol.errors import ConfigError, MessageError, StoreError
+from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE, check_samples
+from protocol.site.site_config import MAX_EXTENT_M, SiteConfig
+from protocol.site.site_config import NAME as MACHINE_NAME
+from protocol.wire.codec import MAX_SEQ
 
 SCHEMA = 4
 KEY = b"sitegrid"  # of our own metadata
 NAME = re.compile(r"\d{4}-\d\d-\d\dT\d\d_(\d+)-(\d+)\.parquet")
 _IDENTITY = ["machine", "row", "spool_id", "seq", "received_ns"]  # columns beside those of samples
+_RANGED = ("row", "received_ns", "stamp_ns", "x_m", "y_m")  # columns whose ranges Parquet's statistics state
+MAX_GROUP = 2**20  # samples of a row group: a small file can claim any number
 _SEAL = b"SGRD"
 _SEAL_BYTES = 12
 
@@ -82,9 +87,11 @@ class ArchiveFile:
         self.path = path
         tail = _tail(path)
         self.identity = tail[len(_SEAL) : _SEAL_BYTES].hex()
-        metadata = arrow("parquet").read_metadata(arrow().BufferReader(tail))
-        self.header = _header(path, metadata.metadata)
-        low, high = _statistics(metadata)
+        with _described(path):
+            metadata = arrow("parquet").read_metadata(arrow().BufferReader(tail))
+            self.header = _header(path, metadata.metadata)
+            _check_schema(metadata)
+            self._low, self._high = low, high = _statistics(metadata)
         self._groups = _spans(low, high)
         self.first_row, self.last_row = int(low["row"].min()), int(high["row"].max())
         self.first_received_ns = int(low["received_ns"].min())
@@ -106,11 +113,34 @@ class ArchiveFile:
         groups = np.flatnonzero(self._groups.may_hold(after, until, selection)).tolist()
         if not groups or selection.without.issuperset(self.header.machines):
             return
-        file = arrow("parquet").ParquetFile(arrow().BufferReader(_checked(self.path)))
+        with _described(self.path):
+            file = arrow("parquet").ParquetFile(arrow().BufferReader(_checked(self.path)))
         for group in groups:
-            table = file.read_row_group(group, [*_IDENTITY, *columns])
+            with _described(self.path):
+                table = file.read_row_group(group, [*_IDENTITY, *columns])
+                self._check(group, {name: table.column(name).to_numpy() for name in table.column_names[1:]}, table)
             if len(rows := _rows(table, columns, after, until, selection)):
                 yield rows
+
+    def _check(self, group: int, columns: Mapping[str, AnyArray], table: Any) -> None:
+        """Raise ValueError unless a row group holds batches, one behind the other, of samples that are plausible."""
+        check_samples({name: values for name, values in columns.items() if name in COLUMNS}, MAX_EXTENT_M)
+        for name in _RANGED:
+            if (columns[name].min(), columns[name].max()) != (self._low[name][group], self._high[name][group]):
+                raise ValueError(f"{name} is not in the range that is stated")
+        names = table.column("machine").combine_chunks().dictionary_encode()
+        if unknown := set(names.dictionary.to_pylist()) - set(self.header.machines):
+            raise ValueError(f"machine {min(unknown)[:70]!r} is not among those that are stated")
+        ahead = np.diff(columns["row"])
+        if ahead.min(initial=0) < 0 or not 1 <= columns["seq"].min() <= columns["seq"].max() <= MAX_SEQ:
+            raise ValueError("rows or sequence numbers are not in order")
+        inside = ahead == 0  # pairs of samples of one batch
+        same = (columns["spool_id"], columns["received_ns"], names.indices.to_numpy())
+        if (
+            any((values[1:] != values[:-1])[inside].any() for values in same)
+            or (np.diff(columns["seq"])[inside] != 1).any()
+        ):
+            raise ValueError("a row is no batch of one machine")
 
     def next_stamp(self, from_ns: int) -> int | None:
         """The least stamp from `from_ns` on; None for none. Only row groups that reach across it are read."""
@@ -150,9 +180,12 @@ def _rows(table: Any, of_samples: Sequence[str], after: int, until: int, selecti
 def _statistics(metadata: Any) -> tuple[dict[str, AnyArray], dict[str, AnyArray]]:
     """Smallest and largest values of the columns of each row group, each (groups,)."""
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    if not groups or any(not 0 < group.num_rows <= MAX_GROUP for group in groups):
+        raise ValueError("it has no samples, or too many at once")
     columns = [{c["path_in_schema"]: c["statistics"] for c in group.to_dict()["columns"]} for group in groups]
-    names = ("row", "received_ns", "stamp_ns", "x_m", "y_m")
-    low, high = ({name: np.array([c[name][end] for c in columns]) for name in names} for end in ("min", "max"))
+    low, high = ({name: np.array([c[name][end] for c in columns]) for name in _RANGED} for end in ("min", "max"))
+    if (low["row"][1:] <= high["row"][:-1]).any():
+        raise ValueError("row groups are not in the order of their rows")
     return low, high
 
 
@@ -193,8 +226,32 @@ def _checked(path: Path | Place) -> bytes:
     return data
 
 
+@contextmanager
+def _described(path: Path | Place) -> Iterator[None]:
+    """Whatever Parquet or a stranger's values can be wrong in, as one StoreError."""
+    wrong = (arrow().ArrowException, OSError, ValueError, TypeError, LookupError, MessageError)
+    try:
+        yield
+    except wrong as error:
+        problem = f"is no file that a map server wrote ({type(error).__name__}: {error}); leave it out"
+        raise StoreError(path, problem) from None
+
+
+def _check_schema(metadata: Any) -> None:
+    """Raise ValueError unless names and types of all columns are those of an archive."""
+    kinds = {"machine": "string", "spool_id": "uint64"} | dict.fromkeys(("seq", "row", "received_ns"), "int64")
+    kinds |= {name: str(arrow().from_numpy_dtype(SAMPLE_DTYPE[name])) for name in COLUMNS}
+    schema = metadata.schema.to_arrow_schema()
+    if stated := [f"{f.name}: {f.type}" for f in schema if f.nullable or kinds.get(f.name) != str(f.type)]:
+        raise ValueError(f"column {stated[0]} is none of an archive")
+    if missing := kinds.keys() - set(schema.names):
+        raise ValueError(f"column {min(missing)} is missing")
+
+
 def _read(path: Path | Place, last: int | None = None) -> bytes:
     """The bytes of a file, or so many of its last ones."""
+    if isinstance(path, Path) and path.exists() and not path.is_file():
+        raise StoreError(path, "is no regular file")  # a FIFO would be waited for
     try:
         with path.open("rb") as file:
             if last is not None:
@@ -205,11 +262,14 @@ def _read(path: Path | Place, last: int | None = None) -> bytes:
 
 
 def _header(path: Path | Place, metadata: dict[bytes, bytes]) -> ArchiveHeader:
-    table = json.loads(metadata[KEY])
+    table = json.loads((metadata or {})[KEY])
     if table["schema"] != SCHEMA:
         problem = f"has schema {table['schema']}, this version knows {SCHEMA}"
         raise StoreError(path, f"{problem}; read it with the version that wrote it")
-    return from_table(ArchiveHeader, table, str(path))
+    header = from_table(ArchiveHeader, table, str(path))
+    if other := [name for name in header.machines if not MACHINE_NAME.fullmatch(name)]:
+        raise ValueError(f"{other[0][:70]!r} is not a name")
+    return header
 
 
 def arrow(module: str = "") -> Any:

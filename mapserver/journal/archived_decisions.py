@@ -44,8 +44,8 @@ def load(folder: Path | Place) -> list[CalibrationDecision]:
         raise StoreError(path, problem)
     try:
         return [CalibrationDecision.from_body(body) for body in table["decisions"]]
-    except ValueError as error:
-        raise StoreError(path, str(error)) from None
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise StoreError(path, f"{error}; remove it, if nobody has a better one") from None
 
 
 def _checksum(table: dict[str, Any]) -> int:

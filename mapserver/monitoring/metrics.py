@@ -21,8 +21,8 @@ from prometheus_client.registry import Collector
 from protocol.errors import ConfigError, MessageError
 from protocol.wire import keys
 from protocol.wire.codec import MAX_SMALL_BYTES, decode_health
+from protocol.wire.heard import Heard
 
-MOST_AGENTS = 1000  # names are free to choose where there are no keys
 _REFUSED, _REFUSED_QUERY = "refused_", "refused_query_"
 Family = GaugeMetricFamily | CounterMetricFamily
 Values = float | Mapping[str, float]  # of one metric, or by the value of its label
@@ -40,14 +40,13 @@ class HealthListener:
     """Keeps the newest health of every agent of a site as bytes until somebody asks: callbacks only move bytes."""
 
     def __init__(self, session: zenoh.Session, site: str, clock: Callable[[], float] = time.time) -> None:
-        self._clock = clock
-        self._newest: dict[str, tuple[bytes, float]] = {}
+        self._newest: Heard[bytes] = Heard(clock)
         self._subscriber = session.declare_subscriber(keys.health_all(site), self._on_health)
 
     def received(self) -> dict[str, ReceivedHealth]:
         """By machine, without health that cannot be read, or that came under the key of another machine."""
         readable = {}
-        for name, (data, received_s) in sorted(self._newest.copy().items()):
+        for name, data, received_s in sorted(self._newest.items()):
             try:
                 health = decode_health(data)
             except MessageError:
@@ -66,8 +65,8 @@ class HealthListener:
         except ConfigError:  # a wildcard names no machine
             return
         data = sample.payload.to_bytes()
-        if len(data) <= MAX_SMALL_BYTES and (machine in self._newest or len(self._newest) < MOST_AGENTS):
-            self._newest[machine] = (data, self._clock())
+        if len(data) <= MAX_SMALL_BYTES:
+            self._newest.hear(machine, data)
 
 
 class ServerCollector(Collector):

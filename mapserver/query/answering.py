@@ -21,6 +21,7 @@ from mapserver.query import roads
 from mapserver.query.areas import cells_to_a_side, finer, inside, means
 from mapserver.query.block_layers import BlockLayers, Look, around_squares
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
+from mapserver.query.on_site import check_on_site
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
 from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
@@ -38,6 +39,7 @@ from protocol.queries.reasons import CellReasons, encode_why
 from protocol.queries.requests import (
     MAX_SPANS,
     NOW,
+    WITHOUT_MEAN,
     HistoryQuery,
     MapQuery,
     PointQuery,
@@ -58,7 +60,6 @@ WAY_BYTES = 2**23  # as much of the budget as a search for a way takes: four may
 LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
 ROADS_MADE, ROADS_MADE_MS = "roads_made", "roads_made_ms"  # road maps of now, and how long that took
 WITHOUT_DIFFERENCE = ("heading",)  # axes: half a turn more is the same one
-WITHOUT_MEAN = ("heading", "resistance_class", "slope_class", "resistance_class_filled")
 
 
 class Answers:
@@ -110,6 +111,7 @@ class Answers:
 
     def answer(self, query: MapQuery) -> bytes:
         """Answer one query; QueryError says what is wrong with it."""
+        check_on_site(query, self._site, lambda: self._source.run(lambda state: state.grid.bounds()))
         if query.fresh.after and _reads_roads(query):
             self._roads.reach(query.fresh.after)
         match query:
@@ -136,9 +138,9 @@ class Answers:
         """Answers about roads and about lines over the map."""
         match query:
             case SegmentsQuery():
-                return encode_segments(roads.segments(self._roads.read, query, self._site.extent_m))
+                return encode_segments(roads.segments(self._roads.read, query))
             case WorklistQuery():
-                return encode_worklist(roads.worklist(self._roads.read, query, self._site.extent_m))
+                return encode_worklist(roads.worklist(self._roads.read, query))
             case RouteQuery():
                 return encode_answer(self._routes.route(query))
             case WayQuery():

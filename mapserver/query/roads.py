@@ -27,9 +27,9 @@ KWH = 3.6e6  # J
 Read = Callable[[int | None, str], RoadMap]  # as of a time, with the traffic of one machine: as `RoadMaps.read`
 
 
-def segments(read: Read, query: SegmentsQuery, extent_m: float) -> answers.Segments:
+def segments(read: Read, query: SegmentsQuery) -> answers.Segments:
     """Roads, and what drove on them."""
-    roads, traffic, hours = _read(read, query, extent_m)
+    roads, traffic, hours = _read(read, query)
     rows = _Records(roads, traffic, _lost(roads, traffic, 0.0), hours)
     chosen = _inside(roads.segments, query.bounds)
     if len(chosen) > MOST_SEGMENTS:
@@ -38,9 +38,9 @@ def segments(read: Read, query: SegmentsQuery, extent_m: float) -> answers.Segme
     return answers.Segments(*_version(roads), hours, traffic.placed, tuple(map(rows, sorted(chosen))))
 
 
-def worklist(read: Read, query: WorklistQuery, extent_m: float) -> answers.Worklist:
+def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
     """Where work pays."""
-    roads, traffic, hours = _read(read, query, extent_m)
+    roads, traffic, hours = _read(read, query)
     lost, saved_j = _lost(roads, traffic, query.target), _saved_j(roads, traffic, query.target)
     saved_kwh_ph = {change: joules / max(hours, 1e-9) / KWH for change, joules in saved_j.items()}
     rows = _Rows(_Records(roads, traffic, lost, hours), roads, daily(traffic), saved_kwh_ph, query.efficiency)
@@ -57,9 +57,8 @@ def worklist(read: Read, query: WorklistQuery, extent_m: float) -> answers.Workl
     )
 
 
-def _read(read: Read, query: RoadQuery, extent_m: float) -> tuple[RoadMap, Ledger, float]:
+def _read(read: Read, query: RoadQuery) -> tuple[RoadMap, Ledger, float]:
     """The roads that a query is about, the ledger of its hours, and how many hours these are."""
-    _require_on_site(query.bounds, extent_m)
     roads = read(query.as_of_ns, query.machine)
     from_ns, to_ns = query.from_ns or 0, query.to_ns or 2**62
     return roads, *roads.hours_with_driving(from_ns // HOUR_NS * HOUR_NS, to_ns)
@@ -67,15 +66,6 @@ def _read(read: Read, query: RoadQuery, extent_m: float) -> tuple[RoadMap, Ledge
 
 def _version(roads: RoadMap) -> tuple[str, int, int, int]:
     return roads.version.store, roads.version.row, roads.version.fact, roads.stamp_ns
-
-
-def _require_on_site(bounds: Bounds | None, extent_m: float) -> None:
-    if bounds is None:
-        return
-    inside = bounds.west_m < extent_m and bounds.east_m > -extent_m
-    if not (inside and bounds.south_m < extent_m and bounds.north_m > -extent_m):
-        problem = f"`bounds` lie off the site, which reaches {extent_m:g} m from its origin"
-        raise QueryError(Refusal.OUT_OF_RANGE, problem)
 
 
 def _lost(roads: RoadMap, traffic: Ledger, target: float) -> Losses:

@@ -47,7 +47,6 @@ class Routes:
 
     def route(self, query: RouteQuery) -> RouteAnswer:
         """What a drive along a line costs."""
-        self._require_on_site("line", query.line)
         machine = self._machines.resolve(query.machine, query.as_of_ns)
         line = np.array(query.line)
         places = steps(line, STEP_M).position_m
@@ -62,8 +61,6 @@ class Routes:
 
     def way(self, query: WayQuery) -> RouteAnswer:
         """The line that costs least, and what it costs."""
-        for name, ends in (("from", [query.start]), ("to", [query.end]), ("avoid", query.avoid)):
-            self._require_on_site(name, ends)
         machine, window = self._machines.resolve(query.machine, query.as_of_ns), self._window(query)
         touched = squares_of(window)
         look, read = self._read(touched, query, lambda read: bare(read, touched))
@@ -210,12 +207,6 @@ class Routes:
     def _cell(self, place: Place, window: CellWindow) -> Cell:
         column, row = (math.floor(value / self._site.cell_m) for value in place)
         return row - window.row, column - window.column
-
-    def _require_on_site(self, name: str, places: Sequence[Place]) -> None:
-        for x, y in places:
-            if max(abs(x), abs(y)) > self._site.extent_m:
-                problem = f"{x:g}, {y:g} m is off the site, which reaches {self._site.extent_m:g} m from its origin"
-                raise _refusal(f"parameter `{name}`: {problem}")
 
 
 def _given(query: RouteQuery | WayQuery) -> float | None:

@@ -3,6 +3,7 @@
 import csv
 import gzip
 import math
+import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from protocol.errors import ConfigError, LogFolderError, RowError
 from protocol.units import factor, stamp_ns, stamp_scale
 
 MAX_LINE = 2**20  # characters of a CSV file
+MAX_COLUMNS = 1000  # of a CSV file
 SPACES = " "  # as a delimiter: any number of spaces and tabs
 DELIMITERS = (",", ";", "\t", SPACES)
 Row = Mapping[str, str]  # texts by column
@@ -148,9 +150,10 @@ def stamp_reader(column: Column) -> Callable[[Row], int]:
 
 @contextmanager
 def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str]"]:
-    """The rows of a file; raises LogFolderError where it cannot be read."""
+    """The rows of a file in a folder; raises LogFolderError where it cannot be read, or lies elsewhere."""
     path = folder / csv_file.file
     try:
+        check_place(path, folder)
         with open_text(path) as text:
             rows = csv.DictReader(
                 _lines(text, path, csv_file),
@@ -166,9 +169,22 @@ def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str
         raise LogFolderError(path, f"cannot be read: {error}") from None
 
 
+def check_place(path: Path, folder: Path) -> None:
+    """Refuse what a stranger's manifest may name: files outside of its folder, FIFOs and devices."""
+    if "\0" in str(path):
+        raise LogFolderError(path, "is no name of a file")
+    place = Path(os.path.realpath(path))
+    if not place.is_relative_to(os.path.realpath(folder)):
+        raise LogFolderError(path, "lies outside of the data folder; copy it there, or name its folder by `--data`")
+    if place.exists() and not place.is_file():
+        raise LogFolderError(path, "is no regular file")
+
+
 def require(names: Iterable[str], rows: "csv.DictReader[str]", path: Path) -> None:
     """Refuse a file that lacks a column, or has two of its name."""
     header = list(rows.fieldnames or ())
+    if len(header) > MAX_COLUMNS:
+        raise LogFolderError(path, f"has {len(header)} columns, over {MAX_COLUMNS}; keep those that the manifest names")
     for name in names:
         if name not in header:
             raise LogFolderError(path, f"has no column `{name}`; it has {', '.join(header)}")

@@ -42,7 +42,10 @@ def std_name(variance: str) -> str:
 
 @dataclass(frozen=True)
 class ReadingColumns:
-    """How the rows of a file become the values of a sensor's readings; `described` are the columns of the manifest."""
+    """How the rows of a file become the values of a sensor's readings; `described` are the columns of the manifest.
+
+    absent: what stands for columns that are not described.
+    """
 
     sensor: SensorConfig
     described: Mapping[str, Column]
@@ -54,15 +57,21 @@ class ReadingColumns:
         It raises ValueError on a text that is no number, MessageError on a value that is impossible.
         """
         picks = [(name, number_reader(column, name)) for name, column in self.described.items()]
-        names, steps = columns(self.sensor.kind), self._steps(site)
+        names, steps, overruled = columns(self.sensor.kind), self._steps(site), self._variances()
 
         def values(row: Row) -> tuple[float, ...]:
             made = {**self.absent, **{name: pick(row) for name, pick in picks}}
             for step in steps:
                 step(made)
+            made |= {name: value for name, value in overruled.items() if not made[name] > 0}  # NaN is unknown too
             return tuple(made[name] for name in names)
 
         return values
+
+    def _variances(self) -> Values:
+        """What the sensor's `std` states, for rows with 0 or less: many receivers write that where they know none."""
+        variances = _VARIANCES.get(self.sensor.kind, {}).items()
+        return {name: self.sensor.std[quantity] ** 2 for name, quantity in variances if quantity in self.sensor.std}
 
     def _steps(self, site: SiteConfig) -> list[Callable[[Values], None]]:
         """What turns described columns into those of the kind."""

@@ -21,6 +21,7 @@ from protocol.machine.csv_file import (
     Column,
     CsvFile,
     Row,
+    check_place,
     no_number,
     opened_rows,
     parse_column,
@@ -170,12 +171,17 @@ class LogFolder:
 
 
 def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
-    """Read a manifest. manifest: the file, or the folder that holds it as `log.toml`; data: where the CSV files are."""
+    """Read a manifest. manifest: the file, or the folder that holds it as `log.toml`; data: where the CSV files are.
+
+    Raises ConfigError, and LogFolderError where it names what is no regular file of that folder.
+    """
     if manifest.is_dir():
         folder, manifest = manifest, manifest / MANIFEST
         if not manifest.exists():
             raise ConfigError(folder, f"has no {MANIFEST} that describes its files; docs/log-folders.md has examples")
     where = str(manifest)
+    if manifest.exists() and not manifest.is_file():
+        raise ConfigError(where, "is no regular file")
     table = load_toml(manifest)
     log = section(table, "log", where)
     machine = section(table, "machine", where)
@@ -187,9 +193,12 @@ def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
         raise ConfigError(where, "no [[sensor]] is described")
     header, site = from_table(_Header, log, f"{where} [log]"), from_table(SiteConfig, site_table, f"{where} [site]")
     sources = tuple(_parse_source(t, site, f"{where} [[sensor]] {i + 1}") for i, t in enumerate(tables))
+    folder = data or manifest.parent
+    for source in sources:
+        check_place(folder / source.file.file, folder)
     return LogFolder(
         name=header.name,
-        data=data or manifest.parent,
+        data=folder,
         start_ns=header.start_ns,
         site=site,
         machine=parse_machine(machine, tuple(s.sensor for s in sources), where),

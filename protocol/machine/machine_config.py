@@ -41,6 +41,7 @@ NOT_NEGATIVE = (
     "drive_friction_n",
 )
 MOST_KG = 500_000.0  # of a machine, and of what it carries: a sample states the sum
+LIGHT_KG, LONG_M = 500.0, 1.5  # no machine with a wheelbase this long is so light: its mass was written in tonnes
 MAX_EARLY_S = 10.0  # a stamp that is further behind its reading is no delay, but another clock
 
 
@@ -164,7 +165,7 @@ class MachineConfig:
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
-        require_between(self, 1, MOST_KG, "mass_kg")
+        self._check_mass()
         if self.wheel_radius_m <= 0:
             raise ValueError("wheel_radius_m must be positive")
         if self.rotating_mass_factor < 1:
@@ -182,6 +183,13 @@ class MachineConfig:
         bases = [s.name for s in self.sensors if s.kind == Correction.kind and s.use]
         if len(bases) > 1:
             raise ValueError(f"sensors: a machine uses one base station, not {' and '.join(bases)}: `use = false`")
+
+    def _check_mass(self) -> None:
+        require_between(self, 1, MOST_KG, "mass_kg")
+        if self.mass_kg < LIGHT_KG and self.wheelbase_m >= LONG_M:
+            wheelbase = f"a machine with a wheelbase of {self.wheelbase_m:g} m"
+            problem = f"{self.mass_kg:g} kg is too little for {wheelbase}; if that is tonnes"
+            raise ValueError(f"mass_kg: {problem}, write {self.mass_kg * 1000:g}")
 
     @property
     def base(self) -> SensorConfig | None:

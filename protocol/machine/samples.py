@@ -1,11 +1,11 @@
 """Samples: geotagged resistance and gradient, as structured rows; the same bytes on machine, wire and server."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from protocol.arrays import Bools, Table
+from protocol.arrays import AnyArray, Bools, Table
 from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 
@@ -34,6 +34,7 @@ SAMPLE_DTYPE = np.dtype(
 COLUMNS: tuple[str, ...] = SAMPLE_DTYPE.names or ()
 RAW_SAMPLE = np.dtype((np.void, SAMPLE_DTYPE.itemsize))  # numpy copies records field by field, and these at once
 
+COVARIANCES = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 RESISTANCE = ("c_rr", "c_rr_var")  # may both be NaN
 GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
 APPLIED = ("applied_zero", "applied_scale")  # what the machine's own calibration has taken off its balance already
@@ -81,39 +82,46 @@ def content_hash(row: Table) -> str:
     return hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest()
 
 
-def check_samples(rows: Table, extent_m: float) -> None:
+Columns = Table | Mapping[str, AnyArray]
+
+
+def check_samples(rows: Columns, extent_m: float) -> None:
     """Raise a MessageError that names field and row if any sample is not plausible.
 
-    extent_m: positions further than this from the site's origin, east or north, are refused.
+    rows: samples, or some of their columns: COVARIANCES and groups of NAN_ALLOWED all together or not at all. extent_m:
+    positions further than this from the site's origin, east or north, are refused.
     """
-    _check_finite(rows)
+    names = rows.keys() if isinstance(rows, Mapping) else COLUMNS
+    _check_finite(rows, [name for name in COLUMNS if name in names])
     for name in ("x_m", "y_m"):
         _refuse(np.abs(rows[name]) > extent_m, rows, name, Refusal.OUTSIDE_SITE, f"beyond {extent_m:g} m of the origin")
-    for name, (low, high) in LIMITS.items():
+    for name, (low, high) in ((name, ends) for name, ends in LIMITS.items() if name in names):
         bad: Bools = (rows[name] < low) | (rows[name] > high)  # NaN passes here: it was checked above
         reason = Refusal.COVARIANCE if name.startswith("cov_") else Refusal.OUT_OF_RANGE
         _refuse(bad, rows, name, reason, f"not between {low:g} and {high:g}")
-    _refuse(~_is_semidefinite(rows), rows, "cov_xy_m2", Refusal.COVARIANCE, "covariance is not positive semidefinite")
+    if COVARIANCES[0] in names:
+        problem = "covariance is not positive semidefinite"
+        _refuse(~_is_semidefinite(rows), rows, "cov_xy_m2", Refusal.COVARIANCE, problem)
 
 
-def _check_finite(rows: Table) -> None:
-    for group in NAN_ALLOWED:
+def _check_finite(rows: Columns, names: Sequence[str]) -> None:
+    for group in (group for group in NAN_ALLOWED if group[0] in names):
         missing = np.stack([np.isnan(rows[name]) for name in group]).sum(axis=0)
         partly = (missing > 0) & (missing < len(group))
         _refuse(partly, rows, group[0], Refusal.NOT_FINITE, f"{', '.join(group)} must be NaN together or not at all")
-    for name in COLUMNS[1:]:
+    for name in names[1:]:
         may_be_nan = any(name in group for group in NAN_ALLOWED)
         bad = np.isinf(rows[name]) if may_be_nan else ~np.isfinite(rows[name])
         _refuse(bad, rows, name, Refusal.NOT_FINITE, "not finite")
 
 
-def _is_semidefinite(rows: Table) -> Bools:
-    xx, xy, yy = (rows[name].astype(np.float64) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
+def _is_semidefinite(rows: Columns) -> Bools:
+    xx, xy, yy = (rows[name].astype(np.float64) for name in COVARIANCES)
     semidefinite: Bools = xx * yy - xy * xy >= -1e-6 * np.maximum(xx * yy, 1e-12)  # single precision rounds the product
     return semidefinite
 
 
-def _refuse(bad: Bools, rows: Table, field: str, reason: Refusal, problem: str) -> None:
+def _refuse(bad: Bools, rows: Columns, field: str, reason: Refusal, problem: str) -> None:
     if bad.any():
         row = int(np.argmax(bad))
         raise MessageError(reason, f"{rows[field][row]!s}: {problem}", field=field, row=row)

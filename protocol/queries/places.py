@@ -67,6 +67,14 @@ def check_outline(name: str, corners: Sequence[Place]) -> None:
         raise refusal(name, f"its sides from corners {first + 1} and {second + 1} on cross each other")
 
 
+def where_it_lies(bounds: Sequence[int] | None, cell_m: float) -> str:
+    """Where a map lies, and what numbers elsewhere may be; bounds: west, south, east, north in cells, None for none."""
+    if not bounds:
+        return "nothing is driven yet; are these UTM or degrees?"
+    west, south, east, north = (edge * cell_m for edge in bounds)
+    return f"the map lies at {west:g}..{east:g}, {south:g}..{north:g} m; are these UTM or degrees?"
+
+
 def refusal(parameter: str, problem: str) -> QueryError:
     """What is wrong with a parameter."""
     return QueryError(Refusal.OUT_OF_RANGE, f"parameter `{parameter}`: {problem}")

@@ -26,6 +26,7 @@ from protocol.site.geometry import MAX_CELLS, Bounds
 MAX_SPANS = 2000  # of one history
 MAX_SPAN_S = 1e9
 MAX_RESOLUTION_M = 1000.0
+WITHOUT_MEAN = ("heading", "resistance_class", "slope_class", "resistance_class_filled")  # layers, in larger cells
 
 
 @dataclass(frozen=True)

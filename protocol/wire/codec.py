@@ -163,7 +163,7 @@ def unpack_batch(data: bytes) -> PackedBatch:
     """Check all of a batch but its samples."""
     table = unpack(data, MAX_BATCH_BYTES)
     n = _take_int(table, "n", 0, MAX_BATCH_SAMPLES, Refusal.TOO_LARGE)
-    first_seq = _take_int(table, "first_seq", 1, MAX_SEQ, Refusal.FIRST_SEQ)
+    first_seq = _take_int(table, "first_seq", 1, MAX_SEQ - max(0, n - 1), Refusal.FIRST_SEQ)
     lost_before = _take_int({"lost_before": 0, **table}, "lost_before", 0, first_seq - 1)
     batch = SampleBatch(
         machine=take_name(table),

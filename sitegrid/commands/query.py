@@ -22,6 +22,7 @@ from protocol.queries.answers import CheckpointCounts, GroundChange, MachineStat
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
 from protocol.queries.parameters import Freshness, text_of
 from protocol.queries.pieces import Progress
+from protocol.queries.places import where_it_lies
 from protocol.queries.requests import parse_query
 from protocol.queries.roads import RoadSegment
 from protocol.queries.route_requests import RouteQuery, WayQuery
@@ -150,7 +151,20 @@ def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Ans
     point = client.point(arguments.x_m, arguments.y_m, layers, **when, **rest)
     table = {"x_m": point.x_m, "y_m": point.y_m, **point.values, **_version(point)}
     head = f"cell at {point.x_m:g}, {point.y_m:g} m{_as_of(when, point.stamp_ns)}"
-    return table, [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
+    lines = [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
+    return table, lines + (
+        [] if np.isfinite([*point.values.values()]).any() else _off_map(client, point.x_m, point.y_m)
+    )
+
+
+def _off_map(client: Client, x_m: float, y_m: float) -> list[str]:
+    """Where the map lies, for who asks for another place."""
+    info = client.info()
+    west, south, east, north = (edge * info.site.cell_m for edge in info.bounds or (0, 0, 0, 0))
+    is_inside = west <= x_m < east and south <= y_m < north
+    if is_inside or not info.bounds:
+        return []
+    return [f"nobody was there: {where_it_lies(info.bounds, info.site.cell_m)}"]
 
 
 def _points(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:

@@ -26,6 +26,8 @@ def add_options(parser: ArgumentParser) -> None:
     usual = ("127.0.0.1", 8080)
     listen = "address to listen on; port 0 takes a free one (default 127.0.0.1:8080)"
     add("--listen", type=address, default=usual, metavar="[HOST:]PORT", help=listen)
+    host = "a name in the address of the page, as that of a proxy; may be repeated (IP addresses, localhost and the"
+    add("--host", action="append", default=[], metavar="NAME", dest="hosts", help=f"{host} host's own name count)")
     safety = parser.add_mutually_exclusive_group()
     tokens = "let in only people with a token; FOLDER is that of the site's keys (see `sitegrid keys token`)"
     safety.add_argument("--tokens", type=Path, metavar="FOLDER", help=tokens)

@@ -196,18 +196,20 @@ def check_clock(offset_s: float, error_s: float, site: SiteConfig | None) -> Fin
 
 def check_time(info: MapInfo) -> Finding:
     """Whether the stamps of machines and the server's clock fit each other."""
-    ahead_s = (info.stamp_ns - info.wall_ns) * 1e-9
-    if count := info.counters.get(f"refused_{Refusal.SERVER_CLOCK}"):
-        problem = f"the map server refused {count} batches since its own clock is behind what it has seen"
-        return Finding(Level.WARN, "time", problem, "set the server's clock; machines wait, and keep their samples")
-    if count := info.counters.get(f"refused_{Refusal.FAR_FUTURE}"):
-        problem = f"{count} batches were refused for stamps more than a day ahead; these samples are quarantined"
-        return Finding(Level.WARN, "time", problem, "the server's log names the machine: set its clock")
-    if ahead_s > AHEAD_S:
+    advice: dict[str, str] = {}  # by problem; counts stay until the server restarts, and may hide nothing
+    if (ahead_s := (info.stamp_ns - info.wall_ns) * 1e-9) > AHEAD_S:
         trusted = {name: counts for name, counts in info.machines.items() if name not in info.distrusted}
         newest = max(trusted, key=lambda name: trusted[name].newest_ns, default="?")
         problem = f"the site's now is {ahead_s / 3600:.1f} h ahead of the server's clock, by {newest}"
-        return Finding(Level.WARN, "time", problem, f"set the clock that is wrong; or `sitegrid distrust {newest}`")
+        advice[problem] = f"set the clock that is wrong; or `sitegrid distrust {newest}`"
+    if count := info.counters.get(f"refused_{Refusal.SERVER_CLOCK}"):
+        problem = f"the map server refused {count} batches since its own clock is behind what it has seen"
+        advice[problem] = "set the server's clock; machines wait, and keep their samples"
+    if count := info.counters.get(f"refused_{Refusal.FAR_FUTURE}"):
+        problem = f"{count} batches were refused for stamps more than a day ahead; these samples are quarantined"
+        advice[problem] = "the server's log names the machine: set its clock"
+    if advice:
+        return Finding(Level.WARN, "time", "; ".join(advice), "; ".join(advice.values()))
     return Finding(Level.PASS, "time", "no stamp is ahead of the map server's clock")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from argparse import Namespace
 from collections.abc import Sequence
 from itertools import pairwise
@@ -25,6 +26,7 @@ from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import receive_pose
+from protocol.wire.heard import Heard
 from protocol.wire.messages import Pose
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
@@ -186,13 +188,13 @@ class TrackRecorder:
 
     def __init__(self, session: zenoh.Session, site: str) -> None:
         self._lock = threading.Lock()
-        self._poses: dict[str, list[Pose]] = {}
+        self._poses: Heard[list[Pose]] = Heard(time.monotonic)
         self._listener = Listener(session, keys.poses_all(site), receive_pose, self._on_pose)
 
     def poses(self) -> dict[str, list[Pose]]:
         """All poses so far, by machine."""
         with self._lock:
-            return {name: list(poses) for name, poses in sorted(self._poses.items())}
+            return {name: list(poses) for name, poses, _ in sorted(self._poses.items())}
 
     def tracks(self) -> list[Track]:
         """All poses so far, as lines to draw."""
@@ -207,7 +209,8 @@ class TrackRecorder:
 
     def _on_pose(self, pose: Pose) -> None:
         with self._lock:
-            poses = self._poses.setdefault(pose.machine, [])
+            poses = self._poses.get(pose.machine) or []
             poses.append(pose)
+            self._poses.hear(pose.machine, poses)
             if len(poses) > MAX_POSES:
                 del poses[: MAX_POSES // 10]

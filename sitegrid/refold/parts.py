@@ -22,9 +22,10 @@ from mapserver.journal.location import JournalLocation
 from mapserver.journal.places import Place
 from mapserver.journal.rows import JournalRows, Selection, SpoolKey
 from protocol.arrays import Bools, Ints
-from protocol.errors import StoreError
-from protocol.machine.samples import COLUMNS
-from protocol.site.site_config import SiteConfig
+from protocol.errors import ConfigError, MessageError, StoreError
+from protocol.machine.samples import COLUMNS, check_samples
+from protocol.site.site_config import MAX_EXTENT_M, SiteConfig
+from protocol.wire.keys import check_name
 
 SLICE_ROWS = 20_000  # of a journal: up to two million samples, as in a file
 HEADS = ("stamp_ns", "x_m", "y_m")  # of samples: all that is needed to choose among them
@@ -91,7 +92,13 @@ class JournalPart:
     def read(self, columns: Sequence[str] = COLUMNS) -> Iterator[JournalRows]:  # noqa: ARG002 # rows are whole records
         """Its rows; StoreError where they are damaged."""
         with self._reader() as journal:
-            yield from read_history(History(journal, self.location.archive), self.after, self.until)
+            for rows in read_history(History(journal, self.location.archive), self.after, self.until):
+                try:
+                    check_samples(rows.samples, MAX_EXTENT_M)
+                    list(map(check_name, rows.machines, rows.machines))
+                except (MessageError, ConfigError) as error:
+                    raise StoreError(self, f"is no journal that a map server wrote ({error}); leave it out") from None
+                yield rows
 
     def __str__(self) -> str:
         return f"{self.location}, rows {self.after + 1} to {self.until}"

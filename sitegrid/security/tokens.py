@@ -1,4 +1,4 @@
-"""Tokens of people who may see the page: one per person, kept as hashes, revoked one by one.
+"""Tokens of people who may see the page: one per person, kept as hashes behind a checksum, revoked one by one.
 
 A token is 128 random bits, so that a plain SHA-256 of it cannot be turned back.
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from protocol.config import from_table, toml_lines
 from protocol.errors import ConfigError
-from protocol.files import load_toml
+from protocol.files import load_sealed_toml, sealed
 from sitegrid.security.register import write_private
 
 TOKENS_FILE = "tokens.toml"
@@ -64,7 +64,7 @@ class Tokens:
 def load_tokens(folder: Path) -> Tokens:
     """The tokens in a folder of keys; none where nobody has one yet."""
     path = folder / TOKENS_FILE
-    return from_table(Tokens, load_toml(path), str(path)) if path.is_file() else Tokens()
+    return from_table(Tokens, load_sealed_toml(path), str(path)) if path.is_file() else Tokens()
 
 
 def save_tokens(folder: Path, tokens: Tokens) -> None:
@@ -73,7 +73,7 @@ def save_tokens(folder: Path, tokens: Tokens) -> None:
     for name, entry in sorted(tokens.names.items()):
         lines += ["", f"[names.{name}]", *toml_lines({"sha256": entry.sha256})]
         lines += [f"expires = {entry.expires.astimezone(UTC):%Y-%m-%dT%H:%M:%SZ}"]
-    write_private(folder / TOKENS_FILE, ("\n".join(lines) + "\n").encode())
+    write_private(folder / TOKENS_FILE, sealed("\n".join(lines) + "\n").encode())
 
 
 class TokenFile:

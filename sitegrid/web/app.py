@@ -7,7 +7,7 @@ import contextlib
 import json
 import logging
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Sequence
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,11 @@ from starlette.websockets import WebSocket
 from protocol.errors import Refusal
 from protocol.queries.answers import MapInfo, MapVersion
 from protocol.site.geometry import Bounds
-from sitegrid.web import live, mercator, values
+from sitegrid.web import live, mercator, overview, values
 from sitegrid.web.encoding import Cache, as_json, beside
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
-from sitegrid.web.resource import tag_of
+from sitegrid.web.resource import has_copy, tag_of
 from sitegrid.web.resources import RESOURCES, follows_now
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Problem, bad, problem_response
@@ -41,14 +41,17 @@ PNG_BYTES = 2**25  # of tiles that are kept: some 4000
 SMALL_ALREADY = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/x-npz")  # deflated inside
 MARGIN_M = 100.0  # around the map's bounds, which are of what is folded: a tile shows samples that still wait for it
 log = logging.getLogger("sitegrid.web")
-MAX_TILE_CELLS = 4_000_000  # of one XYZ tile
 
 
 class WebApp:
-    """All sites, and what answers for them. person, counts: see Guard."""
+    """All sites, and what answers for them. person, counts, names: see Guard."""
 
     def __init__(
-        self, feeds: Sequence[SiteFeed], person: Callable[[str], str | None] | None, counts: Counter[str]
+        self,
+        feeds: Sequence[SiteFeed],
+        person: Callable[[str], str | None] | None,
+        counts: Counter[str],
+        names: Collection[str],
     ) -> None:
         self._feeds = {feed.name: feed for feed in feeds}
         self._pngs: Cache[bytes] = Cache(PNG_BYTES, len)
@@ -67,7 +70,7 @@ class WebApp:
         handlers: dict[Any, Any] = {HTTPException: _not_there, Exception: _failed}
         app = Starlette(routes=routes, exception_handlers=handlers, lifespan=self._lifespan)
         app.add_middleware(GZipMiddleware, minimum_size=1000, compresslevel=5, exclude_content_types=SMALL_ALREADY)
-        self.guard = Guard(app, person, counts)
+        self.guard = Guard(app, person, counts, names)
         self.app: ASGIApp = self.guard
 
     @contextlib.asynccontextmanager
@@ -98,7 +101,7 @@ class WebApp:
             info = await feed.info(FRESH_S)
             tag = _tag(info, with_now=follows_now(resource, parameters))
             headers = {"ETag": tag, "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
-            if request.headers.get("if-none-match") == tag:
+            if has_copy(request, tag):
                 return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
             response = await resource.answer(feed, parameters)
         except Exception as error:  # whatever it was: one answer, as a problem
@@ -128,7 +131,7 @@ class WebApp:
                 "tilejson": "3.0.0",
                 "name": f"{feed.name}: {layer}",
                 "tiles": [f"{base}/{{z}}/{{x}}/{{y}}.png{end}"],
-                "minzoom": 10,
+                "minzoom": 0,
                 "maxzoom": mercator.MAX_ZOOM,
             }
             if info.bounds:
@@ -156,7 +159,7 @@ class WebApp:
         _check_layer(kind, layer, info)
         tag = _tag(info, with_now=layer in ("age_s", "changed_s"))
         headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-        if request.headers.get("if-none-match") == tag:
+        if has_copy(request, tag):
             return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
         key = (feed.name, kind, layer, z, x, y, tag)
         if (png := self._pngs.get(key)) is None:
@@ -183,16 +186,18 @@ class WebApp:
 
 async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tuple[int, int, int]) -> bytes:
     """An XYZ tile: the map's cells below its pixels."""
-    pixels = await beside(mercator.pixels_of, *place, await feed.projection())
-    cell_m = info.site.cell_m
+    cell_m, projection = info.site.cell_m, await feed.projection()
+    png = mercator.value_png if kind == "value" else mercator.colour_png
+    if mercator.pixel_m(place[0], info.site.origin_lat_deg) > overview.LEAST_CELLS * cell_m:
+        tiles = await feed.known_tiles()
+        values_px = await feed.ask_for_much(overview.draw, feed.client, tiles, layer, place, cell_m, projection)
+        return await beside(png, values_px, layer)
+    pixels = await beside(mercator.pixels_of, *place, projection)
     bounds = pixels.bounds(_known(info), cell_m) if info.merged else None
     if bounds is None:
         return mercator.empty_png(kind)
-    if (bounds.east_m - bounds.west_m) * (bounds.north_m - bounds.south_m) > MAX_TILE_CELLS * cell_m**2:
-        raise bad(Refusal.TOO_LARGE, "too many cells in one tile; zoom in")
     region = await feed.ask(feed.client.region, bounds, (layer,))
     edges = region.bounds
-    png = mercator.value_png if kind == "value" else mercator.colour_png
     return await beside(lambda: png(pixels.sample(region[layer], edges.west_m, edges.south_m, cell_m), layer))
 
 

@@ -18,6 +18,7 @@ from protocol.queries.roads import Line, RoadChange, RoadSegment, WorklistRow
 from protocol.site.ground_classes import ZONES
 from protocol.site.site_config import Projection
 from protocol.wire.messages import Pose
+from sitegrid.web.meridian import geometry
 from sitegrid.web.values import iso
 
 LEAST_CELLS = 4  # smaller areas of one kind are noise to the eye
@@ -192,7 +193,7 @@ def _ring(corners_m: Floats, projection: Projection) -> Floats:
 
 
 def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
+    return {"type": "Feature", "geometry": geometry(kind, coordinates), "properties": properties}
 
 
 def _collection(features: list[dict[str, Any]]) -> dict[str, Any]:

@@ -1,12 +1,14 @@
-"""Who may come in, and how much: tokens, origins, limits and headers, before anything is worked on."""
+"""Who may come in, and how much: names, tokens, origins, limits and headers, before anything is worked on."""
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
+from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
@@ -19,8 +21,9 @@ from sitegrid.web.values import Problem, problem_response
 COOKIE = "sitegrid"
 RATE_HZ, BURST = 100.0, 500.0  # requests of one address: a GIS asks for some hundred tiles when its view moves
 ADDRESSES = 4096  # whose rate is known; the one that was silent longest is forgotten first
-MAX_QUERY = 32_768  # bytes of a path and its parameters: a polygon of 1000 corners
+MAX_PATH, MAX_QUERY = 1024, 32_768  # bytes of a path, and of parameters: a polygon of 1000 corners
 OPEN_PATHS = ("/healthz",)
+_HOST = re.compile(r"(\[[^][]*\]|[^][:@/?#]*)(:\d*)?")  # a Host header: a name or address, and a port
 HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
@@ -35,11 +38,13 @@ HEADERS = {
 class Guard:
     """Middleware. person: whose token it is, None for nobody's; without it everybody may come in.
 
-    counts: of what came in and what was refused, sockets among it.
+    counts: of what came in and what was refused, sockets among it. names: of this server, in lower case.
     """
 
-    def __init__(self, app: ASGIApp, person: Callable[[str], str | None] | None, counts: Counter[str]) -> None:
-        self._app, self._person = app, person
+    def __init__(
+        self, app: ASGIApp, person: Callable[[str], str | None] | None, counts: Counter[str], names: Collection[str]
+    ) -> None:
+        self._app, self._person, self._names = app, person, frozenset(names) | {"localhost"}
         self._rates: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self.counts = counts
 
@@ -70,12 +75,11 @@ class Guard:
 
     def _check(self, scope: Scope) -> None:
         headers = Headers(scope=scope)
-        if len(scope["raw_path"]) + len(scope["query_string"]) > MAX_QUERY:
-            raise Problem(HTTPStatus.REQUEST_URI_TOO_LONG, "too_large", f"more than {MAX_QUERY} bytes of address")
-        if int(headers.get("content-length", "0") or 0) or "transfer-encoding" in headers:
-            raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too_large", "no body is taken")
-        if (origin := headers.get("origin")) and urlsplit(origin).netloc != headers.get("host"):
-            raise Problem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
+        if len(scope["raw_path"]) > MAX_PATH or len(scope["query_string"]) > MAX_QUERY:
+            detail = f"more than {MAX_PATH} bytes of path, or {MAX_QUERY} of parameters; ask for less"
+            raise Problem(HTTPStatus.REQUEST_URI_TOO_LONG, "too_large", detail)
+        _check_body(headers)
+        self._check_host(headers)
         self._count_rate(scope)
         if self._person and scope["path"] not in OPEN_PATHS:
             person, token = self._person, _token(scope, headers)
@@ -83,6 +87,17 @@ class Guard:
         if not scope.get("may_stay", _always)():
             detail = "a visitor's token is needed: ask the office for one, and open the link with it"
             raise Problem(HTTPStatus.UNAUTHORIZED, "no_permission", detail, {"WWW-Authenticate": "Bearer"})
+
+    def _check_host(self, headers: Headers) -> None:
+        """Refuse pages of others, and a page whose own name was made to lead here (DNS rebinding)."""
+        host = headers.get("host", "")
+        parts = _HOST.fullmatch(host)
+        name = parts[1].lower().rstrip(".") if parts else host
+        if host and name not in self._names and not (parts and _is_address(name.strip("[]"))):
+            detail = f"`{name[:80]}` is no name of this server: open it by its address, or start it with --host NAME"
+            raise Problem(HTTPStatus.MISDIRECTED_REQUEST, "wrong_host", detail)
+        if (origin := headers.get("origin")) and _place_of(origin) != host:
+            raise Problem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
 
     def _count_rate(self, scope: Scope) -> None:
         """A bucket of BURST that fills with RATE_HZ."""
@@ -115,6 +130,31 @@ class Guard:
         await send({"type": "websocket.accept"})
         code = 4401 if problem.status == HTTPStatus.UNAUTHORIZED else 4403
         await send({"type": "websocket.close", "code": code, "reason": problem.reason})
+
+
+def _check_body(headers: Headers) -> None:
+    """Refuse a body, and end its connection: another reader may see its end elsewhere, and a second request in it."""
+    if "content-length" in headers and "transfer-encoding" in headers:
+        detail = "the request states its length twice (Content-Length, Transfer-Encoding); send neither"
+        raise Problem(HTTPStatus.BAD_REQUEST, "two_lengths", detail, {"Connection": "close"})
+    if headers.get("content-length", "0") not in ("", "0") or "transfer-encoding" in headers:
+        detail = "no body is taken"
+        raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too_large", detail, {"Connection": "close"})
+
+
+def _is_address(text: str) -> bool:
+    try:
+        return bool(ip_address(text))
+    except ValueError:
+        return False
+
+
+def _place_of(origin: str) -> str:
+    """Host and port of an Origin; empty where it is none."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return ""
 
 
 def _always() -> bool:

@@ -53,11 +53,10 @@ class _Page:
     async def receive(self) -> None:
         """Take what the page says: the version that it has taken in."""
         while True:
-            text = await self._socket.receive_text()
             try:
-                table = json.loads(text)
+                table = json.loads(await self._socket.receive_text())  # KeyError for bytes
                 said = int(table["row"]), int(table["fact"])
-            except (ValueError, KeyError, TypeError, RecursionError):
+            except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
                 await self._socket.close(1007, "row and fact are expected")
                 return
             if self._sent and said == (self._sent.row, self._sent.fact):

@@ -62,11 +62,21 @@ def pixels_of(z: int, x: int, y: int, projection: Projection) -> Pixels:
     return Pixels(*projection.to_map_many(lat, lon))
 
 
+def tiles_at(lat_deg: Floats, lon_deg: Floats, z: int) -> tuple[Floats, Floats]:
+    """Columns and rows of tiles of places, with what is behind the point: where in the tile they lie."""
+    row = (1 - np.arcsinh(np.tan(np.radians(lat_deg))) / math.pi) / 2 * 2**z
+    return (lon_deg + 180.0) / 360.0 * 2**z, row
+
+
+def pixel_m(z: int, lat_deg: float) -> float:
+    """Edge of a pixel on the ground [m]."""
+    return float(2 * math.pi * RADIUS_M * math.cos(math.radians(lat_deg)) / (2**z * SIDE_PX))
+
+
 def tile_at(lat_deg: float, lon_deg: float, z: int) -> tuple[int, int]:
     """Column and row of the tile that a place lies in."""
-    x = (lon_deg + 180.0) / 360.0 * 2**z
-    y = (1 - math.asinh(math.tan(math.radians(lat_deg))) / math.pi) / 2 * 2**z
-    return int(x), int(y)
+    column, row = tiles_at(np.array(lat_deg), np.array(lon_deg), z)
+    return int(column), int(row)
 
 
 def coding(layer: str) -> tuple[float, float]:

@@ -49,18 +49,21 @@ def serve(
     """Serve sites, each a name (see `connect` for None) and an endpoint, until `stop` is set."""
     listening = opened.enter_context(listen(address))
     person = TokenFile(arguments.tokens).person if arguments.tokens else None
+    names = {name.lower() for name in (address[0], socket.gethostname(), *arguments.hosts)}
     clients: list[Client] = []
     for name, endpoint in sites:
         if (client := _connected(endpoint, name, arguments.keys, stop)) is None:
             return 0
         clients.append(client)
 
+    logging.getLogger("uvicorn.error").addFilter(_without_traceback)
+
     async def run() -> None:
         if arguments.tls:  # uvicorn cannot be told how long a handshake may take, nor how much it may keep
             sslproto.SSLProtocol.max_size = TLS_BYTES
             loop: Any = asyncio.get_running_loop()
             loop.create_server = partial(loop.create_server, ssl_handshake_timeout=TLS_S, ssl_shutdown_timeout=TLS_S)
-        web = WebApp([SiteFeed(client) for client in clients], person, listening.counts)
+        web = WebApp([SiteFeed(client) for client in clients], person, listening.counts, names)
         config = uvicorn.Config(
             web.app,
             http=partial(PatientProtocol, listening),  # type: ignore[arg-type] # what makes protocols
@@ -100,6 +103,13 @@ def _connected(endpoint: str, name: str | None, keys: Path | None, stop: threadi
                 log.warning("waiting for the router problem=%r", problem)
             stop.wait(ROUTER_S)
     return None
+
+
+def _without_traceback(record: logging.LogRecord) -> bool:
+    """Of a visitor's message that is no text, which uvicorn takes for an error of its own."""
+    if record.msg == "Invalid UTF-8 sequence received from client.":
+        record.exc_info = None
+    return True
 
 
 async def _stop_with(server: uvicorn.Server, stop: threading.Event) -> None:

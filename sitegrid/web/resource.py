@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from starlette.requests import Request
 from starlette.responses import Response
 
 from protocol.queries import requests
@@ -52,6 +53,12 @@ def of_version(response: Response, version: MapVersion) -> Response:
 def tag_of(version: MapVersion) -> str:
     """ETag of what follows from the map alone."""
     return f'"{version.store}-{version.row}-{version.fact}"'
+
+
+def has_copy(request: Request, tag: str) -> bool:
+    """Whether the asker has what this tag names: If-None-Match takes lists and *, and weak tags (RFC 9110 13.1.2)."""
+    text = ",".join(request.headers.getlist("if-none-match")).strip()
+    return text == "*" or tag in [part.strip().removeprefix("W/") for part in text.split(",")]
 
 
 def version_of(version: MapVersion) -> dict[str, Any]:

@@ -6,12 +6,10 @@ import asyncio
 import contextlib
 import json
 import math
-import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -26,9 +24,9 @@ from protocol.wire.codec import decode_health, receive_pose
 from protocol.wire.messages import Health, Pose
 from sitegrid.asking import is_answered
 from sitegrid.client import Client
-from sitegrid.health import faults_of
 from sitegrid.listener import Listener
 from sitegrid.web.encoding import Cache
+from sitegrid.web.machines import Machines
 from sitegrid.web.values import plain
 
 T = TypeVar("T")
@@ -37,8 +35,6 @@ POSES_S = 0.2  # between two times that pages are told where machines are
 STATE_S = 2.0  # between two questions for machines, changes and times
 LINGER_S = 10.0  # the map is followed so much longer than somebody looks: GIS ask every few seconds
 HEARD_S = 1.5  # machines publish their poses several times a second
-MOST_POSES, TRACK_STEP_NS = 600, 10**9  # of a track: ten minutes of site time
-SILENT_S = 120.0  # a machine that said nothing for so long is left out
 THREADS = 8  # questions at once: more visitors wait for each other, not on the map server
 PATIENT_THREADS = 4  # questions at once that may take seconds: these keep no other visitor waiting
 PAST_BYTES = 2**26  # of maps of the past that are kept ready: a hundred of a usual site, so that a slider moves
@@ -58,18 +54,16 @@ class SiteFeed:
         self.is_away = False
         self._moved: asyncio.Future[None] | None = None
         self._woken: tuple[Any, ...] = (None, False, "", 0)  # when pages were woken last, at this time
-        self._woken_s, self._heard = 0.0, 0  # how many poses were heard
+        self._woken_s = 0.0
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix=f"ask-{client.site}")
         self._patient = ThreadPoolExecutor(PATIENT_THREADS, thread_name_prefix=f"much-{client.site}")
         self.watchers = 0
         self._task: asyncio.Task[None] | None = None
         self._looking: asyncio.Task[None] | None = None
-        self._poses: dict[str, tuple[Pose, float]] = {}
-        self._tracks: dict[str, deque[Pose]] = {}
-        self._poses_lock = threading.Lock()
-        self._faults: dict[str, list[str]] = {}  # of machines' sensors
+        self._machines = Machines()
         self._listener: Listener[Pose] | None = None
         self._health: Listener[Health] | None = None
+        self._known: tuple[frozenset[tuple[int, int]], MapVersion | None] = frozenset(), None
         self._info: tuple[float, MapInfo] | None = None
         self._projection: Projection | None = None
         self._poses_text: tuple[float, str] = -math.inf, ""
@@ -115,6 +109,14 @@ class SiteFeed:
             self._moved = asyncio.get_running_loop().create_future()
         return self._moved
 
+    async def known_tiles(self) -> frozenset[tuple[int, int]]:
+        """Columns and rows of the map's tiles that have any ground."""
+        known, version = self._known
+        answer = await self.ask_for_much(self.client.tiles, version)
+        new = frozenset((tile.x, tile.y) for tile in answer.tiles)
+        self._known = new if answer.whole else known | new, answer.version
+        return self._known[0]
+
     def since(self, version: MapVersion | None) -> TilesAnswer | None:
         """What a page that has a version needs to have the newest one; None while no map is known."""
         if self.answer is None:
@@ -128,14 +130,7 @@ class SiteFeed:
 
     def poses(self) -> list[dict[str, Any]]:
         """Newest pose of each machine that said anything lately, and how old it is."""
-        now_s = time.monotonic()
-        with self._poses_lock:
-            self._poses = {name: item for name, item in self._poses.items() if now_s - item[1] < SILENT_S}
-            poses, faults = list(self._poses.values()), self._faults
-        return [
-            plain({**asdict(pose), "age_s": round(now_s - came_s, 3), "faults": faults.get(pose.machine, [])})
-            for pose, came_s in poses
-        ]
+        return self._machines.poses()
 
     def poses_text(self) -> str:
         """The poses as pages are told of them, made once for all; empty for none."""
@@ -149,7 +144,7 @@ class SiteFeed:
         """Wait until a machine says where it is, for a moment."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + HEARD_S
-        while not self._poses and (left_s := end_s - loop.time()) > 0:
+        while not self._machines and (left_s := end_s - loop.time()) > 0:
             await asyncio.wait([self.moved], timeout=left_s)
 
     @contextlib.asynccontextmanager
@@ -183,9 +178,9 @@ class SiteFeed:
         """Ask again and again while somebody looks; ends when nobody does."""
         if self._listener is None:
             key = keys.poses_all(self.name)
-            self._listener = await self.ask(Listener, self.client.session, key, self._pose, self._on_pose)
+            self._listener = await self.ask(Listener, self.client.session, key, self._pose, self._machines.on_pose)
             key = keys.health_all(self.name)
-            self._health = await self.ask(Listener, self.client.session, key, receive_health, self._on_health)
+            self._health = await self.ask(Listener, self.client.session, key, receive_health, self._machines.on_health)
             self._looking = asyncio.create_task(self._look_for_server())
         next_state_s = 0.0
         idle_s = 0.0
@@ -215,7 +210,7 @@ class SiteFeed:
     def _notify(self) -> None:
         """Wake the pages where there is anything new to show; for poses five times a second."""
         now_s, version = time.monotonic(), self.answer.version if self.answer else None
-        heard = self._heard if now_s - self._woken_s >= POSES_S else self._woken[-1]
+        heard = self._machines.heard if now_s - self._woken_s >= POSES_S else self._woken[-1]
         if (news := (version, self.is_away, self.state_text, heard)) != self._woken:
             self._woken, self._woken_s = news, now_s
             self.moved.set_result(None)
@@ -230,9 +225,8 @@ class SiteFeed:
         return await self.info(0.0), await self.ask(self.client.machines), await self.ask(self.client.changes)
 
     def tracks(self) -> dict[str, list[Pose]]:
-        """Where each machine was while somebody looked, oldest first: some MOST_POSES poses."""
-        with self._poses_lock:
-            return {name: list(track) for name, track in self._tracks.items()}
+        """Where each machine was while somebody looked, oldest first."""
+        return self._machines.tracks()
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -241,19 +235,6 @@ class SiteFeed:
 
     def _pose(self, key: str, data: bytes) -> Pose:
         return receive_pose(key, data, self._info[1].site.extent_m if self._info else MAX_EXTENT_M)
-
-    def _on_health(self, health: Health) -> None:
-        with self._poses_lock:
-            if health.machine in self._poses:
-                self._faults[health.machine] = faults_of(health.values)
-
-    def _on_pose(self, pose: Pose) -> None:
-        with self._poses_lock:
-            self._poses[pose.machine] = pose, time.monotonic()
-            self._heard += 1
-            track = self._tracks.setdefault(pose.machine, deque(maxlen=MOST_POSES))
-            if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
-                track.append(pose)
 
 
 async def _run(threads: ThreadPoolExecutor, question: Callable[..., T], *arguments: Any, **named: Any) -> T:

@@ -27,7 +27,7 @@ def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
     """A site on the web where machines drove for a minute: for tests that read, and leave it as it was or driven on."""
     folder = tmp_path_factory.mktemp("web")
     with Children(folder) as started:
-        site = WebSite(folder, started)
+        site = WebSite(folder, started, "--host", "map.example")
         site.drive(60)
         yield site
 

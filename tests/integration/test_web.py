@@ -48,6 +48,8 @@ def same(ours: object, theirs: float) -> bool:
 def test_a_point_has_the_clients_numbers(web: WebSite):
     x_m, y_m = driven_place(web)
     point = web.client.point(x_m, y_m)
+    assert set(web.client.point(x_m, y_m, "resistance").values) == {"resistance"}
+    assert set(web.client.points([(x_m, y_m)], "visits, grade").layers) == {"visits", "grade"}
     answer = web.get("point", {"x": x_m, "y": y_m})
     assert answer.status == 200
     assert set(answer.json["values"]) == set(point.values)
@@ -171,6 +173,57 @@ def test_what_is_no_question_is_refused(web: WebSite):
     assert web.get("/healthz").body == b"ok\n"
 
 
+CHUNKED, SECOND = "Transfer-Encoding: chunked", "0\r\n\r\nGET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+LOST = f"/api/v1/sites/{NAME}/xyz/value/visits/{'9' * 4400}/0/0.png"  # a number that nobody counts to
+RAW = [  # a request and its headers -> the status of its one answer, before the connection ends
+    ("POST / localhost", ["Content-Length: 6", CHUNKED], 400),  # SECOND is in its body, or behind it
+    ("GET / localhost", [CHUNKED, "Content-Length: 0"], 400),
+    ("POST / localhost", ["Content-Length: 5", "Content-Length: 6"], 400),
+    ("POST / localhost", ["Content-Length: 5, 5"], 413),
+    ("GET /healthz evil.example", ["Connection: close"], 421),
+    ("GET / 10.0.0.1.evil.example", ["Connection: close"], 421),
+    ("GET / evil@localhost", ["Connection: close"], 421),
+    ("GET / [::1", ["Connection: close"], 421),
+    ("GET /healthz Map.Example:8080", ["Connection: close"], 200),
+    ("GET /healthz localhost:1", ["Connection: close"], 200),
+    ("GET /healthz [fe80::1]:80", ["Connection: close"], 200),
+    ("GET / localhost", ["Origin: http://[", "Connection: close"], 403),
+    (f"GET {LOST} localhost", ["Connection: close"], 414),
+]
+FRAMES = {  # WebSocket frames, masked with zeros -> how the connection is closed
+    "bytes": (b"\x82\x81\0\0\0\0x", 1007),
+    "no UTF-8": (b"\x81\x82\0\0\0\0\xff\xfe", 1007),
+    "infinite": (b'\x81\x96\0\0\0\0{"row":1e999,"fact":1}', 1007),
+    "no table": (b"\x81\x84\0\0\0\0null", 1007),
+    "reserved": (b"\xc1\x81\0\0\0\0x", 1002),
+    "unmasked": (b"\x81\x01x", 1002),
+    "goes on with nothing": (b"\x80\x81\0\0\0\0x", 1002),
+}
+
+
+@pytest.mark.parametrize(("line", "headers", "status"), RAW)
+def test_a_request_that_lies_gets_one_answer_and_an_end(web: WebSite, line: str, headers: list[str], status: int):
+    method, path, host = line.split()
+    request = "\r\n".join([f"{method} {path} HTTP/1.1", f"Host: {host}", *headers, "", SECOND])
+    with socket.create_connection(("127.0.0.1", web.port), PATIENCE_S) as visitor:
+        visitor.sendall(request.encode())
+        answer = b"".join(iter(lambda: visitor.recv(65536), b""))
+    assert (answer[:13], answer.count(b"HTTP/1.1 ")) == (f"HTTP/1.1 {status} ".encode(), 1)
+    assert (b"start it with --host" in answer) == (status == 421)
+    assert "Traceback" not in (web.folder / "web.log").read_text()
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_frame_that_is_none_closes_its_connection_without_a_traceback(web: WebSite, name: str):
+    frame, code = FRAMES[name]
+    with open_socket(web.live_url(), compression=None, max_size=2**26) as page:
+        page.socket.sendall(frame)
+        with pytest.raises(ConnectionClosed) as ended:
+            _drain(page)
+    assert ended.value.rcvd.code == code
+    assert "Traceback" not in (web.folder / "web.log").read_text()
+
+
 def test_the_page_has_strict_headers_and_asks_nobody_else(web: WebSite):
     answer = web.get("/")
     assert answer.status == 200
@@ -185,8 +238,12 @@ def test_a_copy_is_confirmed_until_the_map_is_another_one(web: WebSite):
     x_m, y_m = driven_place(web)
     parameters = {"x": x_m, "y": y_m, "layers": "resistance"}
     first = web.get("point", parameters)
-    again = web.get("point", parameters, If_None_Match=first.headers["etag"])
-    assert (again.status, again.body) == (304, b"")
+    tag = first.headers["etag"]
+    for known in (tag, f"W/{tag}", f'"other", W/{tag} ,"more"', "*"):  # as caches and proxies send it
+        again = web.get("point", parameters, If_None_Match=known)
+        assert (again.status, again.body) == (304, b""), known
+    for other in ('"*"', f'{tag[:-1]}0"', "W/*", ""):
+        assert web.get("point", parameters, If_None_Match=other).status == 200, other
     web.drive(4)
     until(lambda: web.get("point", parameters, If_None_Match=first.headers["etag"]).status == 200, "another map")
 

@@ -151,7 +151,7 @@ def test_what_nobody_knows_is_null_and_told(web: WebSite):
         ("worklist", {"target": 0}, 400, "out_of_range", "target"),
         ("worklist", {"from": "2026-01-02", "to": "2026-01-01"}, 400, "out_of_range", "after"),
         ("worklist", {"machine": "hauler-9"}, 404, "unknown_machine", "hauler-9"),
-        ("segments", {"bounds": "9e14,0,9.1e14,5"}, 400, "out_of_range", "off the site"),
+        ("segments", {"bounds": "9e14,0,9.1e14,5"}, 400, "outside_site", "off the site"),
         ("route", {"line": "0,0;1e14,0"}, 413, "too_large", "km"),
         ("route", {"line": "20,10;90,10", "machine": "<img src=x>"}, 400, "out_of_range", "machine"),
         ("way", {"from": "20,10;30,10", "to": "20,10"}, 400, "out_of_range", "from"),

@@ -93,6 +93,10 @@ def test_samples_that_are_late_by_the_lag_are_no_wrong_clock_to_the_server() -> 
         ("[pipeline.localisation]\nlag_s = 181", "lag_s: at most 180 s: the map server would take the clock for wrong"),
         ("[machine]\nname = 'No'", "name"),
         ("[machine]\nname = 'a'\nmass_kg = 0", "mass_kg"),
+        (
+            "[machine]\nname = 'a'\nwheelbase_m = 3\nmass_kg = 17.5",
+            "17.5 kg is too little for .* of 3 m; if .* write 17500",
+        ),
         ("[machine]\nname = 'a'\nmass_kg = 5e6", "mass_kg: 5000000.0 is not between 1 and 500000"),
         ("[machine]\nname = 'a'\n[[sensor]]\nname = 'g'\nkind = 'gps'\ndrift_share = 2", "drift_share"),
         (

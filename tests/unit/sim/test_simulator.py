@@ -109,6 +109,8 @@ def test_tracks_are_the_true_ways_at_10_hz() -> None:
 
 def test_recording_holds_the_same_readings_and_the_truth(tmp_path: Path) -> None:
     simulator = record(CONFIG, tmp_path / "logs", tmp_path / "truth")
+    with pytest.raises(ConfigError, match=r"logs: has a recording of .* already; choose another folder"):
+        record(CONFIG, tmp_path / "logs")
     for machine in simulator.machines:
         log = open_log(tmp_path / "logs" / machine.name)
         assert log.machine == machine

@@ -118,7 +118,8 @@ def test_what_cannot_be_written_is_refused_first(command: Command, option: Actio
 def test_what_cannot_be_read_is_one_line(command: Command, option: Action, capsys, tmp_path):
     (tmp_path / "garbage").write_bytes(bytes(range(256)) * 9)
     (tmp_path / "folder").mkdir()
-    for value in ("missing", "garbage", "folder"):
+    _make_strange(tmp_path / "strange")
+    for value in ("missing", "garbage", "folder", "strange"):
         given = {option.dest: value, "endpoint": free_endpoint(), "out": "out.png" if command.name == "plot" else "out"}
         if command.words[0] == "doctor":  # its answer is a report
             assert main(command.line(given)) == 1
@@ -126,6 +127,21 @@ def test_what_cannot_be_read_is_one_line(command: Command, option: Action, capsy
             assert ("FAIL" in out, errors.count("\n")) in [(True, 0), (False, 1)]
         else:
             refused(command.line(given), capsys)
+
+
+def _make_strange(folder: Path) -> None:
+    """A folder of a stranger: a manifest that names what nobody may read, and archives and stores that are none."""
+    folder.mkdir()
+    manifest = (
+        "[log]\nname = 'x'\n[site]\nname = 'lot'\norigin_lat_deg = 49\norigin_lon_deg = 8\n[machine]\nname = 'a'\n"
+    )
+    sensor = "[[sensor]]\nname = 'gps'\nkind = 'gps'\nfile = '%s'\nstd.position = 1.0\n"
+    columns = "[sensor.columns]\nstamp = 't'\nlat_deg = 'a'\nlon_deg = 'b'\n"
+    (folder / "log.toml").write_text(manifest + sensor % "fixes.csv" + columns)
+    os.mkfifo(folder / "fixes.csv")
+    os.mkfifo(folder / "a.parquet")
+    for name in ("site.toml", "tokens.toml", "register.toml", "identity.toml", "journal.db", "world.wld"):
+        (folder / name).write_bytes(bytes(range(256)) * 9)
 
 
 @pytest.mark.parametrize("command", with_all("endpoint"))

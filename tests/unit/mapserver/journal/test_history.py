@@ -30,6 +30,7 @@ from protocol.site.site_config import KnownGround
 from tests.journals import history_beside
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, put, random_samples, same, samples
 
+pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 PARTS = {name: np.split(random_samples(200, seed, half_m=25.0), 10) for seed, name in enumerate("ab")}
 
@@ -242,6 +243,7 @@ def test_every_bit_of_odd_numbers_is_kept(tmp_path):
     with opened(tmp_path) as machines:
         rows = samples(6)
         rows["c_rr"].view("<u4")[:] = [0x7FC00000, 0x7FC00001, 0xFFC00000, 0x7F800001, 0x80000000, 0]  # NaN, -0, 0
+        rows["c_rr_var"][:4] = np.nan
         rows["x_m"] = [-0.0, 0.0, 5e-324, -1e-300, 0.1, 20_000]
         put(machines.journal, batch(rows))
         before = machines.both()
@@ -344,6 +346,60 @@ def test_what_is_no_file_of_this_archive_is_refused(day, tmp_path, monkeypatch):
     ):
         with pytest.raises(StoreError, match=problem):
             ArchiveFile(path)
+
+
+def with_values(name: str, change: Callable[[np.ndarray], object]) -> Callable[[pa.Table], pa.Table]:
+    """A table with other values in a column, as a stranger's file has them."""
+
+    def changed(table: pa.Table) -> pa.Table:
+        values = table.column(name).to_numpy(zero_copy_only=False).copy()
+        change(values)
+        field = table.schema.field(name)
+        return table.set_column(table.column_names.index(name), field, pa.array(values, field.type))
+
+    return changed
+
+
+def putting(value: object, at: int = -1) -> Callable[[np.ndarray], object]:
+    return lambda values: values.__setitem__(at, value)
+
+
+STRANGE = {
+    "NaN for a place": (with_values("y_m", putting(np.nan)), "not finite"),
+    "no place on any site": (with_values("x_m", putting(-1e300)), "beyond 100000 m"),
+    "no covariance": (with_values("cov_xy_m2", putting(9.0)), "positive semidefinite"),
+    "half a measurement": (with_values("grade_var", putting(np.nan)), "together or not at all"),
+    "a machine that is a path": (with_values("machine", putting("../../x")), "machine '../../x' is not among"),
+    "a row of two spools": (with_values("spool_id", putting(9)), "no batch of one machine"),
+    "a number twice": (with_values("seq", putting(1)), "no batch of one machine"),
+    "a number beyond the last": (with_values("seq", lambda seq: seq.__iadd__(2**62)), "not in order"),
+    "rows that go back": (
+        with_values("row", lambda row: row.__setitem__(slice(None), row[::-1].copy())),
+        "not in order",
+    ),
+    "text for a number": (
+        lambda t: t.set_column(5, "stamp_ns", t.column("stamp_ns").cast(pa.string())),
+        "stamp_ns: string",
+    ),
+    "single precision": (lambda t: t.set_column(6, "x_m", t.column("x_m").cast(pa.float32())), "x_m: float"),
+    "a column too few": (lambda t: t.drop_columns(["c_rr"]), "c_rr is missing"),
+    "a column too many": (lambda t: t.append_column("note", t.column("row")), "note: int64 is none"),
+    "no samples": (lambda t: t.slice(0, 0), "no samples"),
+}
+
+
+@pytest.mark.parametrize("name", STRANGE)
+def test_a_file_of_a_stranger_is_refused_in_one_line_for_what_it_holds(file, name):
+    """Its seal is right: anybody can make one."""
+    path, _ = file
+    change, problem = STRANGE[name]
+    header, table = pq.read_metadata(path).metadata[archive_file.KEY], pq.read_table(path)
+    with path.open("w+b") as written:
+        pq.write_table(change(table).replace_schema_metadata({archive_file.KEY: header}), written)
+        archive_file.seal(written)
+    with pytest.raises(StoreError, match="is no file that a map server wrote") as caught:
+        list(ArchiveFile(path).read())
+    assert problem in str(caught.value)
 
 
 def test_a_missing_file_is_an_error(day):

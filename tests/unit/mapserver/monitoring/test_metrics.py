@@ -19,10 +19,11 @@ from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 
 from mapserver.monitoring.exporter import Exporter
-from mapserver.monitoring.metrics import MOST_AGENTS, HealthListener, ReceivedHealth, ServerCollector
+from mapserver.monitoring.metrics import HealthListener, ReceivedHealth, ServerCollector
 from protocol.errors import LinkError
 from protocol.wire import keys
 from protocol.wire.codec import MAX_SMALL_BYTES, encode_health
+from protocol.wire.heard import MOST_NAMES
 from protocol.wire.messages import Health
 from tests.paths import ROOT
 from tests.unit.mapserver.data import NOW_NS, routed
@@ -264,8 +265,8 @@ def test_made_up_names_do_not_fill_the_memory():
             return self.data
 
     with listening() as (_, listener):
-        for i in range(MOST_AGENTS + 10):
+        for i in range(MOST_NAMES + 10):
             listener._on_health(Sample(f"m{i}"))  # type: ignore[arg-type]
-        assert len(listener.received()) == MOST_AGENTS
+        assert len(listener.received()) == MOST_NAMES
         listener._on_health(Sample("m1"))  # type: ignore[arg-type]
         assert "m1" in listener.received()

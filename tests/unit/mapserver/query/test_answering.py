@@ -11,9 +11,9 @@ from mapserver.layers.cell_layers import LAYERS
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.answering import Answers
 from mapserver.query.block_layers import BlockLayers
-from protocol.errors import Refusal
+from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
-from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, TilesQuery, When
+from protocol.queries.requests import HistoryQuery, PointQuery, PointsQuery, RegionQuery, TilesQuery, When, WhyQuery
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
@@ -116,6 +116,27 @@ def test_places_that_lie_far_apart_are_read_as_others(answers, monkeypatch):
         for name in query.layers:
             np.testing.assert_array_equal(got.layers[name][:2], expected.layers[name])
             assert np.isnan(got.layers[name][2])
+
+
+UTM = (456100.5, 5427300.5)
+
+
+@pytest.mark.parametrize(
+    ("query", "name"),
+    [
+        (PointQuery(*UTM), "x`, `y"),
+        (HistoryQuery(*UTM), "x`, `y"),
+        (WhyQuery(0.0, -20_000.5), "x`, `y"),
+        (PointsQuery(((1.0, 1.0), UTM)), "places"),
+        (RegionQuery(Bounds(456_000, 5_427_000, 456_100, 5_427_100)), "bounds"),
+        (RegionQuery((UTM, (456_200.0, 5_427_300.0), (456_200.0, 5_427_400.0))), "polygon"),
+    ],
+)
+def test_numbers_of_another_frame_are_refused_with_where_the_map_lies(answers, query, name):
+    where = r"the map lies at -?\d+\.\.\d+, -?\d+\.\.\d+ m; are these UTM or degrees\?"
+    with pytest.raises(QueryError, match=f"parameter `{name}`: .* is off the site.*: {where}") as caught:
+        answers.answer(query)
+    assert caught.value.reason == Refusal.OUTSIDE_SITE
 
 
 def test_answers_travel_as_bytes(answers):

@@ -189,7 +189,7 @@ def test_bad_parameters_are_refused_by_name(name, parameters, problem):
 
 def test_what_cannot_be_answered_is_refused_with_what_to_do(writer, monkeypatch):
     answers = answers_of(writer)
-    with refused(Refusal.OUT_OF_RANGE, "off the site"):
+    with refused(Refusal.OUTSIDE_SITE, "off the site"):
         segments(answers, bounds=Bounds(1e6, 0, 2e6, 10))
     for ask in (segments, worklist):
         with refused(Refusal.UNKNOWN_MACHINE, "machine `truck-9` has sent nothing"):

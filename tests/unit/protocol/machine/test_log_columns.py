@@ -8,6 +8,7 @@ import pytest
 
 from protocol.errors import ConfigError
 from protocol.machine.log_folder import LogFolder, open_log
+from protocol.machine.readings import columns
 from protocol.site.site_config import Projection
 
 T0 = 1_750_000_000_000_000_000
@@ -74,6 +75,28 @@ def test_a_value_that_cannot_be_is_refused_with_its_line(tmp_path: Path, row: st
     assert len(list(log.readings())) == 1
     assert log.refused == {reason: 1}
     assert log.first_refused[reason].startswith(f"it.csv line 3: {problem}")
+
+
+@pytest.mark.parametrize(
+    ("kind", "described", "quantity"),
+    [
+        ("gps", f'{METRES}, var_e_m2 = "v", var_n_m2 = "v"', "position"),
+        ("gps", f'{METRES}, std_e_m = "v", std_n_m = "v"', "position"),
+        ("gps_velocity", 'speed_mps = "x", course_deg = "y", var_e_m2ps2 = "v", var_n_m2ps2 = "v"', "velocity"),
+    ],
+)
+def test_a_variance_that_is_not_known_is_that_of_std(tmp_path: Path, kind: str, described: str, quantity: str) -> None:
+    """As drivers write it: 0; a stated one stays, since `std` is used in its place later."""
+    text = "t,x,y,v\n0,1,2,0\n1,1,2,0.0\n2,1,2,4\n"
+    log = opened(tmp_path, text, kind, described, f"std = {{ {quantity} = 3.0 }}")
+    variances = [
+        [getattr(reading, name) for name in columns(kind) if name[:6] in ("var_e_", "var_n_")]
+        for reading in log.readings()
+    ]
+    stated = 16.0 if "std_e_m" in described else 4.0
+    assert variances == [[9.0, 9.0], [9.0, 9.0], [stated, stated]]
+    without = opened(tmp_path, text, kind, described, "")
+    assert len(list(without.readings())) == 1
 
 
 @pytest.mark.parametrize(

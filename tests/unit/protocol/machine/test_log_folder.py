@@ -1,5 +1,6 @@
 import gzip
 import math
+import os
 
 import pytest
 from hypothesis import given, settings
@@ -95,6 +96,50 @@ def test_wrong_manifest_is_refused_by_name(tmp_path, old, new, words):
     with pytest.raises(ConfigError, match=words) as caught:
         open_log(folder(tmp_path, MANIFEST.replace(old, new, 1)))
     assert "log.toml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("file", "problem"),
+    [
+        ("../outside.csv", "lies outside of the data folder"),
+        ("/etc/hostname", "lies outside of the data folder"),
+        ("sub/../../outside.csv", "lies outside of the data folder"),
+        ("link.csv", "lies outside of the data folder"),
+        ("there/outside.csv", "lies outside of the data folder"),
+        ("loop.csv", "cannot be read"),
+        ("fifo.csv", "is no regular file"),
+        ("sub", "is no regular file"),
+        ("a\\u0000b", "is no name of a file"),
+        ("wide.csv", "has 1001 columns, over 1000"),
+    ],
+)
+def test_a_manifest_of_a_stranger_stays_in_its_folder_and_reads_files(tmp_path, file, problem):
+    data = folder(tmp_path, MANIFEST.replace("joint.csv", file), joint=None)
+    elsewhere = tmp_path.parent / f"{tmp_path.name}-elsewhere"
+    for place in (data / "sub", elsewhere):
+        place.mkdir()
+    (data / "wide.csv").write_text(",".join(["t", "angle", *map(str, range(999))]))
+    for name, target in {
+        "link.csv": elsewhere / "outside.csv",
+        "there": elsewhere,
+        "loop.csv": data / "loop.csv",
+    }.items():
+        (data / name).symlink_to(target)
+    for outside in (elsewhere / "outside.csv", tmp_path.parent / "outside.csv"):
+        outside.write_text("t,angle\n0,0\n")
+    os.mkfifo(data / "fifo.csv")
+    with pytest.raises(LogFolderError) as caught:
+        list(open_log(data).readings())
+    assert problem in str(caught.value)
+
+
+def test_files_below_the_data_folder_are_read_also_through_links(tmp_path):
+    data = folder(tmp_path, MANIFEST.replace("joint.csv", "day/one.csv"), joint=None)
+    (data / "day").mkdir()
+    (data / "two.csv").write_text("t,angle\n0,0\n")
+    (data / "day" / "one.csv").symlink_to(data / "two.csv")
+    (tmp_path.parent / f"{tmp_path.name}-link").symlink_to(data)
+    assert len(list(open_log(tmp_path.parent / f"{tmp_path.name}-link").readings())) == 1
 
 
 # --- what is written reads back --------------------------------------------------------------------------------------

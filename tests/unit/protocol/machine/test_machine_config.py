@@ -62,7 +62,7 @@ def test_every_option_of_a_machine_is_written_and_read_back():
     body = {
         f.name: 1.25 + i for i, f in enumerate(dataclasses.fields(MachineConfig)) if f.name not in ("name", "sensors")
     }
-    machine = MachineConfig("a", **{**body, "machine_share": 0.5, "skid_steers": True})
+    machine = MachineConfig("a", **{**body, "mass_kg": 2500.0, "machine_share": 0.5, "skid_steers": True})
     assert parse_machine(tomllib.loads(machine_toml(machine))["machine"], (), "x") == machine
 
 

@@ -6,6 +6,7 @@ import inspect
 import json
 import stat
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from sitegrid.client import connect
 from sitegrid.security.access import access_control, router_settings
 from sitegrid.security.join import is_loopback, join
 from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml
+from sitegrid.security.tokens import load_tokens
 
 x509 = pytest.importorskip("cryptography.x509", reason="cryptography is not installed")
 
@@ -194,11 +196,13 @@ def change(path: Path, old: str, new: str) -> None:
     path.write_text(sealed(text.replace(old, new)))
 
 
-@pytest.mark.parametrize("place", ["register.toml", "server/identity.toml"])
+@pytest.mark.parametrize("place", ["register.toml", "tokens.toml", "server/identity.toml"])
 def test_no_flipped_bit_lets_anybody_in(folder: Path, place: str):
     """Bits all over what `sitegrid keys` writes as text: it is refused, with the file's name."""
     path = folder / place
-    load = (lambda: load_register(folder)) if place == "register.toml" else (lambda: load_credentials(path.parent))
+    act(folder, "token", "anna")
+    loads = {"register.toml": load_register, "tokens.toml": load_tokens, "identity.toml": load_credentials}
+    load = partial(loads[path.name], path.parent)
     load()
     whole = path.read_bytes()
     for at in range(0, 8 * len(whole), 37):

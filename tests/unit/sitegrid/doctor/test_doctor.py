@@ -155,6 +155,10 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
             WARN,
             "3 batches were refused for stamps",
         ),
+        *(
+            (network.check_time(replace(AHEAD, counters={f"refused_{reason}": 1})), WARN, "20.0 h ahead of the server")
+            for reason in ("far_future", "server_clock")
+        ),
         (network.check_clock(0.4, 0.01, None), PASS, "0.40 s ahead of"),
         (network.check_clock(1.2, 0.1, None), WARN, "NTP"),
         (network.check_clock(1.2, 0.3, None), PASS, "+-0.30"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from protocol.errors import ConfigError, MessageError, Refusal
+from protocol.files import sealed
 from protocol.wire import keys
 from sitegrid.security.tokens import TOKENS_FILE, TokenFile, Tokens, load_tokens, save_tokens
 
@@ -155,6 +156,6 @@ def test_a_file_that_is_damaged_later_lets_nobody_in_and_is_logged(tmp_path: Pat
     "text", ['[names.a]\nsha256 = "x"\nexpires = 2026-01-01T00:00:00Z\n', "[names.a]\n", "names = 3\n", "["]
 )
 def test_a_damaged_file_is_refused(tmp_path: Path, text: str):
-    (tmp_path / TOKENS_FILE).write_text(text)
+    (tmp_path / TOKENS_FILE).write_text(sealed(text))
     with pytest.raises(ConfigError, match=TOKENS_FILE):
         load_tokens(tmp_path)

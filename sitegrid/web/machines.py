@@ -1,0 +1,77 @@
+"""Machines as pages see them: where each is, where it was, what its sensors lack. Any thread may ask."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from protocol.errors import MessageError, Refusal
+from protocol.wire.heard import Heard
+from protocol.wire.messages import Health, Pose
+from sitegrid.health import faults_of
+from sitegrid.web.values import plain
+
+MOST_POSES, TRACK_STEP_NS = 600, 10**9  # of a track: ten minutes of site time
+MOST_IN_ALL = 100 * MOST_POSES  # where there are more machines, tracks are shorter
+SILENT_S = 120.0  # a machine that said nothing for so long is left out
+
+
+@dataclass
+class _Machine:
+    pose: Pose
+    track: deque[Pose] = field(default_factory=deque)
+    faults: Sequence[str] = ()
+
+
+class Machines:
+    """The machines of a site that said anything lately, at most MOST_NAMES of them. heard: how many poses."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._lock = clock, threading.Lock()
+        self._heard: Heard[_Machine] = Heard(clock)
+        self.heard = 0
+
+    def __len__(self) -> int:
+        return len(self._heard)
+
+    def on_pose(self, pose: Pose) -> None:
+        """Take a pose; MessageError where there are too many machines for another one."""
+        with self._lock:
+            known = self._heard.get(pose.machine)
+            machine = known or _Machine(pose)
+            machine.pose, track = pose, machine.track
+            if not self._heard.hear(pose.machine, machine):
+                raise MessageError(Refusal.OVERLOADED, f"{len(self._heard)} others spoke lately", field="machine")
+            self.heard += 1
+            if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
+                track.append(pose)
+            most = min(MOST_POSES, MOST_IN_ALL // len(self._heard))
+            for each in [machine] if known else self._heard:
+                while len(each.track) > most:
+                    each.track.popleft()
+
+    def on_health(self, health: Health) -> None:
+        """Take what the sensors of a machine lack, whose pose is known."""
+        with self._lock:
+            if machine := self._heard.get(health.machine):
+                machine.faults = faults_of(health.values)
+
+    def poses(self) -> list[dict[str, Any]]:
+        """Newest pose of each machine that said anything lately, and how old it is."""
+        with self._lock:
+            now_s = self._clock()
+            heard = [(machine.pose, now_s - heard_s, machine.faults) for _, machine, heard_s in self._heard.items()]
+        return [
+            plain({**asdict(pose), "age_s": round(age_s, 3), "faults": list(faults)})
+            for pose, age_s, faults in heard
+            if age_s < SILENT_S
+        ]
+
+    def tracks(self) -> dict[str, list[Pose]]:
+        """Where each machine was, oldest first."""
+        with self._lock:
+            return {name: list(machine.track) for name, machine, _ in self._heard.items()}
