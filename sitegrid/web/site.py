@@ -25,6 +25,7 @@ from protocol.wire.codec import decode_health, receive_pose
 from protocol.wire.messages import Health, Pose
 from sitegrid.asking import is_answered
 from sitegrid.client import Client
+from sitegrid.explanations import rolls
 from sitegrid.health import faults_of
 from sitegrid.listener import Listener
 from sitegrid.web.values import plain
@@ -62,6 +63,7 @@ class SiteFeed:
         self._tracks: dict[str, deque[Pose]] = {}
         self._poses_lock = threading.Lock()
         self._faults: dict[str, list[str]] = {}  # of machines' sensors
+        self._rolls: dict[str, list[str]] = {}  # machines that roll unlike the others
         self._listener: Listener[Pose] | None = None
         self._health: Listener[Health] | None = None
         self._info: tuple[float, MapInfo] | None = None
@@ -114,9 +116,10 @@ class SiteFeed:
         now_s = time.monotonic()
         with self._poses_lock:
             self._poses = {name: item for name, item in self._poses.items() if now_s - item[1] < SILENT_S}
-            poses, faults = list(self._poses.values()), self._faults
+            poses, faults, rolls = list(self._poses.values()), self._faults, self._rolls
+        said = {pose.machine: [*faults.get(pose.machine, []), *rolls.get(pose.machine, [])] for pose, _ in poses}
         return [
-            plain({**asdict(pose), "age_s": round(now_s - came_s, 3), "faults": faults.get(pose.machine, [])})
+            plain({**asdict(pose), "age_s": round(now_s - came_s, 3), "faults": said[pose.machine]})
             for pose, came_s in poses
         ]
 
@@ -202,6 +205,7 @@ class SiteFeed:
     async def _ask_state(self) -> dict[str, Any]:
         info = await self.info(0.0)
         machines, changes = await self.ask(self.client.machines), await self.ask(self.client.changes)
+        self._rolls = {machine.name: [said] for machine in machines if (said := rolls(machine))}
         return {
             "name": self.name,
             "stamp_ns": info.stamp_ns,
