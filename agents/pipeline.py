@@ -137,7 +137,7 @@ class Pipeline:
 
     def _take_one(self, accepted: Accepted) -> list[Samples]:
         readings, poses, smoothed, restarts, off_m, concluded = accepted
-        self._track.append(smoothed)
+        self._track.append(smoothed, self._sampler.oldest_ns)
         made: list[Samples] = []
         if restarts:
             made += self._place(concluded)
@@ -159,8 +159,8 @@ class Pipeline:
         distance_m = self._odometer.update(stamp_ns, dead_reckoning.wheels_ns, dead_reckoning.distance_m, speed_mps)
         self._sampler.mark(stamp_ns, distance_m)
         made += self._due_samples()
-        if smoothed:
-            made.append(Samples(NOTHING, self._sampler.final_samples(self._track.corrected)))
+        if smoothed and self._watch.is_clear:
+            made.append(Samples(NOTHING, self._sampler.final_samples(self._corrected)))
         return made
 
     def _place(self, poses: Sequence[PoseBelief]) -> list[Samples]:
@@ -183,9 +183,14 @@ class Pipeline:
 
         def corrected(pose: PoseBelief) -> PoseBelief:
             known = self._track.corrected_by_now(pose, remaining)
-            return replace(known, covariance_m2=known.covariance_m2 + off_m**2 * np.eye(2)) if off_m else known
+            return less_sure(known, max(off_m, self._watch.off_m(pose.stamp_ns)))
 
         return Samples(rows, self._sampler.final_samples(corrected))
+
+    def _corrected(self, pose: PoseBelief) -> PoseBelief | None:
+        """The pose as smoothed, and as sure as it may be after a jump; None while that is not known."""
+        known = self._track.corrected(pose)
+        return less_sure(known, self._watch.off_m(pose.stamp_ns)) if known else None
 
     def _withhold_waiting(self) -> None:
         unproven = self.pose is not None and self._sampler.poses.newest is None
@@ -198,7 +203,7 @@ class Pipeline:
     def _known_c_rr(self) -> float | None:
         """Resistance of the ground here, where the site states it and the position is sure enough."""
         pose, areas = self.pose, self._site.known_ground
-        if not areas or not pose:
+        if not areas or not pose or not self._watch.is_clear:
             return None
         std_m = float(np.sqrt(np.linalg.eigvalsh(pose.covariance_m2)[-1]))
         margin_m = EDGE_M + 2 * std_m
@@ -208,7 +213,8 @@ class Pipeline:
         """Start with nothing known but the calibration, as after power-up or a jump of the clock."""
         config, machine = self._config, self._machine
         self._estimator = GroundEstimator(machine, config.estimation, known)
-        self._sampler = Sampler(machine.load_centre_m)
+        self._sampler, self._watch = Sampler(machine.load_centre_m), self._positioning.localiser.watch
+        self._sampler.is_clear = lambda stamp_ns: not self._watch.off_m(stamp_ns)
         self._odometer = Odometer()
         self._track = SmoothedTrack()
 
@@ -222,10 +228,12 @@ class SmoothedTrack:
     def __init__(self) -> None:
         self._nodes: list[SmoothedPose] = []
 
-    def append(self, nodes: Sequence[SmoothedPose]) -> None:
-        """Add nodes, which are newer than those before."""
+    def append(self, nodes: Sequence[SmoothedPose], needed_ns: int | None = None) -> None:
+        """Add nodes, which are newer than those before. needed_ns: of the oldest pose that may be asked for."""
         if nodes and self._nodes:
-            del self._nodes[: bisect_left(self._nodes, self._nodes[-1].stamp_ns - KEPT_NS, key=_stamp)]
+            newest_ns = self._nodes[-1].stamp_ns
+            oldest_ns = min(newest_ns, newest_ns if needed_ns is None else needed_ns) - KEPT_NS
+            del self._nodes[: bisect_left(self._nodes, oldest_ns, key=_stamp)]
         self._nodes += nodes
 
     def corrected(self, pose: PoseBelief) -> PoseBelief | None:
@@ -236,6 +244,11 @@ class SmoothedTrack:
     def corrected_by_now(self, pose: PoseBelief, remaining: Sequence[SmoothedPose]) -> PoseBelief:
         """The pose as smoothed by what is known now. remaining: nodes that are not final, after those that are."""
         return corrected(pose, [*self._nodes, *remaining])
+
+
+def less_sure(pose: PoseBelief, off_m: float) -> PoseBelief:
+    """The pose, where it may be off by so much beside what it states."""
+    return replace(pose, covariance_m2=pose.covariance_m2 + off_m**2 * np.eye(2)) if off_m else pose
 
 
 def corrected(pose: PoseBelief, nodes: Sequence[SmoothedPose]) -> PoseBelief:

@@ -80,7 +80,7 @@ class Positioning:
     @property
     def faults(self) -> dict[str, str]:
         """What is wrong with sensors that do not count, or contradict others: a sentence by sensor."""
-        return self.judge.problems if self.judge else {}
+        return (self.judge.problems if self.judge else {}) | self.localiser.watch.problem
 
     @property
     def clocks_s(self) -> dict[str, float]:

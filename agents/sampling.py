@@ -119,6 +119,7 @@ class Sampler:
         self.withheld: Counter[str] = Counter()
         self.without_resistance: Counter[str] = Counter()
         self.poses = PoseHistory()
+        self.is_clear: Callable[[int], bool] = lambda _: True  # whether the place of a stamp is
         self._load_centre_m = load_centre_m
         self._marked_m = 0.0
         self._marks: deque[Mark] = deque()  # wait for the estimator
@@ -129,6 +130,11 @@ class Sampler:
     def waiting(self) -> int:
         """How many marks are not sampled yet."""
         return len(self._marks) + len(self._estimated)
+
+    @property
+    def oldest_ns(self) -> int | None:
+        """Stamp of the oldest sample that is not final yet."""
+        return self._pending[0].pose.stamp_ns if self._pending else None
 
     @property
     def pending(self) -> int:
@@ -170,6 +176,9 @@ class Sampler:
 
     def _is_usable(self, pose: PoseBelief, e: GroundEstimate) -> bool:
         """Whether a sample can be made of it; counts why not, and what it lacks."""
+        if not self.is_clear(pose.stamp_ns):
+            self.withheld["place_unclear"] += 1
+            return False
         (xx, _), (_, yy) = pose.covariance_m2
         if max(xx, yy) > MAX_STD_M**2:
             self.withheld["unsure_position"] += 1

@@ -14,10 +14,24 @@ MOST_LISTED = 12  # machines beside a picture
 
 def why(machine: MachineState) -> str:
     """In what it contradicts the others or its data sheet, and what was decided about it; empty for nothing."""
-    said = [_sentence(reason, machine.evidence) for reason in machine.reasons]
+    said = [*(_sentence(reason, machine.evidence) for reason in machine.reasons), rolls(machine)]
     if machine.reason != ", ".join(machine.reasons):
         said.append(machine.reason)
     return "; ".join(filter(None, said))
+
+
+def rolls(machine: MachineState) -> str:
+    """How much harder or easier it rolls than the others, why that may be, and what it costs; empty where it does not.
+
+    Most may roll wrong alike: then the odd one is right, which nothing shows.
+    """
+    known = machine.evidence
+    with suppress(KeyError, TypeError, ValueError):
+        share, than = known["rolls"], "the others" if known["rolls_named"] else "some others, or these than it,"
+        how = f"{100 * abs(share):.0f} +- {100 * known['rolls_std']:.0f} % {'harder' if share > 0 else 'easier'}"
+        costs = f"; costs about {known['rolls_litres_ph']:.2g} l/h" if known.get("rolls_litres_ph", 0.0) > 0 else ""
+        return f"rolls {how} than {than} on the same ground: tyre pressure, brake, torque scale{costs}"
+    return ""
 
 
 def _sentence(reason: str, evidence: Mapping[str, Any]) -> str:

@@ -26,6 +26,7 @@ from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
 from agents.localisation.repeats import Repeats
 from agents.localisation.tracker import Event, Tracker, TrackerConfig, gps_velocity
 from agents.localisation.travel_sign import TravelSign
+from agents.localisation.wheels.place_watch import PlaceWatch
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Correction, Gps, GpsVelocity
@@ -91,7 +92,7 @@ class Localiser:
     """Fuses GPS, IMUs and wheels over 15 states and the sensors' slow errors; takes readings in nearly any order.
 
     engine: the filter; an experiment may put one that watches it in its place, before the first reading. is_weighed:
-    whether the machine's load is known. is_proven: whether poses may become samples.
+    whether the machine's load is known. is_proven: whether poses may become samples. watch: whether places have jumped.
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class Localiser:
     ) -> None:
         self.engine = _engine(config)
         self.is_proven = False
+        self.watch = PlaceWatch()
         self._config = config
         tyres, is_started = (config.slip, config.slip_soft), bool(config.start)
         self._tracker_config = TrackerConfig(
@@ -134,7 +136,8 @@ class Localiser:
     @property
     def counters(self) -> Counter[str]:
         """Measurements used and gated, readings refused."""
-        return self._tracker.counters + self._gatherer.counters + self._repeats.counters + self._counters
+        of_parts = [part.counters for part in (self._tracker, self._gatherer, self._repeats, self.watch)]
+        return sum(of_parts, self._counters)
 
     @property
     def repeating(self) -> list[str]:
@@ -276,11 +279,15 @@ class Localiser:
         """What refused fixes show instead, once they are too many; HeadingRefutedError where a heading was proven."""
         if self._tracker.is_accepted(fix):
             self._refused.clear()
+            self.watch.look(fix.stamp_ns)
             return None
         self._refused.append(fix)
         if not self._tracker.has_relocked or self._tracker.receivers.is_outvoted(fix):
             return None
         shown = align_fixes(self._refused)
+        if self.is_proven:
+            since_ns = self._refused[0].stamp_ns
+            self.watch.jumped(fix.sensor.name, since_ns, fix.stamp_ns, self._tracker.off_m(fix))
         if not self.is_proven or not shown:
             return shown
         belief = self._tracker.belief
@@ -288,7 +295,7 @@ class Localiser:
         believed_rad = float(belief.x[YAW]) - fix.reckoned.angle_rad
         std_rad = math.hypot(shown.std_rad, math.sqrt(belief.P[YAW, YAW]))
         if abs(wrap_angle(shown.rotation_rad - believed_rad)) > REFUTED_SIGMA * std_rad:
-            raise HeadingRefutedError(self._tracker.off_m(fix))
+            raise HeadingRefutedError(math.hypot(*self._tracker.off_m(fix)))
         return None
 
     def _take_back(self, shown: Alignment, distance_m: float) -> list[Belief]:

@@ -162,10 +162,10 @@ class Tracker:
         last = self.fusion.last.get(fix.sensor.name) if self.fusion else None
         return last is not None and last.accepted
 
-    def off_m(self, fix: Fix) -> float:
-        """How far the newest fix of this receiver is off."""
+    def off_m(self, fix: Fix) -> Floats:
+        """What the newest fix of this receiver is off (2,), east and north."""
         last = self.fusion.last.get(fix.sensor.name) if self.fusion else None
-        return float(np.hypot(*last.innovation)) if last else 0.0
+        return last.innovation if last else np.zeros(2)
 
     def _filter_step(self, fusion: Fusion, event: FilterStep) -> list[Belief]:
         """Beliefs that the machine's motion changed."""

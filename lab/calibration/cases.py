@@ -14,7 +14,7 @@ from protocol.arrays import Bools, Floats, Floats32, Table
 Rows = Mapping[str, Table]  # samples by machine
 PAPER = "paper_site"
 STEEP = 0.13  # gradient beyond which a cell or a place is on a ramp
-GAIN, STEP, RAIN = 1.6, 0.015, 0.02
+GAIN, STEP, RAIN, HARDER = 1.6, 0.015, 0.02, 0.25
 RAMP_STEPS = (-0.02, 0.005, 0.01, 0.02)
 PRESETS = ("paper", "harsh", "standalone")  # of sensors, beside `dgps`, which all other cases have
 DIRT = (0.03, 0.05)  # c_rr of the ground that rain makes heavier
@@ -74,6 +74,14 @@ def gain(rows: Rows, scene: Scene, factor: float) -> Tampered:
     return Tampered({**rows, name: table}, scene.truth.c_rr)
 
 
+def rolls_harder(rows: Rows, scene: Scene, share: float) -> Tampered:
+    """The second machine rolls harder on any ground, with right slopes: soft tyres, or a lie."""
+    name = sorted(rows)[1]
+    table = rows[name].copy()
+    table["c_rr"] *= 1 + share
+    return Tampered({**rows, name: table}, scene.truth.c_rr)
+
+
 def majority_off(rows: Rows, scene: Scene, zero: float) -> Tampered:
     """The zeros of all but the last machine are off by the same."""
     off = {name: _with_zero(rows[name], zero, np.ones(len(rows[name]), np.bool_)) for name in sorted(rows)[:-1]}
@@ -116,7 +124,7 @@ def rain(rows: Rows, scene: Scene, step: float) -> Tampered:
 
 
 TAMPERS: dict[str, Callable[[Rows, Scene, float], Tampered]] = {
-    each.__name__: each for each in (nothing, gain, majority_off, step_at_half, other_ramps, rain)
+    each.__name__: each for each in (nothing, gain, rolls_harder, majority_off, step_at_half, other_ramps, rain)
 }
 FLEETS = tuple(FleetCase(f"machines_{count}", machines=count) for count in (1, 2, 3, 4))
 CASES = (
@@ -127,6 +135,7 @@ CASES = (
     FleetCase("loading", "loading", machines=0),
     FleetCase("bad_machine", machines=4, bad=(1,)),
     FleetCase("gain_1.6", machines=4, tamper="gain", argument=GAIN, let_in=(1,)),
+    FleetCase("rolls_harder", machines=4, tamper="rolls_harder", argument=HARDER),
     FleetCase("majority_off", machines=4, tamper="majority_off", argument=STEP),
     FleetCase("step_at_half", tamper="step_at_half", argument=STEP, spans=2),
     *(FleetCase(f"ramp_of_other_ground_{step:+g}", tamper="other_ramps", argument=step) for step in RAMP_STEPS),

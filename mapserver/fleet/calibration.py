@@ -21,12 +21,14 @@ from mapserver.fleet.observability import (
     CommonScale,
     MachineState,
     Observed,
+    Rolling,
     applied_part,
     beyond_data_sheet,
     is_surer,
     observe,
 )
 from mapserver.fleet.passages import sound
+from mapserver.fleet.rolling import rolling
 from mapserver.fleet.solver import SCALE_STD, Estimate, Prior, Problem, against, estimate, problem
 from protocol.arrays import Floats, Table
 from protocol.site.site_config import KnownGround
@@ -116,13 +118,14 @@ def _solved(
 ) -> Calibration:
     """What a solve with these priors says."""
     trusted = {name: table for name, table in known.items() if name not in excluded}
-    pb, result = _common_ground(trusted, areas, priors)
+    pb, result, found = _told_apart(*_common_ground(trusted, areas, priors))
     observed = observe(pb, result)
-    corrections, states = _said(pb, result, observed)
+    corrections, states = _said(pb, result, observed, found)
+    states |= {pb.names[i]: replace(states[pb.names[i]], rolling=one) for i, one in found.items()}
     for name in sorted(set(known) - set(pb.names)):
         own = problem({name: known[name]}, areas, priors)
         alone = against(own, pb, result)
-        more, state = _said(own, alone, observe(own, alone), observed.common)
+        more, state = _said(own, alone, observe(own, alone), {}, observed.common)
         corrections, states = corrections + more, states | state
     return Calibration(tuple(corrections), dict(sorted(states.items())), observed.common)
 
@@ -145,6 +148,20 @@ def _common_ground(
     others = all_of_them if most_seem else _without_odd(trusted, all_of_them, FAULT_SIGMAS[1], solved)
     fewer = _without_odd(trusted, others, FAULTY_SIGMAS, solved) if others[1].edges else others
     return others if fewer[1].edges else fewer
+
+
+def _told_apart(pb: Problem, result: Estimate) -> tuple[Problem, Estimate, Mapping[int, Rolling]]:
+    """Solved again with machines that roll unlike the others as such, which pull on no other one's scale then.
+
+    Where nobody can be named all are: then slopes alone show scales, which are the less sure for it.
+    """
+    found, on_slopes = rolling(pb, result)
+    while new := found.keys() & set(on_slopes) - set(pb.unlike):
+        named = all(one.is_named for one in found.values())
+        pb = replace(pb, unlike=tuple(sorted({*pb.unlike, *(new if named else on_slopes)})))
+        result = estimate(pb)
+        found, on_slopes = rolling(pb, result)
+    return pb, result, found
 
 
 def _without_odd(
@@ -176,21 +193,24 @@ def _odd(pb: Problem, result: Estimate, sigmas: tuple[float, float]) -> list[str
 
 
 def _said(
-    pb: Problem, result: Estimate, observed: Observed, others: CommonScale = KNOWN
+    pb: Problem, result: Estimate, observed: Observed, found: Mapping[int, Rolling], others: CommonScale = KNOWN
 ) -> tuple[list[Correction], dict[str, MachineState]]:
     """Corrections and states of the machines of a problem. others: of those whose ground it was solved against."""
     applied = applied_part(pb, result, observed, others)
-    return _corrections(pb, applied), _states(pb, applied, observed.by)
+    return _corrections(pb, applied, found), _states(pb, applied, observed.by)
 
 
-def _corrections(pb: Problem, applied: Applied) -> list[Correction]:
+def _corrections(pb: Problem, applied: Applied, found: Mapping[int, Rolling]) -> list[Correction]:
     """One correction for each epoch; the newest of a machine holds on. What measures no force has no scale."""
     layout, epochs = pb.layout, pb.epochs
+    both = zip(applied.x[layout.rolls], applied.x[layout.drags], strict=True)
+    rolls = {i: each for i, each in zip(pb.unlike, both, strict=True) if i in found and found[i].is_named}
     out = []
     for epoch, (machine, number) in enumerate(zip(epochs.machine.tolist(), epochs.number.tolist(), strict=True)):
         at = np.array([epoch, layout.scales.start + machine, layout.lateral.start + machine])
         newest = epoch + 1 == len(epochs.number) or epochs.machine[epoch + 1] != machine
         zero, k, across = applied.x[at].tolist()
+        m, b = rolls.get(machine, (0.0, 0.0))
         most_share = ANY_SHARE if applied.scaled[machine] else LEVEL_SHARE
         if not LEAST_GAIN < 1 + k < MOST_GAIN:
             k, most_share = 0.0, NO_SHARE
@@ -204,6 +224,8 @@ def _corrections(pb: Problem, applied: Applied) -> list[Correction]:
                 across=round(across, DIGITS),
                 covariance=_covariance(applied.covariance[np.ix_(at, at)]),
                 most_share=most_share,
+                rolls=round(float(m), DIGITS),
+                drags=round(float(b), DIGITS),
             )
         )
     return out

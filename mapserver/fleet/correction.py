@@ -5,7 +5,8 @@ A sample of direction d (+1 ahead, -1 in reverse) on ground c with slope s ahead
     c_rr = c + d z + d k (d c + s),    slope ahead = s - z,    slope to the left = t + a
 
 and d c_rr + slope ahead is the drive force over weight as it was measured, (1 + k) (d c + s): in it the zero cancels.
-So with scale = k / (1 + k) nothing but the sample itself is needed to undo all three.
+So with scale = k / (1 + k) nothing but the sample itself is needed to undo all three. Of a machine that rolls unlike
+the others what is left then is c (1 + m) + b (`mapserver.fleet.rolling`), which m and b undo.
 
 A machine that calibrates itself has taken a zero and a scale off already, and states them in each sample. Then the sum
 above is (1 - applied scale) of the drive force over weight, so that what was measured follows (`measured`), and a
@@ -46,7 +47,7 @@ LAST_NS = 2**62  # a correction without an end ends then
 DIGITS = 5  # a correction is rounded to 1e-5 before it is used: it is a fact, not a solver's floats
 _C_LOW, _C_HIGH = LIMITS["c_rr"]
 _GRADE_LOW, _GRADE_HIGH = LIMITS["grade_e"]
-VALUES = ("zero", "scale", "across", "most_share")
+VALUES = ("zero", "scale", "across", "most_share", "rolls", "drags")
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ class Correction:
     zero of the balance [-], which is also how much too low the slope ahead is; scale: k / (1 + k) of the drive force;
     across: how much too high the slope to the left is. All rounded to DIGITS. covariance (3, 3): of what is left, in
     this order. most_share: c_rr of a sample with a larger share of drive force over weight stays as it was; less than
-    ANY_SHARE where the scale is not known, and then what the machine itself applied of a scale stays applied.
+    ANY_SHARE where the scale is not known, and then what the machine itself applied of a scale stays applied. rolls,
+    drags: m and b.
     """
 
     machine: str
@@ -67,16 +69,17 @@ class Correction:
     across: float
     covariance: tuple[tuple[float, ...], ...]
     most_share: float = ANY_SHARE
+    rolls: float = 0.0
+    drags: float = 0.0
 
 
 class _Spans:
-    """Corrections of one machine, in order of time, and the same in numbers: spans (k, 2) and values (k, 4)."""
+    """Corrections of one machine, in order of time, and the same in numbers: spans (k, 2) and values (k, 6)."""
 
     def __init__(self, each: Iterable[Correction]) -> None:
         self.each = tuple(sorted(each, key=lambda one: one.from_ns))
         self.spans = np.array([(one.from_ns, one.to_ns) for one in self.each], np.int64).reshape(-1, 2)
-        values = [(one.zero, one.scale, one.across, one.most_share) for one in self.each]
-        self.values = np.array(values, np.float64).reshape(-1, 4)
+        self.values = np.array([values(one) for one in self.each], np.float64).reshape(-1, len(VALUES))
 
 
 class Corrections:
@@ -109,7 +112,7 @@ class Corrections:
         self._machines = {name: machines[name] for name in sorted(machines) if machines[name].each}
         parts, first = [*self._machines.values()], 0
         self._spans = np.concatenate([np.zeros((0, 2), np.int64), *(own.spans for own in parts)])
-        self._values = np.concatenate([np.zeros((0, 4)), *(own.values for own in parts)])
+        self._values = np.concatenate([np.zeros((0, len(VALUES))), *(own.values for own in parts)])
         self._places: dict[str, tuple[int, int]] = {}  # of each machine's: the first, and the end
         for name, own in self._machines.items():
             self._places[name] = first, (first := first + len(own.each))
@@ -200,7 +203,7 @@ def heading_index(heading_rad: float) -> int:
 def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, units: Any) -> None:
     """Correct rows in place. machine (n,): index in places (m, 2), each one's first and end in the corrections.
 
-    spans (k, 2): by machine, in order of time; values (k, 4): zero, scale, across, most_share.
+    spans (k, 2): by machine, in order of time; values (k, 6): by VALUES.
     """
     for i in range(len(rows)):
         row = rows[i]
@@ -221,7 +224,7 @@ def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, unit
                 direction = 1.0 if row.speed_mps >= 0.0 else -1.0
                 share = (direction * c_rr + (east * ahead_e + north * ahead_n)) / (1.0 - applied)
                 if abs(share) <= values[at, 3]:
-                    c_rr = c_rr - direction * (zero + scale * share)
+                    c_rr = (c_rr - direction * (zero + scale * share) - values[at, 5]) / (1.0 + values[at, 4])
                     row.c_rr = np.float32(min(max(c_rr, _C_LOW), _C_HIGH))
             row.grade_e = np.float32(min(max(east + (zero * ahead_e + across * ahead_n), _GRADE_LOW), _GRADE_HIGH))
             row.grade_n = np.float32(min(max(north + (zero * ahead_n - across * ahead_e), _GRADE_LOW), _GRADE_HIGH))
@@ -229,7 +232,7 @@ def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, unit
 
 def values(one: Correction) -> tuple[float, ...]:
     """What a correction does to a sample, by VALUES."""
-    return one.zero, one.scale, one.across, one.most_share
+    return one.zero, one.scale, one.across, one.most_share, one.rolls, one.drags
 
 
 def paint(spans: list[Correction], one: Correction) -> None:

@@ -21,10 +21,10 @@ from mapserver.fleet.correction import (
     LAST_NS,
     LEVEL_SHARE,
     UNCORRECTED,
-    VALUES,
     Correction,
     Corrections,
     paint,
+    values,
 )
 from mapserver.fleet.hysteresis import Hysteresis
 from mapserver.fleet.ledger import EPOCH_NS, NOTHING_STATED, Stated
@@ -56,10 +56,7 @@ class CalibrationDecision:
 
     def body(self) -> dict[str, Any]:
         """Plain values."""
-        spans = [
-            [one.from_ns, one.to_ns, *(getattr(one, name) for name in VALUES), one.covariance]
-            for one in self.corrections
-        ]
+        spans = [_span(one) for one in self.corrections]
         head = {"version": VERSION, "machine": self.machine, "by": self.by, "reason": self.reason}
         return {**head, "stamp_ns": self.stamp_ns, "remembered": self.remembered, "spans": spans}
 
@@ -70,8 +67,8 @@ class CalibrationDecision:
             raise ValueError(f"has a correction of version {body.get('version')!r}, this program knows {VERSION}")
         machine = body["machine"]
         corrections = tuple(
-            Correction(machine, from_ns, to_ns, zero, scale, across, tuple(map(tuple, covariance)), most_share)
-            for from_ns, to_ns, zero, scale, across, most_share, covariance in body["spans"]
+            Correction(machine, from_ns, to_ns, zero, scale, across, tuple(map(tuple, covariance)), most_share, *rolls)
+            for from_ns, to_ns, zero, scale, across, most_share, covariance, *rolls in body["spans"]
         )
         numbers = [(one.zero, one.scale, one.across, one.most_share, *chain(*one.covariance)) for one in corrections]
         if not all(map(math.isfinite, chain(*numbers))):
@@ -195,6 +192,13 @@ class CalibrationDecisions:
         for one in self._spans[PERSON].get(machine, ()):
             paint(spans, one)
         return spans
+
+
+def _span(one: Correction) -> list[Any]:
+    """One correction; how its machine rolls stands last, where it rolls unlike the others."""
+    *first, rolls, drags = values(one)
+    rolling = [rolls, drags] if rolls or drags else []
+    return [one.from_ns, one.to_ns, *first, one.covariance, *rolling]
 
 
 def _as_of_ns(newest: Correction, now_ns: int) -> int:

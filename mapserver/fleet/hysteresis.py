@@ -16,6 +16,7 @@ from mapserver.fleet.ledger import EPOCH_NS, NOTHING_STATED, Stated
 
 IN_A_ROW = 2  # solves that have to differ from what counts; one, of a new machine of which nothing counts
 LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better
+LEAST_ROLLS, TYPICAL_C_RR = 0.04, 0.04  # two deviations at best of how a machine rolls, and the ground it is judged on
 FIRST_NS = 600 * 10**9  # so long after it was first seen, a machine's map is new
 FROZEN_NS = 4 * 3600 * 10**9  # so long after it was first seen, an epoch keeps its zero
 MOST_STEP_NS = 600 * 10**9  # of site time between two judgements: more is a jump, of a wrong clock or at night
@@ -99,10 +100,12 @@ def differs(one: Correction, counts: Correction | None, stated: Stated = NOTHING
     else:
         zero, across = math.hypot(one.zero - stated.zero, stated.zero_std), abs(one.across)
         scale = math.hypot(one.scale - stated.scale, stated.scale_std) if one.most_share >= ANY_SHARE else 0.0
+    before = counts.rolls + counts.drags / TYPICAL_C_RR if counts else 0.0
     zero_std, scale_std, across_std = (math.sqrt(one.covariance[i][i]) for i in range(3))
     return (
         zero > max(zero_std, LEAST_ZERO)
         or scale > max(scale_std, LEAST_SCALE)
         or across > max(across_std, LEAST_ZERO)
+        or abs(one.rolls + one.drags / TYPICAL_C_RR - before) > LEAST_ROLLS
         or (counts is not None and one.most_share != counts.most_share)
     )

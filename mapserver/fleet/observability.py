@@ -90,12 +90,17 @@ def observed_part(result: Estimate) -> tuple[Floats, Floats]:
 
 def _by_evidence(pb: Problem, result: Estimate) -> Floats:
     """Covariance without the data sheets' word on scales: that of many machines together is no evidence."""
-    scales, own = pb.layout.scales, np.array([p.covariance[1][1] for p in pb.priors])
     matrix = result.prior.matrix + sum(each.matrix for each in result.information.values())
-    stated = own < OBSERVED * SCALE_STD**2
-    at = np.arange(scales.start, scales.stop)[~stated]
-    matrix[at, at] -= (1 - WEAK) / own[~stated]
-    return inverse(matrix)
+    return inverse(without_data_sheet(pb, matrix, range(len(pb.names))))
+
+
+def without_data_sheet(pb: Problem, matrix: Floats, machines: Sequence[int]) -> Floats:
+    """An information matrix (p, p), which is changed, without the data sheets' word on the scales of machines."""
+    scales, own = pb.layout.scales, np.array([p.covariance[1][1] for p in pb.priors])
+    weak = np.isin(np.arange(len(own)), machines) & (own >= OBSERVED * SCALE_STD**2)
+    at = np.arange(scales.start, scales.stop)[weak]
+    matrix[at, at] -= (1 - WEAK) / own[weak]
+    return matrix
 
 
 def _by(pb: Problem, result: Estimate) -> dict[str, dict[str, tuple[str, ...]]]:
@@ -124,11 +129,26 @@ def _shown(variances: Mapping[str, Floats], before: Floats, at: Ints) -> Sequenc
 
 
 @dataclass(frozen=True)
+class Rolling:
+    """How much harder a machine rolls than the others, as a share of the ground's c_rr, and the standard deviation.
+
+    is_named: whether most others agree; else two groups differ, or two machines, and either may be the odd one.
+    work_jpkgs: what that costs at the wheels, per kilogram and second of driving.
+    """
+
+    share: float
+    std: float
+    is_named: bool
+    work_jpkgs: float
+
+
+@dataclass(frozen=True)
 class MachineState:
     """What is known of one machine: zero of its newest epoch, scale error k, lateral zero, and standard deviations.
 
     zero_by, scale_by: the sources that show them, none where the data sheet has to do; the scale is 0 then. beyond:
-    how many standard deviations of the data sheet the largest zero and the scale are off, for sure.
+    how many standard deviations of the data sheet the largest zero and the scale are off, for sure. rolling: None of a
+    machine that rolls like the others, as far as anything shows.
     """
 
     zero: float
@@ -140,6 +160,7 @@ class MachineState:
     zero_by: tuple[str, ...]
     scale_by: tuple[str, ...]
     beyond: tuple[float, float]
+    rolling: Rolling | None = None
 
 
 def is_surer(prior: Prior, state: MachineState | None) -> bool:

@@ -28,6 +28,8 @@ from protocol.site.site_config import KnownGround
 ZERO_STD, SCALE_STD = 0.0045, 0.045
 ZERO_WALK = 8e-5
 ZERO_S = 2 * ZERO_STD**2 / ZERO_WALK**2  # a Gauss-Markov process with this walk stays within the data sheet
+# Of machines that roll unlike the others: half of the ground's c_rr, and what a brake costs on any ground.
+ROLLS_STD, DRAGS_STD = 0.5, 0.02
 RAMPS_STD = 0.07  # of c_rr per slope: of what all ramps of a site differ by, 0.02 at 15 degrees
 INSIDE_M = 6.0  # of a cell's centre in an area of known ground: two standard deviations of a position, and 3 m
 MOST_ROUNDS = 20
@@ -52,7 +54,10 @@ DATA_SHEET = Prior()
 
 @dataclass(frozen=True)
 class Problem:
-    """What is solved. names: in order. cells: their numbers. known (cells,): c_rr that the site states, NaN: none."""
+    """What is solved. names: in order. cells: their numbers. known (cells,): c_rr that the site states, NaN: none.
+
+    unlike: indices of the machines that roll unlike the others.
+    """
 
     names: tuple[str, ...]
     passages: Passages
@@ -60,11 +65,12 @@ class Problem:
     cells: Ints
     known: Floats
     priors: tuple[Prior, ...]
+    unlike: tuple[int, ...] = ()
 
     @property
     def layout(self) -> Layout:
         """Of the parameters."""
-        return Layout(len(self.epochs.number), len(self.names))
+        return Layout(len(self.epochs.number), len(self.names), self.unlike)
 
 
 @dataclass(frozen=True)
@@ -196,10 +202,9 @@ def prior_equations(pb: Problem) -> Equations:
     A = sp.identity(layout.size, format="csr") - sp.csr_matrix(
         (kept, (np.arange(n), np.maximum(np.arange(n) - 1, 0))), shape=(layout.size, layout.size)
     )
-    b = np.concatenate([(1 - kept) * zero[machine], scale, np.zeros(layout.machines + 1)])
-    std = np.concatenate(
-        [zero_std[machine] * np.sqrt(1 - kept**2), scale_std, np.full(layout.machines, ZERO_STD), [RAMPS_STD]]
-    )
+    b = np.concatenate([(1 - kept) * zero[machine], scale, np.zeros(layout.size - layout.lateral.start)])
+    beside = np.repeat([ZERO_STD, RAMPS_STD, ROLLS_STD, DRAGS_STD], [layout.machines, 1, *[len(layout.unlike)] * 2])
+    std = np.concatenate([zero_std[machine] * np.sqrt(1 - kept**2), scale_std, beside])
     return equations(A.tocsr(), None, b, std)
 
 

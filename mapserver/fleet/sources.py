@@ -1,6 +1,7 @@
 """The sources of evidence: what stays of machines say of zero, scale and lateral zero, as equations.
 
-With the signs of `mapserver.fleet.correction`, parameters z of each epoch, k and a of each machine:
+With the signs of `mapserver.fleet.correction`, parameters z of each epoch, k and a of each machine, m and b of those
+that roll unlike the others (`mapserver.fleet.rolling`):
 
 - `same_ground`: c_rr of a cell is the same for all machines and in both directions.
 - `crossings`: so is its gradient, which machines measure in their own frames, each with its zeros.
@@ -47,15 +48,19 @@ EDGE_SECTORS = 4
 
 
 class Layout(NamedTuple):
-    """Where parameters lie: z of all epochs, k and a of all machines, and last what slopes have in common."""
+    """Where parameters lie: z of all epochs, k and a of all machines, what slopes have in common, and rolls.
+
+    unlike: indices of the machines that roll unlike the others, in order.
+    """
 
     epochs: int
     machines: int
+    unlike: tuple[int, ...] = ()
 
     @property
     def size(self) -> int:
         """Of all parameters."""
-        return self.epochs + 2 * self.machines + 1
+        return self.ramps + 1 + 2 * len(self.unlike)
 
     @property
     def zeros(self) -> slice:
@@ -76,6 +81,16 @@ class Layout(NamedTuple):
     def ramps(self) -> int:
         """By how much c_rr grows with the slope, everywhere."""
         return self.epochs + 2 * self.machines
+
+    @property
+    def rolls(self) -> slice:
+        """All m: the share by which machines that roll unlike the others roll harder."""
+        return slice(self.ramps + 1, self.ramps + 1 + len(self.unlike))
+
+    @property
+    def drags(self) -> slice:
+        """All b: what they roll harder by on any ground [c_rr]."""
+        return slice(self.rolls.stop, self.size)
 
 
 @dataclass(frozen=True)
@@ -151,17 +166,17 @@ def repeated(count: AnyArray) -> Floats:
     return np.sqrt((1 - SAME) / count + SAME)
 
 
-def same_ground(m: Means, layout: Layout, ground: GroundState, known: Floats) -> Equations:
-    """c_i = c + d z + d k (d c + s), the share d c + s by the ground as it is known so far.
+def same_ground(m: Means, layout: Layout, ground: GroundState, known: Floats, place: Ints | None = None) -> Equations:
+    """c_i = c (1 + m) + b + d z + d k (d c + s), the share d c + s by the ground as it is known so far.
 
     Taken from the same stay, its noise would explain itself by the scale. known (cells,): NaN where the site states no
-    c_rr; cells where it does are another source.
+    c_rr; cells where it does are another source. place: whose c each mean has, if not its cell's.
     """
     at = np.flatnonzero(np.isfinite(m.c_rr) & ~np.isfinite(known[m.cell]))
-    cells = len(known)
+    places, count = (m.cell, len(known)) if place is None else (place, place.max(initial=-1) + 1)
     return equations(
         _balance(m, at, layout, ground.c_rr[m.cell[at]], ground),
-        sparse(len(at), cells, (m.cell[at], 1.0)),
+        sparse(len(at), count, (places[at], 1.0)),
         m.c_rr[at],
         m.c_std[at],
     )
@@ -181,10 +196,15 @@ def known_ground(m: Means, layout: Layout, ground: GroundState, known: Floats) -
 
 
 def _balance(m: Means, at: Ints, layout: Layout, c_rr: Floats, ground: GroundState) -> sp.csr_matrix:
-    """Columns of z and k of balances on ground c_rr."""
+    """Columns of z and k, and of m and b, of balances on ground c_rr."""
     d, slope = m.direction[at], (ground.gradient[m.cell[at]] * m.ahead[at]).sum(axis=1)
     share = d * np.maximum(c_rr, LEAST_C_RR) + slope
-    return sparse(len(at), layout.size, (m.epoch[at], d), (layout.scales.start + m.machine[at], d * share))
+    terms = [(m.epoch[at], d), (layout.scales.start + m.machine[at], d * share)]
+    if layout.unlike:
+        free = np.isin(m.machine[at], layout.unlike)
+        which = np.where(free, np.searchsorted(layout.unlike, m.machine[at]), 0)
+        terms += [(layout.rolls.start + which, free * c_rr), (layout.drags.start + which, free * 1.0)]
+    return sparse(len(at), layout.size, *terms)
 
 
 def crossings(m: Means, layout: Layout, cells: int) -> Equations:

@@ -20,6 +20,7 @@ import numpy as np
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
 from mapserver.fleet.observability import MachineState
 from mapserver.journal.rows import JournalRows
+from mapserver.roads.worklist import litres
 from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
 from mapserver.trust.comparison import ComparedMap, Difference, compare, reverse
 from mapserver.trust.judgement import (
@@ -36,9 +37,11 @@ from mapserver.trust.judgement import (
     outvoted,
 )
 from protocol.arrays import Ints, Table
+from protocol.queries.roads import WorklistQuery
 
 # Standard errors that are added to each limit: a vote may be doubtful where several are needed, a verdict may not.
 PAIR_SIGMAS, VERDICT_SIGMAS = 1.0, 2.0
+HOUR_S = 3600.0
 _PRINTED = {AGREE: "agrees_with", DISAGREE: "disagrees_with", UNKNOWN: "undecided_with"}
 
 Pairs = dict[tuple[str, str], dict[Reason, Judgement]]  # of the first of two machines
@@ -51,8 +54,9 @@ class Verdict:
     reasons: empty unless it contradicts all others. agrees: in what it is seen to agree with them. evidence: plain
     values; what could not be compared is missing. cells, gain, offset_east_m, offset_north_m, offset_std_m,
     agreement [-], spread and spread_of_others (of the levels) against the map of all others in good standing; clock_s:
-    ahead of the others; zero, torque_gain, their standard deviations and what shows them: of the calibration; excess:
-    by reason, 1 at its limit; agrees_with, disagrees_with, undecided_with: machines.
+    ahead of the others; zero, torque_gain, their standard deviations and what shows them: of the calibration; rolls,
+    rolls_std, rolls_named, rolls_litres_ph: see `fleet.observability.Rolling`, of driving; excess: by reason, 1 at its
+    limit; agrees_with, disagrees_with, undecided_with: machines.
     """
 
     machine: str
@@ -70,6 +74,7 @@ class Auditor:
         self._fold = fold or FoldConfig()
         self._maps: dict[str, CoarseMap] = {}
         self._clocks = ClockLeads()
+        self._mass_kg: dict[str, float] = {}  # as last known
 
     def add(self, machine: str, rows: Table) -> None:
         """Add samples of one machine, corrected; in the order of the journal.
@@ -97,6 +102,8 @@ class Auditor:
             return
         if machine not in self._maps:
             self._maps[machine] = CoarseMap(self._cell_m)
+        if len(known_kg := rows["mass_kg"][np.isfinite(rows["mass_kg"])]):
+            self._mass_kg[machine] = float(known_kg.mean())
         sure = is_foldable(rows, self._fold)
         self._maps[machine].add(rows if sure.all() else rows[sure])
 
@@ -118,9 +125,8 @@ class Auditor:
             judgements[Reason.BEYOND_DATA_SHEET] = beyond_data_sheet(known[i])
             reasons = tuple(r for r in Reason if groups[r][i] and judgements[r].state == DISAGREE)
             excess = {str(r): round(j.excess, 3) for r, j in judgements.items() if j.excess}
-            evidence = (
-                _measured(difference) | lead | _calibrated(known[i]) | {"excess": excess} | _sides(names, votes, i)
-            )
+            calibrated = _calibrated(known[i], self._mass_kg.get(names[i], 0.0))
+            evidence = _measured(difference) | lead | calibrated | {"excess": excess} | _sides(names, votes, i)
             agrees = frozenset(r for r, j in judgements.items() if j.state == AGREE)
             verdicts[names[i]] = Verdict(names[i], reasons, evidence, bool(reasons), agrees)
         return verdicts
@@ -176,13 +182,19 @@ def _measured(difference: Difference | None) -> dict[str, Any]:
     return {name: round(value, 3) for name, value in values.items()}
 
 
-def _calibrated(state: MachineState | None) -> dict[str, Any]:
-    """What calibration knows of a machine, in plain values."""
+def _calibrated(state: MachineState | None, mass_kg: float) -> dict[str, Any]:
+    """What calibration knows of a machine, in plain values. mass_kg: 0 where it is not known."""
     if state is None:
         return {}
     values = {"zero": state.zero, "zero_std": state.zero_std}
     values |= {"torque_gain": 1 + state.scale, "torque_gain_std": state.scale_std}
-    known_by = {"zero_by": state.zero_by, "torque_gain_by": state.scale_by}
+    known_by: dict[str, Any] = {"zero_by": state.zero_by, "torque_gain_by": state.scale_by}
+    if rolling := state.rolling:
+        values |= {"rolls": rolling.share, "rolls_std": rolling.std}
+        known_by |= {"rolls_named": rolling.is_named}
+        if mass_kg:
+            work_j = np.array(rolling.work_jpkgs * mass_kg * HOUR_S)
+            values["rolls_litres_ph"] = float(litres(work_j, WorklistQuery.efficiency))
     return {name: round(value, 5) for name, value in values.items()} | known_by
 
 

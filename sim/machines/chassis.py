@@ -21,10 +21,14 @@ SETTLE_STEPS = 200  # with the brakes on, before a world starts
 
 @dataclass(frozen=True)
 class Bodies:
-    """What differs between machines of one kind: true mass, empty [kg], and true wheel radius [m], both (n,)."""
+    """What differs between machines of one kind: true mass, empty [kg], and true wheel radius [m], both (n,).
+
+    rolling: factor (n,) on the rolling resistance of the tyres, or one for all.
+    """
 
     mass_kg: Floats
     wheel_radius_m: Floats
+    rolling: Floats | float = 1.0
 
 
 class Chassis(NamedTuple):

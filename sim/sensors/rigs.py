@@ -21,17 +21,20 @@ class Faults:
     """Faults of a machine from from_s (simulated) on, beyond the errors of its preset.
 
     torque_scale: factor on what the drive train reports. antenna_off_m: how far the antennas really sit from where the
-    config says, in `base_link`. clock_off_s: what the stamps of all its sensors are ahead.
+    config says, in `base_link`. clock_off_s: what the stamps of all its sensors are ahead. rolling: factor on the
+    rolling resistance of its tyres, which are soft or hard from the start.
     """
 
     from_s: float = 0.0
     torque_scale: float = 1.0
     antenna_off_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clock_off_s: float = 0.0
+    rolling: float = 1.0
 
     def __post_init__(self) -> None:
         require_between(self, 0, 1e7, "from_s")
         require_between(self, 0, 10, "torque_scale")
+        require_between(self, 0.1, 10, "rolling")
         require_between(self, -1e6, 1e6, "clock_off_s")
         if not all(abs(off) <= 100 for off in self.antenna_off_m):
             raise ValueError(f"antenna_off_m: {self.antenna_off_m!r} is more than 100 m away")
@@ -100,7 +103,7 @@ def draw_bodies(rigs: Sequence[Rig], seed: int) -> Bodies:
         rng, spread = generator(seed, i, "body"), rig.preset.body
         mass_kg[i] = rig.machine.mass_kg * (1 + spread.mass * rng.uniform(-1, 1))
         radius_m[i] = rig.machine.wheel_radius_m * (1 + spread.wheel_radius * rng.standard_normal())
-    return Bodies(mass_kg, radius_m)
+    return Bodies(mass_kg, radius_m, np.array([rig.faults.rolling for rig in rigs]))
 
 
 def _inertial(kind: str, number: int, model: MachineModel) -> SensorConfig:

@@ -64,6 +64,7 @@ class BulletWorld:
         chassis = self._chassis
         of_wheels = [bodies.wheel_radius_m, chassis.tyre_stiffness_npm, chassis.tyre_damping_nspm]
         of_wheels += [chassis.relaxation_m, chassis.wheel_inertia_kgm2]
+        of_wheels += [np.broadcast_to(bodies.rolling, len(models))]
         self._tyres = Tyres(*(np.repeat(values[:, None], 4, axis=1) for values in of_wheels))
         # Unloaded tyres are so large that the nominal machine stands level when empty, hubs at their radius.
         sunk_m = 0.5 * np.array([m.mass_kg for m in models]) * GRAVITY_MPS2 / chassis.tyre_stiffness_npm
@@ -161,13 +162,17 @@ def _points(models: Sequence[MachineModel]) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Tyres:
-    """Parameters of wheels. radius: the rolling radius, that relates spin to speed and torque to force."""
+    """Parameters of wheels. radius: the rolling radius, that relates spin to speed and torque to force.
+
+    rolling: factor on the soil's rolling resistance.
+    """
 
     radius_m: Floats
     stiffness_npm: Floats
     damping_nspm: Floats
     relaxation_m: Floats
     inertia_kgm2: Floats
+    rolling: Floats | float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +254,7 @@ def turn_wheels(
     side = hard * left - soft * state.left_m
     within = np.minimum(1.0, limit / (np.hypot(traction, side) + _NO_FORCE_N))
     slack = np.minimum(1.0, LONGEST_STRETCH * limit / (stiffness * np.hypot(ahead, left) + _NO_FORCE_N))
-    resistance = -C_RR[zone] * load * np.tanh(motion.ahead_mps / STANDSTILL_MPS)
+    resistance = -tyres.rolling * C_RR[zone] * load * np.tanh(motion.ahead_mps / STANDSTILL_MPS)
     resistance = np.where(spin == 0.0, 0.0, resistance)  # a locked wheel does not roll
     torque = drive_nm - (free - spin) * inertia / dt
     forces = TyreForces(within * traction, resistance, within * side, torque)

@@ -37,7 +37,7 @@ STATE = np.dtype([(name, "f8", _AXES.get(name, ())) for name in (*_IN_BOTH, *_BE
 # give way under the nominal machine, empty, which stands level on them.
 _OF_TYRES = ("tyre_stiffness_npm", "tyre_damping_nspm", "wheel_radius_m", "wheel_inertia_kgm2")
 _OF_BODY = ("rear_to_joint_m", "front_to_joint_m", "half_track_m", "level_front_m", "level_rear_m")
-_FIGURES = (*_OF_BODY, *_OF_TYRES, "skid_grip", *chassis.Weight._fields)
+_FIGURES = (*_OF_BODY, *_OF_TYRES, "rolling", "skid_grip", *chassis.Weight._fields)
 MACHINE = np.dtype([("rolls_with_front", "?"), *((name, "f8") for name in _FIGURES)])
 
 

@@ -248,7 +248,7 @@ def _forces(
     moving = math.tanh(speed / k.standstill_mps)
     crab = -m.mass_kg * rates.force_left / stiffness * moving
     drag = -m.mass_kg * rates.turning * speed * crab
-    against = resistance * moving + drag + climb + tipping + _skidding(m, rates, load) * moving
+    against = m.rolling * resistance * moving + drag + climb + tipping + _skidding(m, rates, load) * moving
     to_stop = inertia * speed / k.dt_s + drive - against
     most = k.traction_use * traction
     tyres = min(max(drive - min(max(to_stop, -brake), brake), -most), most)

@@ -34,7 +34,7 @@ from sitegrid.security.join import join
 ANYBODY = "doctor"  # where there are no keys, every name is as good
 ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
 # Checks that need the map server:
-OF_SERVER = ("server", "losses", "clock", "time", "writer", "followers", "version", "permission")
+OF_SERVER = ("server", "losses", "clock", "time", "writer", "followers", "version", "machines", "permission")
 CORRECTION_S = 1.5  # they come five times a second
 SURE, OFF_M = 3.0, 1.0  # a lasting error of so many standard deviations, and of so much, is a wrong place
 REFUTED = "fixes are further off than the filter expects: look at the variance that the receiver states, and at mounts"
@@ -126,6 +126,7 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
             network.check_writers(network.ask_writers(session, subject.site)),
             network.check_followers(Asker(session, "", subject.site, network.ANSWER_S).followers(), info),
             network.check_version(package_version(), info.version),
+            network.check_machines(network.ask_machines(session, subject.site)),
         ]
     return [*findings, _permission(subject, session, info)]
 

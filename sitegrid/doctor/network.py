@@ -9,6 +9,7 @@ import math
 import secrets
 import socket
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,8 @@ import zenoh
 
 from protocol.errors import LinkError, MessageError, Refusal
 from protocol.machine.samples import empty
-from protocol.queries.answer_codec import decode_info
-from protocol.queries.answers import FollowerState, MapInfo
+from protocol.queries.answer_codec import decode_info, decode_machines
+from protocol.queries.answers import FollowerState, MachineState, MapInfo
 from protocol.queries.origin import SHOWN_S
 from protocol.site.site_config import SiteConfig
 from protocol.version import UNKNOWN
@@ -29,6 +30,7 @@ from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.asking import KNOWN_S
 from sitegrid.doctor import Finding, Level, skipped
+from sitegrid.explanations import rolls
 from sitegrid.security.join import signer
 
 ANSWER_S = 5.0
@@ -108,6 +110,21 @@ def ask_writers(session: zenoh.Session, site: str) -> list[MapInfo]:
         with suppress(MessageError):
             servers += [decode_info(reply.ok.payload.to_bytes())] if reply.ok is not None else []
     return servers
+
+
+def ask_machines(session: zenoh.Session, site: str) -> tuple[MachineState, ...]:
+    """What the server knows of machines; nothing without an answer that can be read."""
+    data = _ask(session, keys.map_query(site, "machines"), b"")
+    with suppress(MessageError):
+        return decode_machines(data).machines if data else ()
+    return ()
+
+
+def check_machines(machines: Iterable[MachineState]) -> Finding:
+    """Whether a machine rolls unlike the others on the same ground."""
+    said = [f"{machine.name} {text}" for machine in machines if (text := rolls(machine))]
+    message = "; ".join(said) or "none is known to roll unlike the others on the same ground"
+    return Finding(Level.WARN if said else Level.PASS, "machines", message)
 
 
 def check_writers(servers: list[MapInfo]) -> Finding:

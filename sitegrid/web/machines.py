@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -33,6 +33,7 @@ class Machines:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()
         self._heard: Heard[_Machine] = Heard(clock)
+        self._findings: Mapping[str, str] = {}
         self.heard = 0
 
     def __len__(self) -> int:
@@ -60,13 +61,21 @@ class Machines:
             if machine := self._heard.get(health.machine):
                 machine.faults = faults_of(health.values)
 
+    def on_findings(self, findings: Mapping[str, str]) -> None:
+        """Take what the map server says of machines, a sentence each."""
+        with self._lock:
+            self._findings = findings
+
     def poses(self) -> list[dict[str, Any]]:
         """Newest pose of each machine that said anything lately, and how old it is."""
         with self._lock:
             now_s = self._clock()
-            heard = [(machine.pose, now_s - heard_s, machine.faults) for _, machine, heard_s in self._heard.items()]
+            heard = [
+                (machine.pose, now_s - heard_s, [*machine.faults, *filter(None, [self._findings.get(name)])])
+                for name, machine, heard_s in self._heard.items()
+            ]
         return [
-            plain({**asdict(pose), "age_s": round(age_s, 3), "faults": list(faults)})
+            plain({**asdict(pose), "age_s": round(age_s, 3), "faults": faults})
             for pose, age_s, faults in heard
             if age_s < SILENT_S
         ]

@@ -24,6 +24,7 @@ from protocol.wire.codec import decode_health, receive_pose
 from protocol.wire.messages import Health, Pose
 from sitegrid.asking import is_answered
 from sitegrid.client import Client
+from sitegrid.explanations import rolls
 from sitegrid.listener import Listener
 from sitegrid.web.encoding import Cache
 from sitegrid.web.machines import Machines
@@ -222,7 +223,10 @@ class SiteFeed:
         self.answer = replace(answer, tiles=())
 
     async def _ask_state(self) -> tuple[MapInfo, Any, Any]:
-        return await self.info(0.0), await self.ask(self.client.machines), await self.ask(self.client.changes)
+        info = await self.info(0.0)
+        machines, changes = await self.ask(self.client.machines), await self.ask(self.client.changes)
+        self._machines.on_findings({machine.name: said for machine in machines if (said := rolls(machine))})
+        return info, machines, changes
 
     def tracks(self) -> dict[str, list[Pose]]:
         """Where each machine was while somebody looked, oldest first."""

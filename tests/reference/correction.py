@@ -21,7 +21,8 @@ def in_numpy(rows: Table, c: Correction) -> Table:
     scale = c.scale - applied if c.most_share >= ANY_SHARE else 0.0
     share = (d * c_rr + (east * unit[:, 0] + north * unit[:, 1])) / (1.0 - applied)
     level = np.abs(share) <= c.most_share
-    new = np.where(level, np.clip(c_rr - d * (zero + scale * share), *LIMITS["c_rr"]), c_rr)
+    rolled = (c_rr - d * (zero + scale * share) - c.drags) / (1.0 + c.rolls)
+    new = np.where(level, np.clip(rolled, *LIMITS["c_rr"]), c_rr)
     low, high = LIMITS["grade_e"]
     out["c_rr"] = np.where(np.isnan(share), rows["c_rr"], new.astype(np.float32))
     out["grade_e"] = np.clip(east + (zero * unit[:, 0] + c.across * unit[:, 1]), low, high)

@@ -4,11 +4,24 @@ from typing import Any
 
 import pytest
 
-from sitegrid.explanations import MOST_LISTED, calibrated, calibrations, why
+from sitegrid.doctor.network import check_machines
+from sitegrid.explanations import MOST_LISTED, calibrated, calibrations, rolls, why
 from tests.unit.records import machine_state
 
 CALIBRATED = {"zero": -0.0034, "zero_std": 0.0005, "torque_gain": 1.49, "torque_gain_std": 0.012}
 CALIBRATED |= {"zero_by": ("heights", "crossings"), "torque_gain_by": ()}
+
+
+def test_how_a_machine_rolls_is_said_with_its_doubt_and_what_it_costs() -> None:
+    known = {"rolls": 0.25, "rolls_std": 0.06, "rolls_named": True, "rolls_litres_ph": 3.04}
+    causes, costs = "on the same ground: tyre pressure, brake, torque scale", "costs about 3 l/h"
+    odd = machine_state("b", evidence=known)
+    assert why(odd) == f"rolls 25 +- 6 % harder than the others {causes}; {costs}"
+    less = known | {"rolls": -0.2, "rolls_named": False, "rolls_litres_ph": -2.0}
+    of_two = f"rolls 20 +- 6 % easier than some others, or these than it, {causes}"
+    assert rolls(machine_state("b", evidence=less)) == of_two
+    assert rolls(machine_state("b")) == rolls(machine_state("b", evidence={"rolls": "new"})) == ""
+    assert check_machines([odd, machine_state("c")]).message.startswith("b rolls 25 +- 6 %")
 
 
 @pytest.mark.parametrize(

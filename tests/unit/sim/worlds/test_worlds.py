@@ -268,6 +268,17 @@ def test_true_bodies_differ_from_the_model(kind: type) -> None:
     world.close()
 
 
+@EACH_ALWAYS
+def test_soft_tyres_take_more_torque_on_the_same_ground(kind: type) -> None:
+    nominal = np.full(2, LOADER.mass_kg), np.full(2, LOADER.wheel_radius_m)
+    starts = np.array([[500, 500, 0.0], [500, 520, 0.0]])
+    world = kind(plane(0), [LOADER] * 2, Bodies(*nominal, rolling=np.array([1.0, 1.25])), starts)
+    torque_nm, c_rr = np.mean([(s.torque_nm, s.c_rr) for s in cruise(world, 2.0, 8.0)[-100:]], axis=0)
+    world.close()
+    assert torque_nm[1] / torque_nm[0] == pytest.approx(1.25, rel=0.01)
+    assert c_rr[0] == c_rr[1]
+
+
 @pytest.mark.slow
 def test_both_worlds_take_the_same_track_under_the_same_commands() -> None:
     cases = [Lane(model, 2, 0.4) for model in MODELS]
