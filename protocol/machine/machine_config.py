@@ -11,7 +11,7 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.config import from_table, require_between
 from protocol.errors import ConfigError
-from protocol.machine.readings import KINDS, Correction
+from protocol.machine.readings import KINDS
 from protocol.rotations import matrix_from_rpy
 from protocol.site.site_config import NAME
 
@@ -179,14 +179,6 @@ class MachineConfig:
         names = [s.name for s in self.sensors]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise ValueError(f"sensors: two are named {twice[0]!r}")
-        bases = [s.name for s in self.sensors if s.kind == Correction.kind and s.use]
-        if len(bases) > 1:
-            raise ValueError(f"sensors: a machine uses one base station, not {' and '.join(bases)}: `use = false`")
-
-    @property
-    def base(self) -> SensorConfig | None:
-        """The base station whose corrections it uses."""
-        return next((s for s in self.sensors if s.kind == Correction.kind and s.use), None)
 
     def sensor(self, name: str) -> SensorConfig | None:
         """The sensor of that name."""

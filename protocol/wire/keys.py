@@ -58,16 +58,6 @@ def sensors(site: str, machine: str) -> str:
     return _machine(site, machine, "sensors")
 
 
-def corrections(site: str, base: str) -> str:
-    """What a base station says of the GPS errors of its site."""
-    return f"{ROOT}/{check_name(site, 'site')}/base/{check_name(base, 'base')}"
-
-
-def corrections_all(site: str) -> str:
-    """Corrections of every base station of a site."""
-    return f"{ROOT}/{check_name(site, 'site')}/base/*"
-
-
 def map_query(site: str, query: str) -> str:
     """One of the map's queryables: point, region, history, info, ..."""
     return f"{ROOT}/{check_name(site, 'site')}/map/{check_name(query, 'query')}"

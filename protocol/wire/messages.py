@@ -6,7 +6,7 @@ from typing import Any
 
 from protocol.arrays import Table
 from protocol.errors import one_line
-from protocol.machine.readings import Correction, Reading
+from protocol.machine.readings import Reading
 
 VERSION = 1
 
@@ -106,14 +106,6 @@ class SensorBundle:
     readings: tuple[Reading, ...]
     last: bool = False
     refused: Mapping[str, int] = field(default_factory=dict)  # readings skipped when decoding, by reason
-
-
-@dataclass(frozen=True)
-class SiteCorrection:
-    """What a base station says of the GPS errors of its site. frame: that of the site, as in a batch."""
-
-    frame: str
-    correction: Correction
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,6 @@ def _messages() -> Iterator[Decoder]:
 
 _SINGLE = (
     "bundle",
-    "correction",
     "pose",
     "health",
     "point",
