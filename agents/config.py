@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from agents.corrections.delivery import CorrectionsConfig
 from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig
 from agents.holdout import HoldoutConfig
@@ -29,6 +30,7 @@ class AgentConfig:
     spool: SpoolConfig = field(default_factory=SpoolConfig)
     uplink: UplinkConfig = field(default_factory=UplinkConfig)
     holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
+    corrections: CorrectionsConfig = field(default_factory=CorrectionsConfig)
     linger_s: float = 30.0
 
     def __post_init__(self) -> None:

@@ -58,6 +58,16 @@ def sensors(site: str, machine: str) -> str:
     return _machine(site, machine, "sensors")
 
 
+def corrections(site: str, base: str) -> str:
+    """RTCM3 of one base, for receivers."""
+    return f"{ROOT}/{check_name(site, 'site')}/corrections/{check_name(base, 'base')}"
+
+
+def corrections_all(site: str) -> str:
+    """RTCM3 of every base of a site."""
+    return f"{ROOT}/{check_name(site, 'site')}/corrections/*"
+
+
 def map_query(site: str, query: str) -> str:
     """One of the map's queryables: point, region, history, info, ..."""
     return f"{ROOT}/{check_name(site, 'site')}/map/{check_name(query, 'query')}"

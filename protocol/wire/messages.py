@@ -109,6 +109,19 @@ class SensorBundle:
 
 
 @dataclass(frozen=True)
+class Corrections:
+    """What a relay has of a base. stamp_ns: when the newest frame came. frames: of RTCM3, whole, end to end.
+
+    problem: what keeps frames from coming, in a sentence; empty where nothing does.
+    """
+
+    base: str
+    stamp_ns: int
+    frames: bytes
+    problem: str = ""
+
+
+@dataclass(frozen=True)
 class Pose:
     """Live position of a machine in `map`."""
 

@@ -26,6 +26,7 @@ from sitegrid.security.join import join, reply_check, signer
 if TYPE_CHECKING:
     from agents.agent import Agent
     from agents.config import AgentConfig
+    from agents.corrections.delivery import CorrectionsDelivery
     from agents.drivers import Driver
     from protocol.wire.owners import Owner
 
@@ -62,6 +63,7 @@ class _Joined:
     machine: MachineConfig
     config: AgentConfig
     owner: Owner
+    corrections: CorrectionsDelivery | None
 
 
 def run(arguments: Namespace) -> int:
@@ -73,7 +75,8 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
-        joined = _Joined(session, site, machine, config, owner)
+        corrections = None if log else _corrections(session, site, config)
+        joined = _Joined(session, site, machine, config, owner, corrections)
         agent = _agent(arguments, joined)
         opened.callback(agent.close)
         driver = _driver(arguments, log, joined)
@@ -92,6 +95,12 @@ def _agent(arguments: Namespace, joined: _Joined) -> Agent:
     key, check, withhold = signer(arguments.keys), reply_check(arguments.keys), arguments.withhold
     sign = key.sign if key else None
     return Agent(**vars(joined), places=places, withhold=withhold, sign=sign, check=check)
+
+
+def _corrections(session: zenoh.Session, site: SiteConfig, config: AgentConfig) -> CorrectionsDelivery | None:
+    from agents.corrections.delivery import open_delivery
+
+    return open_delivery(session, site.name, config.corrections)
 
 
 def _open(settings: SessionConfig) -> zenoh.Session:

@@ -11,6 +11,7 @@ from typing import Any
 
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_SMALL_BYTES
+from protocol.wire.correction_codec import MAX_CORRECTIONS_BYTES
 from sitegrid.security.register import Register, common_name
 
 POSE_HZ, HEALTH_HZ = 50.0, 10.0  # of one link; poses come with 5 Hz, at ten times real time with 50
@@ -47,12 +48,13 @@ def grant(role: str, site: str, name: str) -> Grant:
     grants = {
         "machine": Grant(
             publish=(_whole(site, "machine", name),),
-            subscribe=(keys.sensors(site, name), map_all),
+            subscribe=(keys.sensors(site, name), map_all, keys.corrections_all(site)),
             query=(keys.ingest(site, name), *asks, *alive),
             answer=alive,  # who holds the name, if a second one comes
             alive=alive,
             watch=(*alive, followers),
         ),
+        "corrections": Grant(publish=(keys.corrections(site, name),)),
         "visitor": visitor,
         "admin": replace(visitor, query=(*asks, keys.admin_all(site))),
         "server": Grant(
@@ -107,6 +109,7 @@ def size_limits(site: str) -> list[dict[str, Any]]:
         ("claims", ["query"], keys.writer(site), MAX_SMALL_BYTES),
         ("commands", ["query"], keys.admin_all(site), MAX_SMALL_BYTES),
         ("readings", ["put"], _sensors_all(site), MAX_BUNDLE_BYTES),
+        ("corrections", ["put"], keys.corrections_all(site), MAX_CORRECTIONS_BYTES),
         ("poses", ["put"], keys.poses_all(site), MAX_SMALL_BYTES),
         ("health", ["put"], keys.health_all(site), MAX_SMALL_BYTES),
     )
@@ -118,7 +121,11 @@ def size_limits(site: str) -> list[dict[str, Any]]:
 
 def _rate_limits(site: str) -> dict[str, Any]:
     """Limits for messages that may get lost; a limit on acknowledged ones would lose samples."""
-    rates = ((keys.poses_all(site), POSE_HZ), (keys.health_all(site), HEALTH_HZ))
+    rates = (
+        (keys.poses_all(site), POSE_HZ),
+        (keys.corrections_all(site), POSE_HZ),
+        (keys.health_all(site), HEALTH_HZ),
+    )
     rules = [{"key_expr": key, "freq": rate} for key, rate in rates]
     return {"id": "rates", "messages": ["put"], "flows": ["ingress"], "rules": rules}
 

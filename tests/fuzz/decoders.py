@@ -95,6 +95,7 @@ def _messages() -> Iterator[Decoder]:
 
 _SINGLE = (
     "bundle",
+    "corrections",
     "pose",
     "health",
     "point",

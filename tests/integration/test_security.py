@@ -47,6 +47,7 @@ ROLES = {
     "guest": "visitor",
     "boss": "admin",
     "sim": "sim",
+    "base-1": "corrections",
     "reader-1": "follower",
 }
 DAY = timedelta(days=1)
@@ -331,6 +332,7 @@ def as_machine(guarded: Guarded, name: str, mode: str) -> Iterator[zenoh.Session
         yield session
 
 
+CORRECTIONS = keys.corrections(SITE, "base-1")
 POSE, OTHERS_POSE = keys.pose(SITE, "loader-1"), keys.pose(SITE, "loader-2")
 # Who listens to what; who forges it, under which keys; and who may say it, under which.
 FORGED = {
@@ -338,6 +340,11 @@ FORGED = {
         ("guest", keys.poses_all(SITE)),
         {"loader-1": (OTHERS_POSE, keys.poses_all(SITE), f"sitegrid/{SITE}/**")},
         ("loader-1", POSE),
+    ),
+    "corrections": (
+        ("loader-2", keys.corrections_all(SITE)),
+        {"loader-1": (CORRECTIONS,), "sim": (CORRECTIONS,), "base-1": (keys.corrections(SITE, "base-2"), POSE)},
+        ("base-1", CORRECTIONS),
     ),
     "change": (("guest", keys.changed(SITE)), {"loader-1": (keys.changed(SITE),)}, ("server", keys.changed(SITE))),
 }

@@ -12,8 +12,10 @@ from protocol.machine.readings import KINDS, Encoder, Imu, columns
 from protocol.machine.samples import COLUMNS, LIMITS, SAMPLE_DTYPE, empty
 from protocol.wire import codec, keys
 from protocol.wire.codec import decode_batch, encode_batch
+from protocol.wire.correction_codec import decode_corrections, encode_corrections
 from protocol.wire.messages import Ack, CalibrationOffer, Health, Pose, Refused, SampleBatch, SensorBundle
 from protocol.wire.offer_codec import decode_offer, encode_offer
+from tests.golden import make as golden
 
 EXTENT_M = 20_000.0
 T0 = 1_750_000_000_000_000_000
@@ -247,6 +249,25 @@ def test_bundle_has_a_counter_from_one_on_and_groups_that_are_maps():
     for group in (1, [], None):
         data = codec.pack({"machine": "m-1", "counter": 1, "sensors": [group]})
         assert refusal(data, codec.decode_bundle).field == "sensors"
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason", "field"),
+    [
+        ({"base": "base/*"}, Refusal.OUT_OF_RANGE, "base"),
+        ({"base": "base-2"}, Refusal.OUT_OF_RANGE, "base"),
+        ({"stamp_ns": 2**62}, Refusal.OUT_OF_RANGE, "stamp_ns"),
+        ({"frames": "text"}, Refusal.WRONG_TYPE, "frames"),
+        ({"frames": None}, Refusal.MISSING_FIELD, "frames"),
+        ({"frames": bytes(2**16)}, Refusal.TOO_LARGE, None),
+        ({"problem": 3}, Refusal.WRONG_TYPE, "problem"),
+        ({"v": 2}, Refusal.VERSION, "v"),
+    ],
+)
+def test_bad_corrections_are_refused_and_their_field_named(fields, reason, field):
+    table = msgpack.unpackb(encode_corrections(golden.CORRECTIONS)) | fields
+    error = refusal(msgpack.packb(table), lambda data: decode_corrections(data, "base-1"))
+    assert (error.reason, error.field) == (reason, field)
 
 
 @pytest.mark.parametrize("stamp", [0, -1, 2**63])

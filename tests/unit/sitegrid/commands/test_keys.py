@@ -257,7 +257,14 @@ def test_a_machine_knows_the_keys_of_the_map_servers_which_outlast_a_new_certifi
 
 # --- rules -----------------------------------------------------------------------------------------------------------
 
-NAMES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim"}
+NAMES = {
+    "loader-1": "machine",
+    "loader-2": "machine",
+    "guest": "visitor",
+    "boss": "admin",
+    "sim": "sim",
+    "b1": "corrections",
+}
 REGISTER = Register(
     SITE, (), {n: RegisterEntry(r, "1", NOW) for n, r in {**NAMES, "server": "server", "f1": "follower"}.items()}
 )
@@ -293,6 +300,8 @@ def may(name: str, message: str, key: str, flow: str = "ingress", register: Regi
         ("declare_subscriber", keys.poses_all(SITE), {"guest", "boss", "server"}),
         ("declare_subscriber", keys.health_all(SITE), {"guest", "boss", "server"}),
         ("declare_subscriber", keys.changed(SITE), {"loader-1", "loader-2", "guest", "boss"}),
+        ("declare_subscriber", keys.corrections(SITE, "b1"), {"loader-1", "loader-2"}),
+        ("put", keys.corrections(SITE, "b1"), {"b1"}),
         ("declare_subscriber", "**", set()),
         ("declare_queryable", keys.ingest_all(SITE), {"server"}),
         ("declare_queryable", keys.map_queries_all(SITE), {"server"}),
@@ -333,6 +342,7 @@ def test_every_key_that_exists_is_granted_to_somebody():
         values = {
             "site": SITE,
             "machine": "loader-1",
+            "base": "b1",
             "query": "info",
             "command": "trust",
             "follower": "f1",
@@ -357,7 +367,7 @@ def test_limits_never_touch_what_is_acknowledged():
     for item in settings["downsampling"]:
         assert item["messages"] == ["put"]
         for rule in item["rules"]:
-            assert rule["key_expr"] in (keys.poses_all(SITE), keys.health_all(SITE))
+            assert rule["key_expr"] in (keys.poses_all(SITE), keys.health_all(SITE), keys.corrections_all(SITE))
     sizes = {key: item["size_limit"] for item in settings["low_pass_filter"] for key in item["key_exprs"]}
     assert sizes[keys.ingest_all(SITE)] > MAX_BATCH_BYTES
     assert all("reply" not in item["messages"] for item in settings["low_pass_filter"])

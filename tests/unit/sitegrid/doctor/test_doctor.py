@@ -181,6 +181,7 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
         (disk.check_spool(SpoolState(0, 0, 0, 0, gone=9), NOW_NS), WARN, "9 are gone; its disk has lost recorded"),
         (disk.check_spool(SpoolState(0, 0, 0, 0, damage="a.db-wal is damaged"), NOW_NS), WARN, "a.db-wal is damaged"),
         (disk.check_health("loader-1", {**HEALTHY, "no_sample": "no GPS fixes"}), WARN, "; no GPS fixes"),
+        (disk.check_health("loader-1", {**HEALTHY, "corrections": {"problem": "b: old"}}), WARN, "b: old"),
         (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait, 2 of them for the smoother; "),
         (disk.check_health("loader-1", {**HEALTHY, "uplink": {"problem": "no answer"}}), WARN, "; no answer"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
