@@ -11,6 +11,7 @@ from typing import Any
 import zenoh
 
 from agents.config import AgentConfig
+from agents.corrections.delivery import CorrectionsDelivery
 from agents.delivery.audit import AuditLog
 from agents.delivery.spool import Spool
 from agents.delivery.uplink import Uplink
@@ -56,6 +57,7 @@ class Agent:
         *,
         withhold: bool = False,
         owner: Owner | None = None,
+        corrections: CorrectionsDelivery | None = None,
         sign: Sign | None = None,
         check: Check | None = None,
     ) -> None:
@@ -71,6 +73,7 @@ class Agent:
         self._presence = Presence(session, site.name, machine.name, owner)
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
+        self._corrections = corrections
         self._unsaved, self._spool_problem = WriteBuffer(), ""
         self._first_sample, self._clocks = FirstSample(machine), ""
         self._faults: dict[str, str] = {}  # of sensors, as they were last told
@@ -137,10 +140,13 @@ class Agent:
                 "ack_ms_max": round(uplink.ack_s_max * 1e3),
             },
             "holdout": self._holdout.report() if self._holdout else None,
+            "corrections": self._corrections.report() if self._corrections else None,
         }
 
     def close(self) -> None:
         """End the uplink, leave the network, close the spool."""
+        if self._corrections:
+            self._corrections.close()
         self._uplink_thread.close()
         self._presence.close()
         self._spool.close()

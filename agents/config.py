@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from agents.corrections.delivery import CorrectionsConfig
 from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig
 from agents.holdout import HoldoutConfig
@@ -13,7 +14,6 @@ from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig, parse_machine
 
-ROLES = MACHINE, BASE = ("machine", "base")
 # Of samples behind their stamps: where a machine's are 300 s behind those of others, the map server takes its clock for
 # wrong, and excludes it.
 MOST_LAG_S = 180.0
@@ -23,29 +23,17 @@ MOST_LAG_S = 180.0
 class AgentConfig:
     """Options of one agent.
 
-    role: "machine", or "base": a base station, which publishes what its GPS receivers are off. place: latitude and
-    longitude [deg] of a base as surveyed; receivers stand `mount` metres east and north of it. linger_s: how long to
-    wait at the end for the last samples to be acknowledged.
+    linger_s: how long to wait at the end for the last samples to be acknowledged.
     """
 
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     spool: SpoolConfig = field(default_factory=SpoolConfig)
     uplink: UplinkConfig = field(default_factory=UplinkConfig)
     holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
-    role: str = MACHINE
-    place: tuple[float, ...] = ()
+    corrections: CorrectionsConfig = field(default_factory=CorrectionsConfig)
     linger_s: float = 30.0
 
     def __post_init__(self) -> None:
-        if self.role not in ROLES:
-            raise ValueError(f"role: {self.role!r} is neither {' nor '.join(ROLES)}")
-        if self.role == BASE and len(self.place) != 2:
-            why = "an estimate of its own would feed its errors back"
-            raise ValueError(f"place: a base needs its surveyed latitude and longitude [deg]; {why}")
-        if self.role == MACHINE and self.place:
-            raise ValueError('place: a machine moves; only with role = "base"')
-        if self.place and not (abs(self.place[0]) <= 90 and abs(self.place[1]) <= 180):
-            raise ValueError(f"place: {list(self.place)} is no latitude and longitude [deg]")
         if self.linger_s < 0:
             raise ValueError("linger_s: negative")
         if self.pipeline.localisation.smoothing_s > MOST_LAG_S:
@@ -71,15 +59,4 @@ def load_agent(path: Path) -> tuple[MachineConfig | None, AgentConfig]:
     if sensors and not machine:
         raise ConfigError(where, "[[sensor]] without a [machine] that carries it")
     parsed = tuple(from_table(SensorConfig, s, f"{where} [[sensor]] {i + 1}") for i, s in enumerate(sensors))
-    parsed_machine = parse_machine(machine, parsed, where) if machine else None
-    if config.role == BASE and parsed_machine:
-        _check_base(parsed_machine, where)
-    return parsed_machine, config
-
-
-def _check_base(base: MachineConfig, where: str) -> None:
-    receivers = [s for s in base.sensors if s.kind == "gps" and s.use]
-    if not receivers:
-        raise ConfigError(where, "a base needs a GPS receiver: a [[sensor]] of kind gps")
-    if moved := next((s for s in receivers if s.mode != ABSOLUTE), None):
-        raise ConfigError(where, f"mode: {moved.name}: fixes of a base are places, so {moved.mode!r} means nothing")
+    return parse_machine(machine, parsed, where) if machine else None, config

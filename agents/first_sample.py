@@ -8,7 +8,7 @@ from agents.localisation.localiser import PROVEN_S
 from agents.sampling import MAX_STD_M
 from protocol.machine.clock_watch import GAP_NS
 from protocol.machine.machine_config import MachineConfig
-from protocol.machine.readings import Correction, Encoder, Gps, Odometry, Reading, Torque
+from protocol.machine.readings import Encoder, Gps, Odometry, Reading, Torque
 
 WAIT_NS = 30 * 10**9  # in the readings' time; a machine that drives off has its heading after 10 to 20 s
 UNIT = 1.5  # no tyre is so far off: wheels that turn so much further or less far than the fixes go have another unit
@@ -28,11 +28,10 @@ class FirstSample:
 
     def take(self, readings: Sequence[Reading]) -> None:
         """Take in readings. The time counts from the first one behind a gap, as localisation starts anew there."""
-        own = [reading for reading in readings if not isinstance(reading, Correction)]  # that has another clock
-        if self._is_judged or not own:
+        if self._is_judged or not readings:
             return
-        self._kinds.update(r.kind for r in own if self._sensors.get(r.sensor) == r.kind)
-        for reading in own:
+        self._kinds.update(r.kind for r in readings if self._sensors.get(r.sensor) == r.kind)
+        for reading in readings:
             first_ns, newest_ns = self._spans_ns.get(reading.sensor, (reading.stamp_ns, reading.stamp_ns))
             is_on = abs(reading.stamp_ns - newest_ns) <= GAP_NS
             self._spans_ns[reading.sensor] = (first_ns if is_on else reading.stamp_ns), reading.stamp_ns

@@ -115,7 +115,6 @@ class Pipeline:
             "ground": self._estimator.health(),
             "consistency": {name: value.report for name, value in localiser.consistency.items()},
             "machine_share": localiser.machine_share,
-            "base": localiser.base_report(),
         }
 
     @property

@@ -17,7 +17,7 @@ from agents.sampling import PoseHistory
 from agents.stream_order import Decision, StreamOrder, by_stamp
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, MachineConfig
-from protocol.machine.readings import Correction, Gps, Reading
+from protocol.machine.readings import Gps, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 
@@ -113,9 +113,6 @@ class Positioning:
         sensor = self._sensors.get(reading.sensor)
         if sensor is None or sensor.kind != reading.kind:
             self._counters["reading_unknown_sensor"] += 1
-            return ()
-        if isinstance(reading, Correction):  # of another one's clock, and late: it takes effect with the next readings
-            self.localiser.take(replace(reading, stamp_ns=sensor.true_ns(reading.stamp_ns)))
             return ()
         if isinstance(reading, Gps) and sensor.mode == ABSOLUTE and not self._is_on_site(reading):
             self._counters["fix_outside_site"] += 1

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from protocol.config import from_table, require_between, toml_lines
+from protocol.config import from_table, require_between
 from protocol.errors import ConfigError
 from protocol.files import load_toml
-from protocol.machine.machine_config import SensorConfig, machine_toml
-from protocol.site.site_config import NAME, Projection, site_toml
+from protocol.machine.machine_config import machine_toml
+from protocol.site.site_config import NAME, site_toml
 from sim.scenario.file import check, load_scenario
 from sim.scenario.tables import MAX_MACHINES, FleetConfig, Scenario
 
@@ -76,22 +76,13 @@ def resolve(config: SimConfig) -> Scenario:
 
 
 def write_configs(config: SimConfig, folder: Path) -> list[Path]:
-    """Write `site.toml` and `<machine>.toml` for the agents, nothing of the truth; returns the files of the machines.
-
-    A base station has a file, too, and machines use its corrections, those of the first one where there are more.
-    """
+    """Write `site.toml` and `<machine>.toml` for the agents, nothing of the truth; returns those of the machines."""
     scenario = resolve(config)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "site.toml").write_text(site_toml(scenario.site), encoding="utf-8")
-    used = tuple(SensorConfig(base.name, "correction") for base in scenario.base_station[:1])
-    rigs = [rig.machine for rig in scenario.rigs()]
-    machines = {folder / f"{m.name}.toml": replace(m, sensors=(*m.sensors, *used)) for m in rigs}
+    machines = {folder / f"{rig.machine.name}.toml": rig.machine for rig in scenario.rigs()}
     for path, machine in machines.items():
         path.write_text(machine_toml(machine), encoding="utf-8")
-    for station, base in zip(scenario.base_station, scenario.bases(), strict=True):
-        place = Projection(scenario.site).to_geodetic(*station.surveyed_m)[:2]
-        lines = toml_lines({"role": "base", "place": [round(v, 9) for v in place]})
-        (folder / f"{base.name}.toml").write_text("\n".join([*lines, "", machine_toml(base)]), encoding="utf-8")
     return list(machines)
 
 

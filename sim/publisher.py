@@ -144,7 +144,7 @@ def _drive(
 def _streams(simulator: Simulator, session_config: SessionConfig) -> Iterator[list[Stream]]:
     session: Any = open_session(session_config)
     with contextlib.closing(session), contextlib.ExitStack() as closing:
-        streams = [Stream(session, simulator.site.name, name) for name in simulator.participants]
+        streams = [Stream(session, simulator.site.name, machine.name) for machine in simulator.machines]
         for stream in streams:
             closing.callback(stream.close)
         yield streams

@@ -47,14 +47,14 @@ def record(
     with contextlib.closing(Simulator(config)) as simulator:
         if simulator.bundles is None:
             raise ConfigError("seconds", "a recording needs an end: set seconds above 0")
-        readings: dict[str, list[Reading]] = {name: [] for name in simulator.participants}
+        readings: dict[str, list[Reading]] = {machine.name: [] for machine in simulator.machines}
         for _ in range(simulator.bundles):
             if stop and stop.is_set():
                 break
             for name, new in simulator.advance().items():
                 readings[name] += new
             on_progress(simulator.simulated_s)
-        for machine in [*simulator.machines, *simulator.scenario.bases()]:
+        for machine in simulator.machines:
             name = f"{simulator.site.name}-{machine.name}"
             write_log(record_dir / machine.name, name, simulator.site, machine, readings[machine.name])
         if truth_dir:

@@ -19,7 +19,6 @@ from sim.operators.driver import DRIVER_STEPS, LOOK_OUT_STEPS, at_start, drive, 
 from sim.operators.habits import draw_habits
 from sim.scenario.ground import build_terrain, with_zone
 from sim.scenario.tables import Scenario
-from sim.sensors.gps import BaseReceiver
 from sim.sensors.noise import generator
 from sim.sensors.rigs import draw_bodies
 from sim.sensors.sensors import FleetReadings, Sensors
@@ -68,14 +67,7 @@ class Simulator:
         for machine, start in enumerate(starts):
             if start.payload_kg:
                 self._world.set_payload(machine, start.payload_kg)
-        projection = Projection(self.site)
-        self._sensors = Sensors(rigs, seed, projection)
-        self._bases = {
-            base.name: BaseReceiver(
-                (*base.place_m, base.height_m), self.scenario.preset(base.preset).gps, len(rigs) + i, seed, projection
-            )
-            for i, base in enumerate(self.scenario.base_station)
-        }
+        self._sensors = Sensors(rigs, seed, Projection(self.site))
         self._steps = 0
         self._work_j: Floats = np.zeros(len(starts))
         self._tracks: list[Table] = []
@@ -93,22 +85,14 @@ class Simulator:
         return -int(-seconds * 1000 // self._bundle_ms) if seconds else None
 
     @property
-    def participants(self) -> list[str]:
-        """Names of all that have sensors: machines, then base stations."""
-        return [*(machine.name for machine in self.machines), *self._bases]
-
-    @property
     def state(self) -> FleetState:
         """True state of all machines."""
         return self._world.state
 
     def advance(self) -> dict[str, list[Reading]]:
-        """Simulate the span of one bundle; returns readings of each machine and base station, in order of stamps."""
-        span, first = self.sense(), self._steps - self._bundle_ms // STEP_MS + 1
-        readings = {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
-        steps = np.arange(first, self._steps + 1)
-        bases = {name: base.sample(steps, START_NS + steps * STEP_NS) for name, base in self._bases.items()}
-        return readings | bases
+        """Simulate the span of one bundle; returns readings of each machine, in order of stamps."""
+        span = self.sense()
+        return {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
 
     def sense(self) -> FleetReadings:
         """Simulate the span of one bundle; returns the readings of all machines as columns."""

@@ -73,7 +73,7 @@ class Receivers(ModalSensors[Fix]):
         self._compared = {name: i for i, name in enumerate(absolute)} if slow and machine_share is None else {}
         self._estimator = ShareEstimator(len(absolute))
         self._configured = machine_share
-        self._monitors = {name: InnovationMonitor(adapts=slow and not layout.base) for name in self._sensors}
+        self._monitors = {name: InnovationMonitor(adapts=slow) for name in self._sensors}
         self._judged: dict[str, tuple[int, bool]] = {}  # stamp of the last fix of each, and whether it was accepted
         self._refused: Counter[str] = Counter()  # in a row
         self._off_m: dict[str, list[Floats]] = {}  # innovations of these, since the last relock
@@ -90,11 +90,6 @@ class Receivers(ModalSensors[Fix]):
         """The same, once no jump counts any more: what seemed to be one was none."""
         self._jumps.clear()
         return self.errors
-
-    def errors_beside(self, base: GpsError, site_share: float) -> tuple[GpsError, ...]:
-        """The same, and behind them that of a base station, which has a share of each machine's variance too."""
-        machine = tuple(self._error(name, site_share) for name in self._states)
-        return *machine, GpsError(base.variance_m2, base.time_s, (0.0, site_share * base.variance_m2))
 
     def error_states(self, receiver: str) -> slice | None:
         """States of the slow error of a receiver; None where the filter has none."""
@@ -127,10 +122,6 @@ class Receivers(ModalSensors[Fix]):
         stated = (gps.var_e_m2, gps.var_n_m2)
         variance = np.array([sensor.std["position"] ** 2] * 2 if "position" in sensor.std else stated)
         return Fix(gps.stamp_ns, sensor, np.array([x, y]), factor * variance, reckoned)
-
-    def expected(self, fix: Fix) -> tuple[float, GpsError]:
-        """What a fix is off: variance of its white noise, per axis [m2], and the slow error of its receiver."""
-        return _mean(self._white(fix)), GpsError(_drift_m2(fix), fix.sensor.drift_time_s)
 
     def anchor(self, fix: Fix, belief: Belief) -> None:
         """Shift the receiver so that this fix lies at the believed antenna."""
@@ -178,8 +169,8 @@ class Receivers(ModalSensors[Fix]):
         error = belief.x[states]
         return float(error.dot(error)) / 2 / self._error(name).variance_m2
 
-    def _error(self, name: str, site_share: float = 0.0) -> GpsError:
-        """The slow error of a receiver, as it is now: with parts that the machine, and the site, have in common."""
+    def _error(self, name: str) -> GpsError:
+        """The slow error of a receiver, as it is now: with the part that the machine's receivers have in common."""
         drift_m2, time_s, anchor_m2 = self._drift_m2[name], self._sensors[name].drift_time_s, self._anchor_m2.get(name)
         common_m2 = min(self.machine_share or 0.0, MOST_SHARED) * drift_m2
         # of a relative one both the error now and that of the first fix count, and where the filter was wrong then
@@ -187,8 +178,7 @@ class Receivers(ModalSensors[Fix]):
         if name in self._jumps:  # it errs as far as it jumped, for as long as its errors last
             jumped_ns, jump_m2 = self._jumps[name]
             variance_m2 += jump_m2 * math.exp((jumped_ns - self._judged[name][0]) * 1e-9 / time_s)
-        site_m2 = site_share * drift_m2
-        return GpsError(variance_m2, time_s, (max(common_m2 - site_m2, 0.0), site_m2))
+        return GpsError(variance_m2, time_s, common_m2)
 
     def _position(self, fix: Fix) -> Measurement:
         sensor = fix.sensor

@@ -11,7 +11,6 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.alignment import DISTANCE_M, Alignment, align_fixes, align_start
@@ -29,7 +28,7 @@ from agents.localisation.travel_sign import TravelSign
 from agents.localisation.wheels.place_watch import PlaceWatch
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
-from protocol.machine.readings import Correction, Gps, GpsVelocity
+from protocol.machine.readings import Gps, GpsVelocity
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import Projection
 
@@ -157,10 +156,6 @@ class Localiser:
         """The believed slow error of a receiver (2,), east and north [m]; zeros where it is no state."""
         return self._tracker.slow_error_m(receiver)
 
-    def base_report(self) -> dict[str, Any] | None:
-        """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
-        return self._tracker.base_report()
-
     @property
     def machine_share(self) -> float | None:
         """Share of the slow variance that the receivers have in common, as it is taken for; None of fewer than two."""
@@ -196,10 +191,6 @@ class Localiser:
     def doubt(self, off_m: float, off_mps: float) -> float:
         """Be less sure of place and speed, as wheels that count no longer have led both astray; returns the heading."""
         return self._tracker.doubt(off_m, off_mps)
-
-    def take(self, correction: Correction) -> None:
-        """Keep a correction of a base station until it is due, with a later reading."""
-        self._tracker.correct(correction)
 
     def update(self, readings: Sequence[Sensed], dead_reckoning: DeadReckoning) -> list[PoseBelief]:
         """Take in the readings of one stamp, after dead reckoning did; returns poses that became possible or changed.

@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.localisation.filters.belief import Change, Measurement, Model
 from agents.localisation.filters.motion import EYE, map_from_base, turned_jacobian
-from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE, Layout
+from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 
@@ -69,23 +69,6 @@ def fix(
         return H
 
     return Measurement(sensor, stamp_ns, position_m, R, h, jacobian, gate_sigma=gate, opens=opens, change=change)
-
-
-def correction(
-    stamp_ns: int, base: str, off_m: Floats, R: Floats, fade: float, layout: Layout, gate: float, change: Change | None
-) -> Measurement:
-    """What a base station is off (2,): z = fade b + d. After a jump it is for a change to open d."""
-    b, d = layout.base_error, layout.base_offset
-
-    def h(x: Floats) -> Floats:
-        return fade * x[:, b] + x[:, d]
-
-    def jacobian(x: Floats) -> Floats:
-        H = np.zeros((2, len(x)))
-        H[:, b], H[:, d] = fade * EYE[:2, :2], EYE[:2, :2]
-        return H
-
-    return Measurement(base, stamp_ns, off_m, R, h, jacobian, gate_sigma=gate, relocks=False, change=change)
 
 
 def velocity(stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, lever_m: Floats, gate: float) -> Measurement:

@@ -6,7 +6,6 @@ It is one module because every kind of event meets here the one filter that all 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -14,10 +13,9 @@ from agents.dead_reckoning import turn_source
 from agents.ground_speed import velocity_variances
 from agents.localisation import measurements
 from agents.localisation.alignment import Alignment, start_belief
-from agents.localisation.corrections import Corrections, not_used
 from agents.localisation.filters.belief import Belief, Change, Filter, Measurement, open_states, reset_states
 from agents.localisation.filters.late_measurements import Fusion
-from agents.localisation.filters.motion import GpsError, MotionModel
+from agents.localisation.filters.motion import MotionModel
 from agents.localisation.filters.smoother import nothing_past
 from agents.localisation.filters.state import SPEED, YAW, Layout, X, Y, Z
 from agents.localisation.fix import GPS_GATE_SIGMA, Fix
@@ -28,8 +26,8 @@ from agents.localisation.measurements import PLACE, STANDSTILL
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.arrays import Floats
-from protocol.machine.machine_config import ABSOLUTE, MachineConfig, SensorConfig
-from protocol.machine.readings import Correction, GpsVelocity
+from protocol.machine.machine_config import MachineConfig, SensorConfig
+from protocol.machine.readings import GpsVelocity
 from protocol.site.site_config import Projection
 
 # Without GPS for so long, wheels and IMUs teach neither place and heading nor the gyros' bias: they show none of them,
@@ -77,7 +75,6 @@ class Tracker:
         self.has_relocked = False
         self.receivers = Receivers(machine.sensors, projection, layout, slow=slow, machine_share=share)
         self._config = config
-        self._corrections = Corrections(machine.base, layout) if machine.base and layout.base else None
         self._references = References(machine.sensors, layout, slow=slow)
         source, on_plane = turn_source(machine), not shows_tilt(machine, config.profile)
         self._body = MotionSensors(
@@ -86,7 +83,7 @@ class Tracker:
         turn_error = self._body.turn_error_radps if slow and source and source.kind == "odometry" else 0.0
         unseen = slow and source is None
         self._model = MotionModel(
-            layout, on_plane, self._gps_errors(), turn_error_radps=turn_error, turns_unseen=unseen
+            layout, on_plane, self.receivers.errors, turn_error_radps=turn_error, turns_unseen=unseen
         )
         self._doubt: Change | None = None
         self._placed_ns = 0  # stamp of the newest fix or velocity by GPS that was accepted
@@ -94,8 +91,8 @@ class Tracker:
     @property
     def counters(self) -> Counter[str]:
         """Measurements used and gated, readings refused."""
-        of_parts = [part.counters for part in (self.fusion, self._corrections) if part]
-        return sum(of_parts, Counter(self._body.counters))
+        of_fusion = self.fusion.counters if self.fusion else Counter[str]()
+        return self._body.counters + of_fusion
 
     @property
     def belief(self) -> Belief | None:
@@ -112,18 +109,6 @@ class Tracker:
         """The believed slow error of a receiver (2,), east and north [m]; zeros where it is no state."""
         states = self.receivers.error_states(receiver)
         return self.belief.x[states] if self.belief and states else np.zeros(2)
-
-    def base_report(self) -> dict[str, Any] | None:
-        """Whether the corrections of a base station are used, and why not; None of a machine that uses none."""
-        if self._corrections:
-            return self._corrections.report(self.belief.stamp_ns if self.belief else 0)
-        base = self._config.machine.base
-        return not_used(base, self._config.profile) if base else None
-
-    def correct(self, correction: Correction) -> None:
-        """Keep a correction of a base station until it is due, with a later reading."""
-        if self._corrections and self.belief:
-            self._corrections.take(correction, self.belief.stamp_ns)
 
     def doubt(self, off_m: float, off_mps: float) -> float:
         """Be less sure of place and speed, from the next step on; returns the heading [rad].
@@ -151,11 +136,10 @@ class Tracker:
         return belief
 
     def filter(self, event: Event) -> list[Belief]:
-        """Beliefs that an event changed, and then a correction that is due."""
+        """Beliefs that an event changed."""
         fusion = self.fusion
         assert fusion is not None, "filter before start"
-        own = self._filter_step(fusion, event) if isinstance(event, FilterStep) else self._place(fusion, event)
-        return own + self._correct(fusion, self._corrections, event) if self._corrections else own
+        return self._filter_step(fusion, event) if isinstance(event, FilterStep) else self._place(fusion, event)
 
     def is_accepted(self, fix: Fix) -> bool:
         """Whether the filter took the newest fix of this receiver."""
@@ -208,25 +192,6 @@ class Tracker:
             self._placed_ns = max(self._placed_ns, event.stamp_ns)
         return beliefs
 
-    def _correct(self, fusion: Fusion, corrections: Corrections, event: Event) -> list[Belief]:
-        """Beliefs that a base station's corrections changed, as of what the event shows."""
-        if isinstance(event, Fix):
-            corrections.compare(event, fusion.belief, *self.receivers.expected(event))
-        if not isinstance(event, FilterStep):
-            return []
-        corrections.follow(fusion.belief)
-        if (measurement := corrections.measurement(fusion.belief)) is None:
-            return []
-        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
-        beliefs = fusion.add([measurement])
-        corrections.confirm(fusion.last[measurement.sensor])
-        return beliefs
-
-    def _gps_errors(self) -> tuple[GpsError, ...]:
-        """Slow errors of the machine's receivers and, where it uses one, of the base station's."""
-        base, receivers = self._corrections, self.receivers
-        return receivers.errors_beside(base.base_error, base.site_share) if base else receivers.errors
-
     def _filter_modal(self, fusion: Fusion, sensors: ModalSensors[Value], value: Value) -> list[Belief]:
         """Filter a value whose sensor may count from what is believed at its stamp."""
         if sensors.needs_anchor(value):
@@ -234,7 +199,7 @@ class Tracker:
         measurement = sensors.measurement(value)
         if measurement is None:
             return []
-        fusion.model = replace(fusion.model, gps_errors=self._gps_errors())
+        fusion.model = replace(fusion.model, gps_errors=self.receivers.errors)
         beliefs = fusion.add([measurement])
         if beliefs:
             sensors.confirm(value, fusion.last[measurement.sensor])
@@ -252,8 +217,7 @@ def layout_of(machine: MachineConfig) -> Layout:
     imus = sum(s.kind == "imu" and s.use for s in machine.sensors)
     turns = imus + (source is not None and source.kind != "imu")
     receivers, references = drifting(machine.sensors), heading_references(machine.sensors)
-    base = machine.base is not None and any(s.mode == ABSOLUTE for s in receivers)
-    return Layout(turns, True, len(receivers) + base, len(references), base)
+    return Layout(turns, True, len(receivers), len(references))
 
 
 def gps_velocity(reading: GpsVelocity, sensor: SensorConfig) -> Measurement:

@@ -86,7 +86,7 @@ def gps_errors(
     """Fresh errors of a machine's receivers, by their names, from the start of a simulation until a stamp.
 
     noise: of each receiver, as a preset has it; `machine_share` and `site_share` are in it. number: the machine's place
-    in the fleet. Machines, and base stations, of one seed and different numbers have `site_share` of the slow variance
+    in the fleet. Machines of one seed and different numbers have `site_share` of the slow variance
     in common. The model is the simulator's: with its seed and number come its errors.
     """
     receivers = [s for s in machine.sensors if s.kind == "gps"]

@@ -199,9 +199,9 @@ def _problems(agents: Mapping[str, ReceivedHealth]) -> Metric:
         "sitegrid_agent_problem", "Whether something is wrong with a part of it.", labels=["machine", "part"]
     )
     for name, health in sorted(agents.items()):
-        uplink = health.values.get("uplink")
+        tables = {name: health.values.get(name) for name in ("uplink", "corrections")}
         parts = {
-            "uplink": uplink.get("problem") if isinstance(uplink, Mapping) else None,
+            **{part: table.get("problem") for part, table in tables.items() if isinstance(table, Mapping)},
             "clocks": health.values.get("clocks"),
             "spool": health.values.get("spool_problem"),
             "disk": health.values.get("spool_damage"),

@@ -11,7 +11,7 @@ import numpy as np
 from protocol.arrays import Floats
 from protocol.config import from_table, require_between
 from protocol.errors import ConfigError
-from protocol.machine.readings import KINDS, Correction
+from protocol.machine.readings import KINDS
 from protocol.rotations import matrix_from_rpy
 from protocol.site.site_config import NAME
 
@@ -180,9 +180,6 @@ class MachineConfig:
         names = [s.name for s in self.sensors]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise ValueError(f"sensors: two are named {twice[0]!r}")
-        bases = [s.name for s in self.sensors if s.kind == Correction.kind and s.use]
-        if len(bases) > 1:
-            raise ValueError(f"sensors: a machine uses one base station, not {' and '.join(bases)}: `use = false`")
 
     def _check_mass(self) -> None:
         require_between(self, 1, MOST_KG, "mass_kg")
@@ -190,11 +187,6 @@ class MachineConfig:
             wheelbase = f"a machine with a wheelbase of {self.wheelbase_m:g} m"
             problem = f"{self.mass_kg:g} kg is too little for {wheelbase}; if that is tonnes"
             raise ValueError(f"mass_kg: {problem}, write {self.mass_kg * 1000:g}")
-
-    @property
-    def base(self) -> SensorConfig | None:
-        """The base station whose corrections it uses."""
-        return next((s for s in self.sensors if s.kind == Correction.kind and s.use), None)
 
     def sensor(self, name: str) -> SensorConfig | None:
         """The sensor of that name."""

@@ -186,34 +186,6 @@ class Steering(Reading):
     angle_rad: float
 
 
-@dataclass(frozen=True, slots=True)
-class Correction(Reading):
-    """What a base station's fixes are off, in `map`; its `sensor` is the name of the base.
-
-    east_m, north_m: mean fix less surveyed antenna. Per axis: white_m2, the variance of its white noise; slow_m2, that
-    of the slow error of the base's receivers, whose correlation time is time_s. offset_*: what the base believes to be
-    the lasting part of its error, as of a wrong survey, and the variance of that.
-    """
-
-    kind: ClassVar[str] = "correction"
-    limits: ClassVar[dict[str, tuple[float, float]]] = {
-        **dict.fromkeys(("east_m", "north_m"), (-1000, 1000)),
-        **dict.fromkeys(("white_m2", "slow_m2"), (1e-8, 1e6)),
-        "time_s": (0.1, 1e5),
-        **dict.fromkeys(("offset_e_m", "offset_n_m"), (-1000, 1000)),
-        "offset_m2": (1e-8, 1e6),
-    }
-
-    east_m: float
-    north_m: float
-    white_m2: float
-    slow_m2: float
-    time_s: float
-    offset_e_m: float
-    offset_n_m: float
-    offset_m2: float
-
-
 KINDS: dict[str, type[Reading]] = {
     cls.kind: cls
     for cls in (
@@ -229,7 +201,6 @@ KINDS: dict[str, type[Reading]] = {
         Articulation,
         Steering,
         Payload,
-        Correction,
     )
 }
 

@@ -1,28 +1,21 @@
-"""Corrections of base stations to bytes and back, with full validation."""
+"""Corrections for receivers to bytes and back. That the frames are whole is for whoever writes them to a receiver."""
 
-from protocol.errors import MessageError, Refusal
-from protocol.machine.readings import Correction, columns, parse_reading
-from protocol.wire.codec import MAX_SMALL_BYTES, pack, take, take_name, take_stamp, unpack
-from protocol.wire.messages import SiteCorrection
+from protocol.errors import MessageError, Refusal, one_line
+from protocol.wire.codec import pack, take, take_name, take_stamp, unpack
+from protocol.wire.messages import Corrections
 
-
-def encode_correction(message: SiteCorrection) -> bytes:
-    """What a base station says of its site's GPS errors."""
-    correction = message.correction
-    values = {name: getattr(correction, name) for name in columns(Correction.kind)}
-    return pack({"base": correction.sensor, "frame": message.frame, "stamp_ns": correction.stamp_ns, **values})
+MAX_CORRECTIONS_BYTES = 16 * 2**10  # a second of a base with all satellites and signals has some 2 kB
 
 
-def decode_correction(data: bytes, frame: str) -> SiteCorrection:
-    """Undo `encode_correction`; refused where a value is not plausible, or is of another frame than this one."""
-    table = unpack(data, MAX_SMALL_BYTES)
-    base, stamp_ns, of_base = take_name(table, "base"), take_stamp(table), take(table, "frame", str)
-    if of_base != frame:
-        problem = (
-            f"corrections of {base} are in frame {of_base[:40]!r}, this site's is {frame!r}: compare the site files"
-        )
-        raise MessageError(Refusal.WRONG_FRAME, problem, field="frame")
-    values = tuple(take(table, name, float) for name in columns(Correction.kind))
-    correction = parse_reading(Correction.kind, base, stamp_ns, values)
-    assert isinstance(correction, Correction)
-    return SiteCorrection(of_base, correction)
+def encode_corrections(message: Corrections) -> bytes:
+    """What a relay says of its base."""
+    return pack(vars(message))
+
+
+def decode_corrections(data: bytes, base: str) -> Corrections:
+    """Undo `encode_corrections`; refused where it is of another base than this one."""
+    table = unpack(data, MAX_CORRECTIONS_BYTES)
+    if (sender := take_name(table, "base")) != base:
+        raise MessageError(Refusal.OUT_OF_RANGE, f"of {sender}, on the key of {base}", field="base")
+    problem = one_line(take(table, "problem", str, ""))
+    return Corrections(sender, take_stamp(table), take(table, "frames", bytes), problem)

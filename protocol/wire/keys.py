@@ -59,13 +59,13 @@ def sensors(site: str, machine: str) -> str:
 
 
 def corrections(site: str, base: str) -> str:
-    """What a base station says of the GPS errors of its site."""
-    return f"{ROOT}/{check_name(site, 'site')}/base/{check_name(base, 'base')}"
+    """RTCM3 of one base, for receivers."""
+    return f"{ROOT}/{check_name(site, 'site')}/corrections/{check_name(base, 'base')}"
 
 
 def corrections_all(site: str) -> str:
-    """Corrections of every base station of a site."""
-    return f"{ROOT}/{check_name(site, 'site')}/base/*"
+    """RTCM3 of every base of a site."""
+    return f"{ROOT}/{check_name(site, 'site')}/corrections/*"
 
 
 def map_query(site: str, query: str) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from protocol.arrays import Table
 from protocol.errors import one_line
-from protocol.machine.readings import Correction, Reading
+from protocol.machine.readings import Reading
 
 VERSION = 1
 
@@ -109,11 +109,16 @@ class SensorBundle:
 
 
 @dataclass(frozen=True)
-class SiteCorrection:
-    """What a base station says of the GPS errors of its site. frame: that of the site, as in a batch."""
+class Corrections:
+    """What a relay has of a base. stamp_ns: when the newest frame came. frames: of RTCM3, whole, end to end.
 
-    frame: str
-    correction: Correction
+    problem: what keeps frames from coming, in a sentence; empty where nothing does.
+    """
+
+    base: str
+    stamp_ns: int
+    frames: bytes
+    problem: str = ""
 
 
 @dataclass(frozen=True)

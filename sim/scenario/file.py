@@ -55,7 +55,6 @@ def check(scenario: Scenario, where: str) -> None:
             x, y = outside[0]
             size = f"{scenario.ground.width_m:g} x {scenario.ground.depth_m:g} m"
             raise ConfigError(place, f"leaves the map at ({x:.0f}, {y:.0f}): keep {margin_m:g} m inside its {size}")
-    scenario.bases()  # raises where a preset is not known
     for fleet in scenario.fleet:
         place = f'{where} [[fleet]] "{fleet.name}"'
         try:

@@ -10,14 +10,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from protocol.config import require_between
-from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import NAME, SiteConfig
 from sim.machines.model import load_model
 from sim.operators.habits import DrivingConfig
 from sim.operators.routes import ROUNDING_M, Leg, Route, open_leg, tour
 from sim.scenario.ground import GroundConfig, Point, ZoneConfig
 from sim.sensors.presets import Preset, load_preset
-from sim.sensors.rigs import Faults, Rig, base_config, machine_config
+from sim.sensors.rigs import Faults, Rig, machine_config
 
 WORLDS = ("pybullet", "fast")
 MAX_MACHINES = 1000
@@ -104,33 +103,6 @@ class FleetConfig:
 
 
 @dataclass(frozen=True)
-class BaseStationConfig:
-    """A base station: a receiver that stands still. place_m: east and north in `map`.
-
-    survey_off_m: how far from there its agent is told that it stands. height_m: of its antenna above the site's origin.
-    """
-
-    name: str
-    place_m: Point
-    preset: str = "dgps"
-    height_m: float = 3.0
-    survey_off_m: Point = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        if not NAME.fullmatch(self.name):
-            raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
-        if not all(abs(v) <= 1e5 for v in (*self.place_m, self.height_m)):  # also false for NaN
-            raise ValueError(f"place_m, height_m: {self.name} stands more than 100 km away")
-        if not all(abs(v) <= 100 for v in self.survey_off_m):
-            raise ValueError(f"survey_off_m: {self.survey_off_m!r} is more than 100 m away")
-
-    @property
-    def surveyed_m(self) -> Point:
-        """Where its agent is told that it stands."""
-        return self.place_m[0] + self.survey_off_m[0], self.place_m[1] + self.survey_off_m[1]
-
-
-@dataclass(frozen=True)
 class FaultConfig(Faults):
     """The faults of one machine."""
 
@@ -174,7 +146,6 @@ class Scenario:
     change: tuple[ScheduledChange, ...] = ()
     presets: Mapping[str, Preset] = field(default_factory=dict)
     names: tuple[str, ...] = ()
-    base_station: tuple[BaseStationConfig, ...] = ()
 
     def __post_init__(self) -> None:
         if self.world not in WORLDS:
@@ -186,7 +157,6 @@ class Scenario:
             raise ValueError(f"fleet: more than {MAX_MACHINES} machines")
         machines = self.machine_names
         _check_once("machine", machines)
-        _check_once("machine or base station", [*machines, *(base.name for base in self.base_station)])
         if unknown := next((f.machine for f in self.fault if f.machine not in machines), None):
             raise ValueError(f"fault: there is no machine {unknown!r}; there are {_few(machines)}")
 
@@ -212,10 +182,6 @@ class Scenario:
                 raise ValueError(f'fleet: {fleet.name}: machines that skid-steer need world = "fast"')
             rigs.append(Rig(config, model, preset, faults.get(name, Faults())))
         return rigs
-
-    def bases(self) -> list[MachineConfig]:
-        """Receivers of every base station, as its agent knows them."""
-        return [base_config(base.name, self.preset(base.preset)) for base in self.base_station]
 
     def journeys(self) -> list[tuple[Route, float, float]]:
         """Route, speed [m/s] and share of the cycle to start at, of every machine."""

@@ -90,12 +90,6 @@ def machine_config(
     )
 
 
-def base_config(name: str, preset: Preset) -> MachineConfig:
-    """Describe a base station as its agent knows it: one receiver, whose antenna stands at the place itself."""
-    share, time_s = _slow(preset.gps)
-    return MachineConfig(name, sensors=(SensorConfig("gps-1", "gps", drift_share=share, drift_time_s=time_s),))
-
-
 def draw_bodies(rigs: Sequence[Rig], seed: int) -> Bodies:
     """Draw the true bodies of machines around their nominal ones."""
     mass_kg, radius_m = np.empty(len(rigs)), np.empty(len(rigs))

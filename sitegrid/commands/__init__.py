@@ -8,7 +8,7 @@ so that every command describes itself in any install, and `sitegrid --help` is 
 
 # In the order of `sitegrid --help`: each command once.
 GROUPS = {
-    "run a site": ("router", "server", "agent", "web", "sim", "follow", "demo"),
+    "run a site": ("router", "server", "agent", "corrections", "web", "sim", "follow", "demo"),
     "ask": ("query", "calibrate", "trust", "distrust"),
     "look": ("plot", "log"),
     "keep": ("backup", "restore", "verify", "accept", "fold"),

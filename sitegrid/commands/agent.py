@@ -1,15 +1,12 @@
-"""`sitegrid agent`: the localisation agent of one machine, or the agent of a base station."""
+"""`sitegrid agent`: the localisation agent of one machine."""
 
 from __future__ import annotations
 
 import dataclasses
-import threading
 import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,14 +25,12 @@ from sitegrid.security.join import join, reply_check, signer
 
 if TYPE_CHECKING:
     from agents.agent import Agent
-    from agents.base_agent import BaseAgent
     from agents.config import AgentConfig
+    from agents.corrections.delivery import CorrectionsDelivery
     from agents.drivers import Driver
     from protocol.wire.owners import Owner
 
-    Serve = Callable[[Driver, Callable[[], bool]], dict[str, Any]]
-
-HELP = "run the localisation agent of one machine, or the agent of a base station"
+HELP = "run the localisation agent of one machine"
 EXTRA = "agent"
 KEPT = OutputFile(makes_folder=True)
 LINK_S = 1.0  # how long to wait for the router before starting without it
@@ -48,7 +43,7 @@ def add_options(parser: ArgumentParser) -> None:
     add("--config", type=Path, help="file with machine, sensors and options (config/agent.toml)")
     add("--site-file", type=Path, help="site file (config/site.toml); not needed with --log")
     add("--name", help="name of the machine (overrides the config file)")
-    add("--spool", type=KEPT, help="file of the spool; a base station has none")
+    add("--spool", type=KEPT, help="file of the spool")
     add("--audit", type=KEPT, help="file that lists every recorded sample, to prove that none is lost")
     add("--calibration", type=KEPT, help="calibration file (default: beside the spool)")
     add("--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)")
@@ -61,13 +56,14 @@ def add_options(parser: ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class _Joined:
-    """A machine, or a base station, that has joined the network under its name."""
+    """A machine that has joined the network under its name."""
 
     session: zenoh.Session
     site: SiteConfig
     machine: MachineConfig
     config: AgentConfig
     owner: Owner
+    corrections: CorrectionsDelivery | None
 
 
 def run(arguments: Namespace) -> int:
@@ -75,21 +71,22 @@ def run(arguments: Namespace) -> int:
     stop = stop_flag()
     log = open_log(arguments.log, arguments.data) if arguments.driver == "replay" and arguments.log else None
     site, machine, config = _configure(arguments, log)
-    session = _open(join(arguments.endpoint, arguments.keys, role=config.role, name=machine.name, site=site.name))
+    session = _open(join(arguments.endpoint, arguments.keys, role="machine", name=machine.name, site=site.name))
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
-        joined = _Joined(session, site, machine, config, owner)
-        agent, serve = (_base if config.role == "base" else _machine)(arguments, joined, stop)
+        corrections = None if log else _corrections(session, site, config)
+        joined = _Joined(session, site, machine, config, owner, corrections)
+        agent = _agent(arguments, joined)
         opened.callback(agent.close)
         driver = _driver(arguments, log, joined)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
-        report = serve(driver, stop.is_set)
+        report = agent.run(driver, stop.is_set, wait=stop.wait)
     say({"ended": plain(report)}) if arguments.json else note(_summary(machine.name, report))
     return 0 if report.get("delivered", True) or stop.is_set() else 1
 
 
-def _machine(arguments: Namespace, joined: _Joined, stop: threading.Event) -> tuple[Agent | BaseAgent, Serve]:
+def _agent(arguments: Namespace, joined: _Joined) -> Agent:
     from agents.agent import Agent, Places
     from agents.config import require_place
 
@@ -97,15 +94,13 @@ def _machine(arguments: Namespace, joined: _Joined, stop: threading.Event) -> tu
     places = Places(arguments.spool, arguments.audit, _calibration(arguments))
     key, check, withhold = signer(arguments.keys), reply_check(arguments.keys), arguments.withhold
     sign = key.sign if key else None
-    agent = Agent(**vars(joined), places=places, withhold=withhold, sign=sign, check=check)
-    return agent, partial(agent.run, wait=stop.wait)
+    return Agent(**vars(joined), places=places, withhold=withhold, sign=sign, check=check)
 
 
-def _base(_: Namespace, joined: _Joined, __: threading.Event) -> tuple[Agent | BaseAgent, Serve]:
-    from agents.base_agent import BaseAgent
+def _corrections(session: zenoh.Session, site: SiteConfig, config: AgentConfig) -> CorrectionsDelivery | None:
+    from agents.corrections.delivery import open_delivery
 
-    agent = BaseAgent(**vars(joined))
-    return agent, agent.run
+    return open_delivery(session, site.name, config.corrections)
 
 
 def _open(settings: SessionConfig) -> zenoh.Session:
@@ -141,7 +136,8 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
     machine = machine or (log.machine if log else None)
     if machine is None:
         raise ConfigError(arguments.config or "sitegrid agent", "no [machine] is described; see config/agent.toml")
-    _check_files(arguments, config.role)
+    if not arguments.spool:
+        raise ConfigError("sitegrid agent", "--spool FILE is missing: samples wait there until they are acknowledged")
     if arguments.name:
         machine = dataclasses.replace(machine, name=arguments.name)
     if arguments.site_file:
@@ -151,31 +147,17 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
     return log.site, machine, config
 
 
-def _check_files(arguments: Namespace, role: str) -> None:
-    """Refuse a machine without a place for its samples, and a base station with one."""
-    if role == "machine" and not arguments.spool:
-        raise ConfigError("sitegrid agent", "--spool FILE is missing: samples wait there until they are acknowledged")
-    of_samples = [name for name in ("spool", "audit", "calibration", "withhold") if getattr(arguments, name)]
-    if role == "base" and of_samples:
-        raise ConfigError("sitegrid agent", f"--{of_samples[0]}: a base station makes no samples; leave it out")
-
-
 def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Driver:
-    """What readings come from; a log has the corrections that came in when it was recorded."""
+    """What readings come from."""
     from agents.drivers.replay import Replay
-    from agents.drivers.zenoh import WithCorrections, ZenohDriver
+    from agents.drivers.zenoh import ZenohDriver
 
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)
-    driver = ZenohDriver(joined.session, joined.site.name, joined.machine.name)
-    base = joined.machine.base
-    return WithCorrections(driver, joined.session, joined.site, base.name) if base else driver
+    return ZenohDriver(joined.session, joined.site.name, joined.machine.name)
 
 
 def _summary(machine: str, report: dict[str, Any]) -> str:
-    if base := report.get("base"):
-        made = base["counters"].get("corrections", 0)
-        return f"{machine}: {report['readings']} readings, {made} corrections"
     line = f"{machine}: {report['readings']} readings, {report['samples']} samples"
     withheld = f", withheld fixes {report['holdout']}" if report["holdout"] else ""
     return f"{line}, delivered {report['delivered']}{withheld}"

@@ -91,12 +91,6 @@ def start_agent(plan: DemoPlan, children: Children, config: Path) -> Child:
     return children.start(name, *base, *files, "--json")
 
 
-def start_base(plan: DemoPlan, children: Children, name: str) -> Child:
-    """The agent of a base station of the simulation."""
-    words = ("--endpoint", plan.endpoint, "--site-file", plan.site_file, "--config", plan.work / f"{name}.toml")
-    return children.start(name, "agent", *words, "--json")
-
-
 def start_web(plan: DemoPlan, children: Children) -> str:
     """The live page; returns its address."""
     words = ("web", "--endpoint", plan.endpoint, "--site", plan.scenario.site.name, "--listen", "0")

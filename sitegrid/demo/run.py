@@ -25,7 +25,6 @@ from sitegrid.demo.plan import (
     LogReplay,
     make_plan,
     start_agent,
-    start_base,
     start_server,
     start_sim,
     start_web,
@@ -86,18 +85,17 @@ def _drive(plan: DemoPlan, children: Children, stop: threading.Event, display: D
     """Start everything, wait for the end, judge and draw."""
     display.begin("server starts")
     server = start_server(plan, children, "server", plan.site_file)
-    bases = [start_base(plan, children, base.name) for base in plan.scenario.base_station]
     agents = {path.stem: start_agent(plan, children, path) for path in plan.configs}
     server.expect("ready", READY_S)
     log_replay = LogReplay(plan, plan.log, children) if plan.log else None
-    for child in [*bases, *agents.values()]:
+    for child in agents.values():
         child.expect("ready", READY_S)
     sim = start_sim(plan, children)
     with connect(plan.endpoint, plan.scenario.site.name) as client:
         tracks = TrackRecorder(client.session, plan.scenario.site.name)
         _watch(plan, client, tracks, (sim, agents), (stop, display))
         display.begin("pictures are drawn, and every sample is accounted for")
-        for child in [*bases, *agents.values()]:
+        for child in agents.values():
             child.expect("ended", READY_S)
         client.calibrate(wait_s=MAX_WAIT_S)  # with the last samples too, and the map that we read has it
         region, pictures = _draw(plan, client, tracks)

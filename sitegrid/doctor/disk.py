@@ -118,12 +118,13 @@ def check_spool(state: SpoolState, now_ns: int) -> Finding:
 
 def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     """A running agent, by the values of its health report: of another version, they may be anything."""
-    spool, uplink = (_table_of(values, part) for part in ("spool", "uplink"))
+    spool = _table_of(values, "spool")
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
     message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
     named = ("no_sample", "clocks", "spool_problem", "calibration_problem", "spool_damage")
-    problems = [uplink.get("problem"), *map(values.get, named), *faults_of(values)]
+    of_parts = [_table_of(values, part).get("problem") for part in ("uplink", "corrections")]
+    problems = [*of_parts, *map(values.get, named), *faults_of(values)]
     advice = "; ".join(str(problem) for problem in problems if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""
     lost = any(spool.get(key) for key in ("dropped", "put_aside", "gone"))

@@ -1,7 +1,6 @@
 """The examination of this host's part of a site: what is looked at, in which order, as far as options name it.
 
-Base stations are examined as this host hears them, and positions by a running agent's own health: what its fixes
-confirm, refute, or cannot show.
+Positions are examined by a running agent's own health: what its fixes confirm, refute, or cannot show.
 """
 
 from __future__ import annotations
@@ -18,13 +17,11 @@ from typing import Any
 import zenoh
 
 from protocol.errors import ConfigError, MessageError, SitegridError, StoreError
-from protocol.machine.readings import Correction
 from protocol.queries.answers import MapInfo
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire import keys
-from protocol.wire.correction_codec import decode_correction
 from protocol.wire.credentials import Identity, load_credentials
 from sitegrid.asking import Asker, is_answered
 from sitegrid.doctor import Finding, Level, disk, network, skipped
@@ -35,8 +32,6 @@ ANYBODY = "doctor"  # where there are no keys, every name is as good
 ASKS_MAP = ("machine", "visitor", "admin")  # roles that may ask the map (docs/security.md)
 # Checks that need the map server:
 OF_SERVER = ("server", "losses", "clock", "time", "writer", "followers", "version", "machines", "permission")
-CORRECTION_S = 1.5  # they come five times a second
-SURE, OFF_M = 3.0, 1.0  # a lasting error of so many standard deviations, and of so much, is a wrong place
 REFUTED = "fixes are further off than the filter expects: look at the variance that the receiver states, and at mounts"
 MISSTATED = 2.25  # variance over the stated one: half as far again, more than chance makes of it
 UNSEEN = "a slow GPS error that is larger than stated would not show: there is one receiver, or several that err alike"
@@ -91,13 +86,12 @@ def _keys(arguments: Namespace) -> tuple[list[Finding], Subject | None]:
 def _network(subject: Subject) -> list[Finding]:
     link, session = network.open_link(join(subject.options.endpoint, subject.options.keys, network.LINK_S))
     if session is None:
-        rest = [skipped(name, "no way to the router") for name in (*OF_SERVER, "base")]
+        rest = [skipped(name, "no way to the router") for name in OF_SERVER]
         return [network.check_link(link), *rest, *_spool(subject, None)]
     try:
         return [
             network.check_link(link),
             *_server(subject, session),
-            _base(subject, session),
             *_spool(subject, session),
         ]
     finally:
@@ -129,15 +123,6 @@ def _server(subject: Subject, session: zenoh.Session) -> list[Finding]:
             network.check_machines(network.ask_machines(session, subject.site)),
         ]
     return [*findings, _permission(subject, session, info)]
-
-
-def _base(subject: Subject, session: zenoh.Session) -> Finding:
-    role = subject.identity.role if subject.identity else ""
-    if role and role not in ASKS_MAP:
-        return skipped("base", f"keys of a {role} may not listen")
-    if subject.site_file is None:
-        return skipped("base", "give --site-file FILE to listen to base stations")
-    return check_base(receive_correction(session, subject.site, subject.site_file.frame))
 
 
 def _permission(subject: Subject, session: zenoh.Session, info: MapInfo | None) -> Finding:
@@ -179,35 +164,6 @@ def _store(folder: Path | None, journal: str, site: SiteConfig | None) -> list[F
     except SitegridError as error:
         store = Finding(Level.FAIL, "store", str(error))
     return [store, disk.check_disk("store", disk.free_bytes(folder))]
-
-
-def receive_correction(session: zenoh.Session, site: str, frame: str) -> Correction | MessageError | None:
-    """A correction of whichever base station speaks first, or why it is refused; None if none comes in."""
-    key = keys.corrections_all(site)
-    with session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) as subscriber:
-        end_s = time.monotonic() + CORRECTION_S
-        while not (sample := subscriber.try_recv()):
-            if time.monotonic() >= end_s:
-                return None
-            time.sleep(0.05)
-    try:
-        return decode_correction(sample.payload.to_bytes(), frame).correction
-    except MessageError as error:
-        return error
-
-
-def check_base(correction: Correction | MessageError | None) -> Finding:
-    """Whether what a base station says makes sense; many sites have none."""
-    if correction is None:
-        return skipped("base", "no base station speaks")
-    if isinstance(correction, MessageError):
-        return Finding(Level.FAIL, "base", f"a correction is refused: {correction}", "update the older side")
-    off_m, std_m = math.hypot(correction.offset_e_m, correction.offset_n_m), math.sqrt(correction.offset_m2)
-    lasts = f"its fixes lie {off_m:.1f} m from its place on average, +- {2 * std_m:.1f} m"
-    if off_m > max(SURE * std_m, OFF_M):
-        where = f"{correction.offset_e_m:+.1f} m east, {correction.offset_n_m:+.1f} m north"
-        return Finding(Level.WARN, "base", f"{correction.sensor}: {lasts} ({where})", "check `place` in its config")
-    return Finding(Level.PASS, "base", f"{correction.sensor} publishes corrections; {lasts}")
 
 
 def check_positions(machine: str, values: Mapping[str, Any]) -> Finding:

@@ -11,10 +11,10 @@ from typing import Any
 
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_SMALL_BYTES
+from protocol.wire.correction_codec import MAX_CORRECTIONS_BYTES
 from sitegrid.security.register import Register, common_name
 
 POSE_HZ, HEALTH_HZ = 50.0, 10.0  # of one link; poses come with 5 Hz, at ten times real time with 50
-CORRECTION_HZ = POSE_HZ  # they come as often
 SPARE_BYTES = 4096  # for attachments of a payload, as a signature
 
 Keys = tuple[str, ...]
@@ -41,7 +41,7 @@ def grant(role: str, site: str, name: str) -> Grant:
     asks, alive = (keys.map_queries_all(site), keys.follower_queries_all(site)), (keys.alive(site, name),)
     followers = keys.followers_alive_all(site)
     visitor = Grant(
-        subscribe=(map_all, poses, health, keys.corrections_all(site)),
+        subscribe=(map_all, poses, health),
         query=asks,
         watch=(keys.alive_all(site), followers),
     )
@@ -54,14 +54,7 @@ def grant(role: str, site: str, name: str) -> Grant:
             alive=alive,
             watch=(*alive, followers),
         ),
-        "base": Grant(
-            publish=(keys.corrections(site, name), keys.health(site, name)),
-            subscribe=(keys.sensors(site, name),),
-            query=alive,
-            answer=alive,
-            alive=alive,
-            watch=alive,
-        ),
+        "corrections": Grant(publish=(keys.corrections(site, name),)),
         "visitor": visitor,
         "admin": replace(visitor, query=(*asks, keys.admin_all(site))),
         "server": Grant(
@@ -116,7 +109,7 @@ def size_limits(site: str) -> list[dict[str, Any]]:
         ("claims", ["query"], keys.writer(site), MAX_SMALL_BYTES),
         ("commands", ["query"], keys.admin_all(site), MAX_SMALL_BYTES),
         ("readings", ["put"], _sensors_all(site), MAX_BUNDLE_BYTES),
-        ("corrections", ["put"], keys.corrections_all(site), MAX_SMALL_BYTES),
+        ("corrections", ["put"], keys.corrections_all(site), MAX_CORRECTIONS_BYTES),
         ("poses", ["put"], keys.poses_all(site), MAX_SMALL_BYTES),
         ("health", ["put"], keys.health_all(site), MAX_SMALL_BYTES),
     )
@@ -130,8 +123,8 @@ def _rate_limits(site: str) -> dict[str, Any]:
     """Limits for messages that may get lost; a limit on acknowledged ones would lose samples."""
     rates = (
         (keys.poses_all(site), POSE_HZ),
+        (keys.corrections_all(site), POSE_HZ),
         (keys.health_all(site), HEALTH_HZ),
-        (keys.corrections_all(site), CORRECTION_HZ),
     )
     rules = [{"key_expr": key, "freq": rate} for key, rate in rates]
     return {"id": "rates", "messages": ["put"], "flows": ["ingress"], "rules": rules}

@@ -18,7 +18,7 @@ from protocol.wire.keys import check_name
 
 REGISTER_FILE = "register.toml"
 ROUTER = "router"  # a name and a role: one per site
-ROLES = ("machine", "base", "visitor", "server", "follower", "admin", "sim")
+ROLES = ("machine", "corrections", "visitor", "server", "follower", "admin", "sim")
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ def _messages() -> Iterator[Decoder]:
 
 _SINGLE = (
     "bundle",
-    "correction",
+    "corrections",
     "pose",
     "health",
     "point",

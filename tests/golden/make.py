@@ -8,6 +8,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from protocol.errors import QueryError, Refusal
 from protocol.machine.readings import (
     Articulation,
     Attitude,
-    Correction,
     Encoder,
     Gps,
     GpsVelocity,
@@ -51,16 +51,17 @@ from protocol.queries.roads import (
     encode_worklist,
 )
 from protocol.queries.routing import RouteAnswer, RouteMachine, RouteSteps, RouteTotals, decode_answer, encode_answer
-from protocol.wire import codec, correction_codec
+from protocol.wire import codec
+from protocol.wire.correction_codec import decode_corrections, encode_corrections
 from protocol.wire.messages import (
     Ack,
     CalibrationOffer,
+    Corrections,
     Health,
     Pose,
     Refused,
     SampleBatch,
     SensorBundle,
-    SiteCorrection,
 )
 from protocol.wire.offer_codec import encode_offer
 
@@ -147,17 +148,12 @@ def decode_info_table(data: bytes) -> dict[str, Any]:
     return codec.take_plain(codec.unpack(data, codec.MAX_SMALL_BYTES), "info")
 
 
-def decode_correction(data: bytes) -> SiteCorrection:
-    """Decode with the frame of the golden site."""
-    return correction_codec.decode_correction(data, "0123abcd")
-
-
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
 LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60, store=STORE)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 OFFER = CalibrationOffer("loader-1", T0, 0.00390625, -0.0625, 2.0**-22, 2.0**-16, 2.0**-20)
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
-CORRECTION = SiteCorrection("0123abcd", Correction("base-1", T0, 1.25, -0.5, 0.25, 1.5, 45.0, 0.125, -0.0625, 0.0625))
+CORRECTIONS = Corrections("base-1", T0, bytes.fromhex("d3000047ea4b"), "caster:2101: the caster hung up")
 HEALTH = Health("loader-1", T0, {"spool": {"pending": 12, "dropped": 0}, "gps": "ok", "nis": 1.5, "names": ["a", "b"]})
 POINT = records.PointAnswer(0.5, 1.5, {"resistance": 0.02, "visits": 3.0}, VERSION, T0)
 SPANS = (
@@ -303,7 +299,7 @@ GOLDEN: dict[str, Golden] = {
         codec.decode_bundle,
     ),
     "pose.bin": Golden(POSE, codec.encode_pose, codec.decode_pose),
-    "correction.bin": Golden(CORRECTION, correction_codec.encode_correction, decode_correction),
+    "corrections.bin": Golden(CORRECTIONS, encode_corrections, partial(decode_corrections, base="base-1")),
     "health.bin": Golden(HEALTH, codec.encode_health, codec.decode_health),
     "point.bin": Golden(POINT, answers.encode_point, answers.decode_point),
     "points.bin": Golden(points(), answers.encode_points, answers.decode_points),

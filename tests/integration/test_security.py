@@ -47,7 +47,7 @@ ROLES = {
     "guest": "visitor",
     "boss": "admin",
     "sim": "sim",
-    "base-1": "base",
+    "base-1": "corrections",
     "reader-1": "follower",
 }
 DAY = timedelta(days=1)
@@ -332,21 +332,21 @@ def as_machine(guarded: Guarded, name: str, mode: str) -> Iterator[zenoh.Session
         yield session
 
 
-POSE, OTHERS_POSE = keys.pose(SITE, "loader-1"), keys.pose(SITE, "loader-2")
 CORRECTIONS = keys.corrections(SITE, "base-1")
+POSE, OTHERS_POSE = keys.pose(SITE, "loader-1"), keys.pose(SITE, "loader-2")
 # Who listens to what; who forges it, under which keys; and who may say it, under which.
 FORGED = {
     "pose": (
         ("guest", keys.poses_all(SITE)),
-        {"loader-1": (OTHERS_POSE, keys.poses_all(SITE), f"sitegrid/{SITE}/**"), "base-1": (POSE,)},
+        {"loader-1": (OTHERS_POSE, keys.poses_all(SITE), f"sitegrid/{SITE}/**")},
         ("loader-1", POSE),
     ),
-    "change": (("guest", keys.changed(SITE)), {"loader-1": (keys.changed(SITE),)}, ("server", keys.changed(SITE))),
-    "correction": (
+    "corrections": (
         ("loader-2", keys.corrections_all(SITE)),
-        {"loader-1": (CORRECTIONS,), "sim": (CORRECTIONS,), "base-1": (keys.corrections(SITE, "base-2"),)},
+        {"loader-1": (CORRECTIONS,), "sim": (CORRECTIONS,), "base-1": (keys.corrections(SITE, "base-2"), POSE)},
         ("base-1", CORRECTIONS),
     ),
+    "change": (("guest", keys.changed(SITE)), {"loader-1": (keys.changed(SITE),)}, ("server", keys.changed(SITE))),
 }
 
 

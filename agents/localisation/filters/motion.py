@@ -56,7 +56,6 @@ GYRO_BIAS_WALK = 5e-5  # [rad/s/sqrt(s)]
 WHEEL_SCALE_WALK = 2e-4  # [1/sqrt(s)]
 SLIP_STD = 0.08  # of the wheels' slip per traction, which the speed is corrected by
 SLIP_TIME_S = 5.0  # how long a ground's slip stays the same
-BASE_OFFSET_WALK = 5e-3  # [m/sqrt(s)]: after an hour a mean over fixes says no more
 TURN_S = 3.0  # how long a turn lasts that no sensor shows
 CURVATURE, MAX_TURN_RADPS, LEAST_TURN_RADPS = 0.1, 0.3, 0.005  # it: standard deviation per metre driven, and its limits
 BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a wrong scale makes another in every bend
@@ -66,19 +65,19 @@ BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a
 class GpsError:
     """A receiver's slow error: a stationary Gauss-Markov process per axis, of that variance and correlation time.
 
-    common_m2: the parts of the variance that come from sources which other receivers see too, source by source, as many
-    for all receivers. Of each source two receivers have the smaller part in common, since it is one error in metres.
+    common_m2: the part of the variance that the machine's other receivers see too. Two receivers have the smaller of
+    their parts in common, since it is one error in metres.
     """
 
     variance_m2: float
     time_s: float
-    common_m2: tuple[float, ...] = ()
+    common_m2: float = 0.0
 
     def __post_init__(self) -> None:
         if not (0 < self.variance_m2 < math.inf and 0 < self.time_s < math.inf):
             raise ValueError("variance_m2 and time_s must be positive and finite")
-        if not (all(part >= 0 for part in self.common_m2) and sum(self.common_m2) < self.variance_m2):
-            raise ValueError("common_m2 must not be negative, nor in sum as large as variance_m2")
+        if not 0 <= self.common_m2 < self.variance_m2:
+            raise ValueError("common_m2 must not be negative, nor as large as variance_m2")
 
 
 @dataclass(frozen=True)
@@ -164,8 +163,8 @@ def gps_covariance(errors: tuple[GpsError, ...]) -> Floats:
     What they have in common answers to one noise: with correlation times t and u, 2 sqrt(t u) / (t + u) of it is left.
     """
     times = np.array([error.time_s for error in errors])
-    parts = np.array([error.common_m2 for error in errors]).reshape(len(errors), -1)
-    common = np.minimum(parts[:, None], parts).sum(axis=2)
+    parts = np.array([error.common_m2 for error in errors])
+    common = np.minimum.outer(parts, parts)
     covariance: Floats = common * 2 * np.sqrt(np.outer(times, times)) / np.add.outer(times, times)
     np.fill_diagonal(covariance, [error.variance_m2 for error in errors])
     covariance.setflags(write=False)
@@ -304,7 +303,6 @@ def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats]:
     deviation[layout.gyro_biases] = GYRO_BIAS_WALK
     deviation[layout.wheel_scales] = WHEEL_SCALE_WALK
     deviation[layout.heading_errors] = HEADING_WALK
-    deviation[layout.base_offset] = BASE_OFFSET_WALK
     walks = np.diag(deviation**2)
     for shared in (keep, walks):
         shared.setflags(write=False)

@@ -26,26 +26,22 @@ class Layout:
 
     imus: with a yaw gyro bias each [rad/s], and one more where another sensor shows the turn. wheel_scale: whether
     there is one [-]: wheels turn by 1 + scale times the distance. receivers: GPS receivers with an error east and north
-    each [m]. references: of attitude, with an error of the heading each [rad]. base: whether the last of the receivers
-    is a base station's, whose lasting error has states too. Without any, the 15 states of the paper.
+    each [m]. references: of attitude, with an error of the heading each [rad]. Without any, the 15 states of the paper.
     """
 
     imus: int = 0
     wheel_scale: bool = False
     receivers: int = 0
     references: int = 0
-    base: bool = False
 
     def __post_init__(self) -> None:
         if min(self.imus, self.receivers, self.references) < 0:
             raise ValueError("imus, receivers and references must not be negative")
-        if self.base and not self.receivers:
-            raise ValueError("base: no receiver is the base's")
 
     @cached_property
     def n(self) -> int:
         """Number of states."""
-        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references + 2 * self.base
+        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references
 
     @cached_property
     def gyro_biases(self) -> slice:
@@ -69,16 +65,6 @@ class Layout:
         """One per reference [rad]."""
         first = self.gps_errors.stop
         return slice(first, first + self.references)
-
-    @cached_property
-    def base_error(self) -> slice:
-        """Slow error of the base station: east, north [m]."""
-        return self.gps_error(self.receivers - 1)
-
-    @cached_property
-    def base_offset(self) -> slice:
-        """Lasting error of the base station: east, north [m]; none without one."""
-        return slice(self.n - 2 * self.base, self.n)
 
     def gyro_bias(self, imu: int) -> int:
         """State of the bias of one yaw gyro."""

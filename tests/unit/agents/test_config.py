@@ -40,8 +40,6 @@ def test_files_hold_the_defaults_and_what_the_scenario_has() -> None:
     paper = load_scenario("paper_site")
     assert load_agent(CONFIG / "agent.toml") == (paper.rigs()[0].machine, AgentConfig())
     assert load_site(CONFIG / "site.toml") == paper.site
-    base, options = load_agent(CONFIG / "base.toml")
-    assert (base.name, options.role, options.place) == ("base-1", "base", (49.01, 8.4))
 
 
 def test_files_name_every_option() -> None:
@@ -125,29 +123,3 @@ def test_page_of_ground_estimation_names_every_reason_and_none_else() -> None:
     judged = (CONFIG.parent / "agents" / "estimation" / "plausibility.py").read_text(encoding="utf-8")
     given = set(re.findall(r'return "(\w+)"', judged)) | set(re.findall(r'_hold = "(\w+)"', judged))
     assert given | FAULTS | {NOTHING_KNOWN.reason, "settling"} == reasons
-
-
-def base_file(folder: Path, *lines: str, sensor: str = 'kind = "gps"') -> Path:
-    path = folder / "base.toml"
-    text = "\n".join([*lines, "[machine]", 'name = "base-1"', "[[sensor]]", 'name = "gps-1"', sensor])
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
-@pytest.mark.parametrize(
-    ("lines", "sensor", "problem"),
-    [
-        (('role = "base"',), 'kind = "gps"', "needs its surveyed latitude and longitude"),
-        (('role = "base"', "place = [49.0]"), 'kind = "gps"', "needs its surveyed latitude and longitude"),
-        (('role = "base"', "place = [149.0, 8.0]"), 'kind = "gps"', "no latitude and longitude"),
-        (('role = "base"', "place = [nan, 8.0]"), 'kind = "gps"', "a finite number is expected"),
-        (("place = [49.0, 8.0]",), 'kind = "gps"', "a machine moves"),
-        (('role = "rover"',), 'kind = "gps"', "'rover' is neither machine nor base"),
-        (('role = "base"', "place = [49.0, 8.0]"), 'kind = "imu"', "a base needs a GPS receiver"),
-        (('role = "base"', "place = [49.0, 8.0]"), 'kind = "gps"\nuse = false', "a base needs a GPS receiver"),
-        (('role = "base"', "place = [49.0, 8.0]"), 'kind = "gps"\nmode = "relative"', "fixes of a base are places"),
-    ],
-)
-def test_base_that_cannot_be_one_is_refused(tmp_path: Path, lines: tuple[str, ...], sensor: str, problem: str) -> None:
-    with pytest.raises(ConfigError, match=problem):
-        load_agent(base_file(tmp_path, *lines, sensor=sensor))

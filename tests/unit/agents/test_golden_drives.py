@@ -25,7 +25,7 @@ from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import joined
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Correction, Encoder, Gps, Imu, Reading, Torque
+from protocol.machine.readings import Encoder, Gps, Imu, Reading, Torque
 from protocol.machine.samples import check_samples
 from protocol.site.site_config import KnownGround, SiteConfig
 from tests.unit.agents.drives import (
@@ -142,26 +142,6 @@ def with_doppler() -> Case:
     return SITE, doppler.WITH_DOPPLER, doppler.merged(blind, velocities), config(start=START)
 
 
-def with_base() -> Case:
-    """Corrections of a base that errs as the machine does, jumps once, and falls silent."""
-    vehicle = replace(VEHICLE, sensors=(*VEHICLE.sensors, SensorConfig("base-1", "correction")))
-
-    def error(t_s: float) -> tuple[float, float]:
-        return 2.5 * math.sin(t_s / 12), 2.0 * math.sin(t_s / 17 + 0.4)
-
-    readings: list[Reading] = []
-    for r in noisy(drive(TOUR, VEHICLE).readings, 7):
-        t_s = (r.stamp_ns - START_NS) * 1e-9
-        if isinstance(r, Gps):
-            east, north = error(t_s)
-            r = replace(r, lat_deg=r.lat_deg + north / 111_200, lon_deg=r.lon_deg + east / 73_000)
-            if t_s < 30:
-                values = (east + 8.0 * (t_s > 20), north, 0.01, 2.25, 45.0, 0.3, 0.0, 0.01)
-                readings.append(Correction("base-1", r.stamp_ns - 100_000_000, *values))
-        readings.append(r)
-    return SITE, vehicle, readings, config(start=START)
-
-
 CASES: dict[str, Callable[[], Case]] = {
     "loader, ukf": lambda: loader(engine="ukf"),
     "loader, rls and mass, no lag": lambda: loader(lag_s=0.0, estimation=EstimationConfig("rls", "estimated")),
@@ -178,7 +158,6 @@ CASES: dict[str, Callable[[], Case]] = {
     "truck, odometry": lambda: truck(trucks.ODOMETRY),
     "cart": cart,
     "doppler": with_doppler,
-    "base": with_base,
 }
 ROWS, DIGITS = 6, 8
 AT_NIGHT = ("loader, paper ekf", "modes, paper")  # the profile has another drive by day, and modes have one

@@ -34,7 +34,7 @@ def test_bad_option_is_refused_by_name(name: str, value: object) -> None:
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        ({"scenario": "mars"}, "there is no 'mars'; known: bad_machine, base_station"),
+        ({"scenario": "mars"}, "there is no 'mars'; known: bad_machine, busy_site"),
         ({"world": "flat"}, "world: 'flat' is neither pybullet nor fast"),
         ({"names": ("a", "b")}, "names: 2 names for 3 machines"),
         ({"names": ("a", "a", "b")}, "two machines are named 'a'"),

@@ -136,6 +136,6 @@ def test_base_that_is_missing_or_goes_in_a_circle_is_refused(tmp_path: Path) -> 
         load_scenario(write(tmp_path, "", "mine.toml"))
     with pytest.raises(ConfigError, match="no such file"):
         load_scenario(write(tmp_path, "", "nowhere"))
-    for name, words in (("nowhere", "'nowhere'; known: bad_machine, base_station"), ("gone.toml", r"gone\.toml")):
+    for name, words in (("nowhere", "'nowhere'; known: bad_machine, busy_site"), ("gone.toml", r"gone\.toml")):
         with pytest.raises(ConfigError, match=words):
             load_scenario(name)

@@ -261,7 +261,14 @@ def test_a_machine_knows_the_keys_of_the_map_servers_which_outlast_a_new_certifi
 
 # --- rules -----------------------------------------------------------------------------------------------------------
 
-NAMES = {"loader-1": "machine", "loader-2": "machine", "guest": "visitor", "boss": "admin", "sim": "sim", "b1": "base"}
+NAMES = {
+    "loader-1": "machine",
+    "loader-2": "machine",
+    "guest": "visitor",
+    "boss": "admin",
+    "sim": "sim",
+    "b1": "corrections",
+}
 REGISTER = Register(
     SITE, (), {n: RegisterEntry(r, "1", NOW) for n, r in {**NAMES, "server": "server", "f1": "follower"}.items()}
 )
@@ -297,7 +304,7 @@ def may(name: str, message: str, key: str, flow: str = "ingress", register: Regi
         ("declare_subscriber", keys.poses_all(SITE), {"guest", "boss", "server"}),
         ("declare_subscriber", keys.health_all(SITE), {"guest", "boss", "server"}),
         ("declare_subscriber", keys.changed(SITE), {"loader-1", "loader-2", "guest", "boss"}),
-        ("declare_subscriber", keys.corrections(SITE, "b1"), {"loader-1", "loader-2", "guest", "boss"}),
+        ("declare_subscriber", keys.corrections(SITE, "b1"), {"loader-1", "loader-2"}),
         ("put", keys.corrections(SITE, "b1"), {"b1"}),
         ("declare_subscriber", "**", set()),
         ("declare_queryable", keys.ingest_all(SITE), {"server"}),

@@ -24,8 +24,7 @@ from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.location import JournalLocation
 from mapserver.server import Server
-from protocol.errors import MessageError, Refusal, StoreError
-from protocol.machine.readings import Correction
+from protocol.errors import Refusal, StoreError
 from protocol.machine.samples import empty
 from protocol.queries.answer_codec import encode_info
 from protocol.queries.answers import FollowerState, MapInfo, SampleCounts
@@ -39,7 +38,7 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
 from sitegrid.doctor import Finding, Level, disk, network
 from sitegrid.doctor.disk import SpoolState, StoreState
-from sitegrid.doctor.examine import check_base, check_positions
+from sitegrid.doctor.examine import check_positions
 from sitegrid.doctor.keys import Certificate, check_certificate
 from sitegrid.doctor.network import RouterLink
 from tests.unit.records import map_info
@@ -79,7 +78,6 @@ AHEAD = replace(
     machines={f"loader-{i}": SampleCounts(**COUNTS, newest_ns=NOW_NS + 36_000 * 10**9 * i) for i in (1, 2)},
 )
 STORE = StoreState("pit", SITE.frame, 2, 5000, 100, 3, 4000, 90.0)
-CORRECTION = Correction("base-1", NOW_NS, 1.0, -1.0, 0.1, 1.0, 45.0, 0.2, -0.1, 0.09)
 HEALTHY = {"spool": {"depth": 3, "pending": 2, "dropped": 0, "put_aside": 0}, "uplink": {"problem": ""}}
 
 
@@ -187,6 +185,7 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
         (disk.check_spool(SpoolState(0, 0, 0, 0, gone=9), NOW_NS), WARN, "9 are gone; its disk has lost recorded"),
         (disk.check_spool(SpoolState(0, 0, 0, 0, damage="a.db-wal is damaged"), NOW_NS), WARN, "a.db-wal is damaged"),
         (disk.check_health("loader-1", {**HEALTHY, "no_sample": "no GPS fixes"}), WARN, "; no GPS fixes"),
+        (disk.check_health("loader-1", {**HEALTHY, "corrections": {"problem": "b: old"}}), WARN, "b: old"),
         (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait, 2 of them for the smoother; "),
         (disk.check_health("loader-1", {**HEALTHY, "uplink": {"problem": "no answer"}}), WARN, "; no answer"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
@@ -205,12 +204,6 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
         (store(shortfall="3 journal rows after row 5 are gone"), FAIL, "rows after row 5 are gone; restore a backup"),
         (store(missing={"loader-1": 4}), WARN, "acknowledged samples are missing: 4 of loader-1"),
         (store(frame="0"), FAIL, "choose another --store"),
-        (check_base(CORRECTION), PASS, "base-1 publishes corrections"),
-        (check_base(replace(CORRECTION, offset_e_m=-5.0)), WARN, "-5.0 m east"),
-        (check_base(replace(CORRECTION, offset_e_m=-5.0)), WARN, "check `place`"),
-        (check_base(replace(CORRECTION, offset_e_m=-5.0, offset_m2=9.0)), PASS, "base-1"),  # it has just begun
-        (check_base(MessageError(Refusal.WRONG_FRAME, "another frame")), FAIL, "another frame"),
-        (check_base(None), SKIP, "no base station speaks"),
         (store(replace(SITE, name="hill")), FAIL, "choose another --store"),
     ],
 )

@@ -116,7 +116,7 @@ def test_on_a_plane_nothing_leaves_it() -> None:
 # --- noise -----------------------------------------------------------------------------------------------------------
 
 
-SHARED = (GpsError(3.0, 45.0, (1.0, 1.5)), GpsError(1.5, 20.0, (0.6, 0.0)))
+SHARED = (GpsError(3.0, 45.0, 2.5), GpsError(1.5, 20.0, 0.6))
 
 
 def test_what_receivers_share_moves_both_and_lasts_as_the_covariance_says() -> None:
@@ -153,9 +153,9 @@ def test_slip_lies_along_and_across_the_body() -> None:
         (lambda: GpsError(1.0, 0.0), "positive"),
         (lambda: GpsError(math.nan, 1.0), "positive"),
         (lambda: GpsError(1.0, math.inf), "positive"),
-        (lambda: GpsError(3.0, 45.0, (-0.1,)), "common_m2"),
-        (lambda: GpsError(3.0, 45.0, (1.5, 1.5)), "common_m2"),  # receivers share no more than they err
-        (lambda: GpsError(3.0, 45.0, (math.nan,)), "common_m2"),
+        (lambda: GpsError(3.0, 45.0, -0.1), "common_m2"),
+        (lambda: GpsError(3.0, 45.0, 3.0), "common_m2"),  # receivers share no more than they err
+        (lambda: GpsError(3.0, 45.0, math.nan), "common_m2"),
         (lambda: MotionModel(FULL, gps_errors=ERRORS[:1]), "1 GPS errors for 2 receivers"),
         (lambda: MotionModel(PAPER, heading_errors=(HeadingError(0.05, 100.0),)), "1 heading errors for 0 references"),
         (lambda: Layout(imus=-1), "negative"),

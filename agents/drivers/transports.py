@@ -1,0 +1,94 @@
+"""Where bytes come from: serial ports, TCP, UDP, files. A link that breaks raises OSError; its owner opens it again."""
+
+import errno
+import os
+import re
+import select
+import socket
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+MOST_BYTES = 1 << 16  # of a datagram, which is read whole or cut
+CONNECT_S = 1.0  # a machine's own network answers in milliseconds
+WRITE_S = 1.0  # for a piece of what is sent, at any baud
+BITS = 10  # of a byte on a serial line: start, eight, stop
+WIRED = re.compile(r"/tty(?!ACM)[A-Z]")  # ports whose bytes go over a wire at their baud; ttyACM is USB alone
+# Why a link cannot be opened, and what to do.
+WHY = {
+    errno.EACCES: "no permission: add this user to the group of the port (dialout), and log in again",
+    errno.EAGAIN: "another program has this port: end it (gpsd, ModemManager?)",
+    errno.ECONNREFUSED: "nobody listens there: start the sender, or correct host and port",
+}
+SAME = {errno.EPERM: errno.EACCES, errno.EBUSY: errno.EAGAIN, errno.EADDRINUSE: errno.EAGAIN}
+
+
+class Transport:
+    """An open link. is_live: bytes come when they are sent; a file has them all. byte_ns: how long a byte takes."""
+
+    def __init__(self, link: Any, *, is_live: bool = True, byte_ns: float = 0.0) -> None:
+        """link: with `fileno` and `close`."""
+        self._link, self.is_live, self.byte_ns = link, is_live, byte_ns
+
+    def read(self, timeout_s: float) -> bytes | None:
+        """Bytes that have come in, empty if none came, None at the end of a file; OSError where the link broke."""
+        if self.is_live and not select.select([self._link.fileno()], [], [], timeout_s)[0]:
+            return b""
+        if data := os.read(self._link.fileno(), MOST_BYTES):
+            return data
+        if self.is_live:
+            raise OSError(errno.ENODEV, "closed by the other side")
+        return None
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes to the receiver; OSError where that is not possible, or takes too long."""
+        left = memoryview(data)
+        while left:
+            if not select.select([], [self._link.fileno()], [], WRITE_S)[1]:
+                raise OSError(errno.ETIMEDOUT, "takes no bytes")
+            left = left[os.write(self._link.fileno(), left) :]
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._link.close()
+
+
+def open_transport(address: str, baud: int) -> Transport:
+    """Open `tcp://HOST:PORT`, `udp://[HOST]:PORT`, a file, or a serial port; OSError where that fails."""
+    if "://" in address:
+        scheme, host, port = split_address(address)
+        return Transport(socket.create_connection((host, port), CONNECT_S) if scheme == "tcp" else _bound(host, port))
+    path = Path(address)
+    if path.is_file():
+        return Transport(path.open("rb"), is_live=False)
+    try:
+        import serial  # of the extra `receivers`
+    except ImportError:
+        raise OSError(errno.ENOPKG, "pyserial is not installed: pip install 'sitegrid[receivers]'") from None
+    port = serial.Serial(address, baud, timeout=0, exclusive=True)
+    return Transport(port, byte_ns=BITS * 1e9 / baud if WIRED.search(str(path.resolve())) else 0.0)
+
+
+def split_address(address: str) -> tuple[str, str, int]:
+    """Scheme, host and port; ValueError where it is no address."""
+    parts = urlsplit(address)
+    if parts.scheme not in ("tcp", "udp") or not parts.port or (parts.scheme == "tcp" and not parts.hostname):
+        raise ValueError(f"address: {address!r} is neither tcp://HOST:PORT nor udp://[HOST]:PORT, nor a port or a file")
+    return parts.scheme, parts.hostname or "", parts.port
+
+
+def why_closed(error: OSError) -> str:
+    """Why a link cannot be opened and what to do, in one sentence."""
+    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
+        there = sorted(str(p) for name in ("ttyACM*", "ttyUSB*", "ttyAMA*") for p in Path("/dev").glob(name))
+        return f"no such port; there {'are ' + ', '.join(there) if there else 'is none: plug it in'}"
+    number = error.errno or 0
+    return WHY.get(SAME.get(number, number), error.strerror or str(error))
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    """A socket for datagrams of whoever sends them here."""
+    family, *_, place = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
+    bound = socket.socket(family, socket.SOCK_DGRAM)
+    bound.bind(place)
+    return bound
