@@ -118,10 +118,10 @@ def _solved(
 ) -> Calibration:
     """What a solve with these priors says."""
     trusted = {name: table for name, table in known.items() if name not in excluded}
-    pb, result, found = _told_apart(*_common_ground(trusted, areas, priors))
+    pb, result, unlike = _tyres_apart(*_common_ground(trusted, areas, priors))
     observed = observe(pb, result)
-    corrections, states = _said(pb, result, observed, found)
-    states |= {pb.names[i]: replace(states[pb.names[i]], rolling=one) for i, one in found.items()}
+    corrections, states = _said(pb, result, observed, unlike)
+    states |= {pb.names[i]: replace(states[pb.names[i]], rolling=one) for i, one in unlike.items()}
     for name in sorted(set(known) - set(pb.names)):
         own = problem({name: known[name]}, areas, priors)
         alone = against(own, pb, result)
@@ -150,18 +150,18 @@ def _common_ground(
     return others if fewer[1].edges else fewer
 
 
-def _told_apart(pb: Problem, result: Estimate) -> tuple[Problem, Estimate, Mapping[int, Rolling]]:
+def _tyres_apart(pb: Problem, result: Estimate) -> tuple[Problem, Estimate, Mapping[int, Rolling]]:
     """Solved again with machines that roll unlike the others as such, which pull on no other one's scale then.
 
     Where nobody can be named all are: then slopes alone show scales, which are the less sure for it.
     """
-    found, on_slopes = rolling(pb, result)
-    while new := found.keys() & set(on_slopes) - set(pb.unlike):
-        named = all(one.is_named for one in found.values())
+    unlike, on_slopes = rolling(pb, result)
+    while new := unlike.keys() & set(on_slopes) - set(pb.unlike):
+        named = all(one.is_named for one in unlike.values())
         pb = replace(pb, unlike=tuple(sorted({*pb.unlike, *(new if named else on_slopes)})))
         result = estimate(pb)
-        found, on_slopes = rolling(pb, result)
-    return pb, result, found
+        unlike, on_slopes = rolling(pb, result)
+    return pb, result, unlike
 
 
 def _without_odd(
@@ -193,18 +193,18 @@ def _odd(pb: Problem, result: Estimate, sigmas: tuple[float, float]) -> list[str
 
 
 def _said(
-    pb: Problem, result: Estimate, observed: Observed, found: Mapping[int, Rolling], others: CommonScale = KNOWN
+    pb: Problem, result: Estimate, observed: Observed, unlike: Mapping[int, Rolling], others: CommonScale = KNOWN
 ) -> tuple[list[Correction], dict[str, MachineState]]:
     """Corrections and states of the machines of a problem. others: of those whose ground it was solved against."""
     applied = applied_part(pb, result, observed, others)
-    return _corrections(pb, applied, found), _states(pb, applied, observed.by)
+    return _corrections(pb, applied, unlike), _states(pb, applied, observed.by)
 
 
-def _corrections(pb: Problem, applied: Applied, found: Mapping[int, Rolling]) -> list[Correction]:
+def _corrections(pb: Problem, applied: Applied, unlike: Mapping[int, Rolling]) -> list[Correction]:
     """One correction for each epoch; the newest of a machine holds on. What measures no force has no scale."""
     layout, epochs = pb.layout, pb.epochs
     both = zip(applied.x[layout.rolls], applied.x[layout.drags], strict=True)
-    rolls = {i: each for i, each in zip(pb.unlike, both, strict=True) if i in found and found[i].is_named}
+    rolls = {i: each for i, each in zip(pb.unlike, both, strict=True) if i in unlike and unlike[i].is_named}
     out = []
     for epoch, (machine, number) in enumerate(zip(epochs.machine.tolist(), epochs.number.tolist(), strict=True)):
         at = np.array([epoch, layout.scales.start + machine, layout.lateral.start + machine])

@@ -26,7 +26,7 @@ from starlette.websockets import WebSocket
 from protocol.errors import Refusal
 from protocol.queries.answers import MapInfo, MapVersion
 from protocol.site.geometry import Bounds
-from sitegrid.web import live, mercator, overview, values
+from sitegrid.web import live, values
 from sitegrid.web.encoding import Cache, as_json, beside
 from sitegrid.web.guard import Guard
 from sitegrid.web.openapi import PREFIX, description
@@ -34,6 +34,7 @@ from sitegrid.web.resource import has_copy, tag_of
 from sitegrid.web.resources import RESOURCES, follows_now
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Problem, bad, problem_response
+from sitegrid.web.xyz import mercator, overview
 
 PAGE = Path(__file__).parent / "page"
 FRESH_S = 1.0  # how old the version may be that a tile, or a copy that the asker has, is compared with

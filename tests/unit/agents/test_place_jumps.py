@@ -43,13 +43,13 @@ def measured(receivers: int) -> tuple[MachineConfig, list[Reading]]:
     return own, readings
 
 
-def replayed(off: Off, receivers: int = 1, of: tuple[str, ...] = ("gps-1", "gps-2")) -> tuple[Floats, Bools, Any, str]:
+def replayed(off: Off, receivers: int = 1, hit: tuple[str, ...] = ("gps-1", "gps-2")) -> tuple[Floats, Bools, Any, str]:
     """When final samples are, which are off by over 5 m at a stated error below 3 m; health, and what it said."""
     own, readings = measured(receivers)
     pipeline = Pipeline(SITE, own, PipelineConfig(LocalisationConfig("ekf", slip=0.0, slip_soft=0.0)))
     made, said = [], ""
     for r in readings:
-        if isinstance(r, Gps) and r.sensor in of and (off_m := off(seconds(r))):
+        if isinstance(r, Gps) and r.sensor in hit and (off_m := off(seconds(r))):
             r = shifted(r, 0.6 * off_m, 0.8 * off_m)
         made.append(pipeline.step([r]))
         said = said or " ".join(pipeline.faults.values())

@@ -62,11 +62,11 @@ def test_one_that_rolls_unlike_the_others_is_named_and_moves_nobody(name: str, s
     (honest, before), (result, after) = solved(), solved((name, share, drag))
     assert unlike(honest) == {}
     assert unlike(result) == {name: True}
-    found = result.machines[name].rolling
-    assert found is not None
+    finding = result.machines[name].rolling
+    assert finding is not None
     ground = np.average(before[name]["c_rr"], weights=1 / (0.004 + 0.08 * before[name]["c_rr"]) ** 2)
-    assert abs(found.share - share - drag / ground) < max(2 * found.std, 0.06)
-    assert 0.02 <= found.std < 0.06
+    assert abs(finding.share - share - drag / ground) < max(2 * finding.std, 0.06)
+    assert 0.02 <= finding.std < 0.06
     for other in FLEET:
         was, now = honest.machines[other], result.machines[other]
         assert abs(now.scale - was.scale) <= was.scale_std, other

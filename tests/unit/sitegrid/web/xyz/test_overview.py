@@ -9,7 +9,7 @@ import pytest
 from protocol.queries.map_tiles import TILE_CELLS
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection, SiteConfig
-from sitegrid.web import mercator, overview
+from sitegrid.web.xyz import mercator, overview
 
 PLACES = [(49.01, 8.4), (-16.8, 179.9998), (70.0, -180.0), (-16.8, -179.9999)]
 

@@ -17,8 +17,8 @@ from protocol.queries.requests import MAX_RESOLUTION_M, WITHOUT_MEAN
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection
 from sitegrid.client import Client
-from sitegrid.web import mercator
-from sitegrid.web.mercator import SIDE_PX
+from sitegrid.web.xyz import mercator
+from sitegrid.web.xyz.mercator import SIDE_PX
 
 LEAST_CELLS = 3.0  # edges of cells in that of a pixel: below, a pixel shows the cell at its centre
 FILL = 1.5  # a pixel's edge over that of the larger cells that it is made of: none is without one, turned anyhow

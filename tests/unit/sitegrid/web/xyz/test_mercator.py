@@ -4,8 +4,8 @@ import pytest
 
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection, SiteConfig
-from sitegrid.web import mercator
-from sitegrid.web.mercator import FINE, coding, colour_png, pixels_of, tile_at, value_png
+from sitegrid.web.xyz import mercator
+from sitegrid.web.xyz.mercator import FINE, coding, colour_png, pixels_of, tile_at, value_png
 
 
 def decoded(png: bytes) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Pictures of the map in tiles as web maps have them: zoom, column, row."""
