@@ -5,6 +5,7 @@ from pathlib import Path
 
 from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig
+from agents.drivers.tables import DriverConfig, check_drivers
 from agents.holdout import HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.positioning import PipelineConfig
@@ -23,11 +24,13 @@ MOST_LAG_S = 180.0
 class AgentConfig:
     """Options of one agent.
 
+    driver: what its sensors are read from; empty: bundles on its key `sensors`.
     role: "machine", or "base": a base station, which publishes what its GPS receivers are off. place: latitude and
     longitude [deg] of a base as surveyed; receivers stand `mount` metres east and north of it. linger_s: how long to
     wait at the end for the last samples to be acknowledged.
     """
 
+    driver: tuple[DriverConfig, ...] = ()
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     spool: SpoolConfig = field(default_factory=SpoolConfig)
     uplink: UplinkConfig = field(default_factory=UplinkConfig)
@@ -72,6 +75,8 @@ def load_agent(path: Path) -> tuple[MachineConfig | None, AgentConfig]:
         raise ConfigError(where, "[[sensor]] without a [machine] that carries it")
     parsed = tuple(from_table(SensorConfig, s, f"{where} [[sensor]] {i + 1}") for i, s in enumerate(sensors))
     parsed_machine = parse_machine(machine, parsed, where) if machine else None
+    if parsed_machine:
+        check_drivers(config.driver, parsed_machine, where)
     if config.role == BASE and parsed_machine:
         _check_base(parsed_machine, where)
     return parsed_machine, config

@@ -42,6 +42,10 @@ class ZenohDriver:
         """Bundles that were lost or refused, and readings that were refused, by reason."""
         return dict(self._counters)
 
+    def problems(self) -> Sequence[str]:
+        """None: who publishes is not known."""
+        return ()
+
     def close(self) -> None:
         """Stop listening."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
@@ -94,6 +98,10 @@ class WithCorrections:
     def counters(self) -> Mapping[str, int]:
         """What the driver counts, and corrections that were lost or refused, by reason."""
         return {**self._driver.counters(), **self._counters}
+
+    def problems(self) -> Sequence[str]:
+        """Those of the driver."""
+        return self._driver.problems()
 
     def close(self) -> None:
         """Stop listening."""

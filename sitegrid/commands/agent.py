@@ -163,11 +163,16 @@ def _check_files(arguments: Namespace, role: str) -> None:
 def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Driver:
     """What readings come from; a log has the corrections that came in when it was recorded."""
     from agents.drivers.replay import Replay
+    from agents.drivers.tables import open_sources
     from agents.drivers.zenoh import WithCorrections, ZenohDriver
 
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)
-    driver = ZenohDriver(joined.session, joined.site.name, joined.machine.name)
+    driver: Driver = (
+        open_sources(joined.config.driver, joined.machine, lambda: (time.time_ns(), time.monotonic_ns()))
+        if joined.config.driver
+        else ZenohDriver(joined.session, joined.site.name, joined.machine.name)
+    )
     base = joined.machine.base
     return WithCorrections(driver, joined.session, joined.site, base.name) if base else driver
 
