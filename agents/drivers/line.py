@@ -62,11 +62,10 @@ class Line:
     def _take(self, frame: Frame, host_ns: int | None) -> list[Observed]:
         try:
             messages = self._decoder.decode(frame.data, self._file_ns if host_ns is None else host_ns)
+            return [value for message in messages if (value := self._observed(message, host_ns))]
         except (ValueError, ArithmeticError):
             self._counters["malformed"] += 1
             return []
-        observed = (self._observed(message, host_ns) for message in messages)
-        return [value for value in observed if value]
 
     def _observed(self, message: Message, host_ns: int | None) -> Observed | None:
         if host_ns is None:
@@ -75,8 +74,8 @@ class Line:
                 return None  # nothing in the file has stated the time yet
         if isinstance(message, Fix):
             self.seen = message
-            if message.quality == NO_FIX:
-                self._counters["no_fix"] += 1
+            if message.quality == NO_FIX or not message.utc_ns:
+                self._counters["no_fix" if message.quality == NO_FIX else "undated_fix"] += 1
                 return None
         if isinstance(message, Tagged):
             host_ns = self._untagged_ns(message, host_ns)

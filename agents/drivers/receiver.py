@@ -38,7 +38,7 @@ class Receiver:
         self._clock_ns, self._wait = clock_ns, wait
         self._counters: Counter[str] = Counter()
         self._transport: Transport | None = None
-        self._closed_why = self._note = ""
+        self._problem = ""  # of the link
         self._bauds = list(dict.fromkeys((baud or BAUDS[0], *BAUDS)))  # the one in use comes first
         self._retry_s = 0.0
         self._heard_s = self._framed_s = self._fixed_s = self._now_s()
@@ -49,14 +49,19 @@ class Receiver:
             transport = self._transport or self._open(timeout_s)
             data = transport.read(timeout_s) if transport else b""
         except OSError as error:
-            self._break(f"{self._address}: the link broke ({error.strerror or error}): plug it in again")
+            self._break(f"the link broke ({error.strerror or error}): plug it in again")
             return ()
         if data is None:
             return None
         if not data or not transport:
             self._watch_silence()
             return ()
-        return self._feed(data, transport)
+        if not transport.is_live:
+            return self._line.feed(data, None)
+        before = self._line.frames.total()
+        observed = self._line.feed(data, self._clock_ns(), transport.byte_ns)
+        self._judge(has_frames=self._line.frames.total() > before)
+        return observed
 
     def write(self, data: bytes) -> bool:
         """Send bytes to the receiver, as corrections; whether they went out. For the thread that reads."""
@@ -69,11 +74,12 @@ class Receiver:
 
     def counters(self) -> Mapping[str, int]:
         """Frames, broken bytes, and how often the link broke."""
-        return {**self._line.counters, **self._counters}
+        return {**self._line.counters, **dict(self._counters)}
 
     def problems(self) -> Sequence[str]:
         """What hinders it: the link first, then what comes over it."""
-        return [problem for problem in (self._closed_why or self._note or self._why_unfixed(),) if problem]
+        problem = self._problem or self._why_unfixed()
+        return [f"{self._address}: {problem}"] if problem else []
 
     def close(self) -> None:
         """Give the port back."""
@@ -92,81 +98,73 @@ class Receiver:
             if self._format == GPSD:
                 self._transport.write(GREETING)
         except OSError as error:
-            self._break(why_closed(self._address, error))
-            return None
-        if self._closed_why:
-            log.info("opened again port=%s", self._address)
-        self._closed_why = ""
+            self._break(why_closed(error))
         self._heard_s = self._framed_s = self._now_s()
         return self._transport
 
     def _break(self, why: str) -> None:
-        if self._transport:
-            self._counters["link_broke"] += 1
+        self._counters["link_broke"] += self._transport is not None
         self.close()
-        if why != self._closed_why:
-            log.warning("no readings why=%r", why)
-        self._closed_why = why
+        self._tell(why)
 
-    def _feed(self, data: bytes, transport: Transport) -> Sequence[Observed]:
-        before = self._line.frames.total()
-        if not transport.is_live:
-            return self._line.feed(data, None)
-        observed = self._line.feed(data, self._clock_ns(), transport.byte_ns)
+    def _judge(self, *, has_frames: bool) -> None:
+        """What the bytes that came say of the port."""
         self._heard_s = now_s = self._now_s()
-        if self._line.frames.total() > before:
+        if has_frames:
             self._framed_s = now_s
-            self._tell(self._why_foreign() or self._wrong_baud())
+            self._tell(self._why_foreign() or self._why_baud())
         elif now_s - self._framed_s > TRY_S:
             self._try_another()
-        if not self._line.has_fixes or (self._line.seen and self._line.seen.quality != NO_FIX):
+        if not self._line.has_fixes or (self._line.seen and self._line.seen.utc_ns):
             self._fixed_s = now_s
-        return observed
 
     def _watch_silence(self) -> None:
         if not self._transport or self._now_s() - self._heard_s <= SILENT_S:
             return
-        self._tell(f"{self._address}: nothing comes: is it powered, wired (TX to RX), and set to send on this port?")
+        silent = "nothing comes: is it powered, wired (TX to RX), and set to send on this port?"
         if self._address.startswith("tcp:"):  # a peer that lost its power never hangs up
-            self._break(self._note)
+            self._break(silent)
+        self._tell(silent)
 
     def _try_another(self) -> None:
         """Bytes without frames: take the next baud, where there is one."""
         self._framed_s = self._now_s()
         if "://" in self._address:
-            self._tell(f"{self._address}: bytes come, but neither NMEA, UBX nor gpsd's: is it the right port?")
+            self._tell("bytes come, but neither NMEA, UBX nor gpsd's: is it the right port?")
             return
-        baud = self._bauds.pop(0)
-        self._bauds.append(baud)
+        self._bauds.append(self._bauds.pop(0))
         self._counters["bauds_tried"] += 1
-        self._tell(f"{self._address}: no frame of NMEA or UBX at {baud} baud: trying {self._bauds[0]}")
+        self._tell(f"no frame of NMEA or UBX at {self._bauds[-1]} baud: trying {self._bauds[0]}")
         self.close()
         self._retry_s = 0.0
 
-    def _wrong_baud(self) -> str:
-        is_wrong = self._stated_baud and self._bauds[0] != self._stated_baud
-        return f"{self._address}: it sends at {self._bauds[0]} baud: say `baud = {self._bauds[0]}`" if is_wrong else ""
+    def _why_baud(self) -> str:
+        baud = self._bauds[0]
+        return f"it sends at {baud} baud: say `baud = {baud}`" if self._stated_baud not in (0, baud) else ""
 
     def _why_foreign(self) -> str:
         frames = self._line.frames
         foreign, n = max(frames.items(), key=lambda item: item[1])
         if frames[self._format] or n < FOREIGN_FRAMES:
             return ""
-        other = f'say `kind = "{foreign}"`, or set it to send {self._format.upper()}'
-        return f"{self._address}: it sends {foreign.upper()}, and nothing of {self._format.upper()}: {other}"
+        own = self._format.upper()
+        return f'it sends {foreign.upper()}, and nothing of {own}: say `kind = "{foreign}"`, or set it to send {own}'
 
     def _why_unfixed(self) -> str:
         seen = self._line.seen
         if self._now_s() - self._fixed_s <= NO_FIX_S:
             return ""
         if not seen:
-            return f"{self._address}: it sends no positions: switch on GGA and RMC, or NAV-PVT"
-        return f"{self._address}: no fix, {seen.satellites} satellites: its antenna needs open sky"
+            return "it sends no positions: switch on GGA and RMC, or NAV-PVT"
+        if seen.quality != NO_FIX:
+            return "it sends positions without a date: switch on RMC, or ZDA"
+        return f"no fix, {seen.satellites} satellites: its antenna needs open sky"
 
-    def _tell(self, note: str) -> None:
-        if note and note != self._note:
-            log.warning("a receiver why=%r", note)
-        self._note = note
+    def _tell(self, problem: str) -> None:
+        """Log what is wrong, as it begins and as it ends."""
+        if problem != self._problem:
+            log.warning("receiver port=%s problem=%r", self._address, problem or "none: it is read")
+        self._problem = problem
 
     def _now_s(self) -> float:
         return self._clock_ns() * 1e-9

@@ -131,18 +131,16 @@ def split_address(address: str) -> tuple[str, str, int]:
     return parts.scheme, parts.hostname or "", parts.port
 
 
-def why_closed(address: str, error: OSError) -> str:
-    """Why a link is not there and what to do, in one sentence."""
+def why_closed(error: OSError) -> str:
+    """Why a link cannot be opened and what to do, in one sentence."""
     match error.errno:
         case errno.EACCES | errno.EPERM:
-            return f"{address}: no permission: add this user to the group of the port (dialout), and log in again"
+            return "no permission: add this user to the group of the port (dialout), and log in again"
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.EIO:
             there = sorted(str(p) for name in ("ttyACM*", "ttyUSB*", "ttyAMA*") for p in Path("/dev").glob(name))
-            return f"{address}: no such port; there {'are ' + ', '.join(there) if there else 'is none: plug it in'}"
-        case errno.EAGAIN | errno.EBUSY:
-            return f"{address}: another program has this port: end it (gpsd, ModemManager?)"
+            return f"no such port; there {'are ' + ', '.join(there) if there else 'is none: plug it in'}"
+        case errno.EAGAIN | errno.EBUSY | errno.EADDRINUSE:
+            return "another program has this port: end it (gpsd, ModemManager?)"
         case errno.ECONNREFUSED:
-            return f"{address}: nobody listens there: start the sender, or correct host and port"
-        case errno.EADDRINUSE:
-            return f"{address}: another program has this port: end it, or take another one"
-    return f"{address}: {error.strerror or error}"
+            return "nobody listens there: start the sender, or correct host and port"
+    return error.strerror or str(error)

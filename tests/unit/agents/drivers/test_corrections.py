@@ -44,6 +44,9 @@ class FakeDriver:
     def counters(self) -> Mapping[str, int]:
         return {"bundles_missing": 2}
 
+    def problems(self) -> list[str]:
+        return []
+
     def close(self) -> None:
         self.closed = True
 
