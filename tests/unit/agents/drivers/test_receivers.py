@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import pty
 import random
@@ -11,8 +12,11 @@ import threading
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import astuple, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agents.drivers import Observed
@@ -21,11 +25,15 @@ from agents.drivers.receiver import NO_FIX_S, RETRY_S, SILENT_S, TRY_S, Receiver
 from agents.drivers.sources import Sources
 from agents.drivers.tables import DriverConfig, open_sources
 from agents.drivers.time_base import TimeBase
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
+from agents.sampling import joined
 from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Gps, Reading
+from protocol.machine.readings import Encoder, Gps, Imu, Reading
 from tests.patience import until
 from tests.unit.agents.drivers.frames import TEN, esf, nmea, pvt, spoiled
 from tests.unit.agents.drivers.test_formats import GGA, RMC, SENSORS, TPV
+from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, drive
 
 MACHINE = MachineConfig("loader-1", sensors=tuple(SENSORS.values()))
 GPSD_MACHINE = MachineConfig(
@@ -391,3 +399,51 @@ def test_sensors_ticks_free_their_readings_of_what_delays_single_frames() -> Non
         stamps += [v.host_ns - i * 10**7 for v in line.feed(frame, 10**12 + i * 10**7 + draw.randrange(5 * 10**6))]
     assert len(stamps) == 300
     assert max(stamps[100:]) - min(stamps[100:]) < 200_000
+
+
+# --- a drive ---------------------------------------------------------------------------------------------------------
+
+LEGS = [Leg(4, 0.6), Leg(15, 0.0, 0.12), Leg(12)]
+SEEN = replace(VEHICLE, sensors=tuple(s for s in VEHICLE.sensors if s.kind != "torque"))
+LATE_NS = {"gps": 60_000_000, "encoder": 8_000_000, "imu": 5_000_000}  # until a message is there
+
+
+def in_bytes(reading: Reading) -> bytes:
+    """As a u-blox receiver sends it, rounded as it rounds."""
+    tag = reading.stamp_ns // 10**6 % 2**32
+    match reading:
+        case Gps():
+            seconds = datetime.fromtimestamp(reading.stamp_ns // 10**9, UTC)
+            date = {"year": seconds.year, "month": seconds.month, "day": seconds.day}
+            time = {"hour": seconds.hour, "min": seconds.minute, "second": seconds.second}
+            place = {"lat": reading.lat_deg, "lon": reading.lon_deg, "height": round(reading.height_m * 1e3)}
+            accuracy = {"hAcc": round(reading.var_e_m2**0.5 * 1e3), "vAcc": round(reading.var_u_m2**0.5 * 1e3)}
+            return pvt(**date, **time, nano=reading.stamp_ns % 10**9, **place, **accuracy)
+        case Imu():
+            rates = [round(math.degrees(rate) * 4096) for rate in astuple(reading)[2:5]]
+            forces = [round(force * 1024) for force in astuple(reading)[5:]]
+            return esf(tag, *zip((14, 13, 5, 16, 17, 18), rates + forces, strict=True))
+        case Encoder():
+            return esf(tag, (8, int(reading.left_ticks)), (9, int(reading.right_ticks)))
+    raise AssertionError(reading)
+
+
+@pytest.mark.slow
+def test_a_drive_through_bytes_is_the_same_drive() -> None:
+    """Whatever the links delay, and wherever the host's clock stands."""
+    made, (imu, wheels, gps) = drive(LEGS, SEEN), SEEN.sensors
+    line = Line("ubx", {"fix": gps, "imu": imu, "wheels": wheels})
+    draw = random.Random(7)
+    arrived = sorted(
+        (r.stamp_ns - START_NS + LATE_NS[r.kind] + draw.randrange(3_000_000), i) for i, r in enumerate(made.readings)
+    )
+    pieces = [line.feed(in_bytes(made.readings[i]), 5 * 10**12 + came_ns) for came_ns, i in arrived]
+    readings, _ = played(line=pieces)
+    assert len(readings) > 0.99 * len(made.readings)
+    direct, through = (Pipeline(SITE, SEEN, PipelineConfig()) for _ in range(2))
+    samples = [joined([p.step(r), p.finish()]).final for p, r in ((direct, made.readings), (through, readings))]
+    off_m = [abs(made.off_m(pipeline.pose)) for pipeline in (direct, through) if pipeline.pose]
+    assert len(off_m) == 2
+    assert off_m[1] < off_m[0] + 0.05
+    assert len(samples[1]) == pytest.approx(len(samples[0]), rel=0.1)
+    assert samples[1]["grade_east"] == pytest.approx(np.zeros(len(samples[1])), abs=0.02)
