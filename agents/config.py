@@ -30,7 +30,6 @@ class AgentConfig:
     wait at the end for the last samples to be acknowledged.
     """
 
-    driver: tuple[DriverConfig, ...] = ()
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     spool: SpoolConfig = field(default_factory=SpoolConfig)
     uplink: UplinkConfig = field(default_factory=UplinkConfig)
@@ -38,6 +37,7 @@ class AgentConfig:
     role: str = MACHINE
     place: tuple[float, ...] = ()
     linger_s: float = 30.0
+    driver: tuple[DriverConfig, ...] = ()
 
     def __post_init__(self) -> None:
         if self.role not in ROLES:

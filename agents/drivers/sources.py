@@ -5,6 +5,7 @@ Values wait until a receiver has stated UTC: without one there is no position ei
 
 import queue
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -17,6 +18,7 @@ from protocol.machine.readings import Reading, parse_reading
 QUEUE = 2000  # pieces of some values each that wait for the agent: 10 s and more
 UNTIED = 60_000  # values that wait for UTC: ten minutes at 100 Hz, then the oldest are dropped and counted
 POLL_S = 0.2
+GATHER_S = 0.05  # values of so long are handed on together, as a live bundle does: each time costs a change of threads
 
 
 class Sources:
@@ -66,13 +68,20 @@ class Sources:
             thread.join()
 
     def _run(self, name: str, source: Source) -> None:
+        gathered: list[Observed] = []
+        due_s = 0.0
         while not self._stop.is_set():
-            observed = source.read(POLL_S)
+            observed = source.read(GATHER_S if gathered else POLL_S)
             if observed is None:
                 break
-            if observed:
-                self._put(name, observed)
+            if observed and not gathered:
+                due_s = time.monotonic() + GATHER_S
+            gathered += observed
+            if gathered and time.monotonic() >= due_s:
+                self._put(name, gathered)
+                gathered = []
         source.close()
+        self._put(name, gathered)
         self._put(name, None)
 
     def _put(self, name: str, observed: Sequence[Observed] | None) -> None:

@@ -1,6 +1,7 @@
 """Where bytes come from: serial ports, TCP, UDP, files. A link that breaks raises OSError; its owner opens it again."""
 
 import errno
+import os
 import re
 import select
 import socket
@@ -45,8 +46,11 @@ class SerialPort:
 
     def read(self, timeout_s: float) -> bytes:
         """Bytes as soon as there are some."""
-        select.select([self._port.fileno()], [], [], timeout_s)
-        return bytes(self._port.read(PIECE_BYTES))
+        if not select.select([self._port.fileno()], [], [], timeout_s)[0]:
+            return b""
+        if data := os.read(self._port.fileno(), PIECE_BYTES):  # pyserial would select once more
+            return data
+        raise OSError(errno.EIO, "no device")
 
     def write(self, data: bytes) -> None:
         """Send bytes."""

@@ -123,7 +123,9 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
     message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
     named = ("no_sample", "clocks", "spool_problem", "calibration_problem", "spool_damage")
+    receivers = values.get("driver_problems")
     problems = [uplink.get("problem"), *map(values.get, named), *faults_of(values)]
+    problems += receivers if isinstance(receivers, list) else []
     advice = "; ".join(str(problem) for problem in problems if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""
     lost = any(spool.get(key) for key in ("dropped", "put_aside", "gone"))
