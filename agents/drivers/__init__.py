@@ -5,25 +5,11 @@ have times of the host's monotonic clock, and `Sources` (agents/drivers/sources.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 from protocol.machine.readings import Reading
 
-
-class Driver(Protocol):
-    """A source of readings in the order in which a machine has them: mostly that of their stamps."""
-
-    def read(self, timeout_s: float) -> Sequence[Reading] | None:
-        """Readings that have come in, none if nothing came within timeout_s, None once the stream has ended."""
-
-    def counters(self) -> Mapping[str, int]:
-        """What was refused or lost on the way, by name."""
-
-    def problems(self) -> Sequence[str]:
-        """What hinders it now, and what to do: a sentence each."""
-
-    def close(self) -> None:
-        """Let go of files and subscriptions."""
+Item = TypeVar("Item", covariant=True)
 
 
 class Observed(NamedTuple):
@@ -40,17 +26,21 @@ class Observed(NamedTuple):
     utc_ns: int = 0
 
 
-class Source(Protocol):
-    """Where values of one [[driver]] table come from. A thread of its own reads it; nothing that comes in raises."""
+class Stream(Protocol[Item]):
+    """What comes in, in the order in which a machine has it: mostly that of its stamps. Bad input never raises."""
 
-    def read(self, timeout_s: float) -> Sequence[Observed] | None:
-        """Values that have come in, none if nothing came within timeout_s, None once there will be no more."""
+    def read(self, timeout_s: float) -> Sequence[Item] | None:
+        """What has come in, nothing if nothing came within timeout_s, None once the stream has ended."""
 
     def counters(self) -> Mapping[str, int]:
-        """What was refused or lost, by name."""
+        """What was refused or lost on the way, by name."""
 
     def problems(self) -> Sequence[str]:
         """What hinders it now, and what to do: a sentence each."""
 
     def close(self) -> None:
-        """Let go of ports and files."""
+        """Let go of ports, files and subscriptions."""
+
+
+Driver = Stream[Reading]
+Source = Stream[Observed]  # a thread of its own reads it

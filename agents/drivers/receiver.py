@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from agents.drivers import Observed
-from agents.drivers.formats import NO_FIX
 from agents.drivers.formats.framing import GPSD
 from agents.drivers.formats.gpsd import GREETING
 from agents.drivers.line import Line
@@ -121,7 +120,7 @@ class Receiver:
     def _watch_silence(self) -> None:
         if not self._transport or self._now_s() - self._heard_s <= SILENT_S:
             return
-        silent = "nothing comes: is it powered, wired (TX to RX), and set to send on this port?"
+        silent = "nothing comes: is it powered, wired, and set to send here?"
         if self._address.startswith("tcp:"):  # a peer that lost its power never hangs up
             self._break(silent)
         self._tell(silent)
@@ -156,9 +155,8 @@ class Receiver:
             return ""
         if not seen:
             return "it sends no positions: switch on GGA and RMC, or NAV-PVT"
-        if seen.quality != NO_FIX:
-            return "it sends positions without a date: switch on RMC, or ZDA"
-        return f"no fix, {seen.satellites} satellites: its antenna needs open sky"
+        undated = "it sends positions without a date: switch on RMC, or ZDA"
+        return undated if seen.values else f"no fix, {seen.satellites} satellites: its antenna needs open sky"
 
     def _tell(self, problem: str) -> None:
         """Log what is wrong, as it begins and as it ends."""

@@ -18,7 +18,7 @@ from protocol.machine.readings import Reading, parse_reading
 QUEUE = 2000  # pieces of some values each that wait for the agent: 10 s and more
 UNTIED = 60_000  # values that wait for UTC: ten minutes at 100 Hz, then the oldest are dropped and counted
 POLL_S = 0.2
-GATHER_S = 0.05  # values of so long are handed on together, as a live bundle does: each time costs a change of threads
+GATHER_S = 0.05  # values of so long are handed on together, as in a bundle: each time costs a change of threads
 
 
 class Sources:
@@ -70,14 +70,11 @@ class Sources:
     def _run(self, name: str, source: Source) -> None:
         gathered: list[Observed] = []
         due_s = 0.0
-        while not self._stop.is_set():
-            observed = source.read(GATHER_S if gathered else POLL_S)
-            if observed is None:
-                break
-            if observed and not gathered:
-                due_s = time.monotonic() + GATHER_S
+        while not self._stop.is_set() and (observed := source.read(GATHER_S if gathered else POLL_S)) is not None:
+            now_s = time.monotonic()
+            due_s = due_s if gathered else now_s + GATHER_S
             gathered += observed
-            if gathered and time.monotonic() >= due_s:
+            if gathered and now_s >= due_s:
                 self._put(name, gathered)
                 gathered = []
         source.close()

@@ -6,125 +6,62 @@ import re
 import select
 import socket
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
-PIECE_BYTES = 4096
+MOST_BYTES = 1 << 16  # of a datagram, which is read whole or cut
 CONNECT_S = 1.0  # a machine's own network answers in milliseconds
 BITS = 10  # of a byte on a serial line: start, eight, stop
 WIRED = re.compile(r"/tty(?!ACM)[A-Z]")  # ports whose bytes go over a wire at their baud; ttyACM is USB alone
+# Why a link cannot be opened, and what to do.
+WHY = {
+    errno.EACCES: "no permission: add this user to the group of the port (dialout), and log in again",
+    errno.EAGAIN: "another program has this port: end it (gpsd, ModemManager?)",
+    errno.ECONNREFUSED: "nobody listens there: start the sender, or correct host and port",
+}
+SAME = {errno.EPERM: errno.EACCES, errno.EBUSY: errno.EAGAIN, errno.EADDRINUSE: errno.EAGAIN}
 
 
-class Transport(Protocol):
-    """An open link."""
+class Transport:
+    """An open link. is_live: bytes come when they are sent; a file has them all. byte_ns: how long a byte takes."""
 
-    is_live: bool  # bytes come when they are sent; a file has them all
-    byte_ns: float  # how long a byte takes
+    def __init__(self, link: Any, *, is_live: bool = True, byte_ns: float = 0.0) -> None:
+        """link: with `fileno` and `close`."""
+        self._link, self.is_live, self.byte_ns = link, is_live, byte_ns
 
     def read(self, timeout_s: float) -> bytes | None:
-        """Bytes that have come in, empty if none came, None at the end; OSError where the link broke."""
+        """Bytes that have come in, empty if none came, None at the end of a file; OSError where the link broke."""
+        if self.is_live and not select.select([self._link.fileno()], [], [], timeout_s)[0]:
+            return b""
+        if data := os.read(self._link.fileno(), MOST_BYTES):
+            return data
+        if self.is_live:
+            raise OSError(errno.ENODEV, "closed by the other side")
+        return None
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the receiver; OSError where the link broke."""
+        """Send bytes to the receiver; OSError where that is not possible."""
+        os.write(self._link.fileno(), data)
 
     def close(self) -> None:
         """Let go of it."""
-
-
-class SerialPort:
-    """A serial port."""
-
-    is_live = True
-
-    def __init__(self, path: str, baud: int) -> None:
-        try:
-            import serial  # of the extra `receivers`
-        except ImportError:
-            raise OSError(errno.ENOPKG, "pyserial is not installed: pip install 'sitegrid[receivers]'") from None
-        self._port = serial.Serial(path, baud, timeout=0, write_timeout=1.0, exclusive=True)
-        self.byte_ns = BITS * 1e9 / baud if WIRED.search(str(Path(path).resolve())) else 0.0
-
-    def read(self, timeout_s: float) -> bytes:
-        """Bytes as soon as there are some."""
-        if not select.select([self._port.fileno()], [], [], timeout_s)[0]:
-            return b""
-        if data := os.read(self._port.fileno(), PIECE_BYTES):  # pyserial would select once more
-            return data
-        raise OSError(errno.EIO, "no device")
-
-    def write(self, data: bytes) -> None:
-        """Send bytes."""
-        self._port.write(data)
-
-    def close(self) -> None:
-        """Give the port back."""
-        self._port.close()
-
-
-class Socket:
-    """A TCP connection, or datagrams of whoever sends them here."""
-
-    is_live = True
-    byte_ns = 0.0
-
-    def __init__(self, scheme: str, host: str, port: int) -> None:
-        self._is_tcp = scheme == "tcp"
-        if self._is_tcp:
-            self._socket = socket.create_connection((host, port), CONNECT_S)
-        else:
-            family, *_, place = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[
-                0
-            ]
-            self._socket = socket.socket(family, socket.SOCK_DGRAM)
-            self._socket.bind(place)
-
-    def read(self, timeout_s: float) -> bytes:
-        """Bytes as soon as there are some."""
-        if not select.select([self._socket], [], [], timeout_s)[0]:
-            return b""
-        data = self._socket.recv(1 << 16)
-        if self._is_tcp and not data:
-            raise ConnectionResetError(errno.ECONNRESET, "closed by the other side")
-        return data
-
-    def write(self, data: bytes) -> None:
-        """Send bytes; nobody listens to datagrams."""
-        if self._is_tcp:
-            self._socket.sendall(data)
-
-    def close(self) -> None:
-        """Hang up."""
-        self._socket.close()
-
-
-class RecordedBytes:
-    """A file with what a receiver sent."""
-
-    is_live = False
-    byte_ns = 0.0
-
-    def __init__(self, path: Path) -> None:
-        self._file: BinaryIO = path.open("rb")
-
-    def read(self, _: float) -> bytes | None:
-        """The next bytes, at once."""
-        return self._file.read(PIECE_BYTES) or None
-
-    def write(self, data: bytes) -> None:
-        """A file hears nothing."""
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        self._link.close()
 
 
 def open_transport(address: str, baud: int) -> Transport:
     """Open `tcp://HOST:PORT`, `udp://[HOST]:PORT`, a file, or a serial port; OSError where that fails."""
     if "://" in address:
         scheme, host, port = split_address(address)
-        return Socket(scheme, host, port)
+        return Transport(socket.create_connection((host, port), CONNECT_S) if scheme == "tcp" else _bound(host, port))
     path = Path(address)
-    return RecordedBytes(path) if path.is_file() else SerialPort(address, baud)
+    if path.is_file():
+        return Transport(path.open("rb"), is_live=False)
+    try:
+        import serial  # of the extra `receivers`
+    except ImportError:
+        raise OSError(errno.ENOPKG, "pyserial is not installed: pip install 'sitegrid[receivers]'") from None
+    port = serial.Serial(address, baud, timeout=0, exclusive=True)
+    return Transport(port, byte_ns=BITS * 1e9 / baud if WIRED.search(str(path.resolve())) else 0.0)
 
 
 def split_address(address: str) -> tuple[str, str, int]:
@@ -137,14 +74,16 @@ def split_address(address: str) -> tuple[str, str, int]:
 
 def why_closed(error: OSError) -> str:
     """Why a link cannot be opened and what to do, in one sentence."""
-    match error.errno:
-        case errno.EACCES | errno.EPERM:
-            return "no permission: add this user to the group of the port (dialout), and log in again"
-        case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.EIO:
-            there = sorted(str(p) for name in ("ttyACM*", "ttyUSB*", "ttyAMA*") for p in Path("/dev").glob(name))
-            return f"no such port; there {'are ' + ', '.join(there) if there else 'is none: plug it in'}"
-        case errno.EAGAIN | errno.EBUSY | errno.EADDRINUSE:
-            return "another program has this port: end it (gpsd, ModemManager?)"
-        case errno.ECONNREFUSED:
-            return "nobody listens there: start the sender, or correct host and port"
-    return error.strerror or str(error)
+    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
+        there = sorted(str(p) for name in ("ttyACM*", "ttyUSB*", "ttyAMA*") for p in Path("/dev").glob(name))
+        return f"no such port; there {'are ' + ', '.join(there) if there else 'is none: plug it in'}"
+    number = error.errno or 0
+    return WHY.get(SAME.get(number, number), error.strerror or str(error))
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    """A socket for datagrams of whoever sends them here."""
+    family, *_, place = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
+    bound = socket.socket(family, socket.SOCK_DGRAM)
+    bound.bind(place)
+    return bound

@@ -5,12 +5,24 @@ time belongs to the epoch whose sentences surround it.
 """
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 
-from agents.drivers.formats import NO_FIX, Fix, Heading, Message, Velocity, rolled_over, wrapped
+from agents.drivers.formats import (
+    FIX,
+    HEADING,
+    TIME,
+    VELOCITY,
+    Message,
+    heading,
+    rolled_over,
+    variance,
+    velocity,
+    wrapped,
+)
 from protocol.units import factor
 
+SENTENCES = frozenset(("RMC", "ZDA", "GGA", "GST", "VTG", "HDT", "THS"))  # a method of the receiver each
 DAY_NS = 86_400 * 10**9
 # By GGA's quality: its name, and the error of a range [m], which HDOP turns into a position's where no GST states it.
 QUALITIES = {
@@ -37,8 +49,10 @@ class NmeaDecoder:
         address, *words = frame[1:-3].decode("ascii").split(",")
         talker = address[:-3].lower()
         receiver = self._receivers.get(talker, self._receivers[""])
-        take = _SENTENCES.get(address[-3:]) if len(address) == 5 else None
-        return take(receiver, words, host_ns) if take else ()
+        if len(address) != 5 or (sentence := address[2:]) not in SENTENCES:
+            return ()
+        taken: Sequence[Message] = getattr(receiver, sentence.lower())(words, host_ns)
+        return taken
 
 
 class _Receiver:
@@ -76,7 +90,7 @@ class _Receiver:
         count = int(satellites or 0)
         if self._quality not in QUALITIES or not time:
             self._quality = 0
-            return (Fix(self._source, 0, NO_FIX, count),)
+            return (Message(FIX, self._source, 0, satellites=count),)
         if before != self._quality:
             self._std_m = None  # of another kind of fix
         begun = self._begin_epoch(self._dated_ns(_time_of_day_ns(time)), host_ns)
@@ -84,8 +98,8 @@ class _Receiver:
         horizontal_m = range_m * float(hdop or math.nan)
         std_m = self._std_m or (horizontal_m, horizontal_m, 2 * horizontal_m)
         height_m = float(height or 0) + float(separation or 0)
-        place = _degrees(lat, north), _degrees(lon, east), height_m
-        return *begun, Fix(self._source, self._utc_ns, name, count, *place, std_m)
+        values = (_degrees(lat, north), _degrees(lon, east), height_m, *map(variance, std_m))
+        return *begun, Message(FIX, self._source, self._utc_ns, values, quality=name, satellites=count)
 
     def gst(self, words: list[str], _: int) -> Sequence[Message]:
         """Standard deviations of the fixes around it; a receiver that states 0 does not know them."""
@@ -103,27 +117,25 @@ class _Receiver:
 
     def hdt(self, words: list[str], host_ns: int) -> Sequence[Message]:
         """Heading of two antennas."""
-        return self._heading(_first(words, 1)[0], host_ns)
+        return self.ths([*words[:1], "A"], host_ns)
 
     def ths(self, words: list[str], host_ns: int) -> Sequence[Message]:
         """The same with a mode: autonomous, or else estimated, simulated, not valid."""
-        heading, mode = _first(words, 2)
-        return self._heading(heading, host_ns) if mode == "A" else ()
-
-    def _heading(self, heading: str, host_ns: int) -> Sequence[Message]:
-        if not heading:
+        degrees, mode = _first(words, 2)
+        if mode != "A" or not degrees:
             return ()
-        return (Heading(self._source, self._untimed_ns(host_ns), math.radians(float(heading)), HEADING_STD_RAD),)
+        values = heading(math.radians(float(degrees)), HEADING_STD_RAD)
+        return (Message(HEADING, self._source, self._untimed_ns(host_ns), values),)
 
     def _velocity(self, utc_ns: int, knots: str, course: str) -> Sequence[Message]:
-        """Slow receivers state no course: then their speed is how far their velocity is off zero."""
+        """A receiver that is slow states no course: then its speed is how far its velocity is off zero."""
         if not knots:
             return ()
         speed_mps = float(knots) * KNOT_MPS
+        values = velocity(speed_mps, math.radians(float(course or 0)), SPEED_STD_MPS)
         if not course:
-            return (Velocity(self._source, utc_ns, 0.0, 0.0, max(SPEED_STD_MPS, speed_mps)),)
-        rad = math.radians(float(course))
-        return (Velocity(self._source, utc_ns, speed_mps * math.sin(rad), speed_mps * math.cos(rad), SPEED_STD_MPS),)
+            values = velocity(0.0, 0.0, max(SPEED_STD_MPS, speed_mps))
+        return (Message(VELOCITY, self._source, utc_ns, values),)
 
     def _dated_ns(self, time_ns: int) -> int:
         """A time of day with the date that brings it nearest to the last epoch; 0 while no date is known."""
@@ -136,23 +148,12 @@ class _Receiver:
         if 0 < utc_ns - self._utc_ns <= 2 * 10**9:
             self._period_ns = utc_ns - self._utc_ns
         self._utc_ns, self._arrived_ns = utc_ns, host_ns
-        return (Message(self._source, utc_ns),)
+        return (Message(TIME, self._source, utc_ns),)
 
     def _untimed_ns(self, host_ns: int) -> int:
         """The epoch of a sentence without time: the last one, or the next one shortly before it is due."""
         is_next = host_ns - self._arrived_ns > SAME_EPOCH * self._period_ns
         return self._utc_ns and self._utc_ns + (self._period_ns if is_next else 0)
-
-
-_SENTENCES: dict[str, Callable[[_Receiver, list[str], int], Sequence[Message]]] = {
-    "RMC": _Receiver.rmc,
-    "ZDA": _Receiver.zda,
-    "GGA": _Receiver.gga,
-    "GST": _Receiver.gst,
-    "VTG": _Receiver.vtg,
-    "HDT": _Receiver.hdt,
-    "THS": _Receiver.ths,
-}
 
 
 def _first(words: list[str], n: int) -> list[str]:

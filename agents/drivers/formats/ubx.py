@@ -6,20 +6,22 @@ ESF-RAW have the IMU inside the receiver and wheel ticks, by the sensors' own cl
 
 import math
 import struct
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from struct import Struct
 
 from agents.drivers.formats import (
-    NO_FIX,
+    FIX,
+    HEADING,
+    IMU,
+    TIME,
+    VELOCITY,
     WEEK_NS,
-    Fix,
-    Heading,
-    Inertial,
+    WHEELS,
     Message,
-    Velocity,
-    WheelTicks,
+    heading,
     rolled_over,
+    variance,
     wrapped,
 )
 
@@ -44,14 +46,15 @@ class UbxDecoder:
         self._measured_clock = _TagClock(10**6, 1 << 32)
         self._raw_clock = _TagClock(39_062.5, 1 << 24)  # of the IMU in M8 and F9 receivers, a BMI160
         self._has_raw = False
+        self._takes = {(1, 7): self.pvt, (1, 60): self.relposned, (16, 2): self.measured, (16, 3): self.raw}
         self._axes: dict[int, tuple[int, float]] = {}  # by data type: tag and value
         self._wheels: dict[int, tuple[int, int]] = {}  # by data type: what the counter was, and ticks since the start
 
     def decode(self, frame: bytes, _: int) -> Sequence[Message]:
         """Messages of a frame whose checksum is right; none of a kind that is not used."""
-        take = _FRAMES.get((frame[2], frame[3]))
+        take = self._takes.get((frame[2], frame[3]))
         try:
-            return take(self, frame[6:-2]) if take else ()
+            return take(frame[6:-2]) if take else ()
         except struct.error as error:
             raise ValueError(str(error)) from None
 
@@ -63,24 +66,28 @@ class UbxDecoder:
         utc_ns = _utc_ns(date, nano) if valid & 7 == 7 else 0  # date, time, and leap seconds
         if utc_ns:
             self._epoch = week_ms, utc_ns
-        time = (Message("", utc_ns),) if utc_ns else ()
+        time = (Message(TIME, "", utc_ns),) if utc_ns else ()
         if fix_type not in BY_SATELLITES or not flags & 1 or flags3 & 1:
-            return *time, Fix("", 0, NO_FIX, satellites)
+            return *time, Message(FIX, "", 0, satellites=satellites)
         quality = CARRIER[min(flags >> 6, 2)] if flags >> 6 or not flags & 2 else "differential"
-        std_m = (horizontal_mm * 1e-3, horizontal_mm * 1e-3, vertical_mm * 1e-3)
-        fix = Fix("", utc_ns, quality, satellites, lat * 1e-7, lon * 1e-7, height_mm * 1e-3, std_m)
-        return *time, fix, Velocity("", utc_ns, east_mmps * 1e-3, north_mmps * 1e-3, speed_std_mmps * 1e-3)
+        variances = (variance(std_mm * 1e-3) for std_mm in (horizontal_mm, horizontal_mm, vertical_mm))
+        fix = (lat * 1e-7, lon * 1e-7, height_mm * 1e-3, *variances)
+        moving = (east_mmps * 1e-3, north_mmps * 1e-3, *(variance(speed_std_mmps * 1e-3),) * 2)
+        return (
+            *time,
+            Message(FIX, "", utc_ns, fix, quality=quality, satellites=satellites),
+            Message(VELOCITY, "", utc_ns, moving),
+        )
 
     def relposned(self, payload: bytes) -> Sequence[Message]:
         """The direction from the base's antenna to the rover's."""
-        version, week_ms, heading, accuracy, flags = RELPOSNED.unpack_from(payload)
+        version, week_ms, direction, accuracy, flags = RELPOSNED.unpack_from(payload)
         if version != 1 or flags & HEADING_VALID != HEADING_VALID:
             return ()
-        utc_ns = 0
-        if self._epoch:
-            since_ns = wrapped((week_ms - self._epoch[0]) * 10**6, WEEK_NS)
-            utc_ns = self._epoch[1] + since_ns
-        return (Heading("", utc_ns, math.radians(heading * 1e-5), math.radians(accuracy * 1e-5)),)
+        epoch_ms, epoch_ns = self._epoch or (week_ms, 0)
+        utc_ns = epoch_ns and epoch_ns + wrapped((week_ms - epoch_ms) * 10**6, WEEK_NS)
+        values = heading(math.radians(direction * 1e-5), math.radians(accuracy * 1e-5))
+        return (Message(HEADING, "", utc_ns, values),)
 
     def measured(self, payload: bytes) -> Sequence[Message]:
         """ESF-MEAS: one time for all words, before a word that repeats it."""
@@ -97,7 +104,7 @@ class UbxDecoder:
         tagged = RAW.iter_unpack(payload[4:])
         return list(self._inertial((word, self._raw_clock.ns(tag)) for word, tag in tagged))
 
-    def _inertial(self, tagged: Iterable[tuple[int, int]]) -> Iterator[Inertial]:
+    def _inertial(self, tagged: Iterable[tuple[int, int]]) -> Iterator[Message]:
         """Readings of all six axes, at the middle of their times."""
         for word, tag_ns in tagged:
             axis = word >> 24 & 63
@@ -108,7 +115,7 @@ class UbxDecoder:
                 continue
             tags, values = zip(*(self._axes[a] for a in _SCALES), strict=True)
             if max(tags) - min(tags) <= TOGETHER_NS:
-                yield Inertial("", 0, (min(tags) + max(tags)) // 2, values)
+                yield Message(IMU, "", 0, values, (min(tags) + max(tags)) // 2)
                 self._axes.clear()
 
     def _ticks(self, words: Sequence[int], tag_ns: int) -> Sequence[Message]:
@@ -116,7 +123,7 @@ class UbxDecoder:
         for left, right in AXLES:
             if left in present and right in present:
                 ticks = [self._counted(wheel, present[wheel]) for wheel in dict.fromkeys((left, right))]
-                return (WheelTicks("", 0, tag_ns, (float(ticks[0]), float(ticks[-1]))),)
+                return (Message(WHEELS, "", 0, (float(ticks[0]), float(ticks[-1])), tag_ns),)
         return ()
 
     def _counted(self, wheel: int, word: int) -> int:
@@ -129,12 +136,6 @@ class UbxDecoder:
         return total
 
 
-_FRAMES: dict[tuple[int, int], Callable[[UbxDecoder, bytes], Sequence[Message]]] = {
-    (0x01, 0x07): UbxDecoder.pvt,
-    (0x01, 0x3C): UbxDecoder.relposned,
-    (0x10, 0x02): UbxDecoder.measured,
-    (0x10, 0x03): UbxDecoder.raw,
-}
 _SCALES = dict.fromkeys(GYROS, RAD_PER_LSB) | dict.fromkeys(FORCES, MPS2_PER_LSB)
 
 

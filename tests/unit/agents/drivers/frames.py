@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,21 @@ VALID = {"validDate": 1, "validTime": 1, "fullyResolved": 1, "gnssFixOk": 1, "fi
 ACCURACY = {"hAcc": 14, "vAcc": 19, "sAcc": 35, "numSV": 24, "carrSoln": 2, "diffSoln": 1}
 MOTION = {"velN": 120, "velE": 2150, "velD": -3, "gSpeed": 2153, "headMot": 86.8}
 PLACE = {"lon": 8.4005678, "lat": 49.0101234, "height": 157_300, "hMSL": 110_200}
+RMC = "GNRMC,101527.20,A,4900.6074040,N,00824.0340680,E,4.179,86.80,261126,,,R,V"
+GGA = "GNGGA,101527.20,4900.6074040,N,00824.0340680,E,4,17,0.60,110.2,M,47.1,M,1.0,0001"
+TPV = {
+    "class": "TPV",
+    "device": "/dev/ttyACM0",
+    "mode": 3,
+    "status": 2,
+    "time": "2026-11-26T10:15:27.200Z",
+    "lat": 49.0101234,
+    "lon": 8.4005678,
+    "altHAE": 157.3,
+    "epx": 0.001,
+    "speed": 2.15,
+    "track": 90.0,
+}
 
 
 def nmea(text: str) -> bytes:
@@ -25,6 +41,11 @@ def nmea(text: str) -> bytes:
     for byte in text.encode():
         checksum ^= byte
     return f"${text}*{checksum:02X}\r\n".encode()
+
+
+def report(values: dict[str, Any]) -> bytes:
+    """As gpsd sends it."""
+    return json.dumps(values, separators=(",", ":")).encode() + b"\r\n"
 
 
 def ubx(name: str, **values: Any) -> bytes:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import math
 import os
 import pty
@@ -31,18 +30,14 @@ from agents.sampling import joined
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Imu, Reading
 from tests.patience import until
-from tests.unit.agents.drivers.frames import TEN, esf, nmea, pvt, spoiled
-from tests.unit.agents.drivers.test_formats import GGA, RMC, SENSORS, TPV
+from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, esf, nmea, pvt, report, spoiled
+from tests.unit.agents.drivers.test_formats import SENSORS
 from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, drive
 
 MACHINE = MachineConfig("loader-1", sensors=tuple(SENSORS.values()))
 GPSD_MACHINE = MachineConfig(
     "loader-1", sensors=(SensorConfig("gps-1", "gps", std={"position": 2.0}), SENSORS["velocity"])
 )
-
-
-def report(values: dict[str, object]) -> bytes:
-    return json.dumps(values, separators=(",", ":")).encode() + b"\n"
 
 
 class Clock:
@@ -267,7 +262,7 @@ def problem(source: Receiver, clock: Clock, device: Device, data: bytes, step_s:
         (nmea("GNGGA,,,,,,0,03,99.99,,,,,,"), 1.0, NO_FIX_S + 2, "no fix, 3 satellites: its antenna needs open sky"),
         (nmea(RMC), 1.0, NO_FIX_S + 2, "it sends no positions: switch on GGA and RMC, or NAV-PVT"),
         (nmea(GGA), 1.0, NO_FIX_S + 2, "it sends positions without a date: switch on RMC, or ZDA"),
-        (b"", SILENT_S, 2, "nothing comes: is it powered, wired (TX to RX), and set to send on this port?"),
+        (b"", SILENT_S, 2, "nothing comes: is it powered, wired, and set to send here?"),
         (b"\x00\xff\xd3" * 9, 1.0, 4, "no frame of NMEA or UBX at 115200 baud: trying 9600"),
     ],
 )
