@@ -55,21 +55,10 @@ class Receiver:
         if not data or not transport:
             self._watch_silence()
             return ()
-        if not transport.is_live:
-            return self._line.feed(data, None)
         before = self._line.frames.total()
-        observed = self._line.feed(data, self._clock_ns(), transport.byte_ns)
-        self._judge(has_frames=self._line.frames.total() > before)
+        observed = self._line.feed(data, self._clock_ns() if transport.is_live else None, transport.byte_ns)
+        self._judge(has_frames=self._line.frames.total() > before, is_live=transport.is_live)
         return observed
-
-    def write(self, data: bytes) -> bool:
-        """Send bytes to the receiver, as corrections; whether they went out. For the thread that reads."""
-        try:
-            if self._transport:
-                self._transport.write(data)
-        except OSError:
-            return False  # the next read finds the link broken
-        return self._transport is not None
 
     def counters(self) -> Mapping[str, int]:
         """Frames, broken bytes, and how often the link broke."""
@@ -106,13 +95,13 @@ class Receiver:
         self.close()
         self._tell(why)
 
-    def _judge(self, *, has_frames: bool) -> None:
+    def _judge(self, *, has_frames: bool, is_live: bool) -> None:
         """What the bytes that came say of the port."""
         self._heard_s = now_s = self._now_s()
         if has_frames:
             self._framed_s = now_s
             self._tell(self._why_foreign() or self._why_baud())
-        elif now_s - self._framed_s > TRY_S:
+        elif is_live and now_s - self._framed_s > TRY_S:
             self._try_another()
         if not self._line.has_fixes or (self._line.seen and self._line.seen.utc_ns):
             self._fixed_s = now_s

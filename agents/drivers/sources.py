@@ -3,6 +3,7 @@
 Values wait until a receiver has stated UTC: without one there is no position either, and so no sample.
 """
 
+import logging
 import queue
 import threading
 import time
@@ -14,6 +15,8 @@ from agents.drivers import Observed, Source
 from agents.drivers.time_base import TimeBase
 from protocol.errors import MessageError
 from protocol.machine.readings import Reading, parse_reading
+
+log = logging.getLogger("agents.drivers")
 
 QUEUE = 2000  # pieces of some values each that wait for the agent: 10 s and more
 UNTIED = 60_000  # values that wait for UTC: ten minutes at 100 Hz, then the oldest are dropped and counted
@@ -29,6 +32,7 @@ class Sources:
         self._queue: queue.Queue[tuple[str, Sequence[Observed] | None]] = queue.Queue(QUEUE)
         self._counters: Counter[str] = Counter()
         self._untied: deque[Observed] = deque()
+        self._failed: list[str] = []
         self._stop = threading.Event()
         self._threads = [threading.Thread(target=self._run, args=item, daemon=True) for item in self._sources.items()]
         self._running = len(self._threads)
@@ -53,7 +57,7 @@ class Sources:
 
     def problems(self) -> Sequence[str]:
         """What hinders each source, and that readings wait for UTC."""
-        problems = [problem for source in self._sources.values() for problem in source.problems()]
+        problems = [*self._failed, *(problem for source in self._sources.values() for problem in source.problems())]
         for name, ahead_s in self._time_base.apart_s.items():
             where = "ahead of" if ahead_s > 0 else "behind"
             problems.append(f"{name}: its time is {abs(ahead_s):.0f} s {where} the others', so it is left out")
@@ -68,6 +72,15 @@ class Sources:
             thread.join()
 
     def _run(self, name: str, source: Source) -> None:
+        try:
+            self._gather(name, source)
+        except Exception as error:  # of a plug-in: the others go on
+            log.exception("a driver ended")
+            self._failed.append(f"{name}: its driver ended ({error!r}): mend it, and start the agent again")
+        source.close()
+        self._put(name, None)
+
+    def _gather(self, name: str, source: Source) -> None:
         gathered: list[Observed] = []
         due_s = 0.0
         while not self._stop.is_set() and (observed := source.read(GATHER_S if gathered else POLL_S)) is not None:
@@ -77,9 +90,7 @@ class Sources:
             if gathered and now_s >= due_s:
                 self._put(name, gathered)
                 gathered = []
-        source.close()
         self._put(name, gathered)
-        self._put(name, None)
 
     def _put(self, name: str, observed: Sequence[Observed] | None) -> None:
         """Hand on; while the agent is busy, bytes wait in the port or file."""

@@ -10,7 +10,8 @@ from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from agents.drivers.formats import FIX, TIME, VELOCITY, Message, rolled_over, velocity
+from agents.drivers import formats
+from agents.drivers.formats import Message
 
 GREETING = b'?WATCH={"enable":true,"json":true};\n'  # asks for reports
 QUALITIES = {1: "autonomous", 2: "differential", 3: "fixed", 4: "float"}  # by `status`
@@ -36,17 +37,17 @@ class GpsdDecoder:
         device = report.get("device")
         source = device.lower() if isinstance(device, str) and device.lower() in self._devices else ""
         if report.get("mode") not in (PLANE, SPACE) or "time" not in report:
-            return (Message(FIX, source, 0, satellites=self._satellites),)
+            return (Message(formats.FIX, source, 0, satellites=self._satellites),)
         time = datetime.fromisoformat(str(report["time"]))
-        utc_ns = rolled_over(round(time.replace(tzinfo=time.tzinfo or UTC).timestamp() * 1e6) * 1000)
+        utc_ns = formats.rolled_over(round(time.replace(tzinfo=time.tzinfo or UTC).timestamp() * 1e6) * 1000)
         quality = QUALITIES.get(int(_number(report, "status", 1.0)), "autonomous")
         height_m = _number(report, "altHAE", _number(report, "alt", 0.0))
         place = (_number(report, "lat"), _number(report, "lon"), height_m, *(math.nan,) * 3)
-        moving = velocity(_number(report, "speed"), math.radians(_number(report, "track", 0.0)), math.nan)
+        moving = formats.velocity(_number(report, "speed"), math.radians(_number(report, "track", 0.0)), math.nan)
         return (
-            Message(TIME, source, utc_ns),
-            Message(FIX, source, utc_ns, place, quality=quality, satellites=self._satellites),
-            Message(VELOCITY, source, utc_ns, moving),
+            Message(formats.TIME, source, utc_ns),
+            Message(formats.FIX, source, utc_ns, place, quality=quality, satellites=self._satellites),
+            Message(formats.VELOCITY, source, utc_ns, moving),
         )
 
 

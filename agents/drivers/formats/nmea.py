@@ -8,30 +8,14 @@ import math
 from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 
-from agents.drivers.formats import (
-    FIX,
-    HEADING,
-    TIME,
-    VELOCITY,
-    Message,
-    heading,
-    rolled_over,
-    variance,
-    velocity,
-    wrapped,
-)
+from agents.drivers import formats
+from agents.drivers.formats import Message
 from protocol.units import factor
 
 SENTENCES = frozenset(("RMC", "ZDA", "GGA", "GST", "VTG", "HDT", "THS"))  # a method of the receiver each
 DAY_NS = 86_400 * 10**9
 # By GGA's quality: its name, and the error of a range [m], which HDOP turns into a position's where no GST states it.
-QUALITIES = {
-    1: ("autonomous", 3.0),
-    2: ("differential", 1.5),
-    3: ("autonomous", 3.0),
-    4: ("fixed", 0.02),
-    5: ("float", 0.3),
-}
+QUALITIES = {1: ("autonomous", 3.0), 2: ("differential", 1.5), 4: ("fixed", 0.02), 5: ("float", 0.3)}
 KNOT_MPS = factor("kn", "speed_mps")
 SPEED_STD_MPS = 0.1  # of a Doppler velocity: NMEA states none
 HEADING_STD_RAD = math.radians(0.5)  # of two antennas a metre apart: NMEA states none
@@ -47,10 +31,9 @@ class NmeaDecoder:
     def decode(self, frame: bytes, host_ns: int) -> Sequence[Message]:
         """Messages of a sentence whose checksum is right; none of a kind that is not used."""
         address, *words = frame[1:-3].decode("ascii").split(",")
-        talker = address[:-3].lower()
-        receiver = self._receivers.get(talker, self._receivers[""])
         if len(address) != 5 or (sentence := address[2:]) not in SENTENCES:
             return ()
+        receiver = self._receivers.get(address[:2].lower(), self._receivers[""])
         taken: Sequence[Message] = getattr(receiver, sentence.lower())(words, host_ns)
         return taken
 
@@ -90,7 +73,7 @@ class _Receiver:
         count = int(satellites or 0)
         if self._quality not in QUALITIES or not time:
             self._quality = 0
-            return (Message(FIX, self._source, 0, satellites=count),)
+            return (Message(formats.FIX, self._source, 0, satellites=count),)
         if before != self._quality:
             self._std_m = None  # of another kind of fix
         begun = self._begin_epoch(self._dated_ns(_time_of_day_ns(time)), host_ns)
@@ -98,8 +81,8 @@ class _Receiver:
         horizontal_m = range_m * float(hdop or math.nan)
         std_m = self._std_m or (horizontal_m, horizontal_m, 2 * horizontal_m)
         height_m = float(height or 0) + float(separation or 0)
-        values = (_degrees(lat, north), _degrees(lon, east), height_m, *map(variance, std_m))
-        return *begun, Message(FIX, self._source, self._utc_ns, values, quality=name, satellites=count)
+        values = (_degrees(lat, north), _degrees(lon, east), height_m, *map(formats.variance, std_m))
+        return *begun, Message(formats.FIX, self._source, self._utc_ns, values, quality=name, satellites=count)
 
     def gst(self, words: list[str], _: int) -> Sequence[Message]:
         """Standard deviations of the fixes around it; a receiver that states 0 does not know them."""
@@ -124,22 +107,22 @@ class _Receiver:
         degrees, mode = _first(words, 2)
         if mode != "A" or not degrees:
             return ()
-        values = heading(math.radians(float(degrees)), HEADING_STD_RAD)
-        return (Message(HEADING, self._source, self._untimed_ns(host_ns), values),)
+        values = formats.heading(math.radians(float(degrees)), HEADING_STD_RAD)
+        return (Message(formats.HEADING, self._source, self._untimed_ns(host_ns), values),)
 
     def _velocity(self, utc_ns: int, knots: str, course: str) -> Sequence[Message]:
         """A receiver that is slow states no course: then its speed is how far its velocity is off zero."""
         if not knots:
             return ()
         speed_mps = float(knots) * KNOT_MPS
-        values = velocity(speed_mps, math.radians(float(course or 0)), SPEED_STD_MPS)
+        values = formats.velocity(speed_mps, math.radians(float(course or 0)), SPEED_STD_MPS)
         if not course:
-            values = velocity(0.0, 0.0, max(SPEED_STD_MPS, speed_mps))
-        return (Message(VELOCITY, self._source, utc_ns, values),)
+            values = formats.velocity(0.0, 0.0, max(SPEED_STD_MPS, speed_mps))
+        return (Message(formats.VELOCITY, self._source, utc_ns, values),)
 
     def _dated_ns(self, time_ns: int) -> int:
         """A time of day with the date that brings it nearest to the last epoch; 0 while no date is known."""
-        return self._utc_ns and self._utc_ns + wrapped(time_ns - self._utc_ns % DAY_NS, DAY_NS)
+        return self._utc_ns and self._utc_ns + formats.wrapped(time_ns - self._utc_ns % DAY_NS, DAY_NS)
 
     def _begin_epoch(self, utc_ns: int, host_ns: int) -> Sequence[Message]:
         """Note the time of a sentence; a message of the time itself if it is the first of its epoch."""
@@ -148,7 +131,7 @@ class _Receiver:
         if 0 < utc_ns - self._utc_ns <= 2 * 10**9:
             self._period_ns = utc_ns - self._utc_ns
         self._utc_ns, self._arrived_ns = utc_ns, host_ns
-        return (Message(TIME, self._source, utc_ns),)
+        return (Message(formats.TIME, self._source, utc_ns),)
 
     def _untimed_ns(self, host_ns: int) -> int:
         """The epoch of a sentence without time: the last one, or the next one shortly before it is due."""
@@ -183,4 +166,4 @@ def _utc_ns(time: str, year: str, month: str, day: str) -> int:
     """UTC of time and date; a year of two digits is of 1980 to 2079."""
     full = int(year) if len(year) > 2 else (int(year) - 80) % 100 + 1980
     midnight = datetime(full, int(month), int(day), tzinfo=UTC)
-    return rolled_over(round(midnight.timestamp()) * 10**9 + _time_of_day_ns(time))
+    return formats.rolled_over(round(midnight.timestamp()) * 10**9 + _time_of_day_ns(time))

@@ -10,20 +10,8 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from struct import Struct
 
-from agents.drivers.formats import (
-    FIX,
-    HEADING,
-    IMU,
-    TIME,
-    VELOCITY,
-    WEEK_NS,
-    WHEELS,
-    Message,
-    heading,
-    rolled_over,
-    variance,
-    wrapped,
-)
+from agents.drivers import formats
+from agents.drivers.formats import Message
 
 PVT = Struct("<IH6BIi2BxB4i2I2i12xI6xH")
 RELPOSNED = Struct("<B3xI16xi24xI4xI")
@@ -66,17 +54,17 @@ class UbxDecoder:
         utc_ns = _utc_ns(date, nano) if valid & 7 == 7 else 0  # date, time, and leap seconds
         if utc_ns:
             self._epoch = week_ms, utc_ns
-        time = (Message(TIME, "", utc_ns),) if utc_ns else ()
+        time = (Message(formats.TIME, "", utc_ns),) if utc_ns else ()
         if fix_type not in BY_SATELLITES or not flags & 1 or flags3 & 1:
-            return *time, Message(FIX, "", 0, satellites=satellites)
+            return *time, Message(formats.FIX, "", 0, satellites=satellites)
         quality = CARRIER[min(flags >> 6, 2)] if flags >> 6 or not flags & 2 else "differential"
-        variances = (variance(std_mm * 1e-3) for std_mm in (horizontal_mm, horizontal_mm, vertical_mm))
+        variances = (formats.variance(std_mm * 1e-3) for std_mm in (horizontal_mm, horizontal_mm, vertical_mm))
         fix = (lat * 1e-7, lon * 1e-7, height_mm * 1e-3, *variances)
-        moving = (east_mmps * 1e-3, north_mmps * 1e-3, *(variance(speed_std_mmps * 1e-3),) * 2)
+        moving = (east_mmps * 1e-3, north_mmps * 1e-3, *(formats.variance(speed_std_mmps * 1e-3),) * 2)
         return (
             *time,
-            Message(FIX, "", utc_ns, fix, quality=quality, satellites=satellites),
-            Message(VELOCITY, "", utc_ns, moving),
+            Message(formats.FIX, "", utc_ns, fix, quality=quality, satellites=satellites),
+            Message(formats.VELOCITY, "", utc_ns, moving),
         )
 
     def relposned(self, payload: bytes) -> Sequence[Message]:
@@ -85,9 +73,9 @@ class UbxDecoder:
         if version != 1 or flags & HEADING_VALID != HEADING_VALID:
             return ()
         epoch_ms, epoch_ns = self._epoch or (week_ms, 0)
-        utc_ns = epoch_ns and epoch_ns + wrapped((week_ms - epoch_ms) * 10**6, WEEK_NS)
-        values = heading(math.radians(direction * 1e-5), math.radians(accuracy * 1e-5))
-        return (Message(HEADING, "", utc_ns, values),)
+        utc_ns = epoch_ns and epoch_ns + formats.wrapped((week_ms - epoch_ms) * 10**6, formats.WEEK_NS)
+        values = formats.heading(math.radians(direction * 1e-5), math.radians(accuracy * 1e-5))
+        return (Message(formats.HEADING, "", utc_ns, values),)
 
     def measured(self, payload: bytes) -> Sequence[Message]:
         """ESF-MEAS: one time for all words, before a word that repeats it."""
@@ -110,12 +98,12 @@ class UbxDecoder:
             axis = word >> 24 & 63
             if axis not in _SCALES:
                 continue
-            self._axes[axis] = tag_ns, wrapped(word & 0xFFFFFF, 1 << 24) * _SCALES[axis]
+            self._axes[axis] = tag_ns, formats.wrapped(word & 0xFFFFFF, 1 << 24) * _SCALES[axis]
             if len(self._axes) < len(_SCALES):
                 continue
             tags, values = zip(*(self._axes[a] for a in _SCALES), strict=True)
             if max(tags) - min(tags) <= TOGETHER_NS:
-                yield Message(IMU, "", 0, values, (min(tags) + max(tags)) // 2)
+                yield Message(formats.IMU, "", 0, values, (min(tags) + max(tags)) // 2)
                 self._axes.clear()
 
     def _ticks(self, words: Sequence[int], tag_ns: int) -> Sequence[Message]:
@@ -123,14 +111,14 @@ class UbxDecoder:
         for left, right in AXLES:
             if left in present and right in present:
                 ticks = [self._counted(wheel, present[wheel]) for wheel in dict.fromkeys((left, right))]
-                return (Message(WHEELS, "", 0, (float(ticks[0]), float(ticks[-1])), tag_ns),)
+                return (Message(formats.WHEELS, "", 0, (float(ticks[0]), float(ticks[-1])), tag_ns),)
         return ()
 
     def _counted(self, wheel: int, word: int) -> int:
         """Ticks since the start, of a counter that starts again and counts up in reverse too."""
         counter = word & (TICK_RANGE - 1)
         before, total = self._wheels.get(wheel, (counter, 0))
-        driven = wrapped(counter - before, TICK_RANGE)
+        driven = formats.wrapped(counter - before, TICK_RANGE)
         total += -driven if word & BACKWARD else driven
         self._wheels[wheel] = counter, total
         return total
@@ -148,7 +136,7 @@ class _TagClock:
 
     def ns(self, counter: int) -> int:
         """Nanoseconds from an unknown start."""
-        self._ticks += wrapped(counter - self._ticks, self._period)
+        self._ticks += formats.wrapped(counter - self._ticks, self._period)
         return round(self._ticks * self._unit_ns)
 
 
@@ -158,4 +146,4 @@ def _utc_ns(date: Sequence[int], nano: int) -> int:
     if second > 60 or abs(nano) > 10**9:
         raise ValueError(f"{second} s, {nano} ns are no time")
     minute = datetime(*whole, tzinfo=UTC)  # type: ignore[arg-type, misc]
-    return rolled_over((round(minute.timestamp()) + second) * 10**9 + nano)
+    return formats.rolled_over((round(minute.timestamp()) + second) * 10**9 + nano)

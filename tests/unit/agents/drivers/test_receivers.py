@@ -337,6 +337,17 @@ def time_at(host_ns: int, utc_ns: int) -> Observed:
     return Observed("", "", (), host_ns, utc_ns)
 
 
+def test_a_driver_that_raises_is_named_and_the_others_go_on() -> None:
+    broken = Script([])
+    broken.read = lambda timeout_s: [][0]  # type: ignore[method-assign]
+    driver = Sources({"a": broken, "b": Script([[time_at(10**9, TEN * 10**9)], [rate(10**9)]])}, TimeBase())
+    readings: list[Reading] = []
+    until(lambda: (piece := driver.read(0.1)) is None or readings.extend(piece), "the end")
+    assert len(readings) == 1
+    assert "a: its driver ended (IndexError" in driver.problems()[0]
+    driver.close()
+
+
 def test_readings_wait_for_utc_and_have_the_host_s_monotonic_time_then() -> None:
     waiting = [[rate(5 * 10**9 + i * 10**7)] for i in range(100)]
     readings, _ = played(line=[*waiting, [time_at(6 * 10**9, TEN * 10**9)], [rate(7 * 10**9)]])
