@@ -51,6 +51,7 @@ class Receiver:
             self._break(f"the link broke ({error.strerror or error}): plug it in again")
             return ()
         if data is None:
+            self._tell("" if self._line.frames[self._format] else f"no frame of {self._format.upper()} is in this file")
             return None
         if not data or not transport:
             self._watch_silence()

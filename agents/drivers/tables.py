@@ -37,6 +37,10 @@ class DriverConfig:
     def __post_init__(self) -> None:
         if self.kind not in (known := known_kinds()):
             raise ValueError(f"kind: {self.kind!r} is none of {', '.join(known)}")
+        if not self.address or not self.address.isprintable():
+            raise ValueError(
+                f"address: {self.address!r} is neither a port, tcp://HOST:PORT, udp://[HOST]:PORT nor a file"
+            )
         if not 0 <= self.baud <= 10_000_000:
             raise ValueError(f"baud: {self.baud} is no baud; 0 finds it")
         if self.kind not in DECODERS:

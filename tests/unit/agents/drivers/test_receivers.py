@@ -181,6 +181,10 @@ def test_a_file_is_read_to_its_end_as_fast_as_the_agent_is(tmp_path: Path) -> No
             readings += piece
     assert len(readings) == 2 * 500
     assert [r.stamp_ns for r in readings] == sorted(r.stamp_ns for r in readings)
+    path.write_bytes(pvt() * 3)
+    with receiver(path, Clock()) as source:
+        until(lambda: source.read(0.0) is None, "the end of the file")
+        assert source.problems() == [f"{path}: no frame of NMEA is in this file"]
 
 
 # --- a port that goes and comes --------------------------------------------------------------------------------------
