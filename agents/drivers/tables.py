@@ -38,9 +38,7 @@ class DriverConfig:
         if self.kind not in (known := known_kinds()):
             raise ValueError(f"kind: {self.kind!r} is none of {', '.join(known)}")
         if not self.address or not self.address.isprintable():
-            raise ValueError(
-                f"address: {self.address!r} is neither a port, tcp://HOST:PORT, udp://[HOST]:PORT nor a file"
-            )
+            raise ValueError(f"address: {self.address!r} is neither a port, tcp://HOST:PORT, udp://:PORT nor a file")
         if not 0 <= self.baud <= 10_000_000:
             raise ValueError(f"baud: {self.baud} is no baud; 0 finds it")
         if self.kind not in DECODERS:
@@ -73,11 +71,8 @@ def check_drivers(drivers: Sequence[DriverConfig], machine: MachineConfig, where
     for i, driver in enumerate(drivers):
         for key, name in driver.feeds.items():
             sensor = machine.sensor(name)
-            if (
-                problem := _misfit(driver, split_stream(key)[1], sensor)
-                if sensor
-                else f"no [[sensor]] is named {name!r}"
-            ):
+            problem = _misfit(driver, split_stream(key)[1], sensor) if sensor else f"no [[sensor]] is named {name!r}"
+            if problem:
                 raise ConfigError(f"{where} [[driver]] {i + 1} feeds.{key}", problem)
 
 

@@ -51,12 +51,8 @@ def add_options(parser: ArgumentParser) -> None:
     add("--spool", type=KEPT, help="file of the spool; a base station has none")
     add("--audit", type=KEPT, help="file that lists every recorded sample, to prove that none is lost")
     add("--calibration", type=KEPT, help="calibration file (default: beside the spool)")
-    add(
-        "--driver",
-        choices=("zenoh", "replay"),
-        default="zenoh",
-        help="replay reads --log; zenoh what [[driver]] says, else bundles",
-    )
+    source = "source of the readings: a log, or (default) what [[driver]] says, without one bundles over zenoh"
+    add("--driver", choices=("zenoh", "replay"), default="zenoh", help=source)
     add("--log", type=Path, help="replay: manifest of the log")
     add("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
     add("--speed", type=not_negative, default=1.0, help="replay: speed relative to real time; 0 as fast as possible")
