@@ -129,6 +129,7 @@ class Agent:
             "no_sample": self._first_sample.why_not,
             "clocks": self._clocks,
             "driver": dict(driver.counters()),
+            "driver_problems": list(driver.problems()),
             "pipeline": self._pipeline.health(),
             "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._unsaved.given_up},
             "spool_problem": self._spool_problem,

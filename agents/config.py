@@ -6,6 +6,7 @@ from pathlib import Path
 from agents.corrections.delivery import CorrectionsConfig
 from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig
+from agents.drivers.tables import DriverConfig, check_drivers
 from agents.holdout import HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.positioning import PipelineConfig
@@ -23,7 +24,8 @@ MOST_LAG_S = 180.0
 class AgentConfig:
     """Options of one agent.
 
-    linger_s: how long to wait at the end for the last samples to be acknowledged.
+    driver: what its sensors are read from; empty: bundles on its key `sensors`. linger_s: how long to wait at the end
+    for the last samples to be acknowledged.
     """
 
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
@@ -32,6 +34,7 @@ class AgentConfig:
     holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
     corrections: CorrectionsConfig = field(default_factory=CorrectionsConfig)
     linger_s: float = 30.0
+    driver: tuple[DriverConfig, ...] = ()
 
     def __post_init__(self) -> None:
         if self.linger_s < 0:
@@ -59,4 +62,7 @@ def load_agent(path: Path) -> tuple[MachineConfig | None, AgentConfig]:
     if sensors and not machine:
         raise ConfigError(where, "[[sensor]] without a [machine] that carries it")
     parsed = tuple(from_table(SensorConfig, s, f"{where} [[sensor]] {i + 1}") for i, s in enumerate(sensors))
-    return parse_machine(machine, parsed, where) if machine else None, config
+    parsed_machine = parse_machine(machine, parsed, where) if machine else None
+    if parsed_machine:
+        check_drivers(config.driver, parsed_machine, where)
+    return parsed_machine, config

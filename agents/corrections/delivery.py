@@ -27,8 +27,8 @@ DRAINED = 64  # pieces at a time of what a receiver sends on a port that nobody 
 class CorrectionsConfig:
     """Corrections for the receivers of a machine.
 
-    base: whose; empty for none. ports: where they are written, a serial port or `tcp://HOST:PORT` each. baud: of serial
-    ports.
+    base: whose; empty for none. ports: where they are written: addresses of [[driver]] tables, other serial ports, or
+    `tcp://HOST:PORT`. baud: of those serial ports.
     """
 
     base: str = ""
@@ -172,7 +172,9 @@ class CorrectionsDelivery:
                 self._counters["not_written"] += 1
 
 
-def open_delivery(session: zenoh.Session, site: str, config: CorrectionsConfig) -> CorrectionsDelivery | None:
-    """Begin to write corrections, where a machine takes some."""
-    ports = {address: OwnPort(address, config.baud) for address in config.ports}
+def open_delivery(
+    session: zenoh.Session, site: str, config: CorrectionsConfig, open_ports: Mapping[str, Port]
+) -> CorrectionsDelivery | None:
+    """Begin to write corrections, where a machine takes some. open_ports: those that drivers read, by address."""
+    ports = {address: open_ports.get(address) or OwnPort(address, config.baud) for address in config.ports}
     return CorrectionsDelivery(session, site, config.base, ports) if ports else None

@@ -42,6 +42,10 @@ class Replay:
         """Rows of the log that were refused, by reason."""
         return {f"log_{reason}": n for reason, n in self._log.refused.items()}
 
+    def problems(self) -> Sequence[str]:
+        """None: a file is there or is not."""
+        return ()
+
     def close(self) -> None:
         """Nothing is held open between two reads."""
 

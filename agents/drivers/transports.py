@@ -18,6 +18,7 @@ WIRED = re.compile(r"/tty(?!ACM)[A-Z]")  # ports whose bytes go over a wire at t
 WHY = {
     errno.EACCES: "no permission: add this user to the group of the port (dialout), and log in again",
     errno.EAGAIN: "another program has this port: end it (gpsd, ModemManager?)",
+    errno.EADDRNOTAVAIL: "this host has no such address: udp://:PORT listens at all it has",
     errno.ECONNREFUSED: "nobody listens there: start the sender, or correct host and port",
 }
 SAME = {errno.EPERM: errno.EACCES, errno.EBUSY: errno.EAGAIN, errno.EADDRINUSE: errno.EAGAIN}

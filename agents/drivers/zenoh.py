@@ -38,6 +38,10 @@ class ZenohDriver:
         """Bundles that were lost or refused, and readings that were refused, by reason."""
         return dict(self._counters)
 
+    def problems(self) -> Sequence[str]:
+        """None: who publishes is not known."""
+        return ()
+
     def close(self) -> None:
         """Stop listening."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]

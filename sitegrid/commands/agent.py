@@ -46,7 +46,8 @@ def add_options(parser: ArgumentParser) -> None:
     add("--spool", type=KEPT, help="file of the spool")
     add("--audit", type=KEPT, help="file that lists every recorded sample, to prove that none is lost")
     add("--calibration", type=KEPT, help="calibration file (default: beside the spool)")
-    add("--driver", choices=("zenoh", "replay"), default="zenoh", help="source of the readings (default %(default)s)")
+    source = "source of the readings: a log, or (default) what [[driver]] says, without one bundles over zenoh"
+    add("--driver", choices=("zenoh", "replay"), default="zenoh", help=source)
     add("--log", type=Path, help="replay: manifest of the log")
     add("--data", type=Path, help="replay: folder with the CSV files, if not beside the manifest")
     add("--speed", type=not_negative, default=1.0, help="replay: speed relative to real time; 0 as fast as possible")
@@ -63,7 +64,6 @@ class _Joined:
     machine: MachineConfig
     config: AgentConfig
     owner: Owner
-    corrections: CorrectionsDelivery | None
 
 
 def run(arguments: Namespace) -> int:
@@ -75,18 +75,18 @@ def run(arguments: Namespace) -> int:
     with ExitStack() as opened:
         opened.callback(session.close)
         owner = _claim_name(session, arguments.endpoint, site.name, machine.name)
-        corrections = None if log else _corrections(session, site, config)
-        joined = _Joined(session, site, machine, config, owner, corrections)
-        agent = _agent(arguments, joined)
-        opened.callback(agent.close)
+        joined = _Joined(session, site, machine, config, owner)
         driver = _driver(arguments, log, joined)
+        corrections = None if log else _corrections(joined, driver)
+        agent = _agent(arguments, joined, corrections)
+        opened.callback(agent.close)
         say({"ready": "agent", "machine": machine.name, "site": site.name})
         report = agent.run(driver, stop.is_set, wait=stop.wait)
     say({"ended": plain(report)}) if arguments.json else note(_summary(machine.name, report))
     return 0 if report.get("delivered", True) or stop.is_set() else 1
 
 
-def _agent(arguments: Namespace, joined: _Joined) -> Agent:
+def _agent(arguments: Namespace, joined: _Joined, corrections: CorrectionsDelivery | None) -> Agent:
     from agents.agent import Agent, Places
     from agents.config import require_place
 
@@ -94,13 +94,16 @@ def _agent(arguments: Namespace, joined: _Joined) -> Agent:
     places = Places(arguments.spool, arguments.audit, _calibration(arguments))
     key, check, withhold = signer(arguments.keys), reply_check(arguments.keys), arguments.withhold
     sign = key.sign if key else None
-    return Agent(**vars(joined), places=places, withhold=withhold, sign=sign, check=check)
+    given = vars(joined) | {"corrections": corrections}
+    return Agent(**given, places=places, withhold=withhold, sign=sign, check=check)
 
 
-def _corrections(session: zenoh.Session, site: SiteConfig, config: AgentConfig) -> CorrectionsDelivery | None:
+def _corrections(joined: _Joined, driver: Driver) -> CorrectionsDelivery | None:
     from agents.corrections.delivery import open_delivery
+    from agents.drivers.sources import Sources
 
-    return open_delivery(session, site.name, config.corrections)
+    receivers = driver.receivers() if isinstance(driver, Sources) else {}
+    return open_delivery(joined.session, joined.site.name, joined.config.corrections, receivers)
 
 
 def _open(settings: SessionConfig) -> zenoh.Session:
@@ -150,11 +153,14 @@ def _configure(arguments: Namespace, log: LogFolder | None) -> tuple[SiteConfig,
 def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Driver:
     """What readings come from."""
     from agents.drivers.replay import Replay
+    from agents.drivers.tables import open_sources
     from agents.drivers.zenoh import ZenohDriver
 
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)
-    return ZenohDriver(joined.session, joined.site.name, joined.machine.name)
+    if not joined.config.driver:
+        return ZenohDriver(joined.session, joined.site.name, joined.machine.name)
+    return open_sources(joined.config.driver, joined.machine, lambda: (time.time_ns(), time.monotonic_ns()))
 
 
 def _summary(machine: str, report: dict[str, Any]) -> str:

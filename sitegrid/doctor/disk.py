@@ -124,7 +124,9 @@ def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
     named = ("no_sample", "clocks", "spool_problem", "calibration_problem", "spool_damage")
     of_parts = [_table_of(values, part).get("problem") for part in ("uplink", "corrections")]
+    receivers = values.get("driver_problems")
     problems = [*of_parts, *map(values.get, named), *faults_of(values)]
+    problems += receivers if isinstance(receivers, list) else []
     advice = "; ".join(str(problem) for problem in problems if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""
     lost = any(spool.get(key) for key in ("dropped", "put_aside", "gone"))

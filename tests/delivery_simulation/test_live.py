@@ -139,6 +139,9 @@ class Silent:
     def counters(self) -> dict[str, int]:
         return {}
 
+    def problems(self) -> list[str]:
+        return []
+
     def close(self) -> None:
         return
 

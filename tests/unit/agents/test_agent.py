@@ -45,6 +45,9 @@ class Stream:
     def counters(self) -> dict[str, int]:
         return {}
 
+    def problems(self) -> list[str]:
+        return []
+
     def close(self) -> None:
         return
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from agents.config import MOST_LAG_S, AgentConfig, load_agent
+from agents.drivers.tables import DriverConfig
 from agents.estimation.ground import NOTHING_KNOWN
 from agents.estimation.plausibility import FAULTS
 from agents.localisation.localiser import LocalisationConfig
@@ -44,12 +45,15 @@ def test_files_hold_the_defaults_and_what_the_scenario_has() -> None:
 
 def test_files_name_every_option() -> None:
     named = table("agent.toml")
-    assert unnamed(AgentConfig(), named) == []
+    assert unnamed(AgentConfig(), named) == ["driver"]
+    text = (CONFIG / "agent.toml").read_text()
+    assert "\n# [[driver]]\n" in text, "in a comment: the simulator needs none"
+    assert all(f"\n# {f.name} = " in text for f in fields(DriverConfig))
     assert {f.name for f in fields(SiteConfig)} == set(table("site.toml"))
     estimated = "machine_share", "skid_steers"  # without it; so it is in a comment
     assert {f.name for f in fields(MachineConfig)} - {"sensors", *estimated} == set(named["machine"])
     for name in estimated:
-        assert f"\n# {name} = " in (CONFIG / "agent.toml").read_text()
+        assert f"\n# {name} = " in text
     assert {f.name for f in fields(SensorConfig)} == {key for sensor in named["sensor"] for key in sensor}
     assert {f.name for f in fields(Mount)} == set(named["sensor"][0]["mount"])
 

@@ -25,6 +25,8 @@ from agents.corrections.delivery import (
     open_delivery,
 )
 from agents.corrections.relay import Relay, RelayConfig
+from agents.drivers.line import Line
+from agents.drivers.receiver import Receiver as DriverReceiver
 from protocol.wire import keys
 from protocol.wire.correction_codec import encode_corrections
 from protocol.wire.messages import Corrections
@@ -61,8 +63,8 @@ class Receiver:
 
 
 @contextmanager
-def delivering(session: Any, *addresses: str) -> Iterator[CorrectionsDelivery]:
-    delivery = open_delivery(session, SITE.name, CorrectionsConfig("base-1", addresses))
+def delivering(session: Any, *addresses: str, ports: dict[str, Any] | None = None) -> Iterator[CorrectionsDelivery]:
+    delivery = open_delivery(session, SITE.name, CorrectionsConfig("base-1", addresses), ports or {})
     assert delivery
     try:
         yield delivery
@@ -115,6 +117,19 @@ def test_a_receiver_that_is_unplugged_is_named_and_gets_the_next_ones_when_it_is
         with again.caster:
             until(lambda: session.put(key, said) or again.heard, "frames again")
             until(lambda: not delivery.report()["problem"], "no problem any more")
+
+
+def test_the_port_that_a_driver_reads_takes_corrections_too(session: Any) -> None:
+    receiver = Receiver()
+    source = DriverReceiver(receiver.address, 0, "ubx", Line("ubx", {}))
+    key, said = keys.corrections(SITE.name, "base-1"), encode_corrections(SAID)
+    with receiver.caster, delivering(session, receiver.address, ports={receiver.address: source}) as delivery:
+        session.put(key, said)
+        until(lambda: "has no link" in delivery.report()["problem"], "a port that is not open")
+        source.read(0.1)
+        session.put(key, said)
+        until(lambda: receiver.heard == SAID.frames, "frames")
+        until(lambda: not delivery.report()["problem"], "no problem any more")
 
 
 @pytest.mark.parametrize(
@@ -243,7 +258,7 @@ def test_a_table_that_cannot_be_is_refused(options: dict[str, Any], problem: str
 
 
 def test_a_machine_without_a_base_listens_to_none(session: Any) -> None:
-    assert open_delivery(session, SITE.name, CorrectionsConfig()) is None
+    assert open_delivery(session, SITE.name, CorrectionsConfig(), {}) is None
     with pytest.raises(OSError, match="refused"):
         OwnPort(f"tcp://127.0.0.1:{_closed()}", 9600).write(b"x")
     assert STALE_NS == 60 * S

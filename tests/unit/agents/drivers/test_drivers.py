@@ -220,6 +220,9 @@ class Given:
     def counters(self) -> dict[str, int]:
         return {"given": 1}
 
+    def problems(self) -> list[str]:
+        return []
+
     def close(self) -> None:
         self.closed = True
 

@@ -1,0 +1,149 @@
+"""u-blox's UBX: frames into messages. Pure. Offsets, scales and flags are those of the interface descriptions M8 to F9.
+
+NAV-PVT has a fix, its accuracies and its Doppler velocity; NAV-RELPOSNED the heading of two antennas; ESF-MEAS and
+ESF-RAW have the IMU inside the receiver and wheel ticks, by the sensors' own clock.
+"""
+
+import math
+import struct
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from struct import Struct
+
+from agents.drivers import formats
+from agents.drivers.formats import Message
+
+PVT = Struct("<IH6BIi2BxB4i2I2i12xI6xH")
+RELPOSNED = Struct("<B3xI16xi24xI4xI")
+MEAS, RAW = Struct("<IHH"), Struct("<II")
+BY_SATELLITES = (2, 3, 4)  # fix types with a place: in two and three dimensions, and held up by the receiver's sensors
+CARRIER = ("autonomous", "float", "fixed")  # quality by carrier solution
+HEADING_VALID = 1 | 1 << 2 | 1 << 8  # flags of fix, relative position and heading
+GYROS, FORCES = (14, 13, 5), (16, 17, 18)  # data types of x, y, z
+RAD_PER_LSB, MPS2_PER_LSB = math.radians(2**-12), 2**-10
+AXLES = ((8, 9), (6, 7), (10, 10))  # left and right wheel of the rear axle, of the front one; one sensor for all
+BACKWARD, TICK_RANGE = 1 << 23, 1 << 23  # of a wheel: the flag of reverse; where its counter starts again
+TOGETHER_NS = 20 * 10**6  # between rates and forces of one reading: they come in frames of their own, 5 ms apart
+
+
+class UbxDecoder:
+    """Decodes the frames of one receiver; a line has but one."""
+
+    def __init__(self, _: Collection[str] = ()) -> None:
+        self._epoch: tuple[int, int] | None = None  # time of week [ms] of the newest NAV-PVT, and its UTC [ns]
+        self._measured_clock = _TagClock(10**6, 1 << 32)
+        self._raw_clock = _TagClock(39_062.5, 1 << 24)  # of the IMU in M8 and F9 receivers, a BMI160
+        self._has_raw = False
+        self._takes = {(1, 7): self.pvt, (1, 60): self.relposned, (16, 2): self.measured, (16, 3): self.raw}
+        self._axes: dict[int, tuple[int, float]] = {}  # by data type: tag and value
+        self._wheels: dict[int, tuple[int, int]] = {}  # by data type: what the counter was, and ticks since the start
+
+    def decode(self, frame: bytes, _: int) -> Sequence[Message]:
+        """Messages of a frame whose checksum is right; none of a kind that is not used."""
+        take = self._takes.get((frame[2], frame[3]))
+        try:
+            return take(frame[6:-2]) if take else ()
+        except struct.error as error:
+            raise ValueError(str(error)) from None
+
+    def pvt(self, payload: bytes) -> Sequence[Message]:
+        """Position, velocity and time."""
+        fields = PVT.unpack_from(payload)
+        week_ms, *date, valid, _, nano, fix_type, flags, satellites = fields[:13]
+        lon, lat, height_mm, _, horizontal_mm, vertical_mm, north_mmps, east_mmps, speed_std_mmps, flags3 = fields[13:]
+        utc_ns = _utc_ns(date, nano) if valid & 7 == 7 else 0  # date, time, and leap seconds
+        if utc_ns:
+            self._epoch = week_ms, utc_ns
+        time = (Message(formats.TIME, "", utc_ns),) if utc_ns else ()
+        if fix_type not in BY_SATELLITES or not flags & 1 or flags3 & 1:
+            return *time, Message(formats.FIX, "", 0, satellites=satellites)
+        quality = CARRIER[min(flags >> 6, 2)] if flags >> 6 or not flags & 2 else "differential"
+        variances = (formats.variance(std_mm * 1e-3) for std_mm in (horizontal_mm, horizontal_mm, vertical_mm))
+        fix = (lat * 1e-7, lon * 1e-7, height_mm * 1e-3, *variances)
+        moving = (east_mmps * 1e-3, north_mmps * 1e-3, *(formats.variance(speed_std_mmps * 1e-3),) * 2)
+        return (
+            *time,
+            Message(formats.FIX, "", utc_ns, fix, quality=quality, satellites=satellites),
+            Message(formats.VELOCITY, "", utc_ns, moving),
+        )
+
+    def relposned(self, payload: bytes) -> Sequence[Message]:
+        """The direction from the base's antenna to the rover's."""
+        version, week_ms, direction, accuracy, flags = RELPOSNED.unpack_from(payload)
+        if version != 1 or flags & HEADING_VALID != HEADING_VALID:
+            return ()
+        epoch_ms, epoch_ns = self._epoch or (week_ms, 0)
+        utc_ns = epoch_ns and epoch_ns + formats.wrapped((week_ms - epoch_ms) * 10**6, formats.WEEK_NS)
+        values = formats.heading(math.radians(direction * 1e-5), math.radians(accuracy * 1e-5))
+        return (Message(formats.HEADING, "", utc_ns, values),)
+
+    def measured(self, payload: bytes) -> Sequence[Message]:
+        """ESF-MEAS: one time for all words, before a word that repeats it."""
+        tag, flags, _ = MEAS.unpack_from(payload)
+        count = flags >> 11 or (len(payload) - MEAS.size) // 4 - (flags >> 3 & 1)
+        words = struct.unpack_from(f"<{count}I", payload, MEAS.size)
+        tag_ns = self._measured_clock.ns(tag)
+        inertial = () if self._has_raw else self._inertial((word, tag_ns) for word in words)
+        return [*inertial, *self._ticks(words, tag_ns)]
+
+    def raw(self, payload: bytes) -> Sequence[Message]:
+        """ESF-RAW: a time for each word; its IMU is that of ESF-MEAS, at a higher rate."""
+        self._has_raw = True
+        tagged = RAW.iter_unpack(payload[4:])
+        return list(self._inertial((word, self._raw_clock.ns(tag)) for word, tag in tagged))
+
+    def _inertial(self, tagged: Iterable[tuple[int, int]]) -> Iterator[Message]:
+        """Readings of all six axes, at the middle of their times."""
+        for word, tag_ns in tagged:
+            axis = word >> 24 & 63
+            if axis not in _SCALES:
+                continue
+            self._axes[axis] = tag_ns, formats.wrapped(word & 0xFFFFFF, 1 << 24) * _SCALES[axis]
+            if len(self._axes) < len(_SCALES):
+                continue
+            tags, values = zip(*(self._axes[a] for a in _SCALES), strict=True)
+            if max(tags) - min(tags) <= TOGETHER_NS:
+                yield Message(formats.IMU, "", 0, values, (min(tags) + max(tags)) // 2)
+                self._axes.clear()
+
+    def _ticks(self, words: Sequence[int], tag_ns: int) -> Sequence[Message]:
+        present = {word >> 24 & 63: word for word in words}
+        for left, right in AXLES:
+            if left in present and right in present:
+                ticks = [self._counted(wheel, present[wheel]) for wheel in dict.fromkeys((left, right))]
+                return (Message(formats.WHEELS, "", 0, (float(ticks[0]), float(ticks[-1])), tag_ns),)
+        return ()
+
+    def _counted(self, wheel: int, word: int) -> int:
+        """Ticks since the start, of a counter that starts again and counts up in reverse too."""
+        counter = word & (TICK_RANGE - 1)
+        before, total = self._wheels.get(wheel, (counter, 0))
+        driven = formats.wrapped(counter - before, TICK_RANGE)
+        total += -driven if word & BACKWARD else driven
+        self._wheels[wheel] = counter, total
+        return total
+
+
+_SCALES = dict.fromkeys(GYROS, RAD_PER_LSB) | dict.fromkeys(FORCES, MPS2_PER_LSB)
+
+
+class _TagClock:
+    """Time by a counter of ticks that starts again. unit_ns: of a tick."""
+
+    def __init__(self, unit_ns: float, period: int) -> None:
+        self._unit_ns, self._period = unit_ns, period
+        self._ticks = period  # so that what is a little older is no negative time
+
+    def ns(self, counter: int) -> int:
+        """Nanoseconds from an unknown start."""
+        self._ticks += formats.wrapped(counter - self._ticks, self._period)
+        return round(self._ticks * self._unit_ns)
+
+
+def _utc_ns(date: Sequence[int], nano: int) -> int:
+    """UTC of year, month, day, hour, minute, second and nanoseconds of either sign; second 60 is a leap second."""
+    *whole, second = date
+    if second > 60 or abs(nano) > 10**9:
+        raise ValueError(f"{second} s, {nano} ns are no time")
+    minute = datetime(*whole, tzinfo=UTC)  # type: ignore[arg-type, misc]
+    return formats.rolled_over((round(minute.timestamp()) + second) * 10**9 + nano)

@@ -1,0 +1,112 @@
+"""[[driver]] tables of agent.toml: what talks on which port, and which sensor each of its streams feeds."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+
+from agents.drivers import Source
+from agents.drivers.formats import STREAMS
+from agents.drivers.formats.framing import GPSD
+from agents.drivers.line import DECODERS, Line, split_stream
+from agents.drivers.receiver import Receiver
+from agents.drivers.sources import Sources
+from agents.drivers.time_base import TimeBase
+from agents.drivers.transports import split_address
+from protocol.errors import ConfigError
+from protocol.machine.machine_config import QUANTITIES, MachineConfig, SensorConfig
+
+PLUG_INS = "sitegrid.drivers"  # group of entry points
+
+
+@dataclass(frozen=True)
+class DriverConfig:
+    """One [[driver]]: a port that is listened to.
+
+    kind: `nmea`, `ubx`, `gpsd`, or the name of a plug-in. address: a serial port (`/dev/ttyACM0`), `tcp://HOST:PORT`,
+    `udp://[HOST]:PORT`, or a file of recorded bytes. baud: of a serial port; 0 finds it. feeds: the sensor that takes
+    each stream, one of STREAMS; `gp:fix` is that of one NMEA talker, or gpsd device, among several. options: of a
+    plug-in.
+    """
+
+    kind: str
+    address: str
+    baud: int = 0
+    feeds: Mapping[str, str] = field(default_factory=dict, hash=False)
+    options: Mapping[str, str] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        if self.kind not in (known := known_kinds()):
+            raise ValueError(f"kind: {self.kind!r} is none of {', '.join(known)}")
+        if not self.address or not self.address.isprintable():
+            raise ValueError(f"address: {self.address!r} is neither a port, tcp://HOST:PORT, udp://:PORT nor a file")
+        if not 0 <= self.baud <= 10_000_000:
+            raise ValueError(f"baud: {self.baud} is no baud; 0 finds it")
+        if self.kind not in DECODERS:
+            return
+        if self.options:
+            raise ValueError(f"options: of plug-ins alone, {self.kind} has none")
+        if "://" in self.address:
+            split_address(self.address)
+        for key in self.feeds:
+            if split_stream(key)[1] not in STREAMS:
+                raise ValueError(f"feeds: {key!r} is no stream; there are {', '.join(STREAMS)}")
+
+
+# Of a plug-in: makes the source of a table; raises ValueError where the table is wrong.
+Factory = Callable[[DriverConfig, MachineConfig], Source]
+
+
+def known_kinds() -> list[str]:
+    """Ours, then plug-ins that are installed."""
+    return [*DECODERS, *(plug_in.name for plug_in in entry_points(group=PLUG_INS))]
+
+
+def check_drivers(drivers: Sequence[DriverConfig], machine: MachineConfig, where: str) -> None:
+    """Refuse tables that do not fit each other or the machine; raises ConfigError."""
+    addresses = [driver.address for driver in drivers]
+    fed = [name for driver in drivers for name in driver.feeds.values()]
+    for names, what in ((addresses, "two listen at"), (fed, "two streams feed")):
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ConfigError(where, f"[[driver]]: {what} {twice}")
+    for i, driver in enumerate(drivers):
+        for key, name in driver.feeds.items():
+            sensor = machine.sensor(name)
+            problem = _misfit(driver, split_stream(key)[1], sensor) if sensor else f"no [[sensor]] is named {name!r}"
+            if problem:
+                raise ConfigError(f"{where} [[driver]] {i + 1} feeds.{key}", problem)
+
+
+def _misfit(driver: DriverConfig, stream: str, sensor: SensorConfig) -> str:
+    """Why a stream cannot feed a sensor; empty where it can."""
+    if driver.kind not in DECODERS:
+        return ""
+    if sensor.kind != (kind := STREAMS[stream]):
+        return f"{sensor.name} is of kind {sensor.kind}, and a {stream} feeds one of kind {kind}"
+    quantity = QUANTITIES[kind][0]
+    if driver.kind == GPSD and quantity not in sensor.std:
+        return f"gpsd's accuracies are no standard deviations: give {sensor.name} its `std = {{ {quantity} = ... }}`"
+    if stream == "heading" and sensor.provides("tilt"):
+        return f'two antennas show no tilt: give {sensor.name} `measures = ["heading"]`'
+    return ""
+
+
+def open_sources(
+    drivers: Sequence[DriverConfig], machine: MachineConfig, host_utc: Callable[[], tuple[int, int]]
+) -> Sources:
+    """Begin to listen. host_utc: the host's UTC and monotonic clock [ns], where no receiver states the time."""
+    time_base = TimeBase()
+    if not any(driver.kind in DECODERS for driver in drivers):
+        time_base.take("host", *host_utc())
+    return Sources({driver.address: _open(driver, machine) for driver in drivers}, time_base)
+
+
+def _open(driver: DriverConfig, machine: MachineConfig) -> Source:
+    if driver.kind in DECODERS:
+        feeds = {key: sensor for key, name in driver.feeds.items() if (sensor := machine.sensor(name))}
+        return Receiver(driver.address, driver.baud, driver.kind, Line(driver.kind, feeds))
+    plug_in = next(iter(entry_points(group=PLUG_INS, name=driver.kind)))
+    try:
+        factory: Factory = plug_in.load()
+        return factory(driver, machine)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"[[driver]] {driver.kind}", str(error)) from None
