@@ -5,11 +5,13 @@ import os
 import re
 import select
 import socket
+import time
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 MOST_BYTES = 1 << 16  # of a datagram, which is read whole or cut
+TOGETHER_S = 0.01  # bytes of so long are read at once: to wake up costs more than a frame; times are the senders' own
 CONNECT_S = 1.0  # a machine's own network answers in milliseconds
 WRITE_S = 1.0  # for a piece of what is sent, at any baud
 BITS = 10  # of a byte on a serial line: start, eight, stop
@@ -33,8 +35,10 @@ class Transport:
 
     def read(self, timeout_s: float) -> bytes | None:
         """Bytes that have come in, empty if none came, None at the end of a file; OSError where the link broke."""
-        if self.is_live and not select.select([self._link.fileno()], [], [], timeout_s)[0]:
-            return b""
+        if self.is_live:
+            if not select.select([self._link.fileno()], [], [], timeout_s)[0]:
+                return b""
+            time.sleep(TOGETHER_S)
         if data := os.read(self._link.fileno(), MOST_BYTES):
             return data
         if self.is_live:

@@ -23,6 +23,7 @@ GYROS, FORCES = (14, 13, 5), (16, 17, 18)  # data types of x, y, z
 RAD_PER_LSB, MPS2_PER_LSB = math.radians(2**-12), 2**-10
 AXLES = ((8, 9), (6, 7), (10, 10))  # left and right wheel of the rear axle, of the front one; one sensor for all
 BACKWARD, TICK_RANGE = 1 << 23, 1 << 23  # of a wheel: the flag of reverse; where its counter starts again
+SIGN = 1 << 23  # of a value in 24 bits
 TOGETHER_NS = 20 * 10**6  # between rates and forces of one reading: they come in frames of their own, 5 ms apart
 
 
@@ -98,7 +99,7 @@ class UbxDecoder:
             axis = word >> 24 & 63
             if axis not in _SCALES:
                 continue
-            self._axes[axis] = tag_ns, formats.wrapped(word & 0xFFFFFF, 1 << 24) * _SCALES[axis]
+            self._axes[axis] = tag_ns, ((word & 0xFFFFFF ^ SIGN) - SIGN) * _SCALES[axis]
             if len(self._axes) < len(_SCALES):
                 continue
             tags, values = zip(*(self._axes[a] for a in _SCALES), strict=True)
@@ -107,8 +108,8 @@ class UbxDecoder:
                 self._axes.clear()
 
     def _ticks(self, words: Sequence[int], tag_ns: int) -> Sequence[Message]:
-        present = {word >> 24 & 63: word for word in words}
-        for left, right in AXLES:
+        present = {kind: word for word in words if 6 <= (kind := word >> 24 & 63) <= 10}
+        for left, right in AXLES if present else ():
             if left in present and right in present:
                 ticks = [self._counted(wheel, present[wheel]) for wheel in dict.fromkeys((left, right))]
                 return (Message(formats.WHEELS, "", 0, (float(ticks[0]), float(ticks[-1])), tag_ns),)
