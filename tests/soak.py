@@ -1,8 +1,10 @@
 """Soak: hours of a site at work, compressed in time, against a real map server; its memory has to stay flat.
 
-python -m tests.soak: six hours in twelve minutes.
+python -m tests.soak: twelve hours in twelve minutes. With --whole there are 50 machines whose accelerometers have a
+zero that the server finds and takes off, corrections of a base station, a follower, and a page that is open.
 
-Machines drive laps and send batches of 4 s, stamped as in that hour; visitors ask for the map all along.
+Machines drive laps and send batches of 4 s, stamped as in that hour; visitors ask for the map all along. In the first
+third all is used for the first time, and calibration gathers the four hours of driving that it remembers of a machine.
 """
 
 from __future__ import annotations
@@ -15,12 +17,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import zenoh
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect as open_socket
 
 from protocol.arrays import Table
 from protocol.errors import QueryError
@@ -33,6 +38,7 @@ from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.client import Client, connect
 from sitegrid.process.children import Child, Children
+from tests.golden.make import FOLDER
 from tests.patience import PATIENCE_S
 
 START_NS = 1_767_225_600_000_000_000
@@ -40,16 +46,17 @@ SITE_TOML = 'name = "soak"\norigin_lat_deg = 49.01\norigin_lon_deg = 8.4\n'
 BATCH_S, RATE_HZ = 4.0, 2.5  # of a machine: one batch so often, so many samples a second (5 m/s, one each 2 m)
 ASK_S, PAST_S, LOOK_S = 10.0, 100.0, 60.0  # site time between two questions, two about the past, two looks
 MOST_GROWTH_PCT = 5.0
+WHOLE = 50  # machines
+ZERO = 0.004  # of an accelerometer, over g: this much is found within hours
 
 
 @dataclass(frozen=True)
 class Look:
-    """The site after so many minutes, and resident memory [MiB]."""
+    """The site after so many minutes, and resident memory of its processes [MiB]."""
 
     minute: float
     samples: int
-    server_mib: float
-    router_mib: float
+    mib: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -60,13 +67,13 @@ class Soak:
     sent: int
     late_s: float
 
-    def growth_pct(self) -> float:
-        """Growth of the server from the middle third of the run to its last: medians: one look is up to a tenth off.
+    def growth_pct(self, process: str = "server") -> float:
+        """Growth of a process from the middle third of the run to its last: medians: one look is up to a tenth off.
 
         In the first third everything is used for the first time. Between two looks memory goes up and down with what is
         being answered and folded.
         """
-        memory = [look.server_mib for look in self.looks]
+        memory = [look.mib[process] for look in self.looks]
         third = max(1, len(memory) // 3)
         return 100 * (float(np.median(memory[-third:]) / np.median(memory[-2 * third : -third])) - 1)
 
@@ -74,8 +81,9 @@ class Soak:
 class SoakMachine:
     """One machine on laps of its own around the site; positions err slowly, as those of GPS do."""
 
-    def __init__(self, name: str, seed: int) -> None:
-        self.name = name
+    def __init__(self, name: str, seed: int, zero: float = 0.0) -> None:
+        """zero: of its accelerometer, which c_rr and slope ahead have as well."""
+        self.name, self._zero = name, zero
         self._draw = np.random.default_rng(seed)
         self._centre_m, self._radius_m = self._draw.uniform(80, 220, 2), self._draw.uniform(20, 70)
         self._spool_id, self._seq = seed + 1, 0
@@ -100,67 +108,96 @@ class SoakMachine:
         rows["speed_mps"], rows["distance_m"] = 5.0, 5.0 / RATE_HZ
         rows["c_rr"] = 0.03 + 0.02 * (rows["x_m"] > 150) + self._draw.normal(0, 0.002, len(at_s))
         rows["c_rr_var"] = rows["grade_var"] = 1e-4
+        if self._zero:
+            rows["c_rr"] -= self._zero
+            rows["grade_e"] = self._zero * np.cos(rows["heading_rad"])
+            rows["grade_n"] = self._zero * np.sin(rows["heading_rad"])
         return rows
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run a soak and print its table; 1 where the memory grows."""
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=360.0, help="site time (default %(default)s)")
-    parser.add_argument("--speed", type=float, default=30.0, help="times real time (default %(default)s)")
+    parser.add_argument("--minutes", type=float, default=720.0, help="site time (default %(default)s)")
+    parser.add_argument("--speed", type=float, default=60.0, help="times real time (default %(default)s)")
     parser.add_argument("--machines", type=int, default=10, help="default %(default)s")
+    whole = f"{WHOLE} machines that are calibrated, a base station, a follower, an open page"
+    parser.add_argument("--whole", action="store_true", help=whole)
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
     arguments = parser.parse_args(words)
+    machines = WHOLE if arguments.whole else arguments.machines
     with tempfile.TemporaryDirectory() as folder:
-        result = soak(Path(folder), arguments.minutes, arguments.speed, arguments.machines)
-    growth_pct = result.growth_pct()
+        result = soak(Path(folder), arguments.minutes, arguments.speed, machines, whole=arguments.whole)
+    growth_pct = {process: round(result.growth_pct(process), 2) for process in result.looks[-1].mib}
     report(result, growth_pct)
     if arguments.json:
         last = result.looks[-1]
-        print(json.dumps({"samples": last.samples, "server_mib": last.server_mib, "growth_pct": round(growth_pct, 2)}))
-    return 0 if growth_pct < MOST_GROWTH_PCT else 1
+        print(json.dumps({"samples": last.samples, "mib": last.mib, "growth_pct": growth_pct}))
+    return 0 if max(growth_pct.values()) < MOST_GROWTH_PCT else 1
 
 
-def report(result: Soak, growth_pct: float) -> None:
-    print(" minute   samples   server MiB   router MiB")
+def report(result: Soak, growth_pct: Mapping[str, float]) -> None:
+    print(" minute   samples" + "".join(f"{process:>10} MiB" for process in growth_pct))
     step = max(1, len(result.looks) // 12)
     for look in result.looks[step - 1 :: step]:
-        print(f"{look.minute:7.0f} {look.samples:9d} {look.server_mib:12.1f} {look.router_mib:12.1f}")
-    print(f"last third: {growth_pct:+.1f} % of resident memory; sent {result.sent}, late {result.late_s:.0f} s")
+        print(f"{look.minute:7.0f} {look.samples:9d}" + "".join(f"{mib:14.1f}" for mib in look.mib.values()))
+    growth = ", ".join(f"{process} {pct:+.1f} %" for process, pct in growth_pct.items())
+    print(f"last third, of resident memory: {growth}; sent {result.sent}, late {result.late_s:.0f} s")
 
 
-def soak(folder: Path, minutes: float, speed: float, machines: int) -> Soak:
-    """Run router and map server, let machines drive and visitors ask; returns what was seen each minute."""
+def soak(folder: Path, minutes: float, speed: float, machines: int, *, whole: bool = False) -> Soak:
+    """Run router, map server and what else belongs to the whole, let machines drive and visitors ask.
+
+    Returns what was seen each minute.
+    """
     (folder / "site.toml").write_text(SITE_TOML)
     site, endpoint = load_site(folder / "site.toml"), free_endpoint()
-    with Children(folder) as children:
-        router = children.start("router", "router", "--listen", endpoint)
-        router.expect("ready", PATIENCE_S)
-        files = ("--site-file", folder / "site.toml", "--store", folder / "store")
-        server = children.start("server", "server", "--endpoint", endpoint, *files)
-        server.expect("ready", PATIENCE_S)
-        over = threading.Event()
-        asker = threading.Thread(target=_ask, args=(endpoint, speed, over))
-        asker.start()
-        try:
-            return _drive(site, endpoint, (server, router), (minutes * 60, speed, machines))
-        finally:
-            over.set()
-            asker.join()
+    site_file, store = ("--site-file", folder / "site.toml"), ("--store", folder / "store")
+    started = {"router": ("--listen", endpoint), "server": ("--endpoint", endpoint, *site_file, *store)}
+    if whole:
+        started["follow"] = ("--endpoint", endpoint, *site_file, *store, "--name", "second")
+        started["web"] = ("--endpoint", endpoint, "--site", site.name, "--listen", "0")
+    over = threading.Event()
+    with Children(folder) as children, ExitStack() as asking:
+        watched = {}
+        for name, options in started.items():
+            watched[name] = children.start(name, name, *options)
+            ready = watched[name].expect("ready", PATIENCE_S)
+        askers = [threading.Thread(target=_ask, args=(endpoint, speed, over))]
+        if whole:
+            page = f"ws{ready['url'].removeprefix('http')}api/v1/sites/{site.name}/live"
+            askers.append(threading.Thread(target=_look_on, args=(page, over)))
+        asking.callback(lambda: [asker.join() for asker in askers if asker.ident])
+        asking.callback(over.set)
+        for asker in askers:
+            asker.start()
+        return _drive(site, endpoint, watched, (minutes * 60, speed), _machines(machines, whole=whole))
 
 
-def _drive(site: SiteConfig, endpoint: str, watched: tuple[Child, Child], run: tuple[float, float, int]) -> Soak:
+def _machines(count: int, *, whole: bool) -> list[SoakMachine]:
+    return [SoakMachine(f"machine-{i}", seed=i, zero=ZERO * (i % 3) * whole) for i in range(count)]
+
+
+def _drive(
+    site: SiteConfig,
+    endpoint: str,
+    watched: Mapping[str, Child],
+    run: tuple[float, float],
+    machines: Sequence[SoakMachine],
+) -> Soak:
     """Send what all machines drive, one batch after the other, and look at the processes every minute of the site."""
-    end_s, speed, count = run
-    machines = [SoakMachine(f"machine-{i}", seed=i) for i in range(count)]
+    end_s, speed = run
     session = open_session(SessionConfig(endpoint))
     looks: list[Look] = []
     begin_s, sent, late_s = time.monotonic(), 0, 0.0
+    correction = (FOLDER / "correction.bin").read_bytes()
     with connect(endpoint, site.name) as client:
         for at_s in np.arange(0.0, end_s, BATCH_S):
             early_s = begin_s + at_s / speed - time.monotonic()
             late_s = max(late_s, -early_s * speed)
             time.sleep(max(0.0, early_s))
+            if "web" in watched:
+                session.put(keys.corrections(site.name, "base-1"), correction)
             for machine in machines:
                 _send(session, keys.ingest(site.name, machine.name), machine.drive(at_s, site.frame))
             sent += len(machines) * round(BATCH_S * RATE_HZ)
@@ -196,9 +233,21 @@ def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
                     print(error, file=sys.stderr)
 
 
-def _look(client: Client, watched: tuple[Child, Child], minute: float) -> Look:
-    pages = (int(Path(f"/proc/{child.pid}/statm").read_text().split()[1]) for child in watched)
-    return Look(minute, client.info().samples_merged, *(n * os.sysconf("SC_PAGE_SIZE") / 2**20 for n in pages))
+def _look_on(page: str, over: threading.Event) -> None:
+    """Keep a live page open that takes in all that it is sent."""
+    while not over.is_set():
+        with suppress(OSError, ConnectionClosed), open_socket(page, max_size=None) as socket:
+            while not over.is_set():
+                with suppress(TimeoutError):
+                    if isinstance(data := socket.recv(timeout=1.0), bytes):
+                        head = json.loads(data[4 : 4 + int.from_bytes(data[:4], "big")])
+                        socket.send(json.dumps({"row": head["row"], "fact": head["fact"]}))
+
+
+def _look(client: Client, watched: Mapping[str, Child], minute: float) -> Look:
+    page_mib = os.sysconf("SC_PAGE_SIZE") / 2**20
+    pages = {name: int(Path(f"/proc/{child.pid}/statm").read_text().split()[1]) for name, child in watched.items()}
+    return Look(minute, client.info().samples_merged, {name: n * page_mib for name, n in pages.items()})
 
 
 if __name__ == "__main__":

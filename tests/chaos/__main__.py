@@ -18,7 +18,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.chaos import bit_flips, damage_faults, disk_faults, pending_faults, reader_faults, site_faults, store_faults
+from tests.chaos import (
+    bit_flips,
+    damage_faults,
+    disk_faults,
+    pending_faults,
+    reader_faults,
+    site_faults,
+    store_faults,
+    visitor_faults,
+)
 from tests.chaos.outcome import Console, FaultOutcome, InterruptError, table
 from tests.chaos.recordings import make
 from tests.chaos.scenario import FaultRun
@@ -53,6 +62,9 @@ FAULTS = (
     ChaosFault("far_future", store_faults.far_future),
     ChaosFault("archive_clock", store_faults.archive_clock),
     ChaosFault("wal_flip", damage_faults.wal_flip, 0.03),
+    ChaosFault("visitors", visitor_faults.visitors, 0.05),
+    ChaosFault("scatter", visitor_faults.scatter),
+    ChaosFault("questions", reader_faults.questions, 0.02),
     ChaosFault("sleeping_reader", reader_faults.sleeping_reader, 0.06),
     ChaosFault("waiting_reader", reader_faults.waiting_reader, 0.02),
     ChaosFault("flips", bit_flips.flips, 0.02),

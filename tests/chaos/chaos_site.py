@@ -32,7 +32,7 @@ from tests.memory import memory_mb
 
 READY_S = 120.0  # a server's first start in a new folder compiles its kernels
 RESUME_S = 60.0
-ROUTER, SERVER, SECOND = "router", "server", "second"  # the last: a map server with a store of its own
+ROUTER, SERVER, SECOND, WEB = "router", "server", "second", "web"  # the second: a map server with a store of its own
 COMMAND = ("-m", "sitegrid.cli")
 HOUR_S = 3600
 # The cheaper filter, and a short lag: the suite needs many samples that are true to their form and come soon, not good
@@ -72,7 +72,8 @@ class ChaosSite:
             (folder / name).mkdir(parents=True)
         self.folder, self.console = folder, console
         self.machines = recordings.machines
-        self.endpoints = dict.fromkeys((ROUTER, SERVER, SECOND, *self.machines), free_endpoint())
+        self.guests: tuple[str, ...] = ()  # names of machines that are no processes, see guests.py
+        self.endpoints = dict.fromkeys((ROUTER, SERVER, SECOND, WEB, *self.machines), free_endpoint())
         self.prefix: dict[str, tuple[str, ...]] = {}
         self.env: dict[str, dict[str, str]] = {}
         self.options: dict[str, tuple[str, ...]] = {}
@@ -111,7 +112,7 @@ class ChaosSite:
             self.start(role)
             if role in (ROUTER, SERVER):
                 self.wait_ready(role)
-        self._wait(lambda: self.progress().keys() >= set(self.machines), READY_S, "no samples from every machine")
+        self.wait(lambda: self.progress().keys() >= set(self.machines), READY_S, "no samples from every machine")
         ended = [f"{role}: {p.code} {p.last_words()}" for role, p in self._running.items() if p.code is not None]
         if wrong := [*self.outcome.problems[before:], *ended]:
             raise StartError("; ".join(wrong))
@@ -153,13 +154,13 @@ class ChaosSite:
     def words_of_refusal(self, role: str) -> str | None:
         """Wait until a process that was started works, None, or has refused to: its last words."""
         process = self._running[role]
-        self._wait(lambda: process.said("ready") or process.code is not None, READY_S, f"{role} is not ready")
+        self.wait(lambda: process.said("ready") or process.code is not None, READY_S, f"{role} is not ready")
         return process.last_words() if process.code is not None and not process.said("ready") else None
 
     def deliver_rest(self, machine: str) -> None:
         """Have a machine that is not running deliver what its spool has, and nothing new."""
         process = self.start(machine, idle=True)
-        self._wait(lambda: process.code is not None, RESUME_S, "left-over samples are not delivered")
+        self.wait(lambda: process.code is not None, RESUME_S, "left-over samples are not delivered")
         self._running.pop(machine).end()
 
     def log_of(self, role: str) -> str:
@@ -186,11 +187,11 @@ class ChaosSite:
     def wait_end(self, role: str) -> tuple[int | None, str]:
         """Wait for a process to end by itself; returns its exit code, None if it runs on, and its last words."""
         process = self._running[role]
-        self._wait(lambda: process.code is not None, READY_S, f"{role} runs on")
+        self.wait(lambda: process.code is not None, READY_S, f"{role} runs on")
         return self._running.pop(role).code, process.last_words()
 
     def wait_ready(self, role: str) -> None:
-        self._wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
+        self.wait(lambda: self._running[role].said("ready"), READY_S, f"{role} is not ready")
 
     def wait_runs(self) -> None:
         """Wait until there are samples of every start of every agent in the journal."""
@@ -200,7 +201,7 @@ class ChaosSite:
             runs = Counter(machine for machine, _ in self._marks())
             return all(runs[machine] >= self._starts_of[machine] for machine in self.machines)
 
-        self._wait(are_there, READY_S, "some runs have no samples")
+        self.wait(are_there, READY_S, "some runs have no samples")
 
     def wait_delivered(self) -> None:
         """Wait until all that the agents have recorded so far is in the journal, while they run."""
@@ -210,7 +211,7 @@ class ChaosSite:
             recorded = {machine: len(read_audit(self.folder / "audit" / machine)) for machine in self.machines}
             return all(progress.get(machine, 0) == n for machine, n in recorded.items())
 
-        self._wait(is_there, RESUME_S, "recorded samples stay with their machines")
+        self.wait(is_there, RESUME_S, "recorded samples stay with their machines")
 
     def tend(self) -> None:
         """Start again what has ended by itself; only the end of a drive, or one with an excuse, is no problem."""
@@ -255,7 +256,7 @@ class ChaosSite:
         for machine in self.machines:
             self.start(machine, idle=True)
         drained = [self._running[machine] for machine in self.machines]
-        self._wait(lambda: all(p.code is not None for p in drained), RESUME_S, "left-over samples are not delivered")
+        self.wait(lambda: all(p.code is not None for p in drained), RESUME_S, "left-over samples are not delivered")
         for machine, process in zip(self.machines, drained, strict=True):
             self._running.pop(machine)
             process.end()
@@ -295,10 +296,10 @@ class ChaosSite:
             progress = self.progress()
             return all(progress.get(machine, 0) > before.get(machine, 0) for machine in self.machines)
 
-        self._wait(is_served, RESUME_S, "service does not resume")
+        self.wait(is_served, RESUME_S, "service does not resume")
 
     def _count(self, ended_s: float, resumed_s: float) -> None:
-        audits = {machine: self.folder / "audit" / machine for machine in self.machines}
+        audits = {machine: self.folder / "audit" / machine for machine in (*self.machines, *self.guests)}
         store, site = self.folder / "store", load_site(self.folder / "site.toml")
         result = audit_store(audits, store, site, ServerConfig())
         with SqliteReader(store / JOURNAL_FILE) as reader:
@@ -323,7 +324,8 @@ class ChaosSite:
             longest_pause([s for s in stamps if s < resumed_s], self.faults, resumed_s) for stamps in commits.values()
         )
 
-    def _wait(self, is_so: Callable[[], bool], timeout_s: float, problem: str) -> None:
+    def wait(self, is_so: Callable[[], bool], timeout_s: float, problem: str) -> None:
+        """Wait until something holds; a problem if it never does."""
         end_s = time.monotonic() + timeout_s
         while not is_so():
             if time.monotonic() > end_s:
@@ -335,6 +337,8 @@ class ChaosSite:
         where, site = ("--endpoint", self.endpoints[role]), ("--site-file", str(self.folder / "site.toml"))
         if role == ROUTER:
             return ["router", "--listen", self.endpoints[role], *self.options.get(role, ())]
+        if role == WEB:
+            return ["web", *where, "--site", self.name, *self.options.get(role, ())]
         if role in (SERVER, SECOND):
             folder = self.folder / ("store" if role == SERVER else SECOND)
             store = ("--store", str(folder), "--config", str(self.folder / "server.toml"))

@@ -54,6 +54,22 @@ def looping(ask: Ask) -> None:
                     list(ask(f"piece?cursor={piece['cursor']};number={number}"))
 
 
+def greedy(ask: Ask) -> None:
+    """Ask for what reads most of the ground that is known, one after the other."""
+    zigzag = ",".join(f"{x},{y}" for n, y in enumerate(range(0, 1800, 60)) for x in ((0, 1790), (1790, 0))[n % 2])
+    for query in itertools.cycle(
+        (
+            f"route?line={zigzag};step=1000;stops=none",
+            "region?bounds=0,0,1799,1799;resolution=1000",
+            "region?bounds=0,0,1799,1799;as_of=1767225700000000000;layers=resistance",
+            "way?from=5,5;to=980,980",
+            "worklist",
+            "tiles",
+        )
+    ):
+        list(ask(query))
+
+
 def waiting(ask: Ask) -> None:
     """Wait for a row that never comes, as often as one can, and for the past meanwhile."""
     held = [ask("info?after=1000000000;wait=60") for _ in range(WAITING)]
@@ -62,7 +78,7 @@ def waiting(ask: Ask) -> None:
     del held
 
 
-KINDS = {one.__name__: one for one in (sleeping, leaving, looping, waiting)}
+KINDS = {one.__name__: one for one in (sleeping, leaving, looping, greedy, waiting)}
 
 
 def main(kind: str, endpoint: str, site: str) -> None:

@@ -6,13 +6,17 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
+from http.client import HTTPException
 from itertools import cycle
+
+import numpy as np
 
 from protocol.errors import SitegridError
 from sitegrid.client import connect
 from tests.chaos.chaos_site import ROUTER, SERVER, ChaosSite
+from tests.chaos.guests import Guest, made_up
 from tests.chaos.leashed import Process
 from tests.chaos.outcome import FaultOutcome
 from tests.chaos.scenario import FaultRun
@@ -22,6 +26,7 @@ MOST_MEMORY = 1.5  # of the server: its peak, as a multiple of what it has with 
 LONGEST_ANSWER_S = 5.0  # of a reader that behaves, while others wait
 SETTLE_S, LASTS_S, PAUSE_S = 4.0, 6.0, 1.0
 EVERY_S = 0.2
+KNOWN_M, LANE_M, STEP_M, SURVEY_MPS = 1800.0, 14.0, 2.5, 25.0  # 3.2 km2 of known ground, below what a question may read
 SLEEPING = (("sleeping", 10), ("looping", 2), ("leaving", 10))
 WAITING = (("waiting", 3),)
 
@@ -39,11 +44,33 @@ def waiting_reader(scenario: FaultRun) -> FaultOutcome:
     return outcome
 
 
-def _strike(scenario: FaultRun, kinds: Sequence[tuple[str, int]]) -> FaultOutcome:
+def questions(scenario: FaultRun) -> FaultOutcome:
+    """One reader asks the largest questions that are allowed, over some square kilometres of known ground."""
+    return _strike(scenario, (("greedy", 1),), _know_much)
+
+
+def _know_much(site: ChaosSite) -> None:
+    """Have a fast machine drive all over KNOWN_M x KNOWN_M, to and fro."""
+    along_m = np.arange(0.0, KNOWN_M, STEP_M)
+    with closing(Guest(site, "surveyor")) as surveyor:
+        for number, x_m in enumerate(np.arange(0.0, KNOWN_M, LANE_M)):
+            y_m, first_s = along_m if number % 2 else along_m[::-1], number * (KNOWN_M + LANE_M) / SURVEY_MPS
+            lane = made_up(np.full(len(y_m), x_m), y_m, first_s, STEP_M / SURVEY_MPS, 1.0, STEP_M)
+            if problem := surveyor.send(lane):
+                site.problem(f"samples of an honest machine are refused: {problem}")
+            site.tend()
+
+
+def _strike(
+    scenario: FaultRun, kinds: Sequence[tuple[str, int]], prepare: Callable[[ChaosSite], None] | None = None
+) -> FaultOutcome:
     """Let each kind of reader come once, and again while there is time; beside them one that behaves."""
     with scenario.site() as site:
         site.start_all()
-        with closing(_Reader(site)) as reader:
+        if prepare:
+            prepare(site)
+        client = connect(site.endpoints[ROUTER], site.name, timeout_s=60.0)
+        with closing(client), closing(Asker(lambda: client.point(0.0, 0.0))) as reader:
             site.linger(SETTLE_S)
             idle_mb = site.forget_peak_mb(SERVER)
             reader.forget()
@@ -80,14 +107,16 @@ def _come_and_go(scenario: FaultRun, site: ChaosSite, kinds: Sequence[tuple[str,
     return count
 
 
-class _Reader:
-    """A reader that behaves, on a thread of its own: asks for a point now and then, and notes how long that takes."""
+class Asker:
+    """One that behaves, on a thread of its own: asks now and then, and notes how long that takes.
 
-    def __init__(self, site: ChaosSite) -> None:
-        self._longest_s = 0.0
+    ask: raises where it is refused, or not answered. answers: how many it has.
+    """
+
+    def __init__(self, ask: Callable[[], object]) -> None:
+        self.answers, self._longest_s = 0, 0.0
         self._asked_s: float | None = None  # since when it waits
-        self._client = connect(site.endpoints[ROUTER], site.name, timeout_s=60.0)
-        self._stop = threading.Event()
+        self._ask, self._stop = ask, threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -102,11 +131,11 @@ class _Reader:
     def close(self) -> None:
         self._stop.set()
         self._thread.join()
-        self._client.close()
 
     def _run(self) -> None:
         while not self._stop.wait(EVERY_S):
             self._asked_s = time.monotonic()
-            with suppress(SitegridError):  # refused, or not answered: as long as that took
-                self._client.point(0.0, 0.0)
+            with suppress(SitegridError, OSError, HTTPException):  # refused, or not answered: as long as that took
+                self._ask()
+                self.answers += 1
             self._longest_s, self._asked_s = self.longest_s(), None

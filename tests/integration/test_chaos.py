@@ -19,6 +19,7 @@ from tests.chaos import (
     reader_faults,
     site_faults,
     store_faults,
+    visitor_faults,
 )
 from tests.chaos.disk_shim import build
 from tests.chaos.outcome import Console, FaultOutcome
@@ -113,6 +114,17 @@ def test_readers_that_sleep_cost_machines_nothing(tmp_path):
     assert 0 < outcome.ack_ms_max <= reader_faults.LONGEST_ACK_MS
     assert 0.9 < outcome.memory_ratio <= reader_faults.MOST_MEMORY
     assert outcome.answer_s_max > 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc, addresses of loopback")
+@pytest.mark.parametrize("fault", [visitor_faults.visitors, visitor_faults.scatter, reader_faults.questions])
+def test_strangers_take_no_more_than_their_share(tmp_path, fault):
+    recordings = make(tmp_path / "recordings", machines=2, seed=3, seconds=60)
+    outcome = fault(scenario(tmp_path / "run", recordings=recordings, seconds=1.0))
+    assert outcome.problems == [], "among others: machines that are not served, a server that took more memory"
+    assert (outcome.lost, outcome.double, outcome.silent) == (0, 0, 0)
+    assert outcome.recorded == outcome.merged > 30
+    assert outcome.count > 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="LD_PRELOAD")

@@ -13,7 +13,8 @@ pytestmark = pytest.mark.processes
 
 
 def seen(*server_mib: float) -> Soak:
-    return Soak(tuple(Look(i + 1.0, 100 * i, mib, 40.0) for i, mib in enumerate(server_mib)), 1000, 0.0)
+    looks = (Look(i + 1.0, 100 * i, {"server": mib, "router": 40.0}) for i, mib in enumerate(server_mib))
+    return Soak(tuple(looks), 1000, 0.0)
 
 
 @pytest.mark.nightly
@@ -34,8 +35,8 @@ def test_growth_is_that_of_the_last_third():
 
 @pytest.mark.parametrize(("last", "code"), [(104.9, 0), (105.1, 1)])
 def test_memory_that_grows_is_a_failure(last: float, code: int, monkeypatch: pytest.MonkeyPatch, capsys):
-    monkeypatch.setattr("tests.soak.soak", lambda *_: seen(*[100.0] * 10, *[last] * 5))
+    monkeypatch.setattr("tests.soak.soak", lambda *_, **__: seen(*[100.0] * 10, *[last] * 5))
     assert main(["--json"]) == code
     lines = capsys.readouterr().out.splitlines()
-    assert json.loads(lines[-1])["growth_pct"] == pytest.approx(last - 100, abs=0.01)
-    assert "% of resident memory" in lines[-2]
+    assert json.loads(lines[-1])["growth_pct"] == pytest.approx({"server": last - 100, "router": 0.0}, abs=0.01)
+    assert "of resident memory: server +" in lines[-2]
