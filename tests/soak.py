@@ -17,8 +17,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as open_socket
 
 from protocol.arrays import Table
-from protocol.errors import QueryError
+from protocol.errors import SitegridError
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
@@ -221,16 +221,23 @@ def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
         next_past_s = PAST_S
         begin_s = time.monotonic()
         while not over.wait(ASK_S / speed):
-            client.region((0, 0, 300, 300), ["resistance", "grade", "confidence"])
-            client.point(150, 150)
-            client.machines()
-            if (at_s := (time.monotonic() - begin_s) * speed) >= next_past_s:
-                next_past_s = at_s + PAST_S
-                client.history(150, 150, ["resistance"], span_s=300)
-                try:
+            with _survived():
+                client.region((0, 0, 300, 300), ["resistance", "grade", "confidence"])
+                client.point(150, 150)
+                client.machines()
+                if (at_s := (time.monotonic() - begin_s) * speed) >= next_past_s:
+                    next_past_s = at_s + PAST_S
+                    client.history(150, 150, ["resistance"], span_s=300)
                     client.point(120, 0, as_of_ns=START_NS + round(at_s * 0.5e9))
-                except QueryError as error:
-                    print(error, file=sys.stderr)
+
+
+@contextmanager
+def _survived() -> Iterator[None]:
+    """A visitor who is refused, or not answered, says so and asks again."""
+    try:
+        yield
+    except SitegridError as error:
+        print(error, file=sys.stderr)
 
 
 def _look_on(page: str, over: threading.Event) -> None:

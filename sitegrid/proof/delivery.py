@@ -1,7 +1,8 @@
 """Lost and double: what agents recorded, against the server's journal and against its grid.
 
 Identity is (machine, spool_id, seq), content is the hash of the sample's bytes. The journal is folded again from
-nothing and compared with the grid that the server left in its last snapshot, count by count.
+nothing and compared, count by count, with the grid that a server would start with: that of the last snapshot, and the
+rows since, where this one had to end before it could write another.
 """
 
 from __future__ import annotations
@@ -66,7 +67,10 @@ def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, conf
         rows = list(history_rows(History(journal, location.archive)))
         facts = Decisions.of_journal(journal).facts
     last = rows[-1].row if rows else 0
-    _, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, facts.of_evidence())
+    folded, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, facts.of_evidence())
+    for row in rows:
+        if row.row > folded and row.machine not in facts.excluded:
+            _fold(grid, row, facts)
     return compare(read_audits(audits), rows, grid, site, config, facts)
 
 
@@ -87,8 +91,7 @@ def compare(
         if row.machine in facts.excluded:
             withheld += len(row.rows)
         else:
-            corrected = facts.corrections.applied(row.rows, [row.machine], np.zeros(len(row.rows), np.int64))
-            refolded.fold(corrected, row.machine)
+            _fold(refolded, row, facts)
         for i, sample in enumerate(row.rows):
             content = content_hash(sample)
             hashes.setdefault((row.machine, row.spool_id, row.first_seq + i), []).append(content)
@@ -104,6 +107,10 @@ def compare(
         double=max(by_identity, by_content) + over,
         unrecorded=sum(identity not in recorded for identity in hashes),
     )
+
+
+def _fold(grid: Grid, row: JournalRow, facts: Facts) -> None:
+    grid.fold(facts.corrections.applied(row.rows, [row.machine], np.zeros(len(row.rows), np.int64)), row.machine)
 
 
 def grid_difference(expected: GridState, actual: GridState) -> tuple[int, int]:
