@@ -190,7 +190,7 @@ def _drive(
     session = open_session(SessionConfig(endpoint))
     looks: list[Look] = []
     begin_s, sent, late_s = time.monotonic(), 0, 0.0
-    correction = (FOLDER / "correction.bin").read_bytes()
+    correction = (FOLDER / "corrections.bin").read_bytes()
     with connect(endpoint, site.name) as client:
         for at_s in np.arange(0.0, end_s, BATCH_S):
             early_s = begin_s + at_s / speed - time.monotonic()

@@ -6,6 +6,7 @@ The law is that what was read can be written and read again, and is the same the
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import sqlite3
 import tempfile
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 
 from agents.config import load_agent
 from agents.estimation import calibration_file
@@ -25,7 +27,7 @@ from agents.estimation.calibration import Calibration
 from mapserver.config import ServerConfig
 from mapserver.journal.archive import FOLDER as ARCHIVE
 from mapserver.journal.archive import next_file
-from mapserver.journal.archive_file import ArchiveFile
+from mapserver.journal.archive_file import KEY, ArchiveFile, seal
 from mapserver.journal.rows import Admission, JournalRow
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
@@ -35,6 +37,7 @@ from protocol.files import load_toml, sealed
 from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu
+from protocol.machine.samples import check_samples
 from protocol.queries import requests
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command, parse_command
@@ -43,9 +46,11 @@ from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import NamedMachine
 from protocol.site.geometry import Bounds
-from protocol.site.site_config import SiteConfig
+from protocol.site.site_config import MAX_EXTENT_M, SiteConfig
 from protocol.site.site_file import load_site
+from protocol.wire.codec import receive_pose
 from protocol.wire.credentials import check_valid, load_credentials
+from protocol.wire.keys import check_name, pose
 from protocol.wire.messages import SampleBatch
 from protocol.wire.offer_codec import decode_offer, encode_offer
 from sim.config import load_sim
@@ -53,6 +58,7 @@ from sitegrid.logs.log_truth import read_known_ground, read_log_truth
 from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml
 from tests.fuzz.messages import messages
 from tests.fuzz.mutations import files, texts
+from tests.fuzz.strangers import archives, web
 from tests.fuzz.verdict import Decoder
 from tests.golden.make import EXTENT_M, FOLDER, GOLDEN, NEWER, OLDER, T0, rows
 from tests.paths import CONFIG
@@ -75,7 +81,7 @@ _KEPT: list[tempfile.TemporaryDirectory[str]] = []
 
 @cache
 def decoders() -> tuple[Decoder, ...]:
-    return (*_messages(), *_selectors(), *_configs(), *_logs(), *_kept())
+    return (*_messages(), *_selectors(), *_configs(), *_logs(), *_kept(), *web())
 
 
 # --- messages --------------------------------------------------------------------------------------------------------
@@ -118,6 +124,11 @@ def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], 
         assert abs(value.rows["x_m"]).max(initial=0) <= EXTENT_M
     if name == "region":
         assert isinstance(value.bounds, Bounds)
+    if name == "pose":
+        with suppress(MessageError):  # what every pose is put through behind its codec
+            heard = receive_pose(pose("paper", "loader-1"), data)
+            assert heard.machine == "loader-1"
+            assert max(abs(heard.x_m), abs(heard.y_m)) <= MAX_EXTENT_M
     if name == "error":
         assert str(value).isprintable()
     if name == "reply":
@@ -302,6 +313,7 @@ def _logs() -> Iterator[Decoder]:
 def _log(folder: Path, file: str, data: bytes) -> None:
     (folder / file).write_bytes(data)
     log = open_log(folder)
+    assert all((folder / source.file.file).resolve().is_relative_to(folder.resolve()) for source in log.sources)
     known = [stamp_ns for stamp_ns, _ in log.timed()]
     assert known == sorted(known)
 
@@ -332,7 +344,7 @@ def _kept() -> Iterator[Decoder]:
 
     yield Decoder("calibration", (path.read_bytes(),), decode, (StoreError,), texts, path.name)
     yield _journal(workshop() / "journal")
-    yield _archive(workshop() / "archive")
+    yield from _archive(workshop() / "archive")
 
 
 def _journal(folder: Path) -> Decoder:
@@ -351,8 +363,8 @@ def _journal(folder: Path) -> Decoder:
     return Decoder("journal", (record,), decode, (StoreError,), files, "row 2 is damaged")
 
 
-def _archive(folder: Path) -> Decoder:
-    """A file that is damaged anywhere."""
+def _archive(folder: Path) -> Iterator[Decoder]:
+    """A file that is damaged anywhere, and one that a stranger has sealed."""
     expected = _write_journal(folder)
     with SqliteReader(folder / "journal.db") as reader:
         made = next_file(folder / ARCHIVE, reader, SITE, T0 + 360_000 * 10**9)
@@ -362,7 +374,23 @@ def _archive(folder: Path) -> Decoder:
         made.write_bytes(data)
         _compare(list(ArchiveFile(made).read()), expected)
 
-    return Decoder("archive", (made.read_bytes(),), decode, (StoreError,), files, made.name)
+    yield Decoder("archive", (made.read_bytes(),), decode, (StoreError,), files, made.name)
+    strange = folder / "strange.parquet"
+
+    def decode_strange(data: bytes) -> None:
+        with strange.open("w+b") as file:
+            file.write(data)
+            with suppress(OSError):  # of what states no footer, that is none
+                seal(file)
+        for row in ArchiveFile(strange).read():
+            check_samples(row.rows, MAX_EXTENT_M)
+            check_name(row.machine, "machine")
+
+    plain = io.BytesIO()
+    table = pq.read_table(made)
+    header = {KEY: pq.read_metadata(made).metadata[KEY]}
+    pq.write_table(table.replace_schema_metadata(header), plain)
+    yield Decoder("strange_archive", (plain.getvalue(),), decode_strange, (StoreError,), archives, strange.name)
 
 
 def _write_journal(folder: Path) -> list[JournalRow]:
