@@ -5,7 +5,6 @@ The manifest may lie apart from the data, so that logs of others are described w
 
 import csv
 import heapq
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -39,7 +38,7 @@ from protocol.machine.machine_config import (
     plain_lines,
     sensor_lines,
 )
-from protocol.machine.readings import Reading, columns, parse_reading
+from protocol.machine.readings import MAX_STAMP_NS, Reading, columns, parse_reading
 from protocol.site.site_config import SiteConfig, site_toml
 
 MANIFEST = "log.toml"
@@ -230,7 +229,8 @@ def _parse_source(table: Any, site: SiteConfig, where: str) -> SensorFile:
 def _take_ahead_s(table: dict[str, Any]) -> float:
     """Take a `delay_s` out of a sensor's table that is an offset of its clock: in a recording nothing comes late."""
     delay_s = table.get("delay_s")
-    if isinstance(delay_s, int | float) and math.isfinite(delay_s) and not -MAX_EARLY_S <= delay_s <= MAX_DELAY_S:
+    is_time = type(delay_s) in (int, float) and abs(delay_s) < MAX_STAMP_NS  # not NaN, nor beyond all floats
+    if is_time and not -MAX_EARLY_S <= delay_s <= MAX_DELAY_S:
         return float(table.pop("delay_s"))
     return 0.0
 
