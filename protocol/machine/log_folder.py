@@ -228,7 +228,7 @@ def _parse_source(table: Any, site: SiteConfig, where: str) -> SensorFile:
 
 def _take_ahead_s(table: dict[str, Any]) -> float:
     """Take a `delay_s` out of a sensor's table that is an offset of its clock: in a recording nothing comes late."""
-    delay_s = table.get("delay_s")
+    delay_s: Any = table.get("delay_s")
     is_time = type(delay_s) in (int, float) and abs(delay_s) < MAX_STAMP_NS  # not NaN, nor beyond all floats
     if is_time and not -MAX_EARLY_S <= delay_s <= MAX_DELAY_S:
         return float(table.pop("delay_s"))
