@@ -82,7 +82,7 @@ PARTS = (
     Part("soak", 780, (("tests.soak",),)),
 )
 WEEKLY = (
-    Part("soak-hour", 3700, (("tests.soak", "--minutes", "1800"),)),
+    Part("soak-hour", 3700, (("tests.soak", "--minutes", "3600"),)),
     Part("takeovers", 1500, (("tests.takeover", "--count", "200"),)),
 )
 
