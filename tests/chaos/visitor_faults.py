@@ -29,7 +29,7 @@ from tests.chaos.visitor import KINDS, PATIENCE_S, trusting
 
 ROUND_S = 8.0  # at least, from one kill of the server to the next
 ANSWERS = 5  # of each question of a visitor that behaves, in a round
-WEB_MB = 400.0  # that all visitors may cost the web server: 128 MB of regions and their text, 500 sockets with TLS
+WEB_MB = 600.0  # that all visitors may cost the web server: of 470, large answers take 320 and sockets 150
 BATCHES = 400  # of each machine that scatters or wanders, in the whole suite
 GUEST_MB = 60.0  # that one of them may cost the map server, whatever it sends
 FAR_M, FAR_DEG = 9000.0, 0.05  # from the origin, and of longitude: where nobody is
