@@ -22,7 +22,7 @@ COOKIE = "sitegrid"
 RATE_HZ, BURST = 100.0, 500.0  # requests of one address: a GIS asks for some hundred tiles when its view moves
 ADDRESSES = 4096  # whose rate is known; the one that was silent longest is forgotten first
 MAX_PATH, MAX_QUERY = 1024, 32_768  # bytes of a path, and of parameters: a polygon of 1000 corners
-OPEN_PATHS = ("/healthz",)
+OPEN_PATHS = ("/healthz",)  # says nothing of a site; who watches a server asks without a token, by any name
 _HOST = re.compile(r"(\[[^][]*\]|[^][:@/?#]*)(:\d*)?")  # a Host header: a name or address, and a port
 HEADERS = {
     "Content-Security-Policy": (
@@ -79,7 +79,8 @@ class Guard:
             detail = f"more than {MAX_PATH} bytes of path, or {MAX_QUERY} of parameters; ask for less"
             raise Problem(HTTPStatus.REQUEST_URI_TOO_LONG, "too_large", detail)
         _check_body(headers)
-        self._check_host(headers)
+        if scope["path"] not in OPEN_PATHS:
+            self._check_host(headers)
         self._count_rate(scope)
         if self._person and scope["path"] not in OPEN_PATHS:
             person, token = self._person, _token(scope, headers)
