@@ -49,6 +49,7 @@ def serve(
     """Serve sites, each a name (see `connect` for None) and an endpoint, until `stop` is set."""
     listening = opened.enter_context(listen(address))
     person = TokenFile(arguments.tokens).person if arguments.tokens else None
+    secured = _tls(arguments.tls)
     names = {name.lower() for name in (address[0], socket.gethostname(), *arguments.hosts)}
     clients: list[Client] = []
     for name, endpoint in sites:
@@ -76,7 +77,7 @@ def serve(
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=1,
-            **_tls(arguments.tls),
+            **secured,
         )
         server = uvicorn.Server(config)
         watch = asyncio.create_task(_stop_with(server, stop))

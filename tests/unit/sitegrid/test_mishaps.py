@@ -150,11 +150,15 @@ def test_without_a_router_it_is_named(command: Command, capsys, tmp_path):
     given = {"endpoint": nowhere, "site_file": str(_site_file(tmp_path)), "store": "store"}
     if command.words[0] == "agent":  # which drives and records without one
         assert "no [machine] is described" in refused(command.line(given | {"spool": "x.db"}), capsys)
+    elif command.words[0] == "web":
+        pytest.skip("waits for it: tests/integration/test_web.py")
     elif command.words[0] == "doctor":
         assert main(command.line({"endpoint": nowhere})) == 1
         assert f"nothing listens at {nowhere}" in capsys.readouterr().out
     else:
-        line = refused(command.line(given), capsys)
+        (tmp_path / "base.toml").write_text('name = "base-1"\nsource = "tcp://127.0.0.1:1"\n')
+        config = {"config": "base.toml"} if command.words[0] == "corrections" else {}
+        line = refused(command.line(given | config), capsys)
         assert nowhere in line
         assert "start one with `sitegrid router`" in line
         assert ".rs" not in line, "no sources of Zenoh"

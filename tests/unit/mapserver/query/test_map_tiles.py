@@ -161,7 +161,7 @@ def test_an_empty_map_has_no_tiles_and_no_reasons(tmp_path):
 def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
     monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 3000)
     with closing(open_writer(tmp_path)) as writer:
-        rows = random_samples(3000, 4, half_m=200.0)
+        rows = random_samples(2000, 4, half_m=200.0)
         quarters = [rows[2 * (rows["x_m"] < 0) + (rows["y_m"] < 0) == i] for i in range(4)]
         send(writer, [incoming(quarter, machine=f"m-{i}") for i, quarter in enumerate(quarters)])  # each has its credit
         answers = answers_of(writer)

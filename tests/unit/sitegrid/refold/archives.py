@@ -34,6 +34,7 @@ def samples(rng: np.random.Generator, n: int, *, days: float = 2.0, heavy: bool 
     rows["cov_xx_m2"], rows["cov_yy_m2"] = std**2, (std * rng.uniform(0.5, 1, n)) ** 2
     rows["heading_rad"], rows["distance_m"] = rng.uniform(-3, 3, n), rng.uniform(0, 2, n)
     rows["c_rr"] = np.where(rng.random(n) < 0.1, np.nan, rng.uniform(0.01, 0.3, n))
+    rows["c_rr_var"][np.isnan(rows["c_rr"])] = np.nan
     rows["grade_e"], rows["grade_n"] = rng.normal(0, 0.1, (2, n))
     if heavy:
         rows["x_m"] = rows["y_m"] = 0.0
