@@ -6,6 +6,7 @@ import threading
 import pytest
 
 from sitegrid.process.children import wait_until
+from tests.patience import PATIENCE_S
 from tests.tcp_proxy import Proxy, Weather
 
 
@@ -33,7 +34,7 @@ def echo():
 
 
 def reach(proxy: Proxy) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", int(proxy.endpoint.rpartition(":")[2])), timeout=5.0)
+    return socket.create_connection(("127.0.0.1", int(proxy.endpoint.rpartition(":")[2])), timeout=PATIENCE_S)
 
 
 def test_it_counts_what_it_carries_in_each_direction(echo: int):
