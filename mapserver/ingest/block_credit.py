@@ -96,17 +96,23 @@ class BlockCredit:
             survey(rows, self._limits, self._bucket_ns, place, steps, self._entered)
         keys, numbers = self._entered[:used].T
         pairs = keys << BUCKET_BITS | rows["stamp_ns"][numbers] // self._bucket_ns % 2**BUCKET_BITS
-        credit, counted_m, new, entered, known = before.credit, 0.0, set[int](), set[int](), before.entered
+        counted_m, new, entered, known = 0.0, set[int](), set[int](), before.entered
+        jumps, driven, pages = before.credit
+        driven_at = steps.tolist()
         for key, row, pair in zip(keys.tolist(), numbers.tolist(), pairs.tolist(), strict=True):
             if pair in entered or pair in known:
                 continue
-            until_m, by_jump = steps[row].tolist()
-            credit, counted_m = self._earned(credit, until_m - counted_m), until_m
-            pays = "pages" if key in self.opened or key in new else "jumps"
-            if not by_jump and credit.driven >= 1:
-                pays = "driven"
-            credit = credit._replace(**{pays: getattr(credit, pays) - 1})
-            if min(credit) < 0:
+            until_m, by_jump = driven_at[row]
+            if until_m > counted_m:
+                jumps, driven, pages = self._earned(Credit(jumps, driven, pages), until_m - counted_m)
+                counted_m = until_m
+            if not by_jump and driven >= 1:
+                driven -= 1
+            elif key in self.opened or key in new:
+                pages -= 1
+            else:
+                jumps -= 1
+            if jumps < 0 or pages < 0:
                 if len(rows) == 1:
                     left = replace(before, credit=self._earned(before.credit, until_m))
                     self._move(machine, left, rows, has_jumped=bool(by_jump))
@@ -118,7 +124,7 @@ class BlockCredit:
         if len(known) > MOST_PAIRS:
             known.clear()
         known |= entered
-        credit = self._earned(credit, steps.item(len(rows) - 1, 0) - counted_m)
+        credit = self._earned(Credit(jumps, driven, pages), driven_at[-1][0] - counted_m)
         self._move(machine, replace(before, credit=credit, entered=known), rows, has_jumped=has_jumped)
         self.opened |= new
 
