@@ -53,7 +53,7 @@ def parse_caster(address: str, user: str = "", password: str = "") -> Caster:
     if not port or not parts.hostname or not re.fullmatch(r"[!-~]{1,100}", mountpoint):
         raise ConfigError(address, "is not like ntrip://HOST[:PORT]/MOUNTPOINT (ntrips: with TLS)")
     if parts.username is not None:
-        raise ConfigError("--user", "and --password-file have user and password, not the address, which everybody sees")
+        raise ConfigError(parts.hostname, "say who asks in `user` and `password`, not the address: everybody sees it")
     return Caster(parts.hostname, port, mountpoint, user, password, parts.scheme == "ntrips")
 
 

@@ -13,7 +13,7 @@ from threading import Event
 from typing import Any
 
 from agents.corrections.ntrip import PORTS, NtripStream, parse_caster
-from agents.corrections.rtcm import RtcmFramer
+from agents.corrections.rtcm import rtcm_framer
 from agents.drivers.transports import Transport, open_transport, split_address, why_closed
 from protocol.errors import ConfigError, LinkError
 from protocol.site.site_config import SiteConfig
@@ -79,7 +79,7 @@ class Relay:
         self.problem = ""
         self._publish, self._config, self._site, self._wait = publish, config, site, wait
         self._stream: Transport | NtripStream | None = None
-        self._framer = RtcmFramer()
+        self._framer = rtcm_framer()
         self._frames: list[bytes] = []
         self._gathered_s = self._said_s = self._framed_s = time.monotonic()
         self._retry_s = RETRY_S
@@ -124,7 +124,7 @@ class Relay:
             place = (site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m)
             caster = parse_caster(config.source, config.user, config.password)
             stream = NtripStream(caster, place if config.sends_position else None)
-        self._framer, self._framed_s = RtcmFramer(), time.monotonic()
+        self._framer, self._framed_s = rtcm_framer(), time.monotonic()
         return stream
 
     def _take(self, data: bytes) -> None:
@@ -132,7 +132,7 @@ class Relay:
             return
         self._framed_s, self._retry_s = time.monotonic(), RETRY_S
         self._gathered_s = self._gathered_s if self._frames else self._framed_s
-        self._frames += frames
+        self._frames += [frame.data for frame in frames]
         self.counters["frames"] += len(frames)
         self._framer.broken = 0
         self._tell("")

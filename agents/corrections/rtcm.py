@@ -1,15 +1,13 @@
-"""RTCM3 frames out of bytes: 0xD3, six zero bits, ten of length, a message, CRC-24Q (RTCM 10403, section 4). Pure.
+"""RTCM3 frames out of bytes: 0xD3, six zero bits, ten of length, a message, CRC-24Q (RTCM 10403, section 4). Pure."""
 
-What seems to begin a frame is a candidate until its end has come, and what begins inside of it is one too. So a spoiled
-length hides no whole frame, and holds none up.
-"""
-
-import re
 from functools import reduce
 
+from agents.drivers.formats.framing import Framer, Framing
+
+RTCM, PREAMBLE = "rtcm3", 0xD3
 AROUND = 3  # bytes of preamble and length before a message, and of the CRC behind it
 POLYNOMIAL = 0x1864CFB
-_BEGIN = re.compile(rb"\xd3[\x00-\x03]")
+MOST_BYTES = 1023 + 2 * AROUND
 
 
 def _entry(byte: int) -> int:
@@ -27,56 +25,27 @@ def crc24q(data: bytes | bytearray) -> int:
     return crc
 
 
-class RtcmFramer:
-    """Cuts a stream of bytes into frames. broken: how many bytes belong to none. It keeps less than two frames."""
+def _end(buffer: bytes | bytearray, start: int) -> int | None:
+    """Where a frame that begins at `start` ends, by its length; None where none begins there."""
+    if buffer[start + 1 : start + 2] > b"\x03":
+        return None
+    if len(buffer) < start + AROUND:
+        return start + 2 * AROUND
+    return start + int.from_bytes(buffer[start + 1 : start + AROUND], "big") + 2 * AROUND
 
-    def __init__(self) -> None:
-        self.broken = 0
-        self._buffer = bytearray()
-        self._open: list[int] = []  # candidates whose end has not come
-        self._searched = 0  # up to where candidates are known
 
-    def feed(self, data: bytes) -> list[bytes]:
-        """The frames that these bytes make whole."""
-        buffer, done = self._buffer, 0
-        buffer += data
-        candidates = [*self._open, *(match.start() for match in _BEGIN.finditer(buffer, self._searched))]
-        frames, self._open = list[bytes](), []
-        for start in candidates:
-            if start < done:
-                continue
-            end = _end(buffer, start)
-            if len(buffer) < max(end, start + AROUND):
-                self._open.append(start)
-            elif not crc24q(buffer[start:end]):
-                frames.append(bytes(buffer[start:end]))
-                self.broken += start - done
-                self._open, done = [], end
-        self._forget(done)
-        return frames
-
-    def _forget(self, done: int) -> None:
-        """Drop the bytes that no candidate needs."""
-        searched = len(self._buffer) - self._buffer.endswith(b"\xd3")
-        first = min([max(searched, done), *self._open])
-        self.broken += first - done
-        del self._buffer[:first]
-        self._open = [start - first for start in self._open]
-        self._searched = max(searched - first, 0)
+def rtcm_framer() -> Framer:
+    """Cuts a stream of bytes into frames; all bytes between them are broken ones."""
+    return Framer({RTCM: Framing(bytes([PREAMBLE]), MOST_BYTES, _end, lambda frame: not crc24q(frame))}, between=b"")
 
 
 def whole_frames(data: bytes) -> list[bytes]:
     """Frames that lie end to end; ValueError at the first byte that begins none, so that nothing is looked at twice."""
     frames, at = list[bytes](), 0
     while at < len(data):
-        end = _end(data, at)
-        if not _BEGIN.match(data, at) or end > len(data) or crc24q(data[at:end]):
+        end = _end(data, at) if data[at] == PREAMBLE else None
+        if end is None or end > len(data) or crc24q(data[at:end]):
             raise ValueError(f"no whole frame of RTCM3 at byte {at} of {len(data)}")
         frames.append(data[at:end])
         at = end
     return frames
-
-
-def _end(data: bytes | bytearray, start: int) -> int:
-    """Where a frame that begins at `start` ends, by its length."""
-    return start + int.from_bytes(data[start + 1 : start + AROUND], "big") + 2 * AROUND

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 
 from agents.drivers import Observed
 from agents.drivers.formats import FIX, STREAMS, TIME, Decoder, Message
-from agents.drivers.formats.framing import GPSD, NMEA, UBX, Frame, Framer
+from agents.drivers.formats.framing import FRAMINGS, GPSD, NMEA, UBX, Frame, Framer
 from agents.drivers.formats.gpsd import GpsdDecoder
 from agents.drivers.formats.nmea import NmeaDecoder
 from agents.drivers.formats.ubx import UbxDecoder
@@ -32,7 +32,7 @@ class Line:
         self._feeds = {split_stream(key): sensor for key, sensor in feeds.items()}
         self.has_fixes = any(stream == FIX for _, stream in self._feeds)
         self._decoder = DECODERS[format_]({source for source, _ in self._feeds})
-        self._framer = Framer()
+        self._framer = Framer(FRAMINGS)
         self._counters: Counter[str] = Counter()
         self._ties: dict[str, ClockTie] = {}  # of sensors' own clocks, by stream
         self._file_ns = 0

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from agents.drivers.formats.framing import Framer
+from agents.drivers.formats.framing import FRAMINGS, Framer
 from agents.drivers.line import Line
 from protocol.machine.machine_config import SensorConfig
 
@@ -131,7 +131,7 @@ def spoil(draw: random.Random, data: bytes) -> bytes:
 
 def run(format_: str, cases: int, seed: int = 0) -> Outcome:
     """Feed so many frames in pieces of any size, a whole one behind each tenth."""
-    draw, line, framer = random.Random(f"{format_} {seed}"), Line(format_, FEEDS), Framer()
+    draw, line, framer = random.Random(f"{format_} {seed}"), Line(format_, FEEDS), Framer(FRAMINGS)
     whole, stream, sent, read, used_s = WHOLE[format_], bytearray(), 0, 0, 0.0
     for i in range(cases):
         stream += spoil(draw, MAKERS[format_](draw))

@@ -6,7 +6,7 @@ spoiled length hides nothing, and a whole frame is out as soon as its last byte 
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
@@ -32,15 +32,24 @@ class Framing:
 
     sync: bytes
     most: int
-    end: Callable[[bytearray, int], int | None]
+    end: Callable[[bytes | bytearray, int], int | None]
     is_whole: Callable[[bytes], bool]
 
 
 class Framer:
-    """Cuts a stream of bytes into frames of all formats. broken: how many bytes belong to none."""
+    """Cuts a stream of bytes into frames of some formats, whose first bytes differ.
 
-    def __init__(self) -> None:
+    between: bytes that may stand between frames. broken: how many others belong to none.
+    """
+
+    def __init__(self, framings: Mapping[str, Framing], between: bytes = b"\r\n") -> None:
         self.broken = 0
+        self._by_first = {framing.sync[0]: (name, framing) for name, framing in framings.items()}
+        syncs = [framing.sync for framing in framings.values()]
+        self._sync = re.compile(b"|".join(map(re.escape, syncs)))
+        cut = b"|".join(re.escape(sync[:n]) for sync in syncs for n in range(1, len(sync)))
+        self._cut_sync, self._longest = re.compile(b"(?:" + cut + rb")\Z"), max(map(len, syncs))
+        self._between = between
         self._buffer = bytearray()
         self._open: list[int] = []  # candidates whose end has not come
         self._searched = 0  # up to where candidates are known
@@ -49,13 +58,12 @@ class Framer:
         """The frames that these bytes make whole."""
         buffer, done = self._buffer, 0
         buffer += data
-        candidates = [*self._open, *(match.start() for match in _SYNC.finditer(buffer, self._searched))]
+        candidates = [*self._open, *(match.start() for match in self._sync.finditer(buffer, self._searched))]
         frames, self._open = list[Frame](), []
         for start in candidates:
             if start < done:
                 continue
-            name = _BY_FIRST[buffer[start]]
-            framing = FRAMINGS[name]
+            name, framing = self._by_first[buffer[start]]
             end = framing.end(buffer, start)
             if end is None or end - start > framing.most:
                 continue
@@ -70,7 +78,7 @@ class Framer:
 
     def _forget(self, done: int) -> None:
         """Drop the bytes that no candidate needs, nor a sync that is cut."""
-        cut = _CUT_SYNC.search(self._buffer, max(done, len(self._buffer) - LONGEST_SYNC))
+        cut = self._cut_sync.search(self._buffer, max(done, len(self._buffer) - self._longest))
         searched = cut.start() if cut else len(self._buffer)
         first = min([searched, *self._open])
         self._count_broken(done, first)
@@ -79,10 +87,10 @@ class Framer:
         self._searched = searched - first
 
     def _count_broken(self, begin: int, end: int) -> None:
-        self.broken += len(self._buffer[begin:end].strip(b"\r\n"))
+        self.broken += len(self._buffer[begin:end].strip(self._between))
 
 
-def _ubx_end(buffer: bytearray, start: int) -> int | None:
+def _ubx_end(buffer: bytes | bytearray, start: int) -> int | None:
     """Two bytes of sync, class, identity, length, payload, two of checksum."""
     if len(buffer) < start + 6:
         return start + 8
@@ -98,7 +106,7 @@ def _ubx_is_whole(frame: bytes) -> bool:
 _NMEA_END = re.compile(rb"[^ -#%-)+-~]")  # the star before the checksum, or what no sentence holds
 
 
-def _nmea_end(buffer: bytearray, start: int) -> int | None:
+def _nmea_end(buffer: bytes | bytearray, start: int) -> int | None:
     match = _NMEA_END.search(buffer, start + 1)
     if match is None:
         return len(buffer) + 1
@@ -113,7 +121,7 @@ def _nmea_is_whole(frame: bytes) -> bool:
     return frame[-2:].upper() == b"%02X" % checksum
 
 
-def _gpsd_end(buffer: bytearray, start: int) -> int | None:
+def _gpsd_end(buffer: bytes | bytearray, start: int) -> int | None:
     end = buffer.find(b"\n", start)
     return end + 1 if end >= 0 else len(buffer) + 1
 
@@ -130,8 +138,3 @@ FRAMINGS = {
     NMEA: Framing(b"$", 255, _nmea_end, _nmea_is_whole),  # 82 by the standard, more where receivers are precise
     GPSD: Framing(b'{"class":', 10_240, _gpsd_end, _gpsd_is_whole),  # gpsd's own limit
 }
-_BY_FIRST = {framing.sync[0]: name for name, framing in FRAMINGS.items()}
-_SYNC = re.compile(b"|".join(re.escape(framing.sync) for framing in FRAMINGS.values()))
-_CUT = [re.escape(framing.sync[:n]) for framing in FRAMINGS.values() for n in range(1, len(framing.sync))]
-_CUT_SYNC = re.compile(b"(?:" + b"|".join(_CUT) + rb")\Z")
-LONGEST_SYNC = max(len(framing.sync) for framing in FRAMINGS.values())

@@ -8,7 +8,8 @@ import random
 import pytest
 from pyrtcm import RTCMReader, calc_crc24q
 
-from agents.corrections.rtcm import RtcmFramer, crc24q, whole_frames
+from agents.corrections.rtcm import crc24q, rtcm_framer, whole_frames
+from agents.drivers.formats.framing import Framer
 from tests.paths import SHARED_DATA
 
 RECORDING = SHARED_DATA / "recordings" / "rtcm3_ntrip.rtcm"
@@ -30,11 +31,11 @@ def garbage(rng: random.Random) -> bytes:
     )
 
 
-def fed(data: bytes, rng: random.Random, most: int = 700) -> tuple[list[bytes], RtcmFramer]:
-    framer, frames, at = RtcmFramer(), list[bytes](), 0
+def fed(data: bytes, rng: random.Random, most: int = 700) -> tuple[list[bytes], Framer]:
+    framer, frames, at = rtcm_framer(), list[bytes](), 0
     while at < len(data):
         size = rng.randint(1, most)
-        frames += framer.feed(data[at : at + size])
+        frames += [frame.data for frame in framer.feed(data[at : at + size])]
         assert len(framer._buffer) < 2 * 1029 + size
         at += size
     return frames, framer
@@ -55,10 +56,10 @@ def test_every_whole_frame_among_broken_ones_is_found_and_nothing_else(seed: int
 
 
 def test_a_whole_frame_is_out_with_its_last_byte_whatever_seems_to_have_begun() -> None:
-    rng, framer = random.Random(1), RtcmFramer()
+    rng, framer = random.Random(1), rtcm_framer()
     whole = frame(rng, 100)
     assert framer.feed(b"\xd3\x03\xff" + whole[:-1]) == []
-    assert framer.feed(whole[-1:]) == [whole]
+    assert [frame.data for frame in framer.feed(whole[-1:])] == [whole]
 
 
 def test_noise_without_end_is_dropped_and_counted() -> None:

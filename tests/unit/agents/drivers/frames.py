@@ -1,15 +1,17 @@
-"""Bytes as receivers send them, made by libraries that others wrote."""
+"""Bytes as receivers send them, made by libraries that others wrote; and a source whose values are known."""
 
 from __future__ import annotations
 
 import json
 import random
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pyubx2 import GET, UBXMessage
 
+from agents.drivers import Observed
 from tests.paths import SHARED_DATA
 
 TEN = 1_795_688_127  # 2026-11-26 10:15:27 UTC [s]
@@ -83,3 +85,22 @@ def recording(name: str) -> Path:
     if not path.is_file():
         pytest.skip(f"the recording is not beside the project (../shared/data/recordings/{name})")
     return path
+
+
+class Script:
+    """A source that hands on these pieces."""
+
+    def __init__(self, pieces: Sequence[Sequence[Observed]]) -> None:
+        self._pieces = list(pieces)
+
+    def read(self, timeout_s: float) -> Sequence[Observed] | None:
+        return self._pieces.pop(0) if self._pieces else None
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+    def problems(self) -> list[str]:
+        return []
+
+    def close(self) -> None:
+        pass

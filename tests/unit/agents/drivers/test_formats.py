@@ -11,7 +11,7 @@ import pytest
 import pyubx2
 
 from agents.drivers.formats import EARLIEST_NS, FIX, HEADING, IMU, TIME, VELOCITY, WEEK_NS, Message
-from agents.drivers.formats.framing import Framer
+from agents.drivers.formats.framing import FRAMINGS, Framer
 from agents.drivers.formats.gpsd import GpsdDecoder
 from agents.drivers.formats.nmea import NmeaDecoder
 from agents.drivers.formats.ubx import UbxDecoder
@@ -31,7 +31,7 @@ SENSORS = {
 
 def messages(decoder: Any, *frames: bytes, host_ns: int = 0) -> list[Message]:
     """What a decoder makes of whole frames, without the bare times."""
-    whole = [frame for data in frames for frame in Framer().feed(data)]
+    whole = [frame for data in frames for frame in Framer(FRAMINGS).feed(data)]
     made = [message for frame in whole for message in decoder.decode(frame.data, host_ns)]
     return [message for message in made if message.stream != TIME]
 
@@ -47,7 +47,7 @@ def last(made: list[Message], stream: str) -> Message:
 @pytest.mark.parametrize(("format_", "frame"), [("ubx", pvt()), ("nmea", nmea(GGA)), ("gpsd", report(TPV))])
 def test_every_whole_frame_among_broken_ones_is_read(format_: str, frame: bytes, piece: int) -> None:
     stream, whole = spoiled([frame] * 300)
-    framer, read = Framer(), Counter[str]()
+    framer, read = Framer(FRAMINGS), Counter[str]()
     for begin in range(0, len(stream), piece):
         frames = framer.feed(stream[begin : begin + piece])
         read.update(one.format for one in frames if one.data.strip() == frame.strip())
@@ -56,7 +56,7 @@ def test_every_whole_frame_among_broken_ones_is_read(format_: str, frame: bytes,
 
 
 def test_a_frame_is_out_with_its_last_byte_whatever_lengths_before_it_promise() -> None:
-    framer, frame = Framer(), pvt()
+    framer, frame = Framer(FRAMINGS), pvt()
     assert framer.feed(b'\xb5\x62\x01\x07\xf0\x0f{"class":$GNGGA,' + frame[:-1]) == []
     assert [out.data for out in framer.feed(frame[-1:])] == [frame]
 

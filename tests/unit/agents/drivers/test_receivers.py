@@ -30,7 +30,7 @@ from agents.sampling import joined
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Gps, Imu, Reading
 from tests.patience import until
-from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, esf, nmea, pvt, report, spoiled
+from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, Script, esf, nmea, pvt, report, spoiled
 from tests.unit.agents.drivers.test_formats import SENSORS
 from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, drive
 
@@ -303,25 +303,6 @@ def test_a_port_that_cannot_be_opened_says_why(tmp_path: Path, device: Device, m
 
 
 # --- one time base ---------------------------------------------------------------------------------------------------
-
-
-class Script:
-    """A source whose pieces are known."""
-
-    def __init__(self, pieces: Sequence[Sequence[Observed]]) -> None:
-        self._pieces = list(pieces)
-
-    def read(self, timeout_s: float) -> Sequence[Observed] | None:
-        return self._pieces.pop(0) if self._pieces else None
-
-    def counters(self) -> dict[str, int]:
-        return {}
-
-    def problems(self) -> list[str]:
-        return []
-
-    def close(self) -> None:
-        pass
 
 
 def played(**sources: Sequence[Sequence[Observed]]) -> tuple[list[Reading], Sources]:

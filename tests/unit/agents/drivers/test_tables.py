@@ -1,4 +1,3 @@
-from collections.abc import Sequence
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from agents.drivers.tables import DriverConfig, known_kinds, open_sources
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Payload
+from tests.unit.agents.drivers.frames import Script
 
 MACHINE = """
 [machine]
@@ -56,23 +56,12 @@ def _toml(value: object) -> str:
     return str(value) if isinstance(value, int) else f'"{value}"'
 
 
-class Scale:
+class Scale(Script):
     """A plug-in: a weighing system that speaks once."""
 
     def __init__(self, table: DriverConfig, machine: MachineConfig) -> None:
-        self._pieces = [[Observed(machine.sensors[0].name, "payload", (float(table.options["kg"]),), 5 * 10**9)]]
-
-    def read(self, timeout_s: float) -> Sequence[Observed] | None:
-        return self._pieces.pop() if self._pieces else None
-
-    def counters(self) -> dict[str, int]:
-        return {}
-
-    def problems(self) -> list[str]:
-        return []
-
-    def close(self) -> None:
-        pass
+        value = Observed(machine.sensors[0].name, "payload", (float(table.options["kg"]),), 5 * 10**9)
+        super().__init__([[value]])
 
 
 def test_a_plug_in_is_a_kind_and_without_receivers_its_time_is_the_host_s_as_it_was_at_the_start(
