@@ -22,10 +22,10 @@ from agents.localisation.filters.state import YAW
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.fix import Fix
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
+from agents.localisation.place_watch import PlaceWatch
 from agents.localisation.repeats import Repeats
 from agents.localisation.tracker import Event, Tracker, TrackerConfig, gps_velocity
-from agents.localisation.travel_sign import TravelSign
-from agents.localisation.wheels.place_watch import PlaceWatch
+from agents.localisation.wheels.travel_sign import TravelSign
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, GpsVelocity

@@ -13,8 +13,8 @@ from enum import Enum
 from agents.dead_reckoning import PAUSE_NS, PAUSE_S, DeadReckoning, WheelTracker, rolled_between
 from agents.ground_speed import moved_variance, velocity_variances
 from agents.localisation.imu_steps import Sensed
-from agents.localisation.travel_sign import TravelSign
 from agents.localisation.wheels.stretches import Kind, Place, Run, Stretches
+from agents.localisation.wheels.travel_sign import TravelSign
 from protocol.machine.machine_config import BASE, MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity, Imu, Odometry, WheelReading
 from protocol.site.site_config import Projection

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agents.localisation.localiser import LocalisationConfig
-from agents.localisation.wheels.place_watch import CLEAR_S, MARGIN_NS, MOST_CLEAR_S, PlaceWatch
+from agents.localisation.place_watch import CLEAR_S, MARGIN_NS, MOST_CLEAR_S, PlaceWatch
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import joined

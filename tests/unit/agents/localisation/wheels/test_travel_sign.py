@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from agents.localisation.travel_sign import TravelSign
+from agents.localisation.wheels.travel_sign import TravelSign
 from protocol.units import GRAVITY_MPS2
 
 STEP_S = 0.05
