@@ -70,9 +70,9 @@ class CalibrationDecision:
             Correction(machine, from_ns, to_ns, zero, scale, across, tuple(map(tuple, covariance)), most_share, *rolls)
             for from_ns, to_ns, zero, scale, across, most_share, covariance, *rolls in body["spans"]
         )
-        numbers = [(one.zero, one.scale, one.across, one.most_share, *chain(*one.covariance)) for one in corrections]
-        if not all(map(math.isfinite, chain(*numbers))):
-            raise ValueError(f"has a correction of {machine} that is not finite")
+        numbers = chain(*((*values(one), *chain(*one.covariance)) for one in corrections))
+        if not all(map(math.isfinite, numbers)) or any(one.rolls <= -1 for one in corrections):
+            raise ValueError(f"has a correction of {machine} that no solver made")
         return cls(machine, body["by"], body["reason"], body["stamp_ns"], corrections, body["remembered"])
 
 

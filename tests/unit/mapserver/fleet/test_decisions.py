@@ -1,6 +1,7 @@
 """Which corrections count: hysteresis of the solver, people above it, events, and spans painted over each other."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -191,6 +192,16 @@ def test_a_person_s_correction_stands_until_it_is_taken_back():
 def test_what_another_version_wrote_is_refused():
     body = person(0.02).body() | {"version": 2, "spans": {"another": "form"}}
     with pytest.raises(ValueError, match=r"version 2.*knows 1"):
+        CalibrationDecision.from_body(body)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("zero", math.nan), ("rolls", -1.0), ("rolls", math.inf), ("drags", math.nan)]
+)
+def test_a_correction_that_no_solver_made_is_refused(name: str, value: float):
+    made = person(0.02)
+    body = replace(made, corrections=(replace(made.corrections[0], **{name: value}),)).body()
+    with pytest.raises(ValueError, match="no solver made"):
         CalibrationDecision.from_body(body)
 
 
