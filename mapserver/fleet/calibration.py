@@ -118,7 +118,7 @@ def _solved(
 ) -> Calibration:
     """What a solve with these priors says."""
     trusted = {name: table for name, table in known.items() if name not in excluded}
-    pb, result, unlike = _tyres_apart(*_common_ground(trusted, areas, priors))
+    pb, result, unlike = _with_rolling(*_common_ground(trusted, areas, priors))
     observed = observe(pb, result)
     corrections, states = _said(pb, result, observed, unlike)
     states |= {pb.names[i]: replace(states[pb.names[i]], rolling=one) for i, one in unlike.items()}
@@ -150,7 +150,7 @@ def _common_ground(
     return others if fewer[1].edges else fewer
 
 
-def _tyres_apart(pb: Problem, result: Estimate) -> tuple[Problem, Estimate, Mapping[int, Rolling]]:
+def _with_rolling(pb: Problem, result: Estimate) -> tuple[Problem, Estimate, Mapping[int, Rolling]]:
     """Solved again with machines that roll unlike the others as such, which pull on no other one's scale then.
 
     Where nobody can be named all are: then slopes alone show scales, which are the less sure for it.

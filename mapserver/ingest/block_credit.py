@@ -26,8 +26,6 @@ from protocol.site.geometry import BLOCK_CELLS
 
 JUMPS = 50  # to new ground, each of as many blocks as a sample can open: 200 blocks with cells of 1 m
 JUMP_M = 200.0  # driven for each further one
-
-
 PAGES, FIRST_PAGES = 4000.0, 500.0  # blocks of opened ground, each of up to 11 kB: at most, and of a new machine
 STAY_S = 30.0  # of the server's clock for as many pages as a sample needs: a machine that stays has one bucket in 300 s
 # Of the credit of a new machine, what the next one has less, and what all have more in a minute: names are free where

@@ -24,7 +24,6 @@ from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 PIECE_BYTES = 256 * 256 * 3 * 4  # of an answer: three layers of 256 x 256 cells
 READ_BYTES = 2**24  # layers of cells that one answer is made of, where larger cells are their means
-STEP = BLOCK_CELLS
 MOST_OPEN = 16  # regions that are read at the same time
 IDLE_S = 30.0  # a region of which nobody takes a piece for so long makes room; one piece takes 20 s at 300 kbit/s
 OPEN_S = 600.0  # ... and one that is open for so long, since its pages leave the grid one by one
@@ -60,7 +59,7 @@ class PieceGrid:
     window: CellWindow
     width: int
     height: int
-    step: int = STEP
+    step: int = BLOCK_CELLS
 
     @classmethod
     def of_layers(cls, window: CellWindow, layers: int, count: int = 1) -> PieceGrid:
@@ -68,14 +67,13 @@ class PieceGrid:
 
         count: cells of the map to a side of one of the window. QueryError where one alone is made of more.
         """
-        cells, step = min(PIECE_BYTES // (4 * layers), READ_BYTES // (4 * layers * count**2)), 1 if count > 1 else STEP
+        cells = min(PIECE_BYTES // (4 * layers), READ_BYTES // (4 * layers * count**2))
+        step = 1 if count > 1 else BLOCK_CELLS
         if not cells:
             most = math.isqrt(READ_BYTES // (4 * layers))
             problem = f"cells of {count} x {count} cells of the map, with {layers} layers"
-            raise QueryError(
-                Refusal.TOO_LARGE,
-                f"{problem}: at most {most} x {most}; ask for fewer `layers`, or a finer `resolution`",
-            )
+            instead = "ask for fewer `layers`, or a finer `resolution`"
+            raise QueryError(Refusal.TOO_LARGE, f"{problem}: at most {most} x {most}; {instead}")
         if window.columns * window.rows <= cells:
             return cls(window, window.columns + step, window.rows + step, step)
         side = math.isqrt(cells)

@@ -32,9 +32,8 @@ EDGE_M = 20.0  # so far beyond the known ground a way may lead: around its corne
 DETOUR = 0.5
 LEAST_DETOUR_M = 60.0
 MAX_CELLS = 1_000_000  # of the window of a way: 1 x 1 km, searched in about a second, with 300 MB
-MOST_SQUARES = (
-    768  # of 64 x 64 cells with known ground: 49 km straight on; 120 KB each, and as much while they are read
-)
+# Of 64 x 64 cells with known ground: 49 km straight on; 120 KB each, and as much while they are read.
+MOST_SQUARES = 768
 GROUND = ("resistance_filled", "grade_east_filled", "grade_north_filled", "visits")
 
 
