@@ -37,9 +37,7 @@ KILLS, WAIT_S = 4, 60.0
 
 
 def rows_of(number: int) -> Table:
-    rows = samples(np.random.default_rng(number), 20, days=0.1)
-    rows["c_rr"] = 0.05
-    return rows
+    return samples(np.random.default_rng(number), 20, days=0.1)
 
 
 def send(store: Store, number: int, site: SiteConfig = SITE) -> None:
