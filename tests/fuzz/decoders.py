@@ -39,12 +39,8 @@ from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu
 from protocol.machine.samples import check_samples
 from protocol.queries import requests
-from protocol.queries.answers import MapVersion
-from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command, parse_command
+from protocol.queries.commands import encode_command, parse_command
 from protocol.queries.parameters import selector_of, split_selector
-from protocol.queries.roads import SegmentsQuery, WorklistQuery
-from protocol.queries.route_requests import RouteQuery, WayQuery
-from protocol.queries.routing import NamedMachine
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import MAX_EXTENT_M, SiteConfig
 from protocol.site.site_file import load_site
@@ -60,6 +56,7 @@ from tests.fuzz.messages import messages
 from tests.fuzz.mutations import files, texts
 from tests.fuzz.strangers import archives, web
 from tests.fuzz.verdict import Decoder
+from tests.golden import questions
 from tests.golden.make import EXTENT_M, FOLDER, GOLDEN, NEWER, OLDER, T0, rows
 from tests.paths import CONFIG
 
@@ -146,37 +143,10 @@ def _again(name: str, encode: Callable[[Any], bytes], decode: Callable[[bytes], 
 
 
 def _selectors() -> Iterator[Decoder]:
-    fresh, when = requests.Freshness(17, 2.5), requests.When(T0, T0 - 10**9)
-    asked = (
-        requests.PointQuery(12.0, -40.5, ("resistance", "visits"), fresh, when),
-        requests.RegionQuery(Bounds(0.0, 0.0, 200.0, 150.0), ("resistance",), fresh, when),
-        requests.RegionQuery(((0.0, 0.0), (9.0, 0.5), (3.0, 8.0)), (), fresh, when, 2.0),
-        requests.PointsQuery(((1.5, -2.0), (3.0, 4.0)), ("visits",), fresh, when),
-        RouteQuery(((0.0, 0.0), (30.0, 40.0)), NamedMachine("truck-1", (("mass_kg", 3e4),)), fresh=fresh),
-        WayQuery((0.0, 0.0), (30.0, 40.0), avoid=((3.0, 4.0),), unknown=0.05, as_of_ns=T0, fresh=fresh),
-        requests.HistoryQuery(12.0, 40.5, (), T0, T0 + 10**12, 3600.0, fresh),
-        requests.TilesQuery(MapVersion("0123456789abcdef", 17, 3)),
-        requests.TilesQuery(as_of_ns=T0, place=(-3, 12)),
-        requests.WhyQuery(12.0, 40.5, T0, repairs=True),
-        SegmentsQuery(T0, T0 + 10**12, None, Bounds(0.0, 0.0, 200.0, 150.0), "loader-1", fresh),
-        WorklistQuery(0.03, 0.4, 10, None, None, T0, None, "", fresh),
-        requests.MachinesQuery(fresh),
-        requests.ChangesQuery(3),
-        requests.InfoQuery(fresh),
-        requests.AliveQuery(),
-    )
-    seeds = tuple(f"{query.name}?{selector_of(requests.encode_query(query))}".encode() for query in asked)
-    yield Decoder("query", seeds, _query, (QueryError,), texts)
-    commands = (
-        TrustCommand("loader-2", False, "moved; x = 3", 60.0),
-        TrustCommand("loader-2", None),
-        AcceptCommand("0123456789abcdef", "disk died"),
-        CalibrateCommand(wait_s=60.0),
-        CalibrateCommand("loader-2", 0.004, -0.03, 0.0, reason="levelled; 12 May"),
-        CalibrateCommand("loader-2", auto=True),
-    )
-    seeds = tuple(f"{command.name}?{selector_of(encode_command(command))}".encode() for command in commands)
-    yield Decoder("command", seeds, _command, (QueryError,), texts)
+    for what, known, read in (("query", questions.QUESTIONS, _query), ("command", questions.COMMANDS, _command)):
+        names = {one.name for one in known}
+        seeds = [line for line in questions.SELECTORS.read_text().splitlines() if line.partition("?")[0] in names]
+        yield Decoder(what, tuple(line.encode() for line in seeds), read, (QueryError,), texts)
 
 
 def _split(data: bytes) -> tuple[str, dict[str, str]]:

@@ -35,6 +35,7 @@ from protocol.queries.requests import (
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround, SiteConfig
 from protocol.wire.codec import pack
+from tests.golden import questions
 from tests.unit.records import STORE, site_info, version
 
 positions = st.floats(-1e15, 1e15)
@@ -71,6 +72,15 @@ def histories(draw):
 )
 def test_query_round_trip(query):
     assert parse_query(query.name, split_selector(selector_of(encode_query(query)))) == query
+
+
+def test_selectors_do_not_change_by_accident():
+    lines = questions.SELECTORS.read_text().splitlines()
+    assert questions.selectors() == lines
+    for line, asked in zip(lines, (*questions.QUESTIONS, *questions.COMMANDS), strict=True):
+        name, _, text = line.partition("?")
+        parse = parse_query if asked in questions.QUESTIONS else parse_command
+        assert parse(name, split_selector(text)) == asked
 
 
 @given(st.text(st.characters(exclude_categories=("C", "Z")) | st.just(" "), max_size=MAX_TEXT), st.floats(0, 60))

@@ -1,0 +1,91 @@
+"""Every question and command with every option once, whose selectors stand in `selectors.txt` beside this file.
+
+`PYTHONPATH=. python tests/golden/questions.py` writes them; only after a deliberate change of the wire, with
+docs/protocol.md.
+"""
+
+from __future__ import annotations
+
+from protocol.queries.answers import MapVersion
+from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command
+from protocol.queries.parameters import Freshness
+from protocol.queries.requests import (
+    AliveQuery,
+    CalibrationQuery,
+    ChangesQuery,
+    HistoryQuery,
+    InfoQuery,
+    MachinesQuery,
+    PieceQuery,
+    PointQuery,
+    PointsQuery,
+    RegionQuery,
+    TilesQuery,
+    When,
+    WhyQuery,
+    encode_query,
+)
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
+from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.routing import MACHINES, NamedMachine
+from protocol.site.geometry import Bounds
+from tests.paths import GOLDEN
+
+SELECTORS = GOLDEN / "selectors.txt"
+T0 = 1_750_000_000_000_000_000
+FRESH, WHEN = Freshness(17, 2.5), When(T0, T0 - 10**9, repairs=True)
+RECTANGLE = Bounds(0.0, -3.5, 200.0, 150.0)
+LINE = ((0.0, 0.0), (30.0, 40.0))
+
+QUESTIONS = (
+    PointQuery(12.0, -40.5),
+    PointQuery(12.0, -40.5, ("resistance", "visits"), FRESH, WHEN),
+    PointsQuery(((1.5, -2.0), (3.0, 4.0))),
+    PointsQuery(((1.5, -2.0), (3.0, 4.0)), ("visits",), FRESH, WHEN),
+    RegionQuery(RECTANGLE),
+    RegionQuery(RECTANGLE, ("resistance",), FRESH, WHEN, 4.0),
+    RegionQuery(((0.0, 0.0), (9.0, 0.5), (3.0, 8.0)), (), FRESH, When(T0)),
+    PieceQuery(7, 2),
+    HistoryQuery(12.0, 40.5),
+    HistoryQuery(12.0, 40.5, ("grade",), T0, T0 + 10**12, 3600.0, FRESH),
+    TilesQuery(),
+    TilesQuery(MapVersion("0123456789abcdef", 17, 3), place=(-3, 12)),
+    TilesQuery(as_of_ns=T0, place=(-3, 12)),
+    WhyQuery(12.0, 40.5),
+    WhyQuery(12.0, 40.5, T0, repairs=True),
+    SegmentsQuery(),
+    SegmentsQuery(T0, T0 + 10**12, T0 + 10**13, RECTANGLE, "loader-1", FRESH),
+    WorklistQuery(),
+    WorklistQuery(0.03, 0.4, 10, T0, T0 + 10**12, T0 + 10**13, RECTANGLE, "loader-1", FRESH),
+    RouteQuery(LINE),
+    RouteQuery(LINE, MACHINES["truck"], (False, True), 50.0, "refuse", T0, FRESH, repairs=False),
+    RouteQuery(LINE, NamedMachine("truck-1", (("mass_kg", 3e4), ("speed_mps", 6.0))), (False, False)),
+    WayQuery(*LINE),
+    WayQuery(*LINE, MACHINES["loader"], "time", 0.1, 5.0, LINE, (True, False), 10.0, 0.05, T0, FRESH, repairs=False),
+    MachinesQuery(),
+    MachinesQuery(FRESH),
+    CalibrationQuery(FRESH),
+    ChangesQuery(),
+    ChangesQuery(3),
+    InfoQuery(FRESH),
+    AliveQuery(),
+)
+COMMANDS = (
+    TrustCommand("loader-2", True),
+    TrustCommand("loader-2", False, "moved; x = 3 %", 60.0),
+    TrustCommand("loader-2", None),
+    AcceptCommand("0123456789abcdef", "disk died"),
+    CalibrateCommand(wait_s=60.0),
+    CalibrateCommand("loader-2", 0.004, -0.03, 0.0, reason="levelled; 12 May"),
+    CalibrateCommand("loader-2", auto=True),
+)
+
+
+def selectors() -> list[str]:
+    """Name and parameters of each, these in the order of their names, which means nothing."""
+    sent = [(one.name, encode_query(one)) for one in QUESTIONS] + [(one.name, encode_command(one)) for one in COMMANDS]
+    return [f"{name}?{';'.join(f'{key}={parameters[key]}' for key in sorted(parameters))}" for name, parameters in sent]
+
+
+if __name__ == "__main__":
+    SELECTORS.write_text("\n".join(selectors()) + "\n")
