@@ -17,10 +17,31 @@ from protocol.queries.answers import (
     TrustAnswer,
 )
 from protocol.queries.calibration import CalibrationAnswer, CorrectedSpan, MachineCalibration
-from protocol.queries.map_tiles import MapTile, TilesAnswer
+from protocol.queries.map_tiles import MapTile, TilesAnswer, TilesQuery
 from protocol.queries.origin import Origin
 from protocol.queries.reasons import CellReasons, Votes
-from protocol.queries.roads import RoadChange, RoadSegment, Segments, Worklist, WorklistRow
+from protocol.queries.requests import (
+    QUERIES,
+    CalibrationQuery,
+    ChangesQuery,
+    HistoryQuery,
+    InfoQuery,
+    MachinesQuery,
+    PointQuery,
+    PointsQuery,
+    RegionQuery,
+    WhyQuery,
+)
+from protocol.queries.roads import (
+    RoadChange,
+    RoadSegment,
+    Segments,
+    SegmentsQuery,
+    Worklist,
+    WorklistQuery,
+    WorklistRow,
+)
+from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteAnswer, RouteMachine, RouteSteps, RouteTotals
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
@@ -37,4 +58,7 @@ __all__ += ["CellReasons", "FollowerState", "MapTile", "MapVersion", "Origin", "
 __all__ += ["RoadChange", "RoadSegment", "Segments", "Worklist", "WorklistRow"]
 __all__ += ["LOADER", "MACHINES", "NamedMachine", "RouteAnswer", "RouteMachine", "RouteSteps", "RouteTotals"]
 __all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
+__all__ += ["QUERIES", "CalibrationQuery", "ChangesQuery", "HistoryQuery", "InfoQuery", "MachinesQuery"]
+__all__ += ["PointQuery", "PointsQuery", "RegionQuery", "RouteQuery", "SegmentsQuery", "TilesQuery", "WayQuery"]
+__all__ += ["WhyQuery", "WorklistQuery"]
 __version__ = package_version()

@@ -19,13 +19,12 @@ from typing import Any
 import zenoh
 
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError, Refusal
-from protocol.queries import requests
 from protocol.queries.answer_codec import decode_alive, decode_error
 from protocol.queries.answers import FollowerState, ServerAlive
 from protocol.queries.origin import SERVER, Origin, decode_origin
 from protocol.queries.parameters import selector_of, text_of
-from protocol.queries.roads import SegmentsQuery, WorklistQuery
-from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.request import AskFirst, MapQuery
+from protocol.queries.requests import AliveQuery
 from protocol.wire import keys
 
 # Nobody answers, at once: the server starts again, or has just connected (Zenoh issue 2767). It may answer in a moment.
@@ -40,18 +39,6 @@ FOLLOWER_WAIT_S = 1.0  # for a row, at a follower that lacks it: one that follow
 TIMED_OUT = b"Timeout"  # the error reply of Zenoh itself
 # Refusals that are about who was asked, not about the question.
 ELSEWHERE = (Refusal.AFTER_TIMEOUT, Refusal.NOT_HERE, Refusal.OVERLOADED, Refusal.STORE, "internal")
-PLACES = (requests.PointQuery, requests.PointsQuery, requests.WhyQuery, requests.HistoryQuery)
-READ = (
-    *PLACES,
-    requests.RegionQuery,
-    requests.TilesQuery,
-    SegmentsQuery,
-    WorklistQuery,
-    RouteQuery,
-    WayQuery,
-)
-# A follower has these a moment later than the server, whose events tell of them: it is asked where no server is.
-SERVER_FIRST = (requests.InfoQuery, requests.ChangesQuery)
 
 
 @dataclass(frozen=True)
@@ -139,10 +126,10 @@ class Asker:
         self._session, self._endpoint, self._site, self._timeout_s = session, endpoint, site, timeout_s
         self._followers = Followers(session, site)
 
-    def ask(self, query: requests.MapQuery, *, at: Origin | None = None) -> Answered:
+    def ask(self, query: MapQuery[Any], *, at: Origin | None = None) -> Answered:
         """Ask the map. at: of whoever gave an earlier answer, which has what this one goes on with."""
-        wait_s = query.fresh.wait_s if query.fresh.after else 0.0
-        wait_s += PAST_S if requests.may_read_journal(query) else 0.0
+        wait_s = query.wait_s if query.after else 0.0
+        wait_s += PAST_S if query.may_read_journal else 0.0
         if at and at.follower:
             return self._of_follower(query, at.follower)
         return self._get(query, wait_s)
@@ -151,7 +138,7 @@ class Asker:
         """Followers whose tokens are there and that answer what can be read, by name."""
         states = []
         for name in sorted(self._followers.look()):  # one by one: routers let no wildcard pass to a name
-            key = keys.follower_query(self._site, name, requests.AliveQuery.name)
+            key = keys.follower_query(self._site, name, AliveQuery.name)
             answered = self._once(_Attempt(key, {}, name), self._timeout_s / 2)
             if isinstance(answered, Answered):
                 with suppress(MessageError):
@@ -162,7 +149,7 @@ class Asker:
         """Have the server carry out a command."""
         return self._until_answered(lambda: iter((_Attempt(key, parameters),)), wait_s).data
 
-    def _of_follower(self, query: requests.MapQuery, follower: str) -> Answered:
+    def _of_follower(self, query: MapQuery[Any], follower: str) -> Answered:
         """Ask one follower and nobody else: `expired` where it is gone."""
         attempt = self._attempt(query, follower)
         outcome = self._once(attempt, self._timeout_s)
@@ -173,24 +160,24 @@ class Asker:
             raise outcome
         raise QueryError(Refusal.EXPIRED, f"follower {follower} does not answer any more: ask again from the beginning")
 
-    def _get(self, query: requests.MapQuery, wait_s: float) -> Answered:
-        server = _Attempt(keys.map_query(self._site, query.name), requests.encode_query(query))
+    def _get(self, query: MapQuery[Any], wait_s: float) -> Answered:
+        server = _Attempt(keys.map_query(self._site, query.name), query.parameters())
 
         def attempts() -> Iterator[_Attempt]:
-            if isinstance(query, SERVER_FIRST):
+            if query.ask_first is not AskFirst.FOLLOWER:
                 yield server
-            if isinstance(query, READ + SERVER_FIRST):
+            if query.ask_first is not AskFirst.SERVER_ALONE:
                 for name in self._followers.in_order()[:FOLLOWERS_TRIED]:
                     yield self._attempt(query, name)
-            if not isinstance(query, SERVER_FIRST):
+            if query.ask_first is AskFirst.FOLLOWER:
                 yield server
 
         return self._until_answered(attempts, wait_s)
 
-    def _attempt(self, query: requests.MapQuery, follower: str) -> _Attempt:
-        parameters = requests.encode_query(query)
-        if query.fresh.after:
-            parameters["wait"] = text_of(min(query.fresh.wait_s, FOLLOWER_WAIT_S))
+    def _attempt(self, query: MapQuery[Any], follower: str) -> _Attempt:
+        parameters = query.parameters()
+        if query.after:
+            parameters["wait"] = text_of(min(query.wait_s, FOLLOWER_WAIT_S))
         return _Attempt(keys.follower_query(self._site, follower, query.name), parameters, follower)
 
     def _until_answered(self, attempts: Callable[[], Iterator[_Attempt]], wait_s: float) -> Answered:

@@ -30,6 +30,7 @@ from websockets.sync.client import connect as open_socket
 from protocol.arrays import Table
 from protocol.errors import SitegridError
 from protocol.machine.samples import empty
+from protocol.queries.requests import HistoryQuery
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire import keys
@@ -227,7 +228,7 @@ def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
                 client.machines()
                 if (at_s := (time.monotonic() - begin_s) * speed) >= next_past_s:
                     next_past_s = at_s + PAST_S
-                    client.history(150, 150, ["resistance"], span_s=300)
+                    client.ask(HistoryQuery(150.0, 150.0, ("resistance",), span_s=300.0))
                     client.point(120, 0, as_of_ns=START_NS + round(at_s * 0.5e9))
 
 

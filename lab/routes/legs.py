@@ -130,7 +130,7 @@ def judged_legs(drive: FleetDrive, recorded: Recorded, scene: Scene, cache: Path
 
     def asked(leg: Leg, line: Floats) -> RouteTotals:
         places = tuple(map(tuple, line.tolist()))
-        return routes.route(RouteQuery(places, leg.machine, leg.stops)).totals
+        return routes.route(RouteQuery(places, machine=leg.machine, stops=leg.stops)).totals
 
     legs = legs_of(drive, scene, dict(recorded.rows), cache)
     return [

@@ -103,7 +103,7 @@ def _unknown(draw: np.random.Generator) -> Row:
     shunned = _field(draw, PATCH_CELLS, SIZE) + SHUNNED * (bad - bad.mean()) / bad.std()
     known = shunned <= np.quantile(shunned, 1 - UNKNOWN)
     start, end = (((column + 0.5), (row + 0.5)) for row, column in _ends(draw, known))
-    way = KnownMap({"a": _samples(terrain, known)}).routes().way(WayQuery(start, end, SLOW, max_grade=1.0))
+    way = KnownMap({"a": _samples(terrain, known)}).routes().way(WayQuery(start, end, machine=SLOW, max_grade=1.0))
     squares = true_squares(truth)
     costs = [
         route(line, squares, SLOW, stops=(False, False))[1].energy_j for line in (way.line_m, np.array([start, end]))

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -27,7 +28,8 @@ from lab.speed.site import SITE, Site, ask, ask_map, meanwhile, send, session, s
 from mapserver.query.routes import DETOUR, LEAST_DETOUR_M
 from protocol.arrays import Floats, Table
 from protocol.queries.places import Place
-from protocol.queries.requests import InfoQuery, MapQuery, PointQuery, PointsQuery, RegionQuery, When
+from protocol.queries.request import MapQuery
+from protocol.queries.requests import InfoQuery, PointQuery, PointsQuery, RegionQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from protocol.wire.messages import SampleBatch
@@ -73,7 +75,7 @@ def run(hours: float, queries: int) -> Iterator[Row]:
                     yield from rows_of(f"warm {name}", _answered(link, questions))
 
 
-def _answered(link: zenoh.Session, queries: Sequence[MapQuery]) -> Figures:
+def _answered(link: zenoh.Session, queries: Sequence[MapQuery[Any]]) -> Figures:
     took_ms, empty_ms = [], []
     for query in queries:
         answers: list[bytes] = []
@@ -113,7 +115,7 @@ def _send(endpoint: str, seconds: Iterator[Batches], sent: Counter[str], ended: 
 # --- what is asked ---------------------------------------------------------------------------------------------------
 
 
-def kinds(work: Batches) -> dict[str, Iterator[MapQuery]]:
+def kinds(work: Batches) -> dict[str, Iterator[MapQuery[Any]]]:
     """Endless queries of each kind after so much work; each about other places. as_of: a point as of any time of it."""
     driven = np.concatenate([rows for _, rows in work])
     draw = np.random.default_rng(0)
@@ -129,7 +131,7 @@ def kinds(work: Batches) -> dict[str, Iterator[MapQuery]]:
         "route": (RouteQuery(line) for line in _lines(work, draw)),
         "way": (WayQuery(start, end) for start, end in _ends(scattered, draw)),
         "info": iter(InfoQuery, None),
-        "as_of": (PointQuery(x, y, LAYERS, when=When(as_of_ns=int(draw.choice(stamps)))) for x, y in places),
+        "as_of": (PointQuery(x, y, LAYERS, as_of_ns=int(draw.choice(stamps))) for x, y in places),
     }
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -19,7 +20,7 @@ from protocol.arrays import Table
 from protocol.config import toml_lines
 from protocol.errors import Refusal
 from protocol.queries.parameters import selector_of
-from protocol.queries.requests import MapQuery, encode_query
+from protocol.queries.request import MapQuery
 from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
@@ -91,9 +92,9 @@ def ask(link: zenoh.Session, selector: str, payload: bytes | None = None) -> lis
     return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
 
-def ask_map(link: zenoh.Session, query: MapQuery) -> list[bytes]:
+def ask_map(link: zenoh.Session, query: MapQuery[Any]) -> list[bytes]:
     """All replies to a query of the map."""
-    return ask(link, f"{keys.map_query(SITE.name, query.name)}?{selector_of(encode_query(query))}")
+    return ask(link, f"{keys.map_query(SITE.name, query.name)}?{selector_of(query.parameters())}")
 
 
 def send(link: zenoh.Session, batch: SampleBatch, site: str = SITE.name) -> Ack:

@@ -31,31 +31,40 @@ from mapserver.query.why import reasons
 from protocol.arrays import Floats32, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
-from protocol.queries import requests
-from protocol.queries.answers import HistoryAnswer, HistorySpan, MapVersion, PointAnswer, PointsAnswer, Region
-from protocol.queries.calibration import encode_calibration
-from protocol.queries.map_tiles import TilesAnswer, encode_tiles
-from protocol.queries.reasons import CellReasons, encode_why
+from protocol.queries.answers import (
+    ChangesAnswer,
+    HistoryAnswer,
+    HistorySpan,
+    MachinesAnswer,
+    MapVersion,
+    PointAnswer,
+    PointsAnswer,
+    Region,
+)
+from protocol.queries.map_tiles import TilesAnswer, TilesQuery
+from protocol.queries.reasons import CellReasons
+from protocol.queries.request import Compared, MapQuery, Size
 from protocol.queries.requests import (
     MAX_SPANS,
-    NOW,
     WITHOUT_MEAN,
+    AliveQuery,
+    CalibrationQuery,
+    ChangesQuery,
     HistoryQuery,
-    MapQuery,
+    InfoQuery,
+    MachinesQuery,
+    PieceQuery,
     PointQuery,
     PointsQuery,
     RegionQuery,
-    TilesQuery,
-    When,
     WhyQuery,
 )
-from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery, encode_segments, encode_worklist
-from protocol.queries.route_requests import RouteQuery, WayQuery
-from protocol.queries.routing import encode_answer
-from protocol.site.geometry import Bounds, CellWindow, GridGeometry
+from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery
+from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
+from protocol.site.geometry import MAX_CELLS, Bounds, CellWindow, GridGeometry
 
-SMALL_BYTES = 16_384  # an answer that is no region, with what it takes to make it
-WAY_BYTES = 2**23  # as much of the budget as a search for a way takes: four may wait or be in work
+# Of a search as much of the budget as lets four wait or be in work.
+BYTES = {Size.SMALL: 16_384, Size.PIECE: PIECE_BYTES, Size.SEARCH: 2**23}
 # Counters of `info`: blocks and squares whose layers were kept from an earlier query, and were derived for one.
 LAYERS_KEPT, LAYERS_DERIVED = "layers_kept", "layers_derived"
 ROADS_MADE, ROADS_MADE_MS = "roads_made", "roads_made_ms"  # road maps of now, and how long that took
@@ -74,6 +83,24 @@ class Answers:
         self._roads = RoadMaps(source)
         self._tiles = Tiles(source, self._roads.lately)
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
+        self._answers: dict[type[MapQuery[Any]], Callable[[Any], Any]] = {
+            PointQuery: self.point,
+            PointsQuery: self.points,
+            RegionQuery: self.region,
+            PieceQuery: self.piece,
+            TilesQuery: self.tiles,
+            WhyQuery: self.why,
+            HistoryQuery: self.history,
+            SegmentsQuery: lambda query: roads.segments(self._roads.read, query),
+            WorklistQuery: lambda query: roads.worklist(self._roads.read, query),
+            RouteQuery: self._routes.route,
+            WayQuery: self._routes.way,
+            MachinesQuery: self.machines,
+            ChangesQuery: self.changes,
+            CalibrationQuery: lambda _: source.calibration(),
+            AliveQuery: lambda _: source.alive(),
+            InfoQuery: lambda _: self.info(),
+        }
 
     def start(self) -> None:
         """Make roads beside the questions from here on, until closed."""
@@ -91,74 +118,29 @@ class Answers:
     def _past(self) -> PastMaps:
         return PastMaps(self._source.location, self._source.past, self._config)
 
-    def is_large(self, query: MapQuery) -> bool:
-        """Whether an answer may be made of far more than it holds, and keeps a thread for long."""
-        return isinstance(query, RouteQuery | WayQuery | PointsQuery) or (
-            isinstance(query, RegionQuery) and query.resolution_m is not None
-        )
-
-    def size(self, query: MapQuery) -> int:
-        """About how many bytes the answer has."""
-        if isinstance(query, WayQuery):
-            return WAY_BYTES
-        if isinstance(query, requests.PieceQuery | TilesQuery | RouteQuery | PointsQuery):
-            return PIECE_BYTES
+    def size(self, query: MapQuery[Any]) -> int:
+        """About how many bytes the answer has, with what it takes to make it."""
         if not isinstance(query, RegionQuery):
-            return SMALL_BYTES
+            return BYTES[query.size]
         window, _ = self._window(query)
         layers = len(query.layers or cell_layers.LAYERS)
-        return min(PIECE_BYTES, 4 * window.columns * window.rows * layers + SMALL_BYTES)
+        return min(PIECE_BYTES, 4 * window.columns * window.rows * layers + BYTES[Size.SMALL])
 
-    def answer(self, query: MapQuery) -> bytes:
+    def answer(self, query: MapQuery[Any]) -> bytes:
         """Answer one query; QueryError says what is wrong with it."""
         check_on_site(query, self._site, lambda: self._source.run(lambda state: state.grid.bounds()))
-        if query.fresh.after and _reads_roads(query):
-            self._roads.reach(query.fresh.after)
-        match query:
-            case PointQuery():
-                return codec.encode_point(self.point(query))
-            case PointsQuery():
-                return codec.encode_points(self.points(query))
-            case RegionQuery():
-                return codec.encode_region(self.region(query))
-            case requests.PieceQuery():
-                return codec.encode_region(self.piece(query))
-            case requests.TilesQuery():
-                return encode_tiles(self.tiles(query))
-            case requests.WhyQuery():
-                return encode_why(self.why(query))
-            case HistoryQuery():
-                return codec.encode_history(self.history(query))
-            case SegmentsQuery() | WorklistQuery() | RouteQuery() | WayQuery():
-                return self._of_roads(query)
-            case _:
-                return self._of_process(query)
+        if query.after and _reads_roads(query):
+            self._roads.reach(query.after)
+        return query.encode(self._answers[type(query)](query))
 
-    def _of_roads(self, query: RoadQuery | requests.LineQuery) -> bytes:
-        """Answers about roads and about lines over the map."""
-        match query:
-            case SegmentsQuery():
-                return encode_segments(roads.segments(self._roads.read, query))
-            case WorklistQuery():
-                return encode_worklist(roads.worklist(self._roads.read, query))
-            case RouteQuery():
-                return encode_answer(self._routes.route(query))
-            case WayQuery():
-                return encode_answer(self._routes.way(query))
+    def machines(self, _: MachinesQuery) -> MachinesAnswer:
+        """What is known of each machine."""
+        rows: Any = self._source.machines()  # tables of the fields of their records
+        return MachinesAnswer(tuple(rows), self._version())
 
-    def _of_process(self, query: MapQuery) -> bytes:
-        """Answers that are not about cells."""
-        match query:
-            case requests.AliveQuery():
-                return codec.encode_alive(self._source.alive())
-            case requests.MachinesQuery():
-                return codec.encode_machines(self._source.machines(), self._version())
-            case requests.CalibrationQuery():
-                return encode_calibration(self._source.calibration())
-            case requests.ChangesQuery():
-                changes = self._source.changes(query.after)[: codec.MAX_CHANGES]
-                return codec.encode_changes(changes, self._version())
-        return codec.encode_info(self.info())
+    def changes(self, query: ChangesQuery) -> ChangesAnswer:
+        """Changes of the ground, as many as one answer has."""
+        return ChangesAnswer(tuple(self._source.changes(query.after_id)[: codec.MAX_CHANGES]), self._version())
 
     def info(self) -> dict[str, Any]:
         """State of the map, with the names of its layers."""
@@ -172,9 +154,9 @@ class Answers:
     def point(self, query: PointQuery) -> PointAnswer:
         """Layers of the cell that a position lies in."""
         cell, names = self._cell(query.x_m, query.y_m), _names(query)
-        if query.when == NOW and (kept := self._source.run(lambda state: self._kept_point(state, cell, names))):
+        if not query.reads_past and (kept := self._source.run(lambda state: self._kept_point(state, cell, names))):
             return kept
-        region = self._read(self._reading(cell, names, query.when), cell)
+        region = self._read(self._reading(cell, names, query), cell)
         values = {name: float(layer[0, 0]) for name, layer in region.layers.items()}
         return PointAnswer(float(region.x_m[0]), float(region.y_m[0]), values, region.version, region.stamp_ns)
 
@@ -190,7 +172,7 @@ class Answers:
         """Layers of the cells that positions lie in."""
         names, places = _names(query), np.array(query.places)
         cells = self._site.geometry.cell_of(places)
-        times, repairs = query.when.times, query.when.repairs
+        times, repairs = query.times, query.repairs
         newer, *others = (self._look_at_cells(cells, names, as_of_ns, repairs=repairs) for as_of_ns in times)
         layers, look = {name: newer[0][name] for name in names}, newer[1]
         version = look.version
@@ -203,18 +185,22 @@ class Answers:
     def region(self, query: RegionQuery) -> Region:
         """Layers of all cells of an area, or of the first piece of them: `piece` has the others."""
         (window, count), names = self._window(query), _names(query)
-        requests.check_size(window.columns * count, window.rows * count)
+        if window.columns * window.rows * count**2 > MAX_CELLS:
+            problem = (
+                f"region of {window.columns * count} x {window.rows * count} cells; at most {MAX_CELLS} are answered"
+            )
+            raise QueryError(Refusal.TOO_LARGE, problem)
         outline = () if isinstance(query.area, Bounds) else query.area
         pieces = PieceGrid.of_layers(window, len(names), count)
         if pieces.count > 1:
             self._open.make_room()
-        reading = replace(self._reading(finer(window, count), names, query.when), window=window)
+        reading = replace(self._reading(finer(window, count), names, query), window=window)
         reading = replace(reading, count=count, outline=outline)
         if pieces.count == 1:
             return self._read(reading, window)
         return self._piece(reading, pieces, 0, self._open.open(reading))
 
-    def piece(self, query: requests.PieceQuery) -> Region:
+    def piece(self, query: PieceQuery) -> Region:
         """One more piece of a region that is open."""
         return self._piece(*self._open.reading(query.cursor, query.number), query.number, query.cursor)
 
@@ -269,8 +255,8 @@ class Answers:
         count = cells_to_a_side(query.resolution_m, self._site.cell_m)
         return GridGeometry(count * self._site.cell_m).window(query.bounds), count
 
-    def _reading(self, window: CellWindow, names: tuple[str, ...], when: When) -> Reading:
-        looks = (self._look(window, names, as_of_ns, repairs=when.repairs) for as_of_ns in when.times)
+    def _reading(self, window: CellWindow, names: tuple[str, ...], query: Compared[Any]) -> Reading:
+        looks = (self._look(window, names, as_of_ns, repairs=query.repairs) for as_of_ns in query.times)
         return Reading(window, names, tuple(looks))
 
     def _look_at_cells(
@@ -357,15 +343,13 @@ class Answers:
         )
 
 
-def _reads_roads(query: MapQuery) -> bool:
+def _reads_roads(query: MapQuery[Any]) -> bool:
     """Whether an answer is of roads as they are now."""
     match query:
-        case SegmentsQuery() | WorklistQuery():
+        case RoadQuery():
             return query.as_of_ns is None
-        case RouteQuery() | WayQuery():
+        case LineQuery() | Compared():
             return query.repairs and query.as_of_ns is None
-        case PointQuery() | PointsQuery() | RegionQuery():
-            return query.when.repairs and query.when.as_of_ns is None
     return False
 
 
@@ -380,7 +364,7 @@ def _of_cells(names: tuple[str, ...]) -> tuple[str, ...]:
 def _names(query: PointQuery | PointsQuery | RegionQuery) -> tuple[str, ...]:
     """The layers of a query, checked; none means all, or all of which there is a difference, or a mean."""
     without: tuple[str, ...] = ()
-    if query.when.minus_ns is not None:
+    if query.minus_ns is not None:
         without = WITHOUT_DIFFERENCE
         _refuse_any(query.layers, without, "has no difference; ask for it without `minus`, as of each time")
     if isinstance(query, RegionQuery) and query.resolution_m is not None:

@@ -26,8 +26,7 @@ from mapserver.query.source import MapSource, MapState
 from mapserver.query.views import View
 from protocol.arrays import AnyArray, Ints
 from protocol.queries.answers import MapVersion
-from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, Plane, TilesAnswer
-from protocol.queries.requests import TilesQuery
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, Plane, TilesAnswer, TilesQuery
 from protocol.site.geometry import BLOCK_CELLS
 
 BLOCKS = TILE_CELLS // BLOCK_CELLS  # of a tile, along one side

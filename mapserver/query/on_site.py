@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries.places import Place, where_it_lies
-from protocol.queries.requests import HistoryQuery, MapQuery, PointQuery, PointsQuery, RegionQuery, WhyQuery
-from protocol.queries.roads import SegmentsQuery, WorklistQuery
+from protocol.queries.request import MapQuery
+from protocol.queries.requests import HistoryQuery, PointQuery, PointsQuery, RegionQuery, WhyQuery
+from protocol.queries.roads import RoadQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.site_config import SiteConfig
 
 
-def check_on_site(query: MapQuery, site: SiteConfig, bounds: Callable[[], Sequence[int] | None]) -> None:
+def check_on_site(query: MapQuery[Any], site: SiteConfig, bounds: Callable[[], Sequence[int] | None]) -> None:
     """Refuse a query of places beyond the site's extent, and of an area that lies there as a whole.
 
     bounds: west, south, east and north of the map in cells, None while it is empty; asked for the refusal alone.
@@ -25,14 +27,14 @@ def check_on_site(query: MapQuery, site: SiteConfig, bounds: Callable[[], Sequen
                 raise QueryError(Refusal.OUTSIDE_SITE, problem)
 
 
-def _places(query: MapQuery) -> Mapping[str, Sequence[Place]]:
+def _places(query: MapQuery[Any]) -> Mapping[str, Sequence[Place]]:
     """Places by the name of their parameter; of an area the one that is nearest to the origin."""
     match query:
         case PointQuery() | HistoryQuery() | WhyQuery():
             return {"x`, `y": ((query.x_m, query.y_m),)}
         case PointsQuery():
             return {"places": query.places}
-        case RegionQuery() | SegmentsQuery() | WorklistQuery() if area := query.bounds:
+        case RegionQuery() | RoadQuery() if area := query.bounds:
             x_m, y_m = max(area.west_m, min(0.0, area.east_m)), max(area.south_m, min(0.0, area.north_m))
             return {"polygon" if getattr(query, "area", area) is not area else "bounds": ((x_m, y_m),)}
         case RouteQuery():

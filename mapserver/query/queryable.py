@@ -19,10 +19,10 @@ from mapserver.query.source import MapSource
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import encode_error
 from protocol.queries.origin import encode_origin
-from protocol.queries.parameters import split_selector
+from protocol.queries.parameters import Form, split_selector
 from protocol.queries.places import PLACES_BYTES
-from protocol.queries.requests import PointsQuery, RegionQuery, parse_query, reads_past
-from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.request import parameters_of
+from protocol.queries.requests import QUERIES, parse_query
 from protocol.wire import keys
 
 END_S = 1.0  # at the end, what is in work may take so long; nobody waits for an answer longer than for the end
@@ -106,7 +106,9 @@ def _oldest(waiting: Mapping[int, Work]) -> int:
 ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 pieces, or 2000 points
 MOST_PAST = 16  # that wait or are in work
 MAX_QUESTION = 4096  # bytes of a query's parameters
-WITH_PLACES = tuple(query.name for query in (PointsQuery, RegionQuery, RouteQuery, WayQuery))
+WITH_PLACES = {
+    name for name, query in QUERIES.items() if any(p.kind.form is Form.PLACES for p in parameters_of(query).values())
+}
 ANSWERED = "queries_answered"  # a counter of `info`
 log = logging.getLogger("mapserver.query.queryable")
 
@@ -171,8 +173,8 @@ class MapQueryable:
         try:
             name, parameters = question(asked)
             query = parse_query(name, parameters)
-            pool, size = self._large if self._answers.is_large(query) else self._now, self._answers.size(query)
-            if reads_past(query):
+            pool, size = self._large if query.is_long else self._now, self._answers.size(query)
+            if query.reads_past:
                 pool, size = self._past, 1
         except QueryError as error:
             self._replies.refuse(asked, error)
@@ -185,7 +187,7 @@ class MapQueryable:
                 self._replies.submit(pool, size, asked, lambda: self._answers.answer(query))
 
         try:
-            self._source.waits.add(query.fresh.after, query.fresh.wait_s, enter)
+            self._source.waits.add(query.after, query.wait_s, enter)
         except QueryError as error:
             self._replies.refuse(asked, error)
 

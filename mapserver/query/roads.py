@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
     )
 
 
-def _read(read: Read, query: RoadQuery) -> tuple[RoadMap, Ledger, float]:
+def _read(read: Read, query: RoadQuery[Any]) -> tuple[RoadMap, Ledger, float]:
     """The roads that a query is about, the ledger of its hours, and how many hours these are."""
     roads = read(query.as_of_ns, query.machine)
     from_ns, to_ns = query.from_ns or 0, query.to_ns or 2**62
@@ -132,7 +133,7 @@ class _Records:
             machines=int(self._machines[i]),
         )
 
-    def line(self, i: int) -> answers.Line:
+    def line(self, i: int) -> answers.Corners:
         """Some points of a segment's line."""
         line = self._segments.line(i)
         some = np.concatenate([line[:-1:LINE_POINTS], line[-1:]]).round(2)

@@ -21,7 +21,7 @@ from mapserver.routes.route import LAYERS, STEP_M, route
 from protocol.arrays import Bools, Floats, Floats32, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries.places import Place
-from protocol.queries.route_requests import DEAREST, REFUSE, TIME, RouteQuery, WayQuery
+from protocol.queries.route_requests import DEAREST, REFUSE, TIME, LineQuery, RouteQuery, WayQuery
 from protocol.queries.routing import RouteAnswer, RouteMachine
 from protocol.site.geometry import Bounds, CellWindow
 from protocol.units import GRAVITY_MPS2
@@ -126,7 +126,7 @@ class Routes:
 
     def _answer(
         self,
-        query: RouteQuery | WayQuery,
+        query: LineQuery,
         machine: RouteMachine,
         line: Floats,
         look: Look,
@@ -145,7 +145,7 @@ class Routes:
         return RouteAnswer(look.version, look.stamp_ns, line, totals, steps, machine)
 
     def _read(
-        self, squares: Set[Block], query: RouteQuery | WayQuery, unpriced: Callable[[Squares], Set[Block]]
+        self, squares: Set[Block], query: LineQuery, unpriced: Callable[[Squares], Set[Block]]
     ) -> tuple[Look, Squares]:
         """Layers of squares, and of those around the ones with ground to price, which are known once they are read.
 
@@ -159,7 +159,7 @@ class Routes:
                 return look, read
             wanted |= more
 
-    def _read_once(self, squares: Set[Block], query: RouteQuery | WayQuery) -> tuple[Look, Squares]:
+    def _read_once(self, squares: Set[Block], query: LineQuery) -> tuple[Look, Squares]:
         look = self._look(squares, LAYERS, query.as_of_ns, repairs=query.repairs)
         if (count := len(look.area_states)) > MOST_SQUARES:
             problem = f"{count} squares of {SQUARE_CELLS} cells with known ground along the line, over {MOST_SQUARES}"
@@ -208,7 +208,7 @@ class Routes:
         return row - window.row, column - window.column
 
 
-def _given(query: RouteQuery | WayQuery) -> float | None:
+def _given(query: LineQuery) -> float | None:
     """What the query says that unknown ground costs."""
     return None if isinstance(query.unknown, str) else query.unknown
 

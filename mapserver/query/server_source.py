@@ -10,11 +10,11 @@ from mapserver.past.past import Past
 from mapserver.query.source import MapState
 from mapserver.upkeep.refolding import write
 from mapserver.upkeep.upkeep import Upkeep
-from protocol.queries import answer_codec as codec
 from protocol.queries.answers import GroundChange, ServerAlive
-from protocol.queries.calibration import CalibrationAnswer, encode_calibration
+from protocol.queries.calibration import CalibrationAnswer
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, parse_command
 from protocol.queries.origin import SERVER, Origin
+from protocol.queries.request import Request
 
 T = TypeVar("T")
 
@@ -68,12 +68,17 @@ class Commands:
     def obey(self, name: str, parameters: Mapping[str, str]) -> bytes:
         """Parse and carry out one command; QueryError says what is wrong with it."""
         command = parse_command(name, parameters)
-        if isinstance(command, AcceptCommand):
-            write(self._writer, lambda store: store.accept(command.store, command.reason))
-            return codec.encode_info(self._info())
-        if isinstance(command, CalibrateCommand):
-            return encode_calibration(self._calibrate(command))
-        return codec.encode_machine(self._trust(command))
+        return command.encode(self._obeyed(command))
+
+    def _obeyed(self, command: Request[Any]) -> Any:
+        match command:
+            case AcceptCommand():
+                write(self._writer, lambda store: store.accept(command.store, command.reason))
+                return self._info()
+            case CalibrateCommand():
+                return self._calibrate(command)
+            case TrustCommand():
+                return self._trust(command)
 
     def _trust(self, command: TrustCommand) -> dict[str, Any]:
         """What is known of the machine once the command counts, and the version of the map that it counts in."""

@@ -7,7 +7,7 @@ It is one module because all answers are read by the same few rules.
 import functools
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any, TypeVar
 
@@ -210,9 +210,9 @@ def decode_info(data: bytes) -> answers.MapInfo:
     return take_record(answers.MapInfo, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "info")
 
 
-def encode_machines(machines: Iterable[answers.MachineState | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
+def encode_machines(answer: answers.MachinesAnswer) -> bytes:
     """Answer of `machines`."""
-    return pack({"machines": [_table(machine) for machine in machines], **encode_version(version)})
+    return pack({"machines": [_table(machine) for machine in answer.machines], **encode_version(answer.version)})
 
 
 def decode_machines(data: bytes) -> answers.MachinesAnswer:
@@ -230,9 +230,9 @@ def decode_machine(data: bytes) -> answers.TrustAnswer:
     return take_record(answers.TrustAnswer, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "machine")
 
 
-def encode_changes(changes: Iterable[answers.GroundChange | Mapping[str, Any]], version: answers.MapVersion) -> bytes:
+def encode_changes(answer: answers.ChangesAnswer) -> bytes:
     """Answer of `changes`."""
-    return pack({"changes": [_table(change) for change in changes], **encode_version(version)})
+    return pack({"changes": [_table(change) for change in answer.changes], **encode_version(answer.version)})
 
 
 def decode_changes(data: bytes) -> answers.ChangesAnswer:

@@ -1,47 +1,67 @@
 """Commands to a map server, on keys of their own so that access rules can tell them from queries (docs/protocol.md)."""
 
-from collections.abc import Callable, Mapping
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from protocol.errors import QueryError, Refusal
-from protocol.queries import parameters as ps
-from protocol.site.site_config import NAME
+from protocol.queries.answer_codec import decode_info, decode_machine, encode_info, encode_machine
+from protocol.queries.answers import MapInfo, TrustAnswer
+from protocol.queries.calibration import CalibrationAnswer, decode_calibration, encode_calibration
+from protocol.queries.parameters import LINE, MAX_WAIT_S, choice, name_of, number, refusal
+from protocol.queries.request import Codec, Request, asked, parse
 from protocol.wire.codec import STORE_ID
 
-MAX_WAIT_S = 60.0
 # By which a person may correct: an accelerometer that lies on its side, a torque that reads twice or half as much.
 MOST_OFF = {"zero": 0.5, "scale": 0.9, "across": 0.5}
-_WORDS = {"yes": True, "no": False, "auto": None}
+_VERDICTS = choice({"yes": True, "no": False, "auto": None})
+_STORE = name_of(STORE_ID, "an id of a store; that is 16 hex digits, as an agent names it")
+_WAIT = number(0.0, MAX_WAIT_S, "s")
+WAIT = "how long to wait for the map to be folded again [s]"
 
 
 @dataclass(frozen=True)
-class TrustCommand:
+class TrustCommand(Request[TrustAnswer]):
     """Trust a machine or not.
 
     trusted: None leaves it to the server. reason: one line, required to distrust. wait_s: how long to wait for the map
     to be folded again with it, or without it.
     """
 
-    machine: str
-    trusted: bool | None
-    reason: str = ""
-    wait_s: float = 30.0
+    machine: str = asked(name_of(), "machine", "its name")
+    trusted: bool | None = asked(_VERDICTS, "trusted", "yes, no, or auto: the server decides")
+    reason: str = asked(LINE, "reason", "one line; required to distrust", "")
+    wait_s: float = asked(_WAIT, "wait", WAIT, 30.0)
 
     name = "trust"
+    codec = Codec(encode_machine, decode_machine)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.trusted is False and not self.reason:
+            raise _without_reason("say why the machine is distrusted")
 
 
 @dataclass(frozen=True)
-class AcceptCommand:
+class AcceptCommand(Request[MapInfo]):
     """Let the server's store take the place of another one, which is gone. store: its id; reason: one line."""
 
-    store: str
-    reason: str
+    store: str = asked(_STORE, "store", "id of the store that is gone")
+    reason: str = asked(LINE, "reason", "one line: what became of it", "")
 
     name = "accept"
+    codec = Codec(encode_info, decode_info)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.reason:
+            raise _without_reason("say what became of that store")
 
 
 @dataclass(frozen=True)
-class CalibrateCommand:
+class CalibrateCommand(Request[CalibrationAnswer]):
     """Calibrate all machines with all samples that there are, or decide what is taken off those of one.
 
     machine: empty for all. zero, scale, across: of that one, as in `protocol.queries.calibration.CorrectedSpan`, for
@@ -49,15 +69,28 @@ class CalibrateCommand:
     required with values. wait_s: how long to wait for the map to be folded again.
     """
 
-    machine: str = ""
-    zero: float | None = None
-    scale: float | None = None
-    across: float | None = None
-    auto: bool = False
-    reason: str = ""
-    wait_s: float = 30.0
+    machine: str = asked(name_of(), "machine", "the one that is decided about; without it all", "")
+    zero: float | None = asked(number(-0.5, MOST_OFF["zero"]), "zero", "of the balance [-]", None)
+    scale: float | None = asked(number(-0.9, MOST_OFF["scale"]), "scale", "share of the torque that is not there", None)
+    across: float | None = asked(number(-0.5, MOST_OFF["across"]), "across", "slope to the left, too high [m/m]", None)
+    auto: bool = asked(choice({"yes": True, "no": False}, "no"), "auto", "yes: the server decides", default=False)
+    reason: str = asked(LINE, "reason", "one line; required with values", "")
+    wait_s: float = asked(_WAIT, "wait", WAIT, 30.0)
 
     name = "calibrate"
+    codec = Codec(encode_calibration, decode_calibration)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if bool(self.machine) != bool(self.values or self.auto):
+            problem = (
+                "`machine` comes with one of `zero`, `scale`, `across`, or with `auto=yes`; neither calibrates all"
+            )
+            raise QueryError(Refusal.MISSING_FIELD, problem)
+        if self.values and self.auto:
+            raise refusal("auto", "with values of a person it means nothing")
+        if self.values and not self.reason:
+            raise _without_reason("say where the values are from")
 
     @property
     def values(self) -> dict[str, float]:
@@ -66,86 +99,13 @@ class CalibrateCommand:
         return {name: value for name, value in given.items() if value is not None}
 
 
-Command = TrustCommand | AcceptCommand | CalibrateCommand
+COMMANDS: dict[str, type[Request[Any]]] = {cls.name: cls for cls in (TrustCommand, AcceptCommand, CalibrateCommand)}
 
 
-def encode_command(command: Command) -> dict[str, str]:
-    """Selector parameters."""
-    if isinstance(command, AcceptCommand):
-        return {"store": command.store, "reason": ps.quoted(command.reason)}
-    if isinstance(command, CalibrateCommand):
-        return _of_calibrate(command)
-    word = next(word for word, trusted in _WORDS.items() if trusted is command.trusted)
-    parameters = {"machine": command.machine, "trusted": word, "wait": ps.text_of(command.wait_s)}
-    return parameters | ({"reason": ps.quoted(command.reason)} if command.reason else {})
+def parse_command(name: str, parameters: Mapping[str, str]) -> Request[Any]:
+    """The command of a name and the parameters of its selector; QueryError says what is wrong with which of them."""
+    return parse("command", COMMANDS, name, parameters)
 
 
-def _of_calibrate(command: CalibrateCommand) -> dict[str, str]:
-    parameters = {"machine": command.machine} if command.machine else {}
-    parameters |= {name: ps.text_of(value) for name, value in command.values.items()}
-    parameters |= {"auto": "yes"} if command.auto else {}
-    parameters |= {"reason": ps.quoted(command.reason)} if command.reason else {}
-    return parameters | {"wait": ps.text_of(command.wait_s)}
-
-
-def parse_command(name: str, parameters: Mapping[str, str]) -> Command:
-    """Parse the parameters of the command `name`; QueryError says what is wrong with which of them."""
-    if name not in _COMMANDS:
-        raise QueryError(Refusal.UNKNOWN_QUERY, f"command `{name[:40]}` is not known; known: {', '.join(_COMMANDS)}")
-    known, parse = _COMMANDS[name]
-    ps.check_known(name, parameters, known)
-    return parse(parameters)
-
-
-def _parse_accept(parameters: ps.Parameters) -> AcceptCommand:
-    store, reason = ps.required(parameters, "store"), ps.free_text(parameters, "reason")
-    if not STORE_ID.fullmatch(store):
-        problem = f"parameter `store`: {store[:40]!r} is no id of a store; that is 16 hex digits, as an agent names it"
-        raise QueryError(Refusal.OUT_OF_RANGE, problem)
-    if not reason:
-        raise QueryError(Refusal.MISSING_FIELD, "parameter `reason` is missing: say what became of that store")
-    return AcceptCommand(store, reason)
-
-
-def _parse_calibrate(parameters: ps.Parameters) -> CalibrateCommand:
-    machine = _machine(parameters) if "machine" in parameters else ""
-    values = {name: ps.number(parameters, name) for name in MOST_OFF if name in parameters}
-    auto, reason = parameters.get("auto", "no"), ps.free_text(parameters, "reason")
-    if auto not in ("yes", "no"):
-        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `auto`: {auto[:40]!r} is none of yes, no")
-    if beyond := [name for name, value in values.items() if abs(value) > MOST_OFF[name]]:
-        problem = f"parameter `{beyond[0]}`: {values[beyond[0]]:g} is not between -{MOST_OFF[beyond[0]]:g} and"
-        raise QueryError(Refusal.OUT_OF_RANGE, f"{problem} {MOST_OFF[beyond[0]]:g}")
-    if bool(machine) != bool(values or auto == "yes"):
-        problem = "`machine` comes with one of `zero`, `scale`, `across`, or with `auto=yes`; neither calibrates all"
-        raise QueryError(Refusal.MISSING_FIELD, problem)
-    if values and auto == "yes":
-        raise QueryError(Refusal.OUT_OF_RANGE, "parameter `auto`: with values of a person it means nothing")
-    if values and not reason:
-        raise QueryError(Refusal.MISSING_FIELD, "parameter `reason` is missing: say where the values are from")
-    wait_s = ps.seconds(parameters, "wait", 30.0, MAX_WAIT_S)
-    return CalibrateCommand(machine, **values, auto=auto == "yes", reason=reason, wait_s=wait_s)
-
-
-def _machine(parameters: ps.Parameters) -> str:
-    machine = ps.required(parameters, "machine")
-    if not NAME.fullmatch(machine):
-        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `machine`: {machine[:70]!r} is not a name")
-    return machine
-
-
-def _parse_trust(parameters: ps.Parameters) -> TrustCommand:
-    machine, word = _machine(parameters), ps.required(parameters, "trusted")
-    if word not in _WORDS:
-        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `trusted`: {word[:40]!r} is none of {', '.join(_WORDS)}")
-    reason = ps.free_text(parameters, "reason")
-    if word == "no" and not reason:
-        raise QueryError(Refusal.MISSING_FIELD, "parameter `reason` is missing: say why the machine is distrusted")
-    return TrustCommand(machine, _WORDS[word], reason, ps.seconds(parameters, "wait", 30.0, MAX_WAIT_S))
-
-
-_COMMANDS: dict[str, tuple[tuple[str, ...], Callable[[ps.Parameters], Command]]] = {
-    TrustCommand.name: (("machine", "trusted", "reason", "wait"), _parse_trust),
-    AcceptCommand.name: (("store", "reason"), _parse_accept),
-    CalibrateCommand.name: (("machine", *MOST_OFF, "auto", "reason", "wait"), _parse_calibrate),
-}
+def _without_reason(problem: str) -> QueryError:
+    return QueryError(Refusal.MISSING_FIELD, f"parameter `reason` is missing: {problem}")

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.arrays import Floats
-from protocol.errors import MessageError, Refusal
+from protocol.errors import MessageError, QueryError, Refusal
 from protocol.queries.answers import MapVersion
+from protocol.queries.parameters import METRES, Form, Kind, count, name_of
+from protocol.queries.request import AsOf, Codec, Group, Parameter, Size, asked, grouped
 from protocol.wire.codec import MAX_SEQ, pack, take, unpack
 
 TILE_CELLS = 64
@@ -154,3 +156,48 @@ def _tile(row: Any, index: int) -> MapTile:
         problem = f"{length} bytes of planes, {len(PLANES)} take {len(PLANES) * AREA}"
         raise MessageError(Refusal.COLUMN_LENGTH, problem, field="tiles", row=index)
     return MapTile(x, y, version_row, fact, newest_ns, planes)
+
+
+_SINCE = (
+    Parameter("store", "of the version that the asker has", name_of()),
+    Parameter("row", "its row", count(is_stated=True)),
+    Parameter("fact", "its fact", count(is_stated=True)),
+)
+
+
+def _write_since(since: MapVersion | None) -> dict[str, str]:
+    return {"store": since.store, "row": str(since.row), "fact": str(since.fact)} if since else {}
+
+
+def _read_tile(name: str, text: str) -> tuple[int, int]:
+    numbers = [METRES.read(name, part) for part in text.split(",")]
+    if len(numbers) != 2 or any(n != int(n) for n in numbers):
+        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}` must be column,row of a tile")
+    return int(numbers[0]), int(numbers[1])
+
+
+TILE = Kind(Form.TEXT, _read_tile, lambda value: f"{value[0]},{value[1]}")
+
+
+@dataclass(frozen=True)
+class TilesQuery(AsOf[TilesAnswer]):
+    """Tiles of the map: all, or those that differ since a version of it; or all as of a time [ns].
+
+    place: column and row of the tile from which on they are answered, in this order; None for the first answer.
+    """
+
+    since: MapVersion | None = grouped(
+        Group(_SINCE, lambda given: MapVersion(*(one.read(given) for one in _SINCE)), _write_since), None
+    )
+    place: tuple[int, int] | None = asked(TILE, "place", "column,row of the tile to begin at", None)
+
+    name = "tiles"
+    help = "the map in tiles of 8-bit layers"
+    codec = Codec(encode_tiles, decode_tiles)
+    size = Size.PIECE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.since and self.as_of_ns is not None:
+            problem = "`as_of` with a version: the tiles of a time do not change, ask for all"
+            raise QueryError(Refusal.OUT_OF_RANGE, problem)

@@ -1,39 +1,33 @@
-"""Selector parameters of queries: values to text, and text to checked values; QueryError names what is wrong."""
+"""Kinds of parameters of a selector: the text of a value, and the checked value of a text.
+
+QueryError names the parameter and what is wrong with it.
+"""
+
+from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Any
 from urllib.parse import quote, unquote
 
 from protocol.errors import QueryError, Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.geometry import Bounds
+from protocol.site.site_config import NAME
 
 MAX_WAIT_S = 60.0
 MAX_TEXT = 200  # characters of a text that a person writes
+MAX_NUMBER = 1e15
 
 Parameters = Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class Freshness:
-    """after: answer only once this journal row is merged; wait_s: how long to wait for it."""
-
-    after: int = 0
-    wait_s: float = 10.0
-
-
-ANY_ROW = Freshness()
 
 
 def text_of(number: float) -> str:
     """All digits; as a plain number, where numpy's own `repr` writes its type."""
     return repr(float(number))
-
-
-def quoted(text: str) -> str:
-    """Any text as a value: percent-encoded, since `;` and `=` divide parameters."""
-    return quote(text, safe="")
 
 
 def selector_of(parameters: Parameters) -> str:
@@ -47,107 +41,177 @@ def split_selector(text: str) -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
-def check_known(query: str, parameters: Parameters, known: Sequence[str]) -> None:
-    """Refuse a parameter that the query does not take."""
-    if unknown := sorted(set(parameters) - set(known)):
-        problem = f"parameter `{unknown[0][:40]}` is not known; `{query}` takes {', '.join(known)}"
-        raise QueryError(Refusal.UNKNOWN_PARAMETER, problem)
+def refusal(parameter: str, problem: str, reason: Refusal = Refusal.OUT_OF_RANGE) -> QueryError:
+    """What is wrong with a parameter."""
+    return QueryError(reason, f"parameter `{parameter}`: {problem}")
 
 
-def required(parameters: Parameters, name: str) -> str:
-    """Text of a parameter that has to be there."""
-    if name not in parameters:
-        raise QueryError(Refusal.MISSING_FIELD, f"parameter `{name}` is missing")
-    return parameters[name]
-
-
-def number(parameters: Parameters, name: str) -> float:
+def read_number(name: str, text: str) -> float:
     """A finite number."""
-    text = required(parameters, name)
     try:
         value = float(text)
     except ValueError:
-        raise QueryError(Refusal.WRONG_TYPE, f"parameter `{name}`: {text[:40]!r} is no number") from None
-    if not math.isfinite(value) or abs(value) > 1e15:
-        raise QueryError(Refusal.NOT_FINITE, f"parameter `{name}`: {value} is not usable")
+        raise refusal(name, f"{text[:40]!r} is no number", Refusal.WRONG_TYPE) from None
+    check_finite(name, value)
     return value
 
 
-def flag(parameters: Parameters, name: str, *, default: bool) -> bool:
-    """Yes or no, as 1 or 0."""
-    text = parameters.get(name, str(int(default)))
-    if text not in ("0", "1"):
-        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {text[:40]!r} is neither 0 nor 1")
-    return text == "1"
+def check_finite(name: str, value: float) -> None:
+    """Refuse what is no finite number of a usual size."""
+    if not math.isfinite(value) or abs(value) > MAX_NUMBER:
+        raise refusal(name, f"{value} is not usable", Refusal.NOT_FINITE)
 
 
-def count(parameters: Parameters, name: str) -> int:
-    """A whole number from 0 on; 0 where it is missing."""
-    value = number({name: "0", **parameters}, name)
-    if value < 0 or value != int(value):
-        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {value:g} is no whole number from 0 on")
-    return int(value)
+def check_order(from_ns: int | None, to_ns: int | None) -> None:
+    """Refuse a time that ends before it begins."""
+    if from_ns and to_ns and from_ns > to_ns:
+        raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
 
 
-def seconds(parameters: Parameters, name: str, default_s: float, most_s: float) -> float:
-    """A time to wait [s], 0 to most_s."""
-    value = number({name: text_of(default_s), **parameters}, name)
-    if not 0 <= value <= most_s:
-        raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {value:g} s is not between 0 and {most_s:g} s")
-    return value
+class Form(Enum):
+    """How a value is given: on the command line, in a request over HTTP."""
+
+    NUMBER = auto()
+    TEXT = auto()
+    LINE = auto()  # of a person, which a selector has percent-encoded
+    FLAG = auto()
+    STAMP = auto()
+    PLACE = auto()  # in metres, as the next two
+    PLACES = auto()
+    RECTANGLE = auto()
 
 
-def stamp(parameters: Parameters, name: str) -> int | None:
-    """A stamp in ns, to the last digit; None where it is missing."""
-    text = parameters.get(name)
-    if text is None:
-        return None
+@dataclass(frozen=True)
+class Kind:
+    """A kind of value. read: of a parameter's name and text. write: its text, empty for what a selector leaves out.
+
+    check: refuses a value of the kind that is too large or too small, by the parameter's name.
+    """
+
+    form: Form
+    read: Callable[[str, str], Any]
+    write: Callable[[Any], str] = str
+    check: Callable[[str, Any], None] = lambda _, __: None
+
+
+def number(low: float = -MAX_NUMBER, high: float = MAX_NUMBER, unit: str = "", *, above: bool = False) -> Kind:
+    """A number from low to high; above: not low itself."""
+
+    def check(name: str, value: float) -> None:
+        check_finite(name, value)
+        if not low <= value <= high or (above and value == low):
+            span = f"above {low:g} and at most" if above else f"between {_with(low, unit)} and"
+            raise refusal(name, f"{_with(value, unit)} is not {span} {_with(high, unit)}")
+
+    return Kind(Form.NUMBER, read_number, text_of, check)
+
+
+def _with(value: float, unit: str) -> str:
+    return f"{value:g} {unit}".rstrip()
+
+
+METRES = number()
+
+
+def count(low: int = 0, high: int = int(MAX_NUMBER), *, is_stated: bool = False) -> Kind:
+    """A whole number from low to high; is_stated: written also if it is 0."""
+
+    def read(name: str, text: str) -> int:
+        value = read_number(name, text)
+        if value < 0 or value != int(value):
+            raise refusal(name, f"{value:g} is no whole number from 0 on")
+        return int(value)
+
+    def check(name: str, value: int) -> None:
+        if not low <= value <= high:
+            raise refusal(name, f"{value} is not between {low} and {high}")
+
+    return Kind(Form.NUMBER, read, lambda value: str(value) if value or is_stated else "", check)
+
+
+def _read_stamp(name: str, text: str) -> int:
     if not (text.isascii() and text.isdigit()):
-        raise QueryError(Refusal.WRONG_TYPE, f"parameter `{name}`: {text[:40]!r} is no stamp in nanoseconds")
-    if len(text) > len(str(MAX_STAMP_NS)) or not 1 <= int(text) <= MAX_STAMP_NS:
-        problem = f"parameter `{name}`: {text[:40]} is not between 1 and {MAX_STAMP_NS}"
-        raise QueryError(Refusal.OUT_OF_RANGE, problem)
+        raise refusal(name, f"{text[:40]!r} is no stamp in nanoseconds", Refusal.WRONG_TYPE)
+    if len(text) > len(str(MAX_STAMP_NS)):
+        raise refusal(name, f"{text[:40]} is not between 1 and {MAX_STAMP_NS}")
     return int(text)
 
 
-def free_text(parameters: Parameters, name: str) -> str:
-    """One line that a person wrote, percent-encoded; empty where it is missing."""
-    text = unquote(parameters.get(name, "")).strip()
-    if len(text) > MAX_TEXT or not text.isprintable():
+def _check_stamp(name: str, value: int) -> None:
+    if not 1 <= value <= MAX_STAMP_NS:
+        raise refusal(name, f"{value} is not between 1 and {MAX_STAMP_NS}")
+
+
+STAMP = Kind(Form.STAMP, _read_stamp, str, _check_stamp)  # nanoseconds since 1970, UTC, to the last digit
+
+
+def flag(*, usual: bool) -> Kind:
+    """Yes or no, as 1 or 0; left out where it is as usual."""
+
+    def read(name: str, text: str) -> bool:
+        if text not in ("0", "1"):
+            raise refusal(name, f"{text[:40]!r} is neither 0 nor 1")
+        return text == "1"
+
+    return Kind(Form.FLAG, read, lambda value: "" if value == usual else str(int(value)))
+
+
+def choice(values: Mapping[str, Any], usual: str = "") -> Kind:
+    """One of some words, each with what it means; usual: the word that is not written."""
+
+    def read(name: str, text: str) -> Any:
+        if text not in values:
+            raise refusal(name, f"{text[:40]!r} is none of {', '.join(values)}")
+        return values[text]
+
+    def write(value: Any) -> str:
+        word = next(word for word, meaning in values.items() if meaning == value)
+        return "" if word == usual else word
+
+    def check(name: str, value: Any) -> None:
+        if value not in values.values():
+            read(name, str(value))
+
+    return Kind(Form.TEXT, read, write, check)
+
+
+# Names, comma-separated; left out where there are none.
+WORDS = Kind(Form.TEXT, lambda _, text: tuple(part for part in text.split(",") if part), ",".join)
+
+
+def _check_line(name: str, value: str) -> None:
+    if len(value) > MAX_TEXT or not value.isprintable():
         raise QueryError(Refusal.OUT_OF_RANGE, f"parameter `{name}` must be one line of at most {MAX_TEXT} characters")
-    return text
 
 
-def freshness(parameters: Parameters) -> Freshness:
-    """Which row to wait for, and how long."""
-    return Freshness(count(parameters, "after"), seconds(parameters, "wait", 10.0, MAX_WAIT_S))
+# One line that a person wrote, percent-encoded; left out where it is empty.
+LINE = Kind(Form.LINE, lambda _, text: unquote(text).strip(), lambda value: quote(value, safe=""), _check_line)
 
 
-def times(parameters: Parameters) -> tuple[int | None, int | None]:
-    """The stamps `from` and `to`, in this order; None where one is missing."""
-    from_ns, to_ns = stamp(parameters, "from"), stamp(parameters, "to")
-    if from_ns and to_ns and from_ns > to_ns:
-        raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
-    return from_ns, to_ns
+def name_of(pattern: re.Pattern[str] = NAME, rule: str = "a name") -> Kind:
+    """A name by a rule, which `rule` says in words."""
+
+    def read(name: str, text: str) -> str:
+        if not pattern.fullmatch(text):
+            raise refusal(name, f"{text[:70]!r} is not {rule}")
+        return text
+
+    return Kind(Form.TEXT, read)
 
 
-def text_of_stamps(stamps: Mapping[str, int | None]) -> dict[str, str]:
-    """Stamps by name, those that there are."""
-    return {name: str(stamp_ns) for name, stamp_ns in stamps.items() if stamp_ns is not None}
-
-
-def bounds(parameters: Parameters) -> Bounds:
-    """The rectangle `bounds`."""
-    parts = parameters.get("bounds", "").split(",")
+def _read_rectangle(name: str, text: str) -> Bounds:
+    parts = text.split(",")
     if len(parts) != 4:
-        raise QueryError(Refusal.MISSING_FIELD, "parameter `bounds` must be west,south,east,north in metres")
-    numbers = [number({"bounds": part}, "bounds") for part in parts]
+        raise QueryError(Refusal.MISSING_FIELD, f"parameter `{name}` must be west,south,east,north in metres")
+    numbers = [read_number(name, part) for part in parts]
     try:
         return Bounds(*numbers)
     except ValueError as error:
         raise QueryError(Refusal.OUT_OF_RANGE, str(error)) from None
 
 
-def text_of_bounds(b: Bounds) -> str:
-    """Undo `bounds`."""
-    return ",".join(text_of(v) for v in (b.west_m, b.south_m, b.east_m, b.north_m))
+def _write_rectangle(value: Bounds) -> str:
+    return ",".join(text_of(edge) for edge in (value.west_m, value.south_m, value.east_m, value.north_m))
+
+
+RECTANGLE = Kind(Form.RECTANGLE, _read_rectangle, _write_rectangle)  # west,south,east,north [m]

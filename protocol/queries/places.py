@@ -8,7 +8,9 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.errors import QueryError, Refusal
-from protocol.queries import parameters as ps
+from protocol.queries.parameters import RECTANGLE, Form, Kind, Parameters, read_number, refusal, text_of
+from protocol.queries.request import Group, Parameter
+from protocol.site.geometry import Bounds
 
 Place = tuple[float, float]
 
@@ -17,27 +19,33 @@ MAX_CORNERS = 500  # of one outline: each of its sides is compared with each oth
 PLACES_BYTES = 2**19  # of the parameters of a query with places: MAX_PLACES of them with all their digits
 
 
-def take_places(parameters: ps.Parameters, name: str, most: int = MAX_PLACES) -> tuple[Place, ...]:
-    """A list of places."""
-    parts = ps.required(parameters, name).split(",")
-    if len(parts) % 2:
-        raise refusal(name, f"{len(parts)} numbers; places are pairs x,y in metres")
-    check_count(name, len(parts) // 2, most)
-    numbers = [ps.number({name: part}, name) for part in parts]
-    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
+def places(most: int = MAX_PLACES) -> Kind:
+    """So many places at most, x,y,x,y,... in metres; left out where there are none."""
+
+    def read(name: str, text: str) -> tuple[Place, ...]:
+        parts = text.split(",")
+        if len(parts) % 2:
+            raise refusal(name, f"{len(parts)} numbers; places are pairs x,y in metres")
+        check_count(name, len(parts) // 2, most)
+        numbers = [read_number(name, part) for part in parts]
+        return tuple(zip(numbers[::2], numbers[1::2], strict=True))
+
+    return Kind(Form.PLACES, read, _write_places, lambda name, value: check_count(name, len(value), most))
 
 
-def take_place(parameters: ps.Parameters, name: str) -> Place:
-    """A single place."""
-    places = take_places(parameters, name)
-    if len(places) != 1:
-        raise refusal(name, f"{len(places)} places; it is one, x,y in metres")
-    return places[0]
+def _write_places(value: Sequence[Place]) -> str:
+    return ",".join(text_of(number) for place in value for number in place)
 
 
-def text_of_places(places: Sequence[Place]) -> str:
-    """Undo `take_places`."""
-    return ",".join(ps.text_of(value) for place in places for value in place)
+def _read_place(name: str, text: str) -> Place:
+    numbers = text.split(",")
+    if len(numbers) != 2:
+        raise refusal(name, f"{len(numbers)} numbers; it is one place, x,y in metres")
+    x_m, y_m = (read_number(name, part) for part in numbers)
+    return x_m, y_m
+
+
+PLACE = Kind(Form.PLACE, _read_place, lambda value: _write_places((value,)))
 
 
 def check_count(name: str, count: int, most: int = MAX_PLACES) -> None:
@@ -67,17 +75,35 @@ def check_outline(name: str, corners: Sequence[Place]) -> None:
         raise refusal(name, f"its sides from corners {first + 1} and {second + 1} on cross each other")
 
 
+_BOUNDS = Parameter("bounds", "west,south,east,north [m]", RECTANGLE)
+_POLYGON = Parameter("polygon", "in place of bounds, the corners of an outline: x,y,x,y,... [m]", places(MAX_CORNERS))
+
+
+def _read_area(given: Parameters) -> Bounds | tuple[Place, ...]:
+    if len(given) == 2:
+        raise refusal("polygon", "given with `bounds`: a region is a rectangle or an outline")
+    area: Bounds | tuple[Place, ...] = (_POLYGON if "polygon" in given else _BOUNDS).read(given)
+    return area
+
+
+def _write_area(area: Bounds | tuple[Place, ...]) -> dict[str, str]:
+    return (_BOUNDS if isinstance(area, Bounds) else _POLYGON).write(area)
+
+
+def _check_area(area: Bounds | tuple[Place, ...]) -> None:
+    if not isinstance(area, Bounds):
+        check_outline("polygon", area)
+
+
+AREA = Group((_BOUNDS, _POLYGON), _read_area, _write_area, _check_area)
+
+
 def where_it_lies(bounds: Sequence[int] | None, cell_m: float) -> str:
     """Where a map lies, and what numbers elsewhere may be; bounds: west, south, east, north in cells, None for none."""
     if not bounds:
         return "nothing is driven yet; are these UTM or degrees?"
     west, south, east, north = (edge * cell_m for edge in bounds)
     return f"the map lies at {west:g}..{east:g}, {south:g}..{north:g} m; are these UTM or degrees?"
-
-
-def refusal(parameter: str, problem: str) -> QueryError:
-    """What is wrong with a parameter."""
-    return QueryError(Refusal.OUT_OF_RANGE, f"parameter `{parameter}`: {problem}")
 
 
 def _cross(a: Floats, b: Floats) -> Floats:

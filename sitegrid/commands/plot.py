@@ -5,8 +5,10 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from protocol.queries.route_requests import WayQuery
 from sitegrid.options.groups import add_network, add_site
-from sitegrid.options.values import PICTURE, named_text
+from sitegrid.options.parameters import add_parameters
+from sitegrid.options.values import PICTURE
 
 HELP = "draw the map"
 EXTRA = "server"
@@ -27,8 +29,7 @@ def add_options(parser: ArgumentParser) -> None:
     drawn.add_argument("--line", type=float, nargs="+", metavar="M", help=line)
     ends = ("X1", "Y1", "X2", "Y2")
     drawn.add_argument("--between", type=float, nargs=4, metavar=ends, help="the same of the line that costs least")
-    values = "a value of the drive, as machine=truck or cost=time: as `sitegrid query way` takes it; may be repeated"
-    add("--set", action="append", type=named_text, default=[], metavar="NAME=VALUE", help=values)
+    add_parameters(parser, WayQuery, ("from", "to", "after", "wait"))
 
 
 def run(arguments: Namespace) -> int:

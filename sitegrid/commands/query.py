@@ -6,151 +6,165 @@ It is one module because all queries share their options and their tables.
 from __future__ import annotations
 
 import math
-import re
 import time
 from argparse import SUPPRESS, ArgumentParser, Namespace
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from protocol.arrays import Floats32
-from protocol.errors import ConfigError
 from protocol.files import whole_file
-from protocol.queries.answers import CheckpointCounts, GroundChange, MachineState, PointAnswer, PointsAnswer, Region
+from protocol.queries.answers import (
+    ChangesAnswer,
+    CheckpointCounts,
+    GroundChange,
+    HistoryAnswer,
+    MachinesAnswer,
+    MachineState,
+    MapInfo,
+    PointAnswer,
+    PointsAnswer,
+    Region,
+    ServerAlive,
+)
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
-from protocol.queries.parameters import Freshness, text_of
 from protocol.queries.pieces import Progress
 from protocol.queries.places import where_it_lies
-from protocol.queries.requests import parse_query
-from protocol.queries.roads import RoadSegment
-from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.request import Compared, MapQuery
+from protocol.queries.requests import (
+    QUERIES,
+    AliveQuery,
+    CalibrationQuery,
+    ChangesQuery,
+    HistoryQuery,
+    InfoQuery,
+    MachinesQuery,
+    PointQuery,
+    PointsQuery,
+    RegionQuery,
+)
+from protocol.queries.roads import RoadSegment, Segments, SegmentsQuery, Worklist, WorklistQuery
+from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
 from protocol.queries.routing import RouteAnswer
 from sitegrid.client import Client, connect
 from sitegrid.explanations import calibrated, why
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
-from sitegrid.options.values import HELP as TIME_HELP
-from sitegrid.options.values import OutputFile, SiteTime, named_text, parse_time, positive, utc_text
+from sitegrid.options.parameters import add_parameters, dest, given, spread
+from sitegrid.options.values import OutputFile, utc_text
 from sitegrid.process import streams
 from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
 from sitegrid.process.progress import EVERY_S
 
 HELP = "ask the map"
-Answer = tuple[Any, Iterable[str]]  # a table for programs, None where all is printed already; lines for people
-Ask = Callable[[Client, Namespace, tuple[str, ...]], Answer]  # the names are layers
+Answer = tuple[Any, Iterable[str]]  # a table for programs; lines for people
 HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of a table for people, unless named
+# Words of a query that are no options: what stands for them in the usage, and how many numbers there are.
+WORDS: dict[str, tuple[str, tuple[str, ...] | str]] = {
+    "point": ("position, in metres", ("x_m", "y_m")),
+    "why": ("position, in metres", ("x_m", "y_m")),
+    "history": ("position, in metres", ("x_m", "y_m")),
+    "points": ("positions, in metres", "X_M Y_M"),
+    "region": ("west, south, east, north; or the corners x y x y x y ... of an outline", "M"),
+    "route": ("places of the line, in metres", "X_M Y_M"),
+    "way": ("from a place to another, in metres", ("from_x_m", "from_y_m", "to_x_m", "to_y_m")),
+}
+PLACED = ("x", "y", "places", "bounds", "polygon", "line", "from", "to")  # parameters that these words give
+FOR_PROGRAMS = ("piece", "tiles")
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     _add_common(parser)
     queries = parser.add_subparsers(metavar="QUERY", required=True)
-    point = _add_query(queries, _point, "the cell at a position, in metres")
-    _add_numbers(point, "x_m", "y_m")
-    _add_when(point)
-    points = _add_query(queries, _points, "the cells at many positions, in metres")
-    points.add_argument("places", type=float, nargs="+", metavar="X_M Y_M", help="positions, in metres")
-    _add_when(points)
-    region = _add_query(queries, _region, "the cells of a rectangle or an outline, in metres")
-    area = "west, south, east, north; or the corners x y x y x y ... of an outline"
-    region.add_argument("area", type=float, nargs="+", metavar="M", help=area)
-    larger = "edge of larger cells in metres, a multiple of the map's: means of what is known in each"
-    region.add_argument("--resolution", type=positive, metavar="M", help=larger)
-    region.add_argument("--out", type=OutputFile((".npz",)), help="write coordinates and layers into this .npz file")
-    _add_when(region)
-    history = _add_query(queries, _history, "the cell at a position over time")
-    _add_numbers(history, "x_m", "y_m")
-    _add_times(history, ("from", "samples from this time on"), ("to", "samples up to this time; default the newest"))
-    history.add_argument("--span", type=positive, metavar="SECONDS", help="length of one span; default 5 minutes")
-    for ask, summary in (
-        (_segments, "roads that the map shows, and what drove on them"),
-        (_worklist, "stretches of road where work pays, the dearest first"),
-    ):
-        roads = _add_query(queries, ask, summary)
-        hours = ("from", "traffic of the hours from this time on"), ("to", "traffic of the hours before this time")
-        _add_times(roads, *hours, ("as-of", "the map as of this time"))
-        alone = "traffic of this machine alone, and what it measured"
-        roads.add_argument("--machine", default="", metavar="NAME", help=alone)
-    roads.add_argument("--target", type=positive, default=0.02, help="rolling resistance of good ground (default 0.02)")
-    route = _add_query(queries, _route, "what a drive along a line costs a machine: energy and time")
-    route.add_argument("line", type=float, nargs="+", metavar="X_M Y_M", help="places of the line, in metres")
-    _add_drive(route)
-    way = _add_query(queries, _way, "the line from one place to another that costs least")
-    _add_numbers(way, "from_x_m", "from_y_m", "to_x_m", "to_y_m")
-    _add_drive(way)
-    _add_query(queries, _machines, "state of each machine: samples, trust, reasons")
-    _add_query(queries, _calibration, "what is taken off the samples of each machine")
-    changes = _add_query(queries, _changes, "list of ground changes: place and time")
-    changes.add_argument("--follow", action="store_true", help="print new changes as they are detected, until stopped")
-    _add_query(queries, _info, "state of the map and its server")
-    _add_query(queries, _followers, "followers that answer, and how far behind they are")
-    _add_query(queries, _alive, "whether the map server takes batches: for probes")
+    for name, cls in QUERIES.items():
+        if name not in FOR_PROGRAMS:
+            _add_query(queries, cls)
+    followers = add_action(queries, "followers", FOLLOWERS, sentence(FOLLOWERS))
+    _add_common(followers, again=True)
+    followers.set_defaults(ask=_ask_followers)
 
 
-def _add_query(queries: Subparsers, ask: Ask, summary: str) -> ArgumentParser:
-    query = add_action(queries, ask.__name__.removeprefix("_"), summary, sentence(summary))
+def _add_query(queries: Subparsers, cls: type[MapQuery[Any]]) -> None:
+    query = add_action(queries, cls.name, cls.help, sentence(cls.help))
     _add_common(query, again=True)
-    query.set_defaults(ask=ask)
-    return query
+    by_words = PLACED if cls.name in WORDS and cls.name != "history" else ("x", "y")
+    add_parameters(query, cls, (*by_words, "after", "wait", "layers"))
+    query.set_defaults(ask=partial(_ask, cls))
+    if cls.name in WORDS:
+        what, names = WORDS[cls.name]
+        if isinstance(names, str):
+            query.add_argument("numbers", type=float, nargs="+", metavar=names, help=what)
+        else:
+            for name in names:
+                query.add_argument(name, type=float)
+    if cls is RegionQuery:
+        query.add_argument("--out", type=OutputFile((".npz",)), help="write coordinates and layers into this .npz file")
+    if cls is ChangesQuery:
+        query.add_argument(
+            "--follow", action="store_true", help="print new changes as they are detected, until stopped"
+        )
 
 
 def _add_common(parser: ArgumentParser, *, again: bool = False) -> None:
     """Options of every query, before its name and after it."""
     add_network(parser, again=again)
     add_site(parser, again=again)
+    default = SUPPRESS if again else None
     after = "wait until this journal row is in the map; for changes: list those after this number"
-    parser.add_argument("--after", type=int, default=SUPPRESS if again else 0, help=after)
+    parser.add_argument("--after", dest=dest("after"), type=int, default=default, metavar="NUMBER", help=after)
     layers = "layers, comma-separated; default all"
-    parser.add_argument("--layers", default=SUPPRESS if again else "", help=layers)
-
-
-def _add_numbers(query: ArgumentParser, *names: str) -> None:
-    for name in names:
-        query.add_argument(name, type=float)
-
-
-def _add_drive(query: ArgumentParser) -> None:
-    examples = (
-        "machine=truck (a kind, or a machine's name), mass=30000, speed=6, unknown=refuse, step=50; "
-        "of a way cost=time, margin=5, max_grade=0.1"
-    )
-    option = f"anything that docs/protocol.md (Routes) lists, as {examples}; may be repeated"
-    query.add_argument("--set", action="append", type=named_text, default=[], metavar="NAME=VALUE", help=option)
-    _add_times(query, ("as-of", "the map as of this time"))
-
-
-def _add_when(query: ArgumentParser) -> None:
-    _add_times(query, ("as-of", "the map as of this time"), ("minus", "subtract the map as of this time"))
-    since = "read roads whose ground changed, as the worklist shows it, from the samples since"
-    query.add_argument("--repairs", action="store_true", help=since)
-
-
-def _add_times(query: ArgumentParser, *options: tuple[str, str]) -> None:
-    for name, summary in options:
-        dest = f"{name.replace('-', '_')}_time"
-        query.add_argument(f"--{name}", dest=dest, type=parse_time, metavar="TIME", help=summary)
-    query.epilog = f"TIME: {TIME_HELP}."
-    # argparse knows no public way to say that -2h is a value as -2 is one, not an option
-    query._negative_number_matcher = re.compile(r"-\.?\d.*")  # noqa: SLF001
+    parser.add_argument("--layers", dest=dest("layers"), default=default, help=layers)
 
 
 def run(arguments: Namespace) -> int:
     """Ask once and print the answer; changes, while they are followed, until stopped."""
-    layers = tuple(part for part in arguments.layers.split(",") if part)
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
-        table, lines = arguments.ask(client, arguments, layers)
-    if table is not None:
-        say(plain(table)) if arguments.json else tell(*lines)
+        if getattr(arguments, "follow", False):
+            _follow_changes(client, arguments)
+            return 0
+        table, lines = arguments.ask(client, arguments)
+    say(plain(table)) if arguments.json else tell(*lines)
     return 0
 
 
-def _point(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
-    when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
-    rest = {"repairs": arguments.repairs, "after": arguments.after}
-    point = client.point(arguments.x_m, arguments.y_m, layers, **when, **rest)
+def _ask(cls: type[MapQuery[Any]], client: Client, arguments: Namespace) -> Answer:
+    """Ask the query that the options are of."""
+    vars(arguments).update(_placed(cls, arguments))
+    if cls is HistoryQuery and not arguments.asked_layers and not arguments.json:
+        arguments.asked_layers = ",".join(HISTORY_LAYERS)
+    query = given(cls, arguments, lambda: client.info().stamp_ns)
+    answer = client.ask(query, progress=_pieces_shown())
+    show: Callable[..., Answer] = LINES.get(cls.name, _record)
+    table, lines = show(client, query, answer)
+    return _written(answer, arguments.out, table, lines) if getattr(arguments, "out", None) else (table, lines)
+
+
+def _placed(cls: type[MapQuery[Any]], arguments: Namespace) -> dict[str, Any]:
+    """Parameters that words of a query are of."""
+    if cls.name in ("point", "why", "history"):
+        return spread({"x": arguments.x_m, "y": arguments.y_m})
+    if cls is WayQuery:
+        ends = {end: [getattr(arguments, f"{end}_{axis}_m") for axis in "xy"] for end in ("from", "to")}
+        return spread(ends)
+    numbers: list[float] = getattr(arguments, "numbers", [])
+    if cls is RegionQuery:
+        return spread({"bounds" if len(numbers) == 4 else "polygon": numbers})
+    return spread({"line" if cls is RouteQuery else "places": numbers}) if numbers else {}
+
+
+def _record(_: Client, __: Any, answer: Any) -> Answer:
+    """An answer that has no table of its own: its fields."""
+    table = plain(answer)
+    return table, [f"{name}: {value}" for name, value in table.items()]
+
+
+def _point(client: Client, query: PointQuery, point: PointAnswer) -> Answer:
     table = {"x_m": point.x_m, "y_m": point.y_m, **point.values, **_version(point)}
-    head = f"cell at {point.x_m:g}, {point.y_m:g} m{_as_of(when, point.stamp_ns)}"
+    head = f"cell at {point.x_m:g}, {point.y_m:g} m{_as_of(query, point.stamp_ns)}"
     lines = [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
     return table, lines + (
         [] if np.isfinite([*point.values.values()]).any() else _off_map(client, point.x_m, point.y_m)
@@ -167,10 +181,7 @@ def _off_map(client: Client, x_m: float, y_m: float) -> list[str]:
     return [f"nobody was there: {where_it_lies(info.bounds, info.site.cell_m)}"]
 
 
-def _points(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
-    when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
-    rest = {"repairs": arguments.repairs, "after": arguments.after}
-    answer = client.points(_places_of(arguments.places), layers, **when, **rest)
+def _points(_: Client, __: PointsQuery, answer: PointsAnswer) -> Answer:
     places = {"x_m": answer.x_m.tolist(), "y_m": answer.y_m.tolist()}
     table = {**places, **{name: values.tolist() for name, values in answer.layers.items()}, **_version(answer)}
     rows = (
@@ -180,37 +191,24 @@ def _points(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> An
     return table, _table(["x", "y", *answer.layers], rows)
 
 
-def _places_of(numbers: Sequence[float]) -> list[tuple[float, float]]:
-    if len(numbers) % 2:
-        raise ConfigError("sitegrid query", f"{len(numbers)} numbers; places are pairs x y in metres")
-    return list(zip(numbers[::2], numbers[1::2], strict=True))
-
-
-def _region(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
-    area = arguments.area if len(arguments.area) == 4 else _places_of(arguments.area)
-    when = _stamps(client, as_of=arguments.as_of_time, minus=arguments.minus_time)
-    try:
-        rest = {"repairs": arguments.repairs, "after": arguments.after, "resolution_m": arguments.resolution}
-        region = client.region(area, layers, **when, **rest, progress=_pieces_shown())
-    except ValueError as error:
-        raise ConfigError("sitegrid query region", str(error)) from None
-    if arguments.out:
-        arrays: dict[str, Any] = {"x_m": region.x_m, "y_m": region.y_m, **region.layers}
-        with whole_file(arguments.out) as file:
-            np.savez_compressed(file, **arrays)
+def _region(_: Client, query: RegionQuery, region: Region) -> Answer:
     summary = {name: _statistics(values) for name, values in region.layers.items()}
     size = {"columns": len(region.x_m), "rows": len(region.y_m)}
     b = region.bounds
     place = f"{b.west_m:g}..{b.east_m:g} x {b.south_m:g}..{b.north_m:g} m, {region.cell_m:g} m cells"
-    lines = [f"{place}{_as_of(when, region.stamp_ns)}, journal row {region.merged}"]
+    lines = [f"{place}{_as_of(query, region.stamp_ns)}, journal row {region.merged}"]
     for name, row in summary.items():
         span = f"min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
         lines.append(f"  {name:18} {row['known']:7d} known   {span}")
-    table = {**size, **_version(region), "layers": summary}
-    if arguments.out:
-        table["file"] = str(arguments.out)
-        lines.append(f"written to {arguments.out}")
-    return table, lines
+    return {**size, **_version(region), "layers": summary}, lines
+
+
+def _written(region: Region, out: Path, table: Any, lines: Iterable[str]) -> Answer:
+    """Write a region into a file, and say so."""
+    arrays: dict[str, Any] = {"x_m": region.x_m, "y_m": region.y_m, **region.layers}
+    with whole_file(out) as file:
+        np.savez_compressed(file, **arrays)
+    return {**table, "file": str(out)}, [*lines, f"written to {out}"]
 
 
 def _version(answer: PointAnswer | PointsAnswer | Region | RouteAnswer) -> dict[str, Any]:
@@ -231,24 +229,15 @@ def _pieces_shown() -> Progress:
     return show
 
 
-def _history(client: Client, arguments: Namespace, layers: tuple[str, ...]) -> Answer:
-    layers = layers or (() if arguments.json else HISTORY_LAYERS)
-    times = _stamps(client, **{"from": arguments.from_time, "to": arguments.to_time})
-    spans = client.history(arguments.x_m, arguments.y_m, layers, **times, span_s=arguments.span, after=arguments.after)
-    table = {"spans": [{"first_ns": s.first_ns, "last_ns": s.last_ns, **s.values} for s in spans]}
-    if not spans:
+def _history(_: Client, __: HistoryQuery, answer: HistoryAnswer) -> Answer:
+    table = {"spans": [{"first_ns": s.first_ns, "last_ns": s.last_ns, **s.values} for s in answer.spans]}
+    if not answer.spans:
         return table, ["nobody was there"]
-    rows = ([utc_text(s.first_ns), *map(_value, s.values.values())] for s in spans)
-    return table, _table(["from (UTC)", *spans[0].values], rows)
+    rows = ([utc_text(s.first_ns), *map(_value, s.values.values())] for s in answer.spans)
+    return table, _table(["from (UTC)", *answer.spans[0].values], rows)
 
 
-def _road_times(client: Client, arguments: Namespace) -> dict[str, Any]:
-    times = {"from": arguments.from_time, "to": arguments.to_time, "as_of": arguments.as_of_time}
-    return {**_stamps(client, **times), "machine": arguments.machine, "after": arguments.after}
-
-
-def _segments(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
-    answer = client.segments(**_road_times(client, arguments))
+def _segments(_: Client, __: SegmentsQuery, answer: Segments) -> Answer:
     if not answer.segments:
         return answer, ["no roads are known"]
     head = ["stretch", "around", "m", "resistance", "+-", "grade", "passes/h there", "back", "t/h there", "back"]
@@ -264,8 +253,7 @@ def _segments(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answe
     return answer, [f"{km:.2f} km of roads, traffic of {answer.hours:.2f} h", *_table(head, rows)]
 
 
-def _worklist(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
-    answer = client.worklist(arguments.target, **_road_times(client, arguments))
+def _worklist(_: Client, __: WorklistQuery, answer: Worklist) -> Answer:
     total = f"{answer.total_kwh_ph:.2f} kWh/h lost on all roads against a resistance of {answer.target:g}"
     if not answer.rows and not answer.changes:
         return answer, [f"{total}: no stretch is worse for sure"]
@@ -303,10 +291,9 @@ def _place(segment: RoadSegment) -> list[str]:
     return [segment.id, f"{x_m:.0f}, {y_m:.0f}"]
 
 
-def _machines(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
-    machines = client.machines(after=arguments.after)
+def _machines(_: Client, __: MachinesQuery, answer: MachinesAnswer) -> Answer:
     head = ["machine", "trusted", "since", "samples", "lost", "newest", "accelerometer zero", "torque gain", "why"]
-    return {"machines": machines}, _table(head, map(_machine_row, machines))
+    return {"machines": answer.machines}, _table(head, map(_machine_row, answer.machines))
 
 
 def _machine_row(machine: MachineState) -> list[str]:
@@ -317,8 +304,7 @@ def _machine_row(machine: MachineState) -> list[str]:
     return [machine.name, trusted, since, *counts, utc_text(machine.newest_ns), *calibration, why(machine) or "-"]
 
 
-def _calibration(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
-    answer = client.calibration(after=arguments.after)
+def _calibration(_: Client, __: CalibrationQuery, answer: CalibrationAnswer) -> Answer:
     return answer, calibration_table(answer)
 
 
@@ -344,12 +330,9 @@ def _calibration_row(machine: MachineCalibration) -> list[str]:
     return [machine.name, *map(_value, values), "; ".join(shown) or "-", newest, decided]
 
 
-def _changes(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
-    if arguments.follow:
-        _follow_changes(client, arguments)
-        return None, ()
-    changes = client.changes(arguments.after)
-    return {"changes": changes}, [*map(_change_line, changes)] or ["no change of the ground was found"]
+def _changes(_: Client, __: ChangesQuery, answer: ChangesAnswer) -> Answer:
+    lines = [*map(_change_line, answer.changes)]
+    return {"changes": answer.changes}, lines or ["no change of the ground was found"]
 
 
 def _follow_changes(client: Client, arguments: Namespace) -> None:
@@ -362,7 +345,7 @@ def _follow_changes(client: Client, arguments: Namespace) -> None:
             stop.set()
 
     listener = client.on_change(show)
-    for change in client.changes(arguments.after):
+    for change in client.changes(arguments.asked_after or 0):
         show(change)
     wait(stop)
     listener.close()
@@ -379,8 +362,7 @@ def _change_line(change: GroundChange) -> str:
     return "  ".join(parts)
 
 
-def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
-    info = client.info(after=arguments.after)
+def _info(_: Client, __: InfoQuery, info: MapInfo) -> Answer:
     return info, [
         f"site {info.site.name}: {info.cells} cells driven, bounds {info.bounds and list(info.bounds)}",
         f"  journal row {info.journalled}, merged {info.merged}, snapshot {info.snapshot}",
@@ -394,25 +376,12 @@ def _info(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
     ]
 
 
-def _route(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
-    return _driven(client, arguments, "route", {"line": _numbers(arguments.line)})
-
-
-def _way(client: Client, arguments: Namespace, _: tuple[str, ...]) -> Answer:
-    ends = {name: _numbers([getattr(arguments, f"{name}_{axis}_m") for axis in "xy"]) for name in ("from", "to")}
-    return _driven(client, arguments, "way", ends)
-
-
-def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str, str]) -> Answer:
+def _drive(_: Client, query: LineQuery, answer: RouteAnswer) -> Answer:
     """What a drive costs, in a line of totals and a table of steps."""
-    times = {key: str(stamp) for key, stamp in _stamps(client, as_of=arguments.as_of_time).items() if stamp}
-    query = parse_query(name, {**places, **dict(arguments.set), **{k.removesuffix("_ns"): v for k, v in times.items()}})
-    assert isinstance(query, RouteQuery | WayQuery)
-    answer = client.drive(replace(query, fresh=Freshness(arguments.after)))
     totals, steps, machine = answer.totals, answer.steps, answer.machine
     corners = (
         []
-        if name == "route"
+        if isinstance(query, RouteQuery)
         else [f"{len(answer.line_m)} places: " + " ".join(f"{x:.0f},{y:.0f}" for x, y in answer.line_m)]
     )
     kwh = f"{totals.energy_j / 3.6e6:.2f} kWh ({totals.energy_low_j / 3.6e6:.2f}..{totals.energy_high_j / 3.6e6:.2f})"
@@ -446,17 +415,15 @@ def _driven(client: Client, arguments: Namespace, name: str, places: Mapping[str
     return table, [*lines, *_table(head, rows)]
 
 
-def _numbers(values: Sequence[float]) -> str:
-    return ",".join(text_of(value) for value in values)
+FOLLOWERS = "followers that answer, and how far behind they are"
 
 
-def _followers(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:
+def _ask_followers(client: Client, _: Namespace) -> Answer:
     followers = client.followers()
     return followers, [*map(str, followers)] or ["no follower answers"]
 
 
-def _alive(client: Client, _: Namespace, __: tuple[str, ...]) -> Answer:
-    alive = client.alive()
+def _alive(_: Client, __: AliveQuery, alive: ServerAlive) -> Answer:
     return alive, [f"batches are taken: journal row {alive.journalled}, merged {alive.merged}"]
 
 
@@ -467,20 +434,10 @@ def _checkpoints(counts: CheckpointCounts) -> str:
     return f"checkpoints {counts.count} ({counts.bytes / 1e6:.0f} MB){newest}{damaged}"
 
 
-def _stamps(client: Client, **times: SiteTime | None) -> dict[str, Any]:
-    """Times of options as the client's arguments: `as_of` becomes `as_of_ns`."""
-
-    def now_ns() -> int:
-        return client.info().stamp_ns
-
-    given = {name: time for name, time in times.items() if time}
-    return {f"{name}_ns": time.stamp(f"--{name.replace('_', '-')}", now_ns) for name, time in given.items()}
-
-
-def _as_of(when: Mapping[str, int], stamp_ns: int) -> str:
+def _as_of(query: Compared[Any], stamp_ns: int) -> str:
     """What to say of the time of an answer, nothing where it is the map as it is."""
-    as_of = f", as of {utc_text(stamp_ns)}" if "as_of_ns" in when else ""
-    return as_of + (f", minus that of {utc_text(when['minus_ns'])}" if "minus_ns" in when else "")
+    as_of = f", as of {utc_text(stamp_ns)}" if query.as_of_ns else ""
+    return as_of + (f", minus that of {utc_text(query.minus_ns)}" if query.minus_ns else "")
 
 
 def _value(value: float | None) -> str:
@@ -498,3 +455,20 @@ def _statistics(values: Floats32) -> dict[str, float]:
     if not known.size:
         return {"known": 0, "min": math.nan, "mean": math.nan, "max": math.nan}
     return {"known": known.size, "min": float(known.min()), "mean": float(known.mean()), "max": float(known.max())}
+
+
+LINES: dict[str, Callable[..., Answer]] = {
+    "point": _point,
+    "points": _points,
+    "region": _region,
+    "history": _history,
+    "segments": _segments,
+    "worklist": _worklist,
+    "route": _drive,
+    "way": _drive,
+    "machines": _machines,
+    "calibration": _calibration,
+    "changes": _changes,
+    "info": _info,
+    "alive": _alive,
+}

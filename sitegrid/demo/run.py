@@ -14,7 +14,7 @@ from mapserver.config import ServerConfig
 from mapserver.pictures.plotter import side_by_side, write_image
 from protocol.errors import ConfigError, LinkError, QueryError
 from protocol.queries.answers import Region
-from protocol.queries.commands import MAX_WAIT_S
+from protocol.queries.parameters import MAX_WAIT_S
 from protocol.site.site_file import load_site
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import TruthMap

@@ -57,13 +57,6 @@ def not_negative(text: str) -> float:
     return float(text)
 
 
-def named_text(text: str) -> tuple[str, str]:
-    """NAME=VALUE, of a query's parameters."""
-    name, equals, value = text.partition("=")
-    _require(bool(name and equals), f"{text!r} is not NAME=VALUE")
-    return name, value
-
-
 def shares(text: str) -> tuple[float, ...]:
     """Shares of 0 to 1, comma-separated; the least first."""
     values = tuple(sorted(set(map(float, text.split(",")))))

@@ -21,8 +21,9 @@ from protocol.arrays import Floats32
 from protocol.errors import ConfigError
 from protocol.queries.answers import MachineState, Region
 from protocol.queries.parameters import text_of
-from protocol.queries.requests import parse_query
-from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.requests import RegionQuery
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
+from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import receive_pose
@@ -32,6 +33,7 @@ from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.explanations import calibrations
 from sitegrid.listener import Listener
+from sitegrid.options.parameters import dest, given, spread
 from sitegrid.process.lifetime import note, say
 
 AROUND_M = 30.0  # of the map around a drive
@@ -45,7 +47,7 @@ def run(arguments: Namespace) -> int:
     """Draw what is asked for."""
     files = {"picture": str(arguments.out)}
     with connect(arguments.endpoint, arguments.site, keys=arguments.keys) as client:
-        if query := _query(arguments):
+        if query := _query(client, arguments):
             draw_line(client, arguments.out, query, arguments.bounds)
         elif arguments.worklist:
             draw_roads(client, arguments.out, arguments.bounds)
@@ -57,21 +59,20 @@ def run(arguments: Namespace) -> int:
     return 0
 
 
-def _query(arguments: Namespace) -> RouteQuery | WayQuery | None:
+def _query(client: Client, arguments: Namespace) -> LineQuery | None:
     """What is asked of a drive, if one is to be drawn."""
-    if arguments.line or arguments.between:
-        places = arguments.line or arguments.between
-        asked = {"step": text_of(_step_m(places)), **dict(arguments.set)}
-        if arguments.line:
-            query = parse_query("route", {"line": _text(places), **asked})
-        else:
-            query = parse_query("way", {"from": _text(places[:2]), "to": _text(places[2:]), **asked})
-    elif arguments.set:
-        raise ConfigError("--set", "is of a drive: give `--line` or `--between` too")
-    else:
-        return None
-    assert isinstance(query, RouteQuery | WayQuery)
-    return query
+    cls: type[LineQuery] = RouteQuery if arguments.line else WayQuery
+    if places := arguments.line or arguments.between:
+        ends = {"from": arguments.between and places[:2], "to": arguments.between and places[2:]}
+        vars(arguments).update(spread({"line": arguments.line, **ends}))
+        arguments.asked_step = arguments.asked_step or text_of(_step_m(places))
+        query = given(cls, arguments, lambda: client.info().stamp_ns)
+        assert isinstance(query, LineQuery)
+        return query
+    if options := [name for name, value in vars(arguments).items() if name.startswith(dest("")) and value is not None]:
+        option = options[0].removeprefix(dest("")).replace("_", "-")
+        raise ConfigError(f"--{option}", "is of a drive: give `--line` or `--between` too")
+    return None
 
 
 def _step_m(places: Sequence[float]) -> float:
@@ -82,23 +83,20 @@ def _step_m(places: Sequence[float]) -> float:
     return max(STEP_M, length_m / MOST_STEPS) if math.isfinite(length_m) else STEP_M
 
 
-def _text(values: Sequence[float]) -> str:
-    return ",".join(map(text_of, values))
-
-
-def draw_line(client: Client, out: Path, query: RouteQuery | WayQuery, bounds: list[float] | None) -> None:
+def draw_line(client: Client, out: Path, query: LineQuery, bounds: list[float] | None) -> None:
     """Ask for a drive and the map around it, and write their picture."""
-    answer = client.drive(query)
+    answer = client.ask(query)
     low, high = answer.line_m.min(axis=0) - AROUND_M, answer.line_m.max(axis=0) + AROUND_M
     chosen = _bounds(client, bounds) if bounds else Bounds(*low.tolist(), *high.tolist())
-    region = client.region(chosen, ("resistance", "resistance_filled"), as_of_ns=query.as_of_ns, repairs=query.repairs)
+    layers = "resistance", "resistance_filled"
+    region = client.ask(RegionQuery(chosen, layers, as_of_ns=query.as_of_ns, repairs=query.repairs))
     write_image(out, draw_drive(region, answer))
 
 
 def draw_roads(client: Client, out: Path, bounds: list[float] | None) -> None:
     """Ask for roads and worklist, and write their picture."""
     chosen = _bounds(client, bounds) if bounds else None
-    write_image(out, draw_worklist(client.segments(bounds=chosen), client.worklist(bounds=chosen)))
+    write_image(out, draw_worklist(client.ask(SegmentsQuery(bounds=chosen)), client.ask(WorklistQuery(bounds=chosen))))
 
 
 def draw(

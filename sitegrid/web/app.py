@@ -25,6 +25,7 @@ from starlette.websockets import WebSocket
 
 from protocol.errors import Refusal
 from protocol.queries.answers import MapInfo, MapVersion
+from protocol.queries.requests import RegionQuery
 from protocol.site.geometry import Bounds
 from sitegrid.web import live, values
 from sitegrid.web.encoding import Cache, as_json, beside
@@ -104,7 +105,7 @@ class WebApp:
             headers = {"ETag": tag, "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
             if has_copy(request, tag):
                 return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-            response = await resource.answer(feed, parameters)
+            response = await resource.answered(feed, parameters)
         except Exception as error:  # whatever it was: one answer, as a problem
             return _failed(request, error)
         own = response.headers.get("etag")
@@ -197,7 +198,7 @@ async def _png(feed: SiteFeed, info: MapInfo, kind: str, layer: str, place: tupl
     bounds = pixels.bounds(_known(info), cell_m) if info.merged else None
     if bounds is None:
         return mercator.empty_png(kind)
-    region = await feed.ask(feed.client.region, bounds, (layer,))
+    region = await feed.ask(feed.client.ask, RegionQuery(bounds, (layer,)))
     edges = region.bounds
     return await beside(lambda: png(pixels.sample(region[layer], edges.west_m, edges.south_m, cell_m), layer))
 

@@ -14,7 +14,7 @@ import numpy as np
 from protocol.arrays import AnyArray, Floats, Ints
 from protocol.queries.answers import GroundChange
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer
-from protocol.queries.roads import Line, RoadChange, RoadSegment, WorklistRow
+from protocol.queries.roads import Corners, RoadChange, RoadSegment, WorklistRow
 from protocol.site.ground_classes import ZONES
 from protocol.site.site_config import Projection
 from protocol.wire.messages import Pose
@@ -176,7 +176,7 @@ def _road(road: RoadSegment, more: dict[str, Any], projection: Projection) -> di
     return _feature("LineString", _line(road.line, projection), {**more, **properties})
 
 
-def _line(line: Line, projection: Projection) -> list[list[float]]:
+def _line(line: Corners, projection: Projection) -> list[list[float]]:
     return [_corner(x, y, 1.0, projection) for x, y in line]
 
 

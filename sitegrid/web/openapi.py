@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from protocol.queries.parameters import Form
 from protocol.version import package_version
 from sitegrid.web.resource import Resource
 from sitegrid.web.resources import RESOURCES
 
 PREFIX = "/api/v1"
-NUMBERS = (
-    *("x", "y", "lat", "lon", "span", "after", "row", "fact", "target", "efficiency", "limit", "mass", "speed"),
-    *("power", "accelerate", "brake", "lateral", "rotating", "step", "max_grade", "margin", "resolution"),
-)
+JSON = {Form.NUMBER: "number"}  # types of parameters, where they are not text
 PROBLEM = {
     "description": "Refused, or not possible now",
     "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
@@ -55,11 +53,16 @@ def description() -> dict[str, Any]:
 
 def _operation(name: str, resource: Resource) -> dict[str, Any]:
     parameters = [
-        {"name": key, "in": "query", "description": text, "schema": {"type": "number" if key in NUMBERS else "string"}}
-        for key, text in resource.parameters.items()
+        {
+            "name": one.name,
+            "in": "query",
+            "description": one.help,
+            "schema": {"type": JSON.get(one.kind.form, "string")},
+        }
+        for one in resource.parameters.values()
     ]
     return {
-        "summary": resource.summary,
+        "summary": resource.summary[0].upper() + resource.summary[1:],
         "operationId": name.replace("/", "_"),
         "parameters": [SITE, *parameters],
         "responses": _responses(resource.media),

@@ -2,41 +2,93 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+import math
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import Response
 
-from protocol.queries import requests
+from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion
+from protocol.queries.parameters import Form, number, text_of
+from protocol.queries.request import Fresh, MapQuery, Parameter, parameters_of
+from protocol.queries.requests import parse_query
 from sitegrid.web import values
 from sitegrid.web.encoding import as_json, beside
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters
 
-Answer = Callable[[SiteFeed, Parameters], Awaitable[Response]]
-
-PLACE = {"x": "east of the site's origin [m]", "y": "north of it [m]"}
-PLACE |= {"lat": "latitude [deg], with lon in place of x and y", "lon": "longitude [deg]"}
-AS_OF = {"as_of": "the map as of this time, ISO 8601 or nanoseconds since 1970 (UTC)"}
-LAYERS = {"layers": "names, comma-separated; without it all"}
-BOUNDS = {"bounds": "west,south,east,north [m]"}
-REPAIRS = {"repairs": "1: cells of roads whose ground changed, from the samples since (default 0)"}
-WHEN = {**AS_OF, "minus": "less the map as of this time, value by value", **REPAIRS}
+Answer = Callable[[SiteFeed, Any, Parameters], Awaitable[Response]]
+LAT_LON = (
+    Parameter("lat", "latitude [deg], with lon in place of x and y", number(-90.0, 90.0)),
+    Parameter("lon", "longitude [deg]", number(-360.0, 360.0)),  # some programs count on beyond 180
+)
 GEOJSON = ("application/geo+json",)
 
 
 @dataclass(frozen=True)
 class Resource:
-    """What a path answers. parameters: name -> meaning. media: what it may answer with."""
+    """What a path answers: a query of the map server, or what the web server itself knows.
+
+    query: what it asks, with all of its parameters but `without`, and but those of what it waits for. more: further
+    parameters, which `answer` gets as they are. media: what it may answer with. follows_now: whether it changes with
+    the site's now, not with the map alone.
+    """
 
     answer: Answer
     summary: str
-    parameters: Mapping[str, str]
+    query: type[MapQuery[Any]] | None = None
+    without: tuple[str, ...] = ()
+    more: tuple[Parameter, ...] = ()
     media: tuple[str, ...] = ("application/json",)
-    follows_now: bool = False  # whether it changes with the site's now, not with the map alone
+    follows_now: bool = False
+
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """All that it takes, by name."""
+        known = parameters_of(self.query) if self.query else {}
+        waits = parameters_of(Fresh) if self.query and issubclass(self.query, Fresh) else {}
+        taken = {name: one for name, one in known.items() if name not in self.without and name not in waits}
+        places = LAT_LON if "x" in taken else ()
+        return taken | {one.name: one for one in (*places, *self.more)}
+
+    async def answered(self, feed: SiteFeed, parameters: Parameters) -> Response:
+        """The answer to parameters that are known; QueryError or Problem says what is wrong with them."""
+        more = {one.name for one in self.more}
+        rest = {name: text for name, text in parameters.items() if name in more}
+        if self.query is None:
+            return await self.answer(feed, None, rest)
+        asked = {name: text for name, text in parameters.items() if name not in more}
+        if "lat" in self.parameters:
+            asked = await _in_metres(feed, asked)
+        return await self.answer(feed, _parsed(self.query, asked), rest)
+
+
+async def _in_metres(feed: SiteFeed, asked: dict[str, str]) -> dict[str, str]:
+    """Parameters with a place in `map` [m] for one in latitude and longitude."""
+    if not {"lat", "lon"} & set(asked):
+        return asked
+    degrees = [one.read(asked) for one in LAT_LON]
+    for one, value in zip(LAT_LON, degrees, strict=True):
+        one.check(value)
+    x_m, y_m, _ = (await feed.projection()).to_map(degrees[0], degrees[1], 0.0)
+    if not (math.isfinite(x_m) and math.isfinite(y_m)):
+        raise values.bad(Refusal.OUT_OF_RANGE, "`lat`, `lon`: too far from the site")
+    rest = {name: text for name, text in asked.items() if name not in ("x", "y", "lat", "lon")}
+    return {**rest, "x": text_of(x_m), "y": text_of(y_m)}
+
+
+def _parsed(query: type[MapQuery[Any]], parameters: Parameters) -> MapQuery[Any]:
+    """A query, checked as the map server does; times may be ISO 8601, places x,y;x,y;... too."""
+    texts = dict(parameters)
+    for name, one in parameters_of(query).items():
+        if name in texts and one.kind.form is Form.STAMP:
+            texts[name] = str(values.stamp(parameters, name))
+        elif name in texts and one.kind.form in (Form.PLACE, Form.PLACES):
+            texts[name] = texts[name].replace(";", ",")
+    return parse_query(query.name, texts)
 
 
 async def as_geojson(make: Callable[..., Any], *arguments: Any) -> Response:
@@ -64,12 +116,3 @@ def has_copy(request: Request, tag: str) -> bool:
 def version_of(version: MapVersion) -> dict[str, Any]:
     """The map that an answer is of, as all answers name it."""
     return {"store": version.store, "merged": version.row, "fact": version.fact}
-
-
-def parsed(
-    name: str, parameters: Parameters, times: Sequence[str] = ("as_of",), places: Sequence[str] = ()
-) -> requests.MapQuery:
-    """The map server's query of this name, checked as there. times may be ISO 8601, places x,y;x,y;... too."""
-    stamps = {key: str(values.stamp(parameters, key)) for key in times if key in parameters}
-    lines = {key: parameters[key].replace(";", ",") for key in places if key in parameters}
-    return requests.parse_query(name, {**parameters, **stamps, **lines})

@@ -17,7 +17,9 @@ import zenoh
 
 from protocol.errors import LinkError, MessageError, QueryError, Refusal
 from protocol.queries.answers import GroundChange, MachineState, MapInfo, MapVersion
-from protocol.queries.map_tiles import MapTile, TilesAnswer
+from protocol.queries.map_tiles import MapTile, TilesAnswer, TilesQuery
+from protocol.queries.request import MapQuery
+from protocol.queries.requests import ChangesQuery, InfoQuery, MachinesQuery, RegionQuery
 from protocol.site.site_config import MAX_EXTENT_M, Projection, SiteConfig
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, receive_pose
@@ -78,11 +80,16 @@ class SiteFeed:
         """As `ask`, for what takes the map server long: large areas, routes, the past."""
         return await _run(self._patient, question, *arguments, **named)
 
+    async def answer_to(self, query: MapQuery[T]) -> T:
+        """The map server's answer to a query."""
+        is_long = query.is_long or query.reads_past or isinstance(query, RegionQuery)
+        return await (self.ask_for_much if is_long else self.ask)(self.client.ask, query)
+
     async def info(self, most_s: float = STATE_S) -> MapInfo:
         """State of the map, at most so old."""
         now_s = time.monotonic()
         if self._info is None or now_s - self._info[0] > most_s:
-            self._info = now_s, await self.ask(self.client.info)
+            self._info = now_s, await self.answer_to(InfoQuery())
         return self._info[1]
 
     async def projection(self) -> Projection:
@@ -98,7 +105,7 @@ class SiteFeed:
         if key in self._past:
             self._past.move_to_end(key)
             return self._past[key]
-        answer = await self.ask_for_much(self.client.tiles, as_of_ns=as_of_ns)
+        answer = await self.answer_to(TilesQuery(as_of_ns=as_of_ns))
         if as_of_ns < info.stamp_ns - 60 * 10**9:  # samples that are a minute late are rare, and show after a while
             self._past.keep(key, answer)
         return answer
@@ -113,7 +120,7 @@ class SiteFeed:
     async def known_tiles(self) -> frozenset[tuple[int, int]]:
         """Columns and rows of the map's tiles that have any ground."""
         known, version = self._known
-        answer = await self.ask_for_much(self.client.tiles, version)
+        answer = await self.ask_for_much(self.client.ask, TilesQuery(version))
         new = frozenset((tile.x, tile.y) for tile in answer.tiles)
         self._known = new if answer.whole else known | new, answer.version
         return self._known[0]
@@ -188,7 +195,7 @@ class SiteFeed:
         while idle_s < LINGER_S:
             began_s = time.monotonic()
             try:
-                self._take(await self.ask(self.client.tiles, self.answer.version if self.answer else None))
+                self._take(await self.answer_to(TilesQuery(self.answer.version if self.answer else None)))
                 self._notify()  # the map first
                 if began_s >= next_state_s:
                     next_state_s = began_s + STATE_S
@@ -224,7 +231,8 @@ class SiteFeed:
 
     async def _ask_state(self) -> tuple[MapInfo, Any, Any]:
         info = await self.info(0.0)
-        machines, changes = await self.ask(self.client.machines), await self.ask(self.client.changes)
+        machines = (await self.answer_to(MachinesQuery())).machines
+        changes = (await self.answer_to(ChangesQuery())).changes
         self._machines.on_findings({machine.name: said for machine in machines if (said := rolls(machine))})
         return info, machines, changes
 

@@ -18,8 +18,6 @@ from starlette.responses import Response
 
 from protocol.errors import LinkError, QueryError, Refusal, SitegridError
 from protocol.machine.readings import MAX_STAMP_NS
-from protocol.queries import parameters as ps
-from protocol.site.site_config import Projection
 
 Parameters = Mapping[str, str]
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -32,26 +30,6 @@ STATUS: dict[str, HTTPStatus] = {
     Refusal.STORE: HTTPStatus.SERVICE_UNAVAILABLE,
     Refusal.AFTER_TIMEOUT: HTTPStatus.GATEWAY_TIMEOUT,
 }
-
-
-def number(parameters: Parameters, name: str, default: float | None = None) -> float:
-    """A finite number, as the map server's own queries have it."""
-    if default is not None and name not in parameters:
-        return default
-    return ps.number(parameters, name)
-
-
-def place(parameters: Parameters, projection: Projection) -> tuple[float, float]:
-    """A position in `map` [m], given as x and y, or as lat and lon."""
-    if {"lat", "lon"} <= set(parameters):
-        lat_deg, lon_deg = number(parameters, "lat"), number(parameters, "lon")
-        if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 360):  # some programs count on beyond 180
-            raise bad(Refusal.OUT_OF_RANGE, f"`lat`, `lon`: {lat_deg:g}, {lon_deg:g} is no place on Earth")
-        x_m, y_m, _ = projection.to_map(lat_deg, lon_deg, 0.0)
-        if not (math.isfinite(x_m) and math.isfinite(y_m)):
-            raise bad(Refusal.OUT_OF_RANGE, "`lat`, `lon`: too far from the site")
-        return x_m, y_m
-    return number(parameters, "x"), number(parameters, "y")
 
 
 def stamp(parameters: Parameters, name: str) -> int | None:
@@ -72,11 +50,6 @@ def stamp(parameters: Parameters, name: str) -> int | None:
     if not 1 <= stamp_ns <= MAX_STAMP_NS:
         raise bad(Refusal.OUT_OF_RANGE, f"parameter `{name}`: {text[:40]} is no time from 1970 on")
     return stamp_ns
-
-
-def layers(parameters: Parameters) -> tuple[str, ...]:
-    """Names of layers, comma-separated; none means all."""
-    return tuple(part for part in parameters.get("layers", "").split(",") if part)
 
 
 def check_known(parameters: Parameters, known: tuple[str, ...]) -> None:

@@ -314,13 +314,13 @@ GOLDEN: dict[str, Golden] = {
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),
     "machines.bin": Golden(
         records.MachinesAnswer((MACHINE,), VERSION),
-        lambda answer: answers.encode_machines(answer.machines, answer.version),
+        answers.encode_machines,
         answers.decode_machines,
     ),
     "machine.bin": Golden(TRUST, answers.encode_machine, answers.decode_machine),
     "changes.bin": Golden(
         records.ChangesAnswer((CHANGE,), VERSION),
-        lambda answer: answers.encode_changes(answer.changes, answer.version),
+        answers.encode_changes,
         answers.decode_changes,
     ),
     "change.bin": Golden(CHANGE, answers.encode_change, answers.decode_change),

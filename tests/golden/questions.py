@@ -7,8 +7,8 @@ docs/protocol.md.
 from __future__ import annotations
 
 from protocol.queries.answers import MapVersion
-from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand, encode_command
-from protocol.queries.parameters import Freshness
+from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand
+from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.requests import (
     AliveQuery,
     CalibrationQuery,
@@ -20,10 +20,7 @@ from protocol.queries.requests import (
     PointQuery,
     PointsQuery,
     RegionQuery,
-    TilesQuery,
-    When,
     WhyQuery,
-    encode_query,
 )
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
@@ -33,41 +30,44 @@ from tests.paths import GOLDEN
 
 SELECTORS = GOLDEN / "selectors.txt"
 T0 = 1_750_000_000_000_000_000
-FRESH, WHEN = Freshness(17, 2.5), When(T0, T0 - 10**9, repairs=True)
+FRESH = {"after": 17, "wait_s": 2.5}
+WHEN = {"as_of_ns": T0, "minus_ns": T0 - 10**9, "repairs": True}
 RECTANGLE = Bounds(0.0, -3.5, 200.0, 150.0)
+ROADS = {"from_ns": T0, "to_ns": T0 + 10**12, "as_of_ns": T0 + 10**13, "bounds": RECTANGLE, "machine": "loader-1"}
 LINE = ((0.0, 0.0), (30.0, 40.0))
+LATER = {"as_of_ns": T0, "repairs": False, **FRESH}
 
 QUESTIONS = (
     PointQuery(12.0, -40.5),
-    PointQuery(12.0, -40.5, ("resistance", "visits"), FRESH, WHEN),
+    PointQuery(12.0, -40.5, ("resistance", "visits"), **FRESH, **WHEN),
     PointsQuery(((1.5, -2.0), (3.0, 4.0))),
-    PointsQuery(((1.5, -2.0), (3.0, 4.0)), ("visits",), FRESH, WHEN),
+    PointsQuery(((1.5, -2.0), (3.0, 4.0)), ("visits",), **FRESH, **WHEN),
     RegionQuery(RECTANGLE),
-    RegionQuery(RECTANGLE, ("resistance",), FRESH, WHEN, 4.0),
-    RegionQuery(((0.0, 0.0), (9.0, 0.5), (3.0, 8.0)), (), FRESH, When(T0)),
+    RegionQuery(RECTANGLE, ("resistance",), 4.0, **FRESH, **WHEN),
+    RegionQuery(((0.0, 0.0), (9.0, 0.5), (3.0, 8.0)), as_of_ns=T0, **FRESH),
     PieceQuery(7, 2),
     HistoryQuery(12.0, 40.5),
-    HistoryQuery(12.0, 40.5, ("grade",), T0, T0 + 10**12, 3600.0, FRESH),
+    HistoryQuery(12.0, 40.5, ("grade",), T0, T0 + 10**12, 3600.0, **FRESH),
     TilesQuery(),
     TilesQuery(MapVersion("0123456789abcdef", 17, 3), place=(-3, 12)),
     TilesQuery(as_of_ns=T0, place=(-3, 12)),
     WhyQuery(12.0, 40.5),
-    WhyQuery(12.0, 40.5, T0, repairs=True),
+    WhyQuery(12.0, 40.5, as_of_ns=T0, repairs=True),
     SegmentsQuery(),
-    SegmentsQuery(T0, T0 + 10**12, T0 + 10**13, RECTANGLE, "loader-1", FRESH),
+    SegmentsQuery(**ROADS, **FRESH),
     WorklistQuery(),
-    WorklistQuery(0.03, 0.4, 10, T0, T0 + 10**12, T0 + 10**13, RECTANGLE, "loader-1", FRESH),
+    WorklistQuery(0.03, 0.4, 10, **ROADS, **FRESH),
     RouteQuery(LINE),
-    RouteQuery(LINE, MACHINES["truck"], (False, True), 50.0, "refuse", T0, FRESH, repairs=False),
-    RouteQuery(LINE, NamedMachine("truck-1", (("mass_kg", 3e4), ("speed_mps", 6.0))), (False, False)),
+    RouteQuery(LINE, machine=MACHINES["truck"], stops=(False, True), step_m=50.0, unknown="refuse", **LATER),
+    RouteQuery(LINE, machine=NamedMachine("truck-1", (("mass_kg", 3e4), ("speed_mps", 6.0))), stops=(False, False)),
     WayQuery(*LINE),
-    WayQuery(*LINE, MACHINES["loader"], "time", 0.1, 5.0, LINE, (True, False), 10.0, 0.05, T0, FRESH, repairs=False),
+    WayQuery(*LINE, "time", 0.1, 5.0, LINE, stops=(True, False), step_m=10.0, unknown=0.05, **LATER),
     MachinesQuery(),
-    MachinesQuery(FRESH),
-    CalibrationQuery(FRESH),
+    MachinesQuery(**FRESH),
+    CalibrationQuery(**FRESH),
     ChangesQuery(),
     ChangesQuery(3),
-    InfoQuery(FRESH),
+    InfoQuery(**FRESH),
     AliveQuery(),
 )
 COMMANDS = (
@@ -83,7 +83,7 @@ COMMANDS = (
 
 def selectors() -> list[str]:
     """Name and parameters of each, these in the order of their names, which means nothing."""
-    sent = [(one.name, encode_query(one)) for one in QUESTIONS] + [(one.name, encode_command(one)) for one in COMMANDS]
+    sent = [(one.name, one.parameters()) for one in (*QUESTIONS, *COMMANDS)]
     return [f"{name}?{';'.join(f'{key}={parameters[key]}' for key in sorted(parameters))}" for name, parameters in sent]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from protocol.arrays import Table
+from protocol.queries.roads import WorklistQuery
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import SampleBatch
 from sitegrid.process.children import Children
@@ -59,5 +60,5 @@ def hauling_site(folder: Path, children: Children) -> WebSite:
     site = WebSite(folder, children)
     site.machines = haulers()  # type: ignore[assignment]
     site.drive(DAYS * BATCH_S)
-    site.client.worklist(after=site.client.info().merged)  # roads are of all that they drove from here on
+    site.client.ask(WorklistQuery(after=site.client.info().merged))  # roads are of all that they drove from here on
     return site

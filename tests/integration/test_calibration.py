@@ -21,6 +21,7 @@ from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
 from protocol.arrays import Table
+from protocol.queries.requests import CalibrationQuery
 from protocol.site.site_file import load_site
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
@@ -147,7 +148,7 @@ def test_after_an_accident_the_next_start_has_the_fact_in_its_map(
     with site.connect() as client:
         info = client.info()
         assert (info.fact, info.decided, info.corrections) == (1, 1, 1)
-        assert client.calibration().machines[0].by == PERSON
+        assert client.ask(CalibrationQuery()).machines[0].by == PERSON
     server.stop()
     with stored(site.folder / "store", site) as store:
         assert same(store.grid, folded(site, by_person("a"), DRIVES))

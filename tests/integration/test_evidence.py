@@ -11,6 +11,7 @@ import pytest
 
 from protocol.arrays import Table
 from protocol.machine.samples import empty
+from protocol.queries.requests import HistoryQuery
 from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
@@ -93,7 +94,7 @@ def test_a_repaved_zone_is_reported_dated_and_can_be_undone_in_time(site_run: Si
         assert resistance(client, after=row) == pytest.approx(NEW, rel=0.1)
         assert resistance(client, as_of_ns=before_ns) == pytest.approx(OLD, rel=0.1)
         assert resistance(client, minus_ns=before_ns) == pytest.approx(NEW - OLD, rel=0.1)
-        spans = client.history(SIZE - 8.5, 20.5, ["resistance"], span_s=3600.0)
+        spans = client.ask(HistoryQuery(SIZE - 8.5, 20.5, ("resistance",), span_s=3600.0)).spans
         assert [round(span.values["resistance"], 2) for span in spans] == [OLD, OLD, NEW]
         until(lambda: events and client.changes()[0].cells > 400, f"a change of server pid {server.pid}")
         (change,) = client.changes()

@@ -18,6 +18,7 @@ from protocol.queries.answer_codec import decode_info, decode_point
 from protocol.queries.answers import MapVersion
 from protocol.queries.map_tiles import decode_tiles
 from protocol.queries.origin import decode_origin
+from protocol.queries.requests import PointQuery
 from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
@@ -276,7 +277,7 @@ def test_a_follower_that_lacks_a_row_refuses_and_the_server_is_asked(quiet: Quie
         client.point(1.0, 1.0)
         assert client.origin.follower == "near"
         with pytest.raises(QueryError, match=r"row 99 is not merged after 1\.5 s") as refused:
-            client.point(1.0, 1.0, after=99, wait_s=1.5)  # who says so last is the server
+            client.ask(PointQuery(1.0, 1.0, after=99, wait_s=1.5))  # who says so last is the server
         assert refused.value.reason == "after_timeout"
         assert client.info().counters["refused_query_after_timeout"] == 1, f"follower pid {quiet.follower.pid}"
 

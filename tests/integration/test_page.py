@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from protocol.machine.samples import empty
+from protocol.queries.map_tiles import TilesQuery
+from protocol.queries.requests import WhyQuery
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_pose
 from protocol.wire.messages import Pose, SampleBatch
@@ -66,7 +68,7 @@ def test_a_click_says_why(tab: Tab, web: WebSite):
     tab.page.mouse.click(*tab.pixel_of(x_m, y_m))
     panel = tab.page.locator("#panel")
     panel.locator(".big b").wait_for(timeout=WAIT_MS)
-    why = web.client.why(x_m, y_m)
+    why = web.client.ask(WhyQuery(x_m, y_m))
     assert panel.locator(".big b").inner_text() == f"{100 * why.values['resistance']:.1f} %"
     text = panel.inner_text()
     assert all(name in text for name in why.machines)
@@ -89,7 +91,7 @@ def test_the_slider_shows_the_map_of_its_time(tab: Tab, web: WebSite):
     tab.until("sitegrid.time.map !== null && sitegrid.time.at !== null")
     at_ns = int(tab.js("String(BigInt(sitegrid.time.at))"))
     tab.until(f"sitegrid.time.map.stamp_ns === {at_ns}")
-    tiles = {(tile.x, tile.y) for tile in web.client.tiles(as_of_ns=at_ns).tiles}
+    tiles = {(tile.x, tile.y) for tile in web.client.ask(TilesQuery(as_of_ns=at_ns)).tiles}
     assert {tuple(map(int, key.split(","))) for key in tab.js("[...sitegrid.time.map.tiles.keys()]")} == tiles
     assert START_NS < at_ns < web.now_ns
     assert "The map as of" in tab.page.locator("#status").inner_text()

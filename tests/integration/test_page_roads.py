@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from protocol.queries.roads import WorklistRow
+from protocol.queries.roads import WorklistQuery, WorklistRow
+from protocol.queries.route_requests import WayQuery
 from protocol.queries.routing import MACHINES
 from tests.integration.browser_tab import Tab, needs_browser, watched
 from tests.integration.hauling_site import DAY_NS, FIRST_NS
@@ -40,7 +41,7 @@ def figure(value: float) -> str:
 
 
 def listed(web: WebSite) -> tuple[WorklistRow, ...]:
-    return web.client.worklist(limit=10).rows
+    return web.client.ask(WorklistQuery(limit=10)).rows
 
 
 def row_of(tab: Tab, row: WorklistRow) -> Any:
@@ -101,7 +102,7 @@ def test_the_target_is_chosen_and_a_link_keeps_it(tab: Tab, browser, web: WebSit
     panel = opened(tab)
     tab.page.locator("#target").fill("5")
     tab.page.keyboard.press("Enter")
-    rows = web.client.worklist(0.05, limit=10).rows
+    rows = web.client.ask(WorklistQuery(0.05, limit=10)).rows
     tab.until(f"sitegrid.work.rows.length === {len(rows)}")
     tab.until("location.search.includes('panel=work') && location.search.includes('target=0.05')")
     shown = panel.inner_text()
@@ -125,7 +126,7 @@ def test_the_list_is_of_the_time_that_is_shown(tab: Tab, web: WebSite):
     assert panel.locator(".stretch.short").count() > 0
     at_ns = FIRST_NS + DAY_NS
     tab.js(f"sitegrid.time.go({at_ns})")
-    rows = web.client.worklist(limit=10, as_of_ns=at_ns).rows
+    rows = web.client.ask(WorklistQuery(limit=10, as_of_ns=at_ns)).rows
     tab.until(f"sitegrid.time.map !== null && sitegrid.panelAt === {at_ns} && {QUIET}")
     assert panel.locator("ol .stretch").count() == len(rows)
     assert figure(rows[0].kwh_ph[0]) in panel.locator("ol .stretch").first.inner_text()
@@ -205,7 +206,10 @@ def test_the_cheapest_line_between_two_clicks_is_beside_the_straight_one(tab: Ta
     tab.until(f"sitegrid.route.cheapest && {QUIET}")
     set_places(tab, (25, 10), (25, 130))
     ends = places(tab)
-    cheapest, straight = web.client.way(*ends, MACHINES["truck"]), web.client.route(ends, MACHINES["truck"])
+    cheapest, straight = (
+        web.client.ask(WayQuery(*ends, machine=MACHINES["truck"])),
+        web.client.route(ends, MACHINES["truck"]),
+    )
     assert tab.js("sitegrid.route.answer.line") == cheapest.line_m.tolist()
     assert cheapest.totals.energy_j <= straight.totals.energy_j
     text = panel.inner_text()
@@ -214,7 +218,7 @@ def test_the_cheapest_line_between_two_clicks_is_beside_the_straight_one(tab: Ta
     assert (f", {more} % more, with" if more else "The straight line costs the same, with") in text
     tab.page.locator("#cost-time").click()
     tab.until(f"sitegrid.route.cost === 'time' && {QUIET} && sitegrid.route.answer !== null")
-    quickest = web.client.way(*ends, MACHINES["truck"], cost="time")
+    quickest = web.client.ask(WayQuery(*ends, "time", machine=MACHINES["truck"]))
     assert tab.js("sitegrid.route.answer.totals.time_s") == pytest.approx(quickest.totals.time_s, rel=1e-6)
     tab.page.mouse.click(*tab.pixel_of(60, 10))  # a third click begins anew
     tab.until(f"sitegrid.route.places.length === 1 && sitegrid.route.answer === null && {QUIET}")

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from protocol.errors import QueryError
+from protocol.queries.route_requests import WayQuery
 from protocol.queries.routing import MACHINES, NamedMachine
 from sitegrid import Client, RouteAnswer
 from tests.command_lines import Said, said
@@ -87,14 +88,14 @@ def named(**values: float) -> NamedMachine:
 
 
 def blocked(client: Client) -> RouteAnswer:
-    return client.way(*ROAD, margin_m=1.0, avoid=ACROSS, unknown="refuse")
+    return client.ask(WayQuery(*ROAD, margin_m=1.0, avoid=ACROSS, unknown="refuse"))
 
 
 def test_a_way_is_never_dearer_to_drive_than_straight_on(site: WebSite):
     """Also between roads, over ground where nobody was, whatever the detour has of curves."""
     for ends in (((40.0, 10.0), (40.0, 130.0)), ((150.0, 10.0), (150.0, 70.0)), ((20.0, 70.0), (90.0, 10.0))):
         for cost, total in (("energy", "energy_j"), ("time", "time_s")):
-            way = site.client.way(*ends, "truck", cost=cost)
+            way = site.client.ask(WayQuery(*ends, cost, machine=MACHINES["truck"]))
             straight = site.client.route(ends, "truck")
             assert getattr(way.totals, total) <= getattr(straight.totals, total)
             again = site.client.route(way.line_m.tolist(), "truck")

@@ -17,6 +17,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as open_socket
 
+from protocol.queries.map_tiles import TilesQuery
+from protocol.queries.requests import CalibrationQuery, HistoryQuery, PointsQuery, WhyQuery
 from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
 from protocol.wire import keys
@@ -49,7 +51,7 @@ def test_a_point_has_the_clients_numbers(web: WebSite):
     x_m, y_m = driven_place(web)
     point = web.client.point(x_m, y_m)
     assert set(web.client.point(x_m, y_m, "resistance").values) == {"resistance"}
-    assert set(web.client.points([(x_m, y_m)], "visits, grade").layers) == {"visits", "grade"}
+    assert set(web.client.ask(PointsQuery(((x_m, y_m),), ("visits", "grade"))).layers) == {"visits", "grade"}
     answer = web.get("point", {"x": x_m, "y": y_m})
     assert answer.status == 200
     assert set(answer.json["values"]) == set(point.values)
@@ -93,15 +95,15 @@ def test_larger_cells_and_outlines_are_the_clients(web: WebSite):
 
 def test_why_history_machines_changes_are_the_clients(web: WebSite):
     x_m, y_m = driven_place(web)
-    why, answer = web.client.why(x_m, y_m), web.get("why", {"x": x_m, "y": y_m}).json
+    why, answer = web.client.ask(WhyQuery(x_m, y_m)), web.get("why", {"x": x_m, "y": y_m}).json
     assert answer["resistance"]["votes"] == pytest.approx(list(why.resistance.votes))
     assert answer["machines"] == list(why.machines)
     assert answer["newest_time"].startswith("2026-01-01T00:0")
     spans = web.get("history", {"x": x_m, "y": y_m, "layers": "resistance"}).json["spans"]
-    ours = web.client.history(x_m, y_m, ["resistance"])
+    ours = web.client.ask(HistoryQuery(x_m, y_m, ("resistance",))).spans
     assert [span["first_ns"] for span in spans] == [span.first_ns for span in ours]
     assert [m["name"] for m in web.get("machines").json["machines"]] == ["machine-0", "machine-1", "machine-2"]
-    calibration, ours = web.get("calibration").json, web.client.calibration()
+    calibration, ours = web.get("calibration").json, web.client.ask(CalibrationQuery())
     assert (calibration["store"], calibration["fact"]) == (ours.store, ours.fact)
     assert [m["name"] for m in calibration["machines"]] == [m.name for m in ours.machines]
     assert calibration["machines"][0]["spans"] == [values.plain(span) for span in ours.machines[0].spans]
@@ -122,9 +124,9 @@ def test_the_past_is_asked_for_by_time_or_stamp(web: WebSite):
     assert all(same(by_time["values"][name], value) for name, value in point.values.items())
     frame = Frame.read(web.get("tiles", {"as_of": "2026-01-01T00:00:20Z"}).body)
     assert frame.head["whole"]
-    assert {(tile.x, tile.y): (tile.newest_ns, tile_planes(tile)) for tile in web.client.tiles(
+    assert {(tile.x, tile.y): (tile.newest_ns, tile_planes(tile)) for tile in web.client.ask(TilesQuery(
         as_of_ns=1_767_225_620_000_000_000
-    ).tiles} == frame.tiles  # fmt: skip
+    )).tiles} == frame.tiles  # fmt: skip
 
 
 def tile_planes(tile) -> bytes:
@@ -357,7 +359,7 @@ def test_pages_that_are_fast_slow_or_asleep_end_with_the_map_as_it_is(web: WebSi
             fast.take((web.client.info().merged - 2, 0))
         frames_of_fast = fast.frames
         tiles, version = newest(web)
-        last = max((tile.row for tile in web.client.tiles().tiles), default=0)
+        last = max((tile.row for tile in web.client.ask(TilesQuery()).tiles), default=0)
         fast.take((last, 0))
         slow.take((last, 0))  # it slept through four drives, and gets them as one or two maps
         assert fast.tiles == slow.tiles == tiles
@@ -378,13 +380,13 @@ def test_a_page_goes_on_after_web_server_map_server_and_trust_were_others(tmp_pa
         web.drive(8)
         web.web = web.start_web(port=port)
         with page.open():
-            page.take((max(tile.row for tile in web.client.tiles().tiles), 0))
+            page.take((max(tile.row for tile in web.client.ask(TilesQuery()).tiles), 0))
             assert page.tiles == newest(web)[0]
             web.server.send(signal.SIGKILL)
             web.server.wait(PATIENCE_S)
             web.server = web.start_server()
             web.drive(8)
-            page.take((max(tile.row for tile in web.client.tiles().tiles), 0))
+            page.take((max(tile.row for tile in web.client.ask(TilesQuery()).tiles), 0))
             assert page.tiles == newest(web)[0]
             trusted = web.client.distrust("machine-1", "test")
             page.take((trusted.merged, trusted.fact))

@@ -8,6 +8,9 @@ import numpy as np
 import pyogrio
 import pytest
 
+from protocol.queries.requests import PointQuery
+from protocol.queries.roads import SegmentsQuery, WorklistQuery
+from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection
@@ -30,15 +33,15 @@ def text_of(line: tuple[tuple[float, float], ...]) -> str:
 
 
 def test_roads_and_worklist_are_the_clients(web: WebSite):
-    assert web.get("segments").json == values.plain(web.client.segments())
-    assert web.get("worklist").json == values.plain(web.client.worklist())
+    assert web.get("segments").json == values.plain(web.client.ask(SegmentsQuery()))
+    assert web.get("worklist").json == values.plain(web.client.ask(WorklistQuery()))
     one = web.get("segments", {"machine": "hauler-2"}).json
-    assert one == values.plain(web.client.segments(machine="hauler-2"))
+    assert one == values.plain(web.client.ask(SegmentsQuery(machine="hauler-2")))
     assert one != web.get("segments").json
     bounds = Bounds(0.0, 0.0, 200.0, 40.0)
     asked = {"target": 0.03, "efficiency": 0.4, "limit": 3, "bounds": "0,0,200,40"}
     answer = web.get("worklist", asked).json
-    assert answer == values.plain(web.client.worklist(0.03, efficiency=0.4, limit=3, bounds=bounds))
+    assert answer == values.plain(web.client.ask(WorklistQuery(0.03, efficiency=0.4, limit=3, bounds=bounds)))
     assert len(answer["rows"]) == 3
     some = web.get("segments", {"bounds": "0,0,200,40"}).json["segments"]
     assert 0 < len(some) < len(web.get("segments").json["segments"])
@@ -63,16 +66,20 @@ def test_the_worklist_tells_days_a_repair_and_guessed_masses(web: WebSite):
 def test_the_worklist_of_a_time_is_of_what_was_known_then(web: WebSite):
     first = FIRST_NS + DAY_NS
     then = web.get("worklist", {"as_of": values.iso(first)}).json
-    assert then == web.get("worklist", {"as_of": first}).json == values.plain(web.client.worklist(as_of_ns=first))
+    assert (
+        then
+        == web.get("worklist", {"as_of": first}).json
+        == values.plain(web.client.ask(WorklistQuery(as_of_ns=first)))
+    )
     assert not then["changes"]
     assert all(len(row["day_ns"]) == 1 for row in then["rows"])
     hours = web.get("segments", {"from": values.iso(first), "to": values.iso(first + DAY_NS)}).json
-    assert hours == values.plain(web.client.segments(from_ns=first, to_ns=first + DAY_NS))
+    assert hours == values.plain(web.client.ask(SegmentsQuery(from_ns=first, to_ns=first + DAY_NS)))
 
 
 def test_lines_of_roads_are_where_gis_look_for_them(web: WebSite):
     projection = Projection(load_site(web.folder / "site.toml"))
-    roads = web.client.segments().segments
+    roads = web.client.ask(SegmentsQuery()).segments
     listed = web.get("features/segments").json["features"]
     assert [feature["properties"]["id"] for feature in listed] == [road.id for road in roads]
     for feature, road in zip(listed, roads, strict=True):
@@ -80,7 +87,7 @@ def test_lines_of_roads_are_where_gis_look_for_them(web: WebSite):
         assert np.array(line) == pytest.approx(np.array(road.line), abs=2e-3)
     meta, _, geometry, columns = pyogrio.raw.read(f"{web.url}api/v1/sites/{NAME}/features/worklist?limit=5")
     table = dict(zip(meta["fields"], columns, strict=True))
-    rows = web.client.worklist(limit=5).rows
+    rows = web.client.ask(WorklistQuery(limit=5)).rows
     assert (meta["geometry_type"], len(geometry)) == ("LineString", 5)
     assert table["kwh_ph_low"] == pytest.approx([row.kwh_ph[1] for row in rows])
     assert list(table["id"]) == [row.segment.id for row in rows]
@@ -88,7 +95,7 @@ def test_lines_of_roads_are_where_gis_look_for_them(web: WebSite):
 
 
 def test_a_repaired_road_is_read_as_it_is_since(web: WebSite):
-    change = web.client.worklist().changes[0]
+    change = web.client.ask(WorklistQuery()).changes[0]
     (feature, *_) = web.get("features/repairs").json["features"]
     assert feature["properties"]["id"] == change.id
     assert feature["properties"]["resistance_after"] == change.after
@@ -96,7 +103,7 @@ def test_a_repaired_road_is_read_as_it_is_since(web: WebSite):
     x_m, y_m = change.line[len(change.line) // 2]
     asked = {"x": x_m, "y": y_m, "layers": "resistance"}
     plain, since = (web.get("point", {**asked, "repairs": given}).json["values"]["resistance"] for given in (0, 1))
-    assert since == web.client.point(x_m, y_m, ["resistance"], repairs=True).values["resistance"]
+    assert since == web.client.ask(PointQuery(x_m, y_m, ("resistance",), repairs=True)).values["resistance"]
     assert abs(since - change.after) < abs(plain - change.after)
     why = web.get("why", {"x": x_m, "y": y_m, "repairs": 1}).json
     assert why["values"]["resistance"] == pytest.approx(since)
@@ -115,7 +122,7 @@ def test_a_route_and_the_cheapest_line_are_the_clients(web: WebSite):
     asked = {"line": text_of(LINE), "machine": "truck", "mass": 30_000, "step": 10, "stops": "begin"}
     answer = web.get("route", asked).json
     machine = replace(MACHINES["truck"], mass_kg=30_000.0)
-    ours = web.client.route(LINE, machine, step_m=10.0, stops=(True, False))
+    ours = web.client.ask(RouteQuery(LINE, machine=machine, step_m=10.0, stops=(True, False)))
     assert answer["steps"] == values.plain(vars(ours.steps))
     assert answer["line"] == ours.line_m.tolist()
     assert answer["totals"].pop("litres") == pytest.approx(ours.totals.litres)
@@ -125,7 +132,7 @@ def test_a_route_and_the_cheapest_line_are_the_clients(web: WebSite):
     ends = {"from": "20,10", "to": "20,130", "machine": "loader", "cost": "time", "avoid": "60,70;80,70"}
     cheapest = web.get("way", ends).json
     avoid = ((60.0, 70.0), (80.0, 70.0))
-    theirs = web.client.way((20.0, 10.0), (20.0, 130.0), cost="time", avoid=avoid)
+    theirs = web.client.ask(WayQuery((20.0, 10.0), (20.0, 130.0), cost="time", avoid=avoid))
     assert cheapest["line"] == theirs.line_m.tolist()
     assert cheapest["totals"]["time_s"] == theirs.totals.time_s
     first = FIRST_NS + DAY_NS

@@ -132,7 +132,7 @@ def test_no_place_is_asked_for_twice_and_all_are_where_somebody_drove():
     cells = set(map(tuple, np.floor(np.stack([driven["x_m"], driven["y_m"]], axis=1)).tolist()))
     assert len(set(places)) == 300
     assert set(places) <= cells
-    assert {q.when.as_of_ns for q in past} <= set(driven["stamp_ns"].tolist())
+    assert {q.as_of_ns for q in past} <= set(driven["stamp_ns"].tolist())
     tracks = set(zip(driven["x_m"].tolist(), driven["y_m"].tolist(), strict=True))
     assert all(set(route.line) <= tracks for route in islice(asked["route"], 5))
 

@@ -10,22 +10,15 @@ import zenoh
 from mapserver import server as server_module
 from mapserver.journal.location import JournalLocation
 from mapserver.query import queryable
-from mapserver.query.answering import SMALL_BYTES
+from mapserver.query.answering import BYTES
 from mapserver.server import Server
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.answers import MapVersion
-from protocol.queries.commands import TrustCommand, encode_command
+from protocol.queries.commands import TrustCommand
 from protocol.queries.parameters import selector_of
-from protocol.queries.requests import (
-    AliveQuery,
-    Freshness,
-    HistoryQuery,
-    InfoQuery,
-    PointQuery,
-    RegionQuery,
-    encode_query,
-)
+from protocol.queries.request import Size
+from protocol.queries.requests import AliveQuery, HistoryQuery, InfoQuery, PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
@@ -58,7 +51,7 @@ def deliver(client: zenoh.Session, sent, machine: str = "a"):
 
 
 def ask(client: zenoh.Session, query) -> bytes:
-    return get(client, keys.map_query("pit", query.name), encode_query(query)).ok.payload.to_bytes()
+    return get(client, keys.map_query("pit", query.name), query.parameters()).ok.payload.to_bytes()
 
 
 def refusal(client: zenoh.Session, name: str, parameters: dict[str, str]):
@@ -75,7 +68,7 @@ def test_a_batch_is_acknowledged_and_seen_by_a_query_that_waits_for_it(served):
     _, client = served
     ack = deliver(client, batch(samples(5, c_rr=0.25)))
     assert ack == Ack(5, 1, store=ack.store)
-    query = RegionQuery(Bounds(0, 0, 16, 16), ("resistance", "grade_north"), Freshness(after=ack.row))
+    query = RegionQuery(Bounds(0, 0, 16, 16), ("resistance", "grade_north"), after=ack.row)
     region = codec.decode_region(ask(client, query))
     assert region["resistance"][8, 8] == pytest.approx(0.25, rel=1e-3)
     assert np.isfinite(region["resistance"]).sum() == 1
@@ -125,7 +118,7 @@ def test_a_refused_query_or_command_gets_its_reason_and_is_counted(served, key, 
 
 def test_a_bug_in_a_query_is_answered(served, monkeypatch):
     server, client = served
-    monkeypatch.setattr(server.answers, "point", lambda _: 1 // 0)
+    monkeypatch.setitem(server.answers._answers, PointQuery, lambda _: 1 // 0)
     error = refusal(client, "point", {"x": "0", "y": "0"})
     assert error.reason == "internal"
     assert str(error).startswith("the server failed")
@@ -179,17 +172,17 @@ def test_waiting_queries_keep_no_other_from_an_answer_and_get_theirs(served):
 
 
 @pytest.mark.parametrize(
-    ("limit", "key", "parameters", "held"),
+    ("limit", "key", "parameters"),
     [
-        ("ANSWER_BYTES", keys.map_query("pit", "info"), {}, "info"),
-        ("MOST_PAST", keys.map_query("pit", "point"), {"x": "0", "y": "0", "as_of": "1"}, "point"),
-        ("MOST_COMMANDS", keys.admin("pit", "trust"), {"machine": "a", "trusted": "yes"}, "_trust"),
+        ("ANSWER_BYTES", keys.map_query("pit", "info"), {}),
+        ("MOST_PAST", keys.map_query("pit", "point"), {"x": "0", "y": "0", "as_of": "1"}),
+        ("MOST_COMMANDS", keys.admin("pit", "trust"), {"machine": "a", "trusted": "yes"}),
     ],
 )
-def test_queries_beyond_a_budget_have_to_come_again(sessions, tmp_path, monkeypatch, limit, key, parameters, held):
+def test_queries_beyond_a_budget_have_to_come_again(sessions, tmp_path, monkeypatch, limit, key, parameters):
     router, client = sessions
     module = server_module if limit == "MOST_COMMANDS" else queryable
-    monkeypatch.setattr(module, limit, 2 if limit != "ANSWER_BYTES" else 2 * SMALL_BYTES)
+    monkeypatch.setattr(module, limit, 2 if limit != "ANSWER_BYTES" else 2 * BYTES[Size.SMALL])
     with closing(Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)) as server:
         release = threading.Event()
 
@@ -197,7 +190,9 @@ def test_queries_beyond_a_budget_have_to_come_again(sessions, tmp_path, monkeypa
             assert release.wait(WAIT_S)
             raise QueryError(Refusal.STORE, "held")
 
-        monkeypatch.setattr(server._commands if limit == "MOST_COMMANDS" else server.answers, held, hold)
+        monkeypatch.setattr(server._commands, "_trust", hold)
+        for query in (InfoQuery, PointQuery):
+            monkeypatch.setitem(server.answers._answers, query, hold)
         first = begun(client, key, parameters, 2)
         refused = codec.decode_error(get(client, key, parameters).err.payload.to_bytes())
         assert refused.reason == Refusal.OVERLOADED
@@ -228,7 +223,7 @@ def test_a_command_reaches_the_upkeep_with_its_reason(served):
     _, client = served
     deliver(client, batch(samples(5)))
     command = TrustCommand("a", False, "50 % too high; gain = 1.5 & more?")
-    row = codec.decode_machine(get(client, keys.admin("pit", "trust"), encode_command(command)).ok.payload.to_bytes())
+    row = codec.decode_machine(get(client, keys.admin("pit", "trust"), command.parameters()).ok.payload.to_bytes())
     assert (row.name, row.trusted, row.merged, row.fact) == ("a", False, 1, 1)
     assert row.reason == command.reason
     gone = {"x": "8.5", "y": "8.5", "layers": "weight"}
@@ -253,11 +248,11 @@ def test_the_map_as_it_is_does_not_wait_for_what_is_slow(served, monkeypatch, sl
         assert release.wait(WAIT_S)
         raise QueryError(Refusal.STORE, "held")
 
-    monkeypatch.setattr(server.answers, "history", hold)
+    monkeypatch.setitem(server.answers._answers, HistoryQuery, hold)
     monkeypatch.setattr(server._commands, "_trust", hold)
     key, asked = {
-        "past": (keys.map_query("pit", "history"), encode_query(HistoryQuery(0, 0))),
-        "command": (keys.admin("pit", "trust"), encode_command(TrustCommand("a", True))),
+        "past": (keys.map_query("pit", "history"), HistoryQuery(0, 0).parameters()),
+        "command": (keys.admin("pit", "trust"), TrustCommand("a", True).parameters()),
     }[slow]
     askers = [threading.Thread(target=get, args=(client, key, asked)) for _ in range(3)]
     for asker in askers:

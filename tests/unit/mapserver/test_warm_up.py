@@ -13,7 +13,6 @@ from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 from mapserver.config import ServerConfig
 from mapserver.server import warm_up
-from protocol.queries.requests import encode_query
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from tests.unit.mapserver.data import incoming, open_writer, send
@@ -33,7 +32,7 @@ with tempfile.TemporaryDirectory() as folder, closing(open_writer(Path(folder)))
     answers = answers_of(writer)
     line = ((12.0, 10.0), (150.0, 10.0))
     for query in (SegmentsQuery(), WorklistQuery(), RouteQuery(line), WayQuery(*line)):
-        answered(answers, query.name, encode_query(query))
+        answered(answers, query.name, query.parameters())
 print(json.dumps([before, sorted(set(ready()))]))
 """
 

@@ -9,9 +9,10 @@ import pytest
 
 from protocol.errors import LinkError, QueryError, Refusal
 from protocol.queries import answer_codec as codec
-from protocol.queries.answers import GroundChange, Piece, PointAnswer, Region, ServerAlive
+from protocol.queries.answers import ChangesAnswer, GroundChange, Piece, PointAnswer, Region, ServerAlive
 from protocol.queries.origin import Origin, encode_origin
-from protocol.queries.requests import AliveQuery, Freshness, InfoQuery, PointQuery, RegionQuery
+from protocol.queries.parameters import split_selector
+from protocol.queries.requests import AliveQuery, InfoQuery, PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import pack
@@ -151,8 +152,8 @@ def test_a_bad_question_is_refused_once():
 
 def test_a_follower_is_given_a_second_for_a_row_and_the_server_all_of_the_wait():
     site = Site(a=QueryError(Refusal.AFTER_TIMEOUT, "not yet"))
-    asker(site).ask(PointQuery(0, 0, fresh=Freshness(7, 30.0)))
-    waits = [parameters.partition("wait=")[2] for _, parameters in site.asked]
+    asker(site).ask(PointQuery(0, 0, after=7, wait_s=30.0))
+    waits = [split_selector(parameters)["wait"] for _, parameters in site.asked]
     assert [float(wait) for wait in waits] == [asking.FOLLOWER_WAIT_S, 30.0]
 
 
@@ -256,6 +257,8 @@ def test_a_region_that_expired_is_asked_for_again_from_its_first_piece_so_many_t
 def test_more_changes_than_one_answer_holds_are_asked_for(monkeypatch):
     monkeypatch.setattr(codec, "MAX_CHANGES", 2)
     changes = [GroundChange(i, 1, 1, (0.0, 0.0, 1.0, 1.0), 4, None, 0.25, None, None) for i in (3, 4, 5)]
-    asking, site = client(*(codec.encode_changes(some, version(1, 0)) for some in (changes[:2], changes[2:])))
+    asking, site = client(
+        *(codec.encode_changes(ChangesAnswer(tuple(some), version(1, 0))) for some in (changes[:2], changes[2:]))
+    )
     assert asking.changes(2) == changes
     assert site.asked[1][1].endswith("after=4")

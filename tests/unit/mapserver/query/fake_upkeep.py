@@ -56,7 +56,7 @@ def answered(answers: AnswersOf, name: str, parameters: dict[str, str]) -> bytes
     if parameters.get("as_of") is None and name in ("segments", "worklist", "route", "way"):
         parameters = {"after": str(newest), **parameters}
     query, waited = parse_query(name, parameters), Future()
-    answers.source.waits.add(query.fresh.after, query.fresh.wait_s, waited.set_result)
+    answers.source.waits.add(query.after, query.wait_s, waited.set_result)
     if error := waited.result(WAIT_S):
         raise error
     return answers.answer(query)

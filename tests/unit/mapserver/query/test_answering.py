@@ -13,7 +13,8 @@ from mapserver.query.answering import Answers
 from mapserver.query.block_layers import BlockLayers
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_info, decode_point, decode_region
-from protocol.queries.requests import HistoryQuery, PointQuery, PointsQuery, RegionQuery, TilesQuery, When, WhyQuery
+from protocol.queries.map_tiles import TilesQuery
+from protocol.queries.requests import HistoryQuery, PointQuery, PointsQuery, RegionQuery, WhyQuery
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
@@ -66,7 +67,7 @@ def test_a_region_is_cut_from_its_blocks(answers, bounds):
 
 def test_a_region_that_no_reply_carries_is_refused(answers):
     bounds = Bounds(0, 0, 5000, 4000)
-    for query in (RegionQuery(bounds), RegionQuery(bounds, resolution_m=1000.0), RegionQuery(bounds, when=When(1))):
+    for query in (RegionQuery(bounds), RegionQuery(bounds, resolution_m=1000.0), RegionQuery(bounds, as_of_ns=1)):
         with refused(Refusal.TOO_LARGE, "5000 x 4000 cells"):
             answers.region(query)
 
@@ -76,7 +77,7 @@ TOO_MUCH = [
     RegionQuery(Bounds(-45, -45, 45, 45), ("visits",)),
     RegionQuery(Bounds(-45, -45, 45, 45), ("grade_east",), resolution_m=30.0),
     RegionQuery(Bounds(-45, -45, 45, 45), ("resistance_filled",)),
-    RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), when=When(NOW_NS + 10**11)),
+    RegionQuery(Bounds(-45, -45, 45, 45), ("visits",), as_of_ns=NOW_NS + 10**11),
     PointsQuery(tuple((x + 0.5, -x - 0.5) for x in range(-40, 40, 10)), ("visits",)),
     PointsQuery(PLACES, ("resistance_filled",)),
     RouteQuery(PLACES, repairs=False),

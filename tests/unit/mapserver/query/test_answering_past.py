@@ -14,8 +14,8 @@ from mapserver.query.answering import Answers
 from mapserver.query.server_source import Commands
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
-from protocol.queries.commands import TrustCommand, encode_command
-from protocol.queries.requests import MAX_SPANS, Freshness, HistoryQuery, PointQuery, RegionQuery, When, reads_past
+from protocol.queries.commands import TrustCommand
+from protocol.queries.requests import MAX_SPANS, HistoryQuery, PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import FakeUpkeep, answered, answers_of
@@ -63,7 +63,7 @@ def equal(one, other, names=NAMES) -> bool:
 
 def test_the_map_as_of_now_is_the_map_to_the_bit(answers):
     here = answers.region(RegionQuery(BOX, NAMES))
-    then = answers.region(RegionQuery(BOX, NAMES, when=When(as_of_ns=NEWEST_NS)))
+    then = answers.region(RegionQuery(BOX, NAMES, as_of_ns=NEWEST_NS))
     assert equal(here, then)
     assert np.isfinite(here["resistance"]).any()
     assert (then.merged, then.stamp_ns, then.bounds) == (4, NEWEST_NS, here.bounds)
@@ -72,7 +72,7 @@ def test_the_map_as_of_now_is_the_map_to_the_bit(answers):
 @pytest.mark.parametrize(("after_s", "bounds"), [(900, (-3, 5, 12, 9)), (3600 + 900, (-40, -40, 40, 40))])
 def test_the_map_as_of_a_time_is_that_of_a_server_that_knew_no_more(answers, served, after_s, bounds):
     stamp_ns = NOW_NS + after_s * S  # in the midst of journal rows
-    then = answers.region(RegionQuery(Bounds(*bounds), NAMES, when=When(as_of_ns=stamp_ns)))
+    then = answers.region(RegionQuery(Bounds(*bounds), NAMES, as_of_ns=stamp_ns))
     known = until(ROWS, stamp_ns)
     only = served(known).region(RegionQuery(Bounds(*bounds), NAMES))
     # Ages count from the time that was asked for, not from the newest sample before it.
@@ -96,7 +96,7 @@ def test_what_changed_later_has_not_changed_yet(served):
     answers = served(repaved())
     names = ("resistance", "changed_s", "resistance_class")
     stamps = (NOW_NS + HOUR_NS, NOW_NS + 3 * HOUR_NS)
-    before, after = (answers.point(PointQuery(10.0, 10.0, names, when=When(t))).values for t in stamps)
+    before, after = (answers.point(PointQuery(10.0, 10.0, names, as_of_ns=t)).values for t in stamps)
     assert before["resistance"] == pytest.approx(0.02, rel=0.05)
     assert np.isnan(before["changed_s"])
     assert after["resistance"] == pytest.approx(0.25, rel=0.05)
@@ -108,18 +108,17 @@ def test_what_changed_later_has_not_changed_yet(served):
 def test_excluded_machines_are_excluded_from_the_past(answers, served):
     without = served(excluded="b")
     only_a = served({"a": ROWS["a"]})
-    when = When(as_of_ns=NEWEST_NS)
-    here, there = (asked.region(RegionQuery(BOX, ("resistance",), when=when)) for asked in (without, only_a))
+    here, there = (asked.region(RegionQuery(BOX, ("resistance",), as_of_ns=NEWEST_NS)) for asked in (without, only_a))
     assert equal(here, there, ["resistance"])
-    assert not equal(here, answers.region(RegionQuery(BOX, ("resistance",), when=when)), ["resistance"])
+    assert not equal(here, answers.region(RegionQuery(BOX, ("resistance",), as_of_ns=NEWEST_NS)), ["resistance"])
 
 
 def test_a_difference_is_value_by_value_and_unknown_where_either_is(answers):
     names = ("resistance", "visits", "resistance_filled")
     middle_ns = NOW_NS + 900 * S
     newer = answers.region(RegionQuery(BOX, names))
-    older = answers.region(RegionQuery(BOX, names, when=When(as_of_ns=middle_ns)))
-    both = answers.region(RegionQuery(BOX, names, when=When(minus_ns=middle_ns)))
+    older = answers.region(RegionQuery(BOX, names, as_of_ns=middle_ns))
+    both = answers.region(RegionQuery(BOX, names, minus_ns=middle_ns))
     for name in names:
         assert np.array_equal(both[name], newer[name] - older[name], equal_nan=True)
         assert (np.isnan(both[name]) == (np.isnan(newer[name]) | np.isnan(older[name]))).all()
@@ -130,18 +129,18 @@ def test_a_difference_of_two_pasts_is_as_of_the_newer(served):
     answers = served(repaved())
     early, late = NOW_NS + HOUR_NS, NOW_NS + 3 * HOUR_NS
     names = ("resistance", "resistance_class")
-    point = answers.point(PointQuery(10.0, 10.0, names, when=When(late, early)))
+    point = answers.point(PointQuery(10.0, 10.0, names, as_of_ns=late, minus_ns=early))
     assert point.values["resistance"] == pytest.approx(0.23, rel=0.05)
     assert point.values["resistance_class"] == 3.0  # from class 1 to class 4: a number of classes
     assert point.stamp_ns == late
-    back = answers.point(PointQuery(10.0, 10.0, names, when=When(early, late)))
+    back = answers.point(PointQuery(10.0, 10.0, names, as_of_ns=early, minus_ns=late))
     assert back.values["resistance_class"] == -3.0
 
 
 def test_axes_have_no_difference(answers):
     with refused(Refusal.OUT_OF_RANGE, "`heading` has no difference; ask for it without `minus`"):
-        answers.point(PointQuery(0.0, 0.0, ("visits", "heading"), when=When(minus_ns=NOW_NS)))
-    values = answers.point(PointQuery(0.0, 0.0, when=When(minus_ns=NOW_NS))).values
+        answers.point(PointQuery(0.0, 0.0, ("visits", "heading"), minus_ns=NOW_NS))
+    values = answers.point(PointQuery(0.0, 0.0, minus_ns=NOW_NS)).values
     assert set(values) == set(LAYERS) - {"heading"}
 
 
@@ -208,16 +207,16 @@ def test_a_past_that_cannot_be_read_is_refused(tmp_path):
     with closing(open_writer(tmp_path)) as writer:
         writer.location = JournalLocation(tmp_path / "elsewhere")
         answers = answers_of(writer)
-        for query in (PointQuery(0, 0, when=When(1)), HistoryQuery(0, 0)):
+        for query in (PointQuery(0, 0, as_of_ns=1), HistoryQuery(0, 0)):
             with refused(Refusal.STORE, "no usable journal"):
                 answers.answer(query)
 
 
 def test_questions_about_the_past_are_recognised():
-    assert reads_past(HistoryQuery(0, 0))
-    assert reads_past(PointQuery(0, 0, when=When(as_of_ns=1)))
-    assert reads_past(RegionQuery(BOX, when=When(minus_ns=1)))
-    assert not reads_past(PointQuery(0, 0, fresh=Freshness(3)))
+    assert HistoryQuery(0, 0).reads_past
+    assert PointQuery(0, 0, as_of_ns=1).reads_past
+    assert RegionQuery(BOX, minus_ns=1).reads_past
+    assert not PointQuery(0, 0, after=3).reads_past
 
 
 def test_the_upkeep_is_asked(served):
@@ -228,7 +227,7 @@ def test_the_upkeep_is_asked(served):
     assert [(machine.name, machine.trusted) for machine in machines] == [("a", True), ("b", False)]
     changes = codec.decode_changes(answered(answers, "changes", {"after": "41"})).changes
     assert [change.id for change in changes] == [42]
-    row = codec.decode_machine(commands.obey("trust", encode_command(TrustCommand("b", False, "drifts; x=1", 5.0))))
+    row = codec.decode_machine(commands.obey("trust", TrustCommand("b", False, "drifts; x=1", 5.0).parameters()))
     assert (row.name, row.trusted, row.merged) == ("b", False, 4)
     commands.obey("trust", {"machine": "b", "trusted": "auto"})
     assert upkeep.asked == [41, ("b", False, "drifts; x=1", 5.0), ("b", None, "", 30.0)]

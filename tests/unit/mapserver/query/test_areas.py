@@ -14,7 +14,7 @@ from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, R
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_points, decode_region
 from protocol.queries.pieces import joined
-from protocol.queries.requests import PieceQuery, PointQuery, PointsQuery, RegionQuery, When, encode_query, parse_query
+from protocol.queries.requests import PieceQuery, PointQuery, PointsQuery, RegionQuery, parse_query
 from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, refused, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
@@ -34,7 +34,7 @@ def answers(tmp_path_factory):
 
 def ask(answers, query):
     """Through the bytes of question and answer, piece by piece."""
-    first = decode_region(answers.answer(parse_query(query.name, encode_query(query))))
+    first = decode_region(answers.answer(parse_query(query.name, query.parameters())))
     if not first.piece:
         return first
     more = (PieceQuery(first.piece.cursor, number) for number in range(1, first.piece.count))
@@ -50,8 +50,8 @@ def winding(x, y, outline) -> bool:
 
 def test_an_outline_cuts_the_rectangle_around_it(answers):
     box = Bounds(-33.0, -22.0, 30.0, 30.0)
-    for when in (When(), When(minus_ns=NOW_NS + 1800 * 10**9)):
-        cut, whole = (ask(answers, RegionQuery(area, NAMES, when=when)) for area in (STAR, box))
+    for when in ({}, {"minus_ns": NOW_NS + 1800 * 10**9}):
+        cut, whole = (ask(answers, RegionQuery(area, NAMES, **when)) for area in (STAR, box))
         within = np.array([[winding(x, y, STAR) for x in whole.x_m] for y in whole.y_m])
         assert (cut.x_m.tolist(), cut.y_m.tolist()) == (whole.x_m.tolist(), whole.y_m.tolist())
         for name in NAMES:
@@ -104,16 +104,16 @@ def test_a_resolution_is_a_multiple_of_the_cell(answers, resolution_m):
     assert cells_to_a_side(0.3, 0.1) == 3
 
 
-@pytest.mark.parametrize("when", [When(), When(as_of_ns=NOW_NS + 900 * 10**9), When(minus_ns=NOW_NS + 1800 * 10**9)])
+@pytest.mark.parametrize("when", [{}, {"as_of_ns": NOW_NS + 900 * 10**9}, {"minus_ns": NOW_NS + 1800 * 10**9}])
 def test_points_are_what_each_point_is(answers, when):
     draw = np.random.default_rng(8)
     places = [*draw.uniform(-70, 70, (20, 2)).tolist(), [-1.0, -16.0], [2e4, -2e4], [-1.0, -16.0]]
     names = ("resistance", "resistance_filled", "age_s", "visits")
-    query = PointsQuery(tuple(map(tuple, places)), names, when=when)
-    many = decode_points(answers.answer(parse_query("points", encode_query(query))))
+    query = PointsQuery(tuple(map(tuple, places)), names, **when)
+    many = decode_points(answers.answer(parse_query("points", query.parameters())))
     known = 0
     for i, (x, y) in enumerate(places):
-        one = answers.point(PointQuery(x, y, names, when=when))
+        one = answers.point(PointQuery(x, y, names, **when))
         assert (many.x_m[i], many.y_m[i]) == (one.x_m, one.y_m)
         for name in names:
             assert many[name][i] == pytest.approx(one.values[name], nan_ok=True, abs=0)

@@ -18,7 +18,7 @@ from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.block_layers import BlockLayers
 from protocol.arrays import Table
 from protocol.queries.answer_codec import decode_point
-from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, When, WhyQuery, encode_query
+from protocol.queries.requests import PointQuery, PointsQuery, RegionQuery, WhyQuery
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow
@@ -119,15 +119,19 @@ LINE = along([(-60, -20), (60, 10)])
 ENDS = ((-50.0, -17.5), (50.0, 7.5))
 metres = st.integers(-60, 60).map(float)
 names = st.lists(st.sampled_from((*LAYERS, *AREA_LAYERS)), max_size=4, unique=True).map(tuple)
-times = st.booleans().map(lambda repairs: When(repairs=repairs))
 bounds = st.builds(
     lambda west, south, width, height: Bounds(west, south, west + width, south + height),
     *(metres, metres, st.integers(1, 90), st.integers(1, 90)),
 )
 asked = st.one_of(
-    st.builds(PointQuery, metres, metres, names, when=times),
-    st.builds(PointsQuery, st.lists(st.tuples(metres, metres), min_size=1, max_size=4).map(tuple), names, when=times),
-    st.builds(RegionQuery, bounds, names, when=times),
+    st.builds(PointQuery, metres, metres, names, repairs=st.booleans()),
+    st.builds(
+        PointsQuery,
+        st.lists(st.tuples(metres, metres), min_size=1, max_size=4).map(tuple),
+        names,
+        repairs=st.booleans(),
+    ),
+    st.builds(RegionQuery, bounds, names, repairs=st.booleans()),
     st.builds(WhyQuery, metres, metres),
     st.builds(SegmentsQuery, bounds=st.none() | bounds),
     st.builds(WorklistQuery, st.sampled_from([0.01, 0.03])),
@@ -160,6 +164,6 @@ def test_an_answer_is_that_of_a_server_that_begins_now(course):
                 send(writer, [incoming(rows_of(*step, turn), 1, "ab"[turn % 2], spool_id=1 + turn)])
                 continue
             newest = writer.run(lambda store: store.merged)
-            words = encode_query(step) if isinstance(step, WhyQuery) else {**encode_query(step), "after": str(newest)}
+            words = step.parameters() if isinstance(step, WhyQuery) else {**step.parameters(), "after": str(newest)}
             fresh = answers_of(writer)
             assert answered(kept, step.name, words) == answered(fresh, step.name, words)

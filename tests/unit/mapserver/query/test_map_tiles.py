@@ -8,8 +8,8 @@ import pytest
 from mapserver.query.answering import Answers
 from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion
-from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer, decode_tiles, encode_tiles
-from protocol.queries.requests import PointQuery, RegionQuery, TilesQuery, WhyQuery, parse_query
+from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer, TilesQuery, decode_tiles, encode_tiles
+from protocol.queries.requests import PointQuery, RegionQuery, WhyQuery, parse_query
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import NOW_NS, SITE, incoming, open_writer, random_samples, refused, samples, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of

@@ -17,17 +17,8 @@ from mapserver.query.answering import ROADS_MADE, Answers
 from mapserver.query.map_tiles import Tiles
 from mapserver.query.road_maps import ASKED_S, FRESH_S, RoadMaps
 from protocol.errors import QueryError, Refusal, StoreError
-from protocol.queries.map_tiles import PLANES
-from protocol.queries.requests import (
-    Freshness,
-    PointQuery,
-    RegionQuery,
-    TilesQuery,
-    When,
-    WhyQuery,
-    encode_query,
-    parse_query,
-)
+from protocol.queries.map_tiles import PLANES, TilesQuery
+from protocol.queries.requests import PointQuery, RegionQuery, WhyQuery, parse_query
 from protocol.queries.roads import MAX_LIMIT, SegmentsQuery, WorklistQuery, decode_segments, decode_worklist
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import decode_answer
@@ -70,11 +61,11 @@ def of_both(count, c_rr, after_s):
 
 
 def segments(answers, **parameters):
-    return decode_segments(answered(answers, "segments", encode_query(SegmentsQuery(**parameters))))
+    return decode_segments(answered(answers, "segments", SegmentsQuery(**parameters).parameters()))
 
 
 def worklist(answers, **parameters):
-    return decode_worklist(answered(answers, "worklist", encode_query(WorklistQuery(**parameters))))
+    return decode_worklist(answered(answers, "worklist", WorklistQuery(**parameters).parameters()))
 
 
 def test_an_empty_map_has_an_empty_list_and_traffic_of_one_stamp_a_finite_one(tmp_path):
@@ -242,7 +233,7 @@ def repaired(tmp_path):
 
 
 def resistance(answers, *, repairs, as_of_ns=None):
-    return answers.region(RegionQuery(BOX, ("resistance",), when=When(as_of_ns, None, repairs))).layers["resistance"]
+    return answers.region(RegionQuery(BOX, ("resistance",), as_of_ns=as_of_ns, repairs=repairs)).layers["resistance"]
 
 
 def test_a_found_change_begins_a_new_age_of_its_cells(repaired):
@@ -260,7 +251,7 @@ def test_a_found_change_begins_a_new_age_of_its_cells(repaired):
     np.testing.assert_array_equal(before, resistance(answers, repairs=False, as_of_ns=then_ns))
     newest = max(int(passes(LINE, 3, 0.02, after_s=930.0)["stamp_ns"].max()), 0)
     np.testing.assert_array_equal(resistance(answers, repairs=True, as_of_ns=newest), since)
-    point = answers.point(PointQuery(40.0, 10.0, ("resistance",), when=When(repairs=True)))
+    point = answers.point(PointQuery(40.0, 10.0, ("resistance",), repairs=True))
     assert point.values["resistance"] == pytest.approx(0.02, rel=0.2)
     assert point.merged == worklist(answers).merged
 
@@ -269,11 +260,11 @@ def test_reasons_are_of_the_value_that_is_read_with_repairs(repaired):
     opened, then_ns = repaired
     answers = answers_of(opened)
     now, plain, then = (
-        answers.why(WhyQuery(40.0, 10.0, as_of_ns, repairs))
+        answers.why(WhyQuery(40.0, 10.0, as_of_ns=as_of_ns, repairs=repairs))
         for as_of_ns, repairs in ((None, True), (None, False), (then_ns, True))
     )
     for repairs, reasons in ((True, now), (False, plain)):
-        point = answers.point(PointQuery(40.0, 10.0, ("resistance", "visits"), when=When(repairs=repairs)))
+        point = answers.point(PointQuery(40.0, 10.0, ("resistance", "visits"), repairs=repairs))
         assert {name: reasons.values[name] for name in point.values} == pytest.approx(point.values)
         assert reasons.merged == point.merged
     assert now.before["resistance"] == pytest.approx(0.06, rel=0.2)
@@ -284,7 +275,7 @@ def test_reasons_are_of_the_value_that_is_read_with_repairs(repaired):
 
 
 def drive(answers, line=((15.0, 10.0), (205.0, 10.0)), **more):
-    return decode_answer(answered(answers, "route", encode_query(RouteQuery(line, **more))))
+    return decode_answer(answered(answers, "route", RouteQuery(line, **more).parameters()))
 
 
 def test_a_route_is_of_the_road_as_it_is_since_its_repair(repaired):
@@ -296,7 +287,7 @@ def test_a_route_is_of_the_road_as_it_is_since_its_repair(repaired):
     assert since.totals.energy_j < 0.8 * plain.totals.energy_j
     assert since.version.row == worklist(answers).merged
     way = WayQuery((15.0, 10.0), (205.0, 10.0))
-    cheapest = decode_answer(answered(answers, "way", encode_query(way)))
+    cheapest = decode_answer(answered(answers, "way", way.parameters()))
     assert cheapest.totals.energy_j == pytest.approx(since.totals.energy_j, rel=0.05)
 
 
@@ -378,7 +369,7 @@ def slow(repaired, monkeypatch):
     monkeypatch.setattr(road_maps, "CHEAP", DEAR)
     come(opened)
     with ThreadPoolExecutor(4) as pool:
-        waiting = [pool.submit(row_of, answers, replace(WHOLE, fresh=Freshness(5))) for _ in range(4)]
+        waiting = [pool.submit(row_of, answers, replace(WHOLE, after=5)) for _ in range(4)]
         assert began.wait(WAIT_S)
         yield answers, may_end, waiting
         may_end.set()

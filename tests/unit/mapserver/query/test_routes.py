@@ -14,7 +14,7 @@ from mapserver.query.answering import Answers
 from mapserver.query.named_machines import LOOK_BACK_NS, NamedMachines
 from protocol.arrays import Table
 from protocol.errors import QueryError, Refusal
-from protocol.queries.requests import encode_query, parse_query
+from protocol.queries.requests import parse_query
 from protocol.queries.route_requests import REFUSE, TIME, RouteQuery, WayQuery
 from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteAnswer, RouteMachine, decode_answer
 from protocol.units import GRAVITY_MPS2
@@ -46,7 +46,7 @@ def answers_on(folder: Path, rows: Table) -> Iterator[Answers]:
 
 def ask(answers: Answers, query: RouteQuery | WayQuery) -> RouteAnswer:
     """Through the bytes of question and answer."""
-    again = parse_query(query.name, encode_query(query))
+    again = parse_query(query.name, query.parameters())
     assert again == query
     return decode_answer(answers.answer(again))
 
@@ -56,7 +56,8 @@ def test_two_soils_cost_what_each_does_over_its_length(tmp_path):
     soils = lambda x, y: np.where(x < 0, 0.02, 0.06)  # noqa: E731
     with answers_on(tmp_path, ground(soils, lambda x, y: 0.015 + 0 * x)) as answers:
         there, back = (
-            ask(answers, RouteQuery(line, SLOW, ROLLING)) for line in (((-40, 5.0), (40, 5.0)), ((40, 5.0), (-40, 5.0)))
+            ask(answers, RouteQuery(line, machine=SLOW, stops=ROLLING))
+            for line in (((-40, 5.0), (40, 5.0)), ((40, 5.0), (-40, 5.0)))
         )
         assert there.totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 40 + 0.06 * 40 + 0.015 * 80), rel=0.02)
         assert back.totals.energy_j == pytest.approx(WEIGHT_N * (0.02 * 40 + 0.06 * 40 - 0.015 * 80), rel=0.03)
@@ -73,13 +74,13 @@ def test_a_way_leads_around_sand_and_costs_less_than_straight(tmp_path):
     sand = lambda x, y: (abs(x) < 15) & (y < 25)  # noqa: E731
     with answers_on(tmp_path, ground(lambda x, y: np.where(sand(x, y), 0.25, 0.02))) as answers:
         ends = (-40.0, 0.0), (40.0, 0.0)
-        way = ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
-        straight = ask(answers, RouteQuery(ends, SLOW, ROLLING))
+        way = ask(answers, WayQuery(*ends, machine=SLOW, stops=ROLLING))
+        straight = ask(answers, RouteQuery(ends, machine=SLOW, stops=ROLLING))
         assert way.line_m[[0, -1]].tolist() == [[-40, 0], [40, 0]]
         assert way.line_m[:, 1].max() > 24
         assert way.totals.energy_j < 0.5 * straight.totals.energy_j
         assert way.steps.resistance.max() < 0.1
-        again = ask(answers, RouteQuery(tuple(map(tuple, way.line_m.tolist())), SLOW, ROLLING))
+        again = ask(answers, RouteQuery(tuple(map(tuple, way.line_m.tolist())), machine=SLOW, stops=ROLLING))
         assert again.totals.energy_j == pytest.approx(way.totals.energy_j)
 
 
@@ -88,15 +89,15 @@ def test_unknown_ground_is_dear_refused_or_as_told(tmp_path):
     soils = lambda x, y: np.where(y > 45, 0.08, 0.02)  # noqa: E731
     with answers_on(tmp_path, ground(soils, skipped=gap)) as answers:
         ends = (-30.0, -30.0), (30.0, -30.0)
-        refused = ask(answers, WayQuery(*ends, SLOW, unknown=REFUSE))
+        refused = ask(answers, WayQuery(*ends, machine=SLOW, unknown=REFUSE))
         assert refused.totals.unknown == 0.0
         assert refused.line_m[:, 1].max() > 34
-        cheap = ask(answers, WayQuery(*ends, SLOW, unknown=0.02))
+        cheap = ask(answers, WayQuery(*ends, machine=SLOW, unknown=0.02))
         assert len(cheap.line_m) == 2
         with pytest.raises(QueryError, match=r"unknown ground at -?\d, -30 m; without `unknown=refuse` it has a cost"):
-            ask(answers, RouteQuery(ends, SLOW, unknown=REFUSE))
+            ask(answers, RouteQuery(ends, machine=SLOW, unknown=REFUSE))
         with pytest.raises(QueryError, match="parameter `to`: unknown ground"):
-            ask(answers, WayQuery((-30.0, -30.0), (0.0, 0.0), SLOW, unknown=REFUSE))
+            ask(answers, WayQuery((-30.0, -30.0), (0.0, 0.0), machine=SLOW, unknown=REFUSE))
 
 
 def test_a_way_keeps_to_a_road_of_fifteen_degrees(tmp_path):
@@ -105,11 +106,13 @@ def test_a_way_keeps_to_a_road_of_fifteen_degrees(tmp_path):
     beside = lambda x, y: (abs(y) > 2) & (abs(x) < 45)  # noqa: E731
     with answers_on(tmp_path, ground(lambda x, y: 0.03 + 0 * x, up, beside)) as answers:
         for ends in (((-50.0, 0.0), (50.0, 20.0)), ((-50.0, -30.0), (50.0, 30.0))):
-            way = ask(answers, WayQuery(*ends, SLOW, stops=ROLLING))
+            way = ask(answers, WayQuery(*ends, machine=SLOW, stops=ROLLING))
             assert way.totals.lift_m == pytest.approx(20 * 0.27, rel=0.2)
-            middle = ask(answers, RouteQuery(tuple(map(tuple, way.line_m.tolist())), SLOW, ROLLING, step_m=1.0)).steps
+            middle = ask(
+                answers, RouteQuery(tuple(map(tuple, way.line_m.tolist())), machine=SLOW, stops=ROLLING, step_m=1.0)
+            ).steps
             assert abs(middle.y_m[abs(middle.x_m) < 10]).max() < 4.0
-        off = ask(answers, RouteQuery(((-50, 0), (-40, 20), (40, 20), (50, 0)), SLOW, ROLLING)).totals
+        off = ask(answers, RouteQuery(((-50, 0), (-40, 20), (40, 20), (50, 0)), machine=SLOW, stops=ROLLING)).totals
         assert off.unknown > 0.6
         assert off.lift_m == pytest.approx(20 * 0.27, rel=0.1), "heights at both ends of the unknown are known"
 
@@ -119,19 +122,21 @@ def test_unknown_ground_costs_the_same_whoever_asks_from_wherever(tmp_path):
     soils = lambda x, y: np.where(y > 45, 0.08, np.where(x < 0, 0.02, 0.05))  # noqa: E731
     with answers_on(tmp_path, ground(soils, lambda x, y: 0.001 * x, skipped=gap)) as answers:
         for ends in (((-20.0, 0.0), (20.0, 0.0)), ((20.0, -55.0), (-30.0, 58.0))):
-            way = ask(answers, WayQuery(*ends, SLOW))
+            way = ask(answers, WayQuery(*ends, machine=SLOW))
             line = tuple(map(tuple, way.line_m.tolist()))
-            again, straight = ask(answers, RouteQuery(line, SLOW)), ask(answers, RouteQuery(ends, SLOW))
+            again, straight = ask(answers, RouteQuery(line, machine=SLOW)), ask(answers, RouteQuery(ends, machine=SLOW))
             assert again.totals == way.totals
             assert way.totals.energy_j <= straight.totals.energy_j
-        then = ask(answers, WayQuery(*ends, SLOW, as_of_ns=way.stamp_ns))
+        then = ask(answers, WayQuery(*ends, machine=SLOW, as_of_ns=way.stamp_ns))
         assert then.line_m.tolist() == way.line_m.tolist()
         assert then.totals == way.totals, "as of a time as now"
-        long, short = (ask(answers, RouteQuery(((-x, 3.0), (x, 3.0)), SLOW, step_m=1.0)).steps for x in (58.0, 12.0))
+        long, short = (
+            ask(answers, RouteQuery(((-x, 3.0), (x, 3.0)), machine=SLOW, step_m=1.0)).steps for x in (58.0, 12.0)
+        )
         assert long.resistance[46:70] == pytest.approx(short.resistance)
-        alone = ask(answers, RouteQuery(((-2.0, 3.0), (2.0, 3.0)), SLOW)).totals
+        alone = ask(answers, RouteQuery(((-2.0, 3.0), (2.0, 3.0)), machine=SLOW)).totals
         assert alone.unknown_resistance == pytest.approx(short.resistance[10:14].mean())
-        assert ask(answers, RouteQuery(((20.0, 0.0), (50.0, 0.0)), SLOW)).totals.unknown_resistance == 0.0
+        assert ask(answers, RouteQuery(((20.0, 0.0), (50.0, 0.0)), machine=SLOW)).totals.unknown_resistance == 0.0
 
 
 def test_no_drive_over_the_way_is_dearer_than_straight_on(tmp_path):
@@ -151,26 +156,26 @@ def test_no_drive_over_the_way_is_dearer_than_straight_on(tmp_path):
 def test_margins_keep_away_from_parked_machines(tmp_path):
     with answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x)) as answers:
         ends, parked = ((-40.0, 0.0), (40.0, 0.0)), ((0.0, 0.0), (10.0, 3.0))
-        way = ask(answers, WayQuery(*ends, SLOW, margin_m=8.0, avoid=parked))
+        way = ask(answers, WayQuery(*ends, machine=SLOW, margin_m=8.0, avoid=parked))
         along = np.concatenate([np.linspace(a, b, 200) for a, b in zip(way.line_m[:-1], way.line_m[1:], strict=True)])
         for place in parked:
             assert np.hypot(*(along - place).T).min() > 7.0
         with pytest.raises(QueryError, match="parameter `from`: nearer than `margin` to what no way leads over"):
-            ask(answers, WayQuery((1.0, 1.0), ends[1], SLOW, margin_m=8.0, avoid=parked))
+            ask(answers, WayQuery((1.0, 1.0), ends[1], machine=SLOW, margin_m=8.0, avoid=parked))
 
 
 def test_no_way_says_which_limit_leaves_none(tmp_path):
     wall = lambda x, y: np.where(abs(x) < 6, 0.25, 0.0)  # noqa: E731
     with answers_on(tmp_path, ground(lambda x, y: 0.02 + 0 * x, wall)) as answers:
         ends = (-40.0, 0.0), (40.0, 0.0)
-        assert ask(answers, WayQuery(*ends, SLOW, unknown=REFUSE)).totals.length_m == pytest.approx(80)
+        assert ask(answers, WayQuery(*ends, machine=SLOW, unknown=REFUSE)).totals.length_m == pytest.approx(80)
         with pytest.raises(QueryError, match="no way: `max_grade` leaves none"):
-            ask(answers, WayQuery(*ends, SLOW, max_grade=0.1, unknown=REFUSE))
+            ask(answers, WayQuery(*ends, machine=SLOW, max_grade=0.1, unknown=REFUSE))
         row = tuple((0.0, float(y)) for y in range(-HALF - 10, HALF + 10))
         with pytest.raises(QueryError, match="no way: `margin` leaves none"):
-            ask(answers, WayQuery(*ends, SLOW, margin_m=5.0, avoid=row, unknown=REFUSE))
+            ask(answers, WayQuery(*ends, machine=SLOW, margin_m=5.0, avoid=row, unknown=REFUSE))
         with pytest.raises(QueryError, match=r"parameter `to`: 25% steep, over `max_grade`"):
-            ask(answers, WayQuery(ends[0], (0.0, 0.0), SLOW, max_grade=0.1))
+            ask(answers, WayQuery(ends[0], (0.0, 0.0), machine=SLOW, max_grade=0.1))
 
 
 def test_the_fastest_way_is_not_the_cheapest(tmp_path):
@@ -178,7 +183,7 @@ def test_the_fastest_way_is_not_the_cheapest(tmp_path):
     with answers_on(tmp_path, ground(soils)) as answers:
         strong = RouteMachine(mass_kg=20_000.0, speed_mps=4.0, power_w=400_000.0)
         ends = (-50.0, 0.0), (50.0, 0.0)
-        cheapest, fastest = (ask(answers, WayQuery(*ends, strong, cost=cost)) for cost in ("energy", TIME))
+        cheapest, fastest = (ask(answers, WayQuery(*ends, machine=strong, cost=cost)) for cost in ("energy", TIME))
         assert abs(cheapest.line_m[:, 1]).max() > 19
         assert len(fastest.line_m) == 2
         assert cheapest.totals.energy_j < fastest.totals.energy_j
@@ -191,7 +196,7 @@ def test_an_empty_map_knows_no_cost(tmp_path):
         for query in (RouteQuery(((0.0, 0.0), (30.0, 0.0))), WayQuery((0.0, 0.0), (30.0, 0.0))):
             with pytest.raises(QueryError, match="nobody has driven near"):
                 ask(answers, query)
-        given = ask(answers, WayQuery((0.0, 0.0), (30.0, 0.0), SLOW, unknown=0.05, stops=ROLLING))
+        given = ask(answers, WayQuery((0.0, 0.0), (30.0, 0.0), machine=SLOW, unknown=0.05, stops=ROLLING))
         assert given.totals.energy_j == pytest.approx(WEIGHT_N * 0.05 * 30)
 
 
@@ -233,7 +238,7 @@ def answers(tmp_path):
 
 
 def asked(answers, machine: NamedMachine, as_of_ns: int | None = None):
-    query = RouteQuery(LINE, machine, stops=(False, False), as_of_ns=as_of_ns)
+    query = RouteQuery(LINE, machine=machine, stops=(False, False), as_of_ns=as_of_ns)
     return decode_answer(answers.answer(query))
 
 

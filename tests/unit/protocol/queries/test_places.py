@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from protocol.errors import QueryError
 from protocol.queries.parameters import selector_of, split_selector
 from protocol.queries.places import MAX_CORNERS, MAX_PLACES, check_outline
-from protocol.queries.requests import Freshness, PointsQuery, RegionQuery, When, encode_query, parse_query
+from protocol.queries.requests import PointsQuery, RegionQuery, parse_query
 from protocol.queries.route_requests import REFUSE, TIME, RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES, NamedMachine, RouteMachine, machine_of
 from protocol.site.geometry import Bounds
@@ -20,12 +20,12 @@ SQUARE = ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0))
 
 
 def round_trip(query):
-    return parse_query(query.name, split_selector(selector_of(encode_query(query))))
+    return parse_query(query.name, split_selector(selector_of(query.parameters())))
 
 
 @given(st.lists(PLACE, min_size=1, max_size=30).map(tuple), st.none() | st.integers(1, 10**18))
 def test_points_are_asked_as_they_were_meant(places, as_of_ns):
-    query = PointsQuery(places, ("resistance",), Freshness(3, 4.0), When(as_of_ns, None))
+    query = PointsQuery(places, ("resistance",), after=3, wait_s=4.0, as_of_ns=as_of_ns)
     assert round_trip(query) == query
 
 
@@ -102,9 +102,9 @@ def test_no_places_and_no_numbers_are_refused_where_a_query_is_made():
 
 
 def test_a_machine_is_a_kind_or_a_name_and_keeps_what_is_given():
-    named = RouteQuery(SQUARE[:2], NamedMachine("truck-1", (("efficiency", 0.4), ("mass_kg", 3e4))))
+    named = RouteQuery(SQUARE[:2], machine=NamedMachine("truck-1", (("efficiency", 0.4), ("mass_kg", 3e4))))
     assert round_trip(named) == named
-    assert encode_query(named)["machine"] == "truck-1"
+    assert named.parameters()["machine"] == "truck-1"
     assert machine_of("truck") is MACHINES["truck"]
     assert machine_of("truck-1") == NamedMachine("truck-1")
     with pytest.raises(ValueError, match="mass_kg"):
@@ -115,10 +115,26 @@ def test_a_machine_is_a_kind_or_a_name_and_keeps_what_is_given():
     "query",
     [
         RouteQuery(((0.1, -0.2), (1e5 / 3, 7.0), (0.0, 0.0))),
-        RouteQuery(((0.0, 0.0), (1.0, 1.0)), MACHINES["truck"], (False, True), 1.5, REFUSE, 17, Freshness(3, 5.0)),
+        RouteQuery(
+            ((0.0, 0.0), (1.0, 1.0)),
+            machine=MACHINES["truck"],
+            stops=(False, True),
+            step_m=1.5,
+            unknown=REFUSE,
+            after=3,
+        ),
         WayQuery((0.0, 0.0), (30.0, 40.0)),
         WayQuery(
-            (0.0, 0.0), (3.0, 4.0), MACHINES["truck"], TIME, 0.1, 5.0, ((1.0, 2.0),), (False, False), 9.0, 0.05, 17
+            (0.0, 0.0),
+            (3.0, 4.0),
+            TIME,
+            0.1,
+            5.0,
+            ((1.0, 2.0),),
+            stops=(False, False),
+            step_m=9.0,
+            unknown=0.05,
+            as_of_ns=17,
         ),
     ],
 )
@@ -136,4 +152,4 @@ def test_a_machine_is_a_kind_with_values_of_its_own():
 def test_as_many_places_as_a_line_may_have():
     places = tuple((i / 3, 0.1) for i in range(MAX_PLACES))
     query = RouteQuery(places)
-    assert parse_query("route", encode_query(query)) == query
+    assert parse_query("route", query.parameters()) == query

@@ -15,11 +15,11 @@ import zenoh
 
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import encode_change, encode_changes, encode_error, encode_machine, encode_machines
-from protocol.queries.answers import GroundChange, TrustAnswer
+from protocol.queries.answers import ChangesAnswer, GroundChange, MachinesAnswer, TrustAnswer
 from protocol.queries.calibration import CalibrationAnswer, CorrectedSpan, MachineCalibration, encode_calibration
 from protocol.queries.commands import CalibrateCommand, TrustCommand, parse_command
 from protocol.queries.parameters import split_selector
-from protocol.queries.requests import CalibrationQuery, ChangesQuery, Freshness, MachinesQuery, parse_query
+from protocol.queries.requests import CalibrationQuery, ChangesQuery, MachinesQuery, parse_query
 from protocol.wire import keys
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.cli import main
@@ -73,9 +73,9 @@ class FakeServer:
             parsed = parse_query(keys.query_of(str(query.key_expr)), split_selector(str(query.parameters)))
             self.asked.append(parsed)
             answers = {
-                MachinesQuery: lambda: encode_machines(MACHINES, version()),
+                MachinesQuery: lambda: encode_machines(MachinesAnswer(tuple(MACHINES), version())),
                 CalibrationQuery: lambda: encode_calibration(CALIBRATION),
-                ChangesQuery: lambda: encode_changes([CHANGE], version()),
+                ChangesQuery: lambda: encode_changes(ChangesAnswer((CHANGE,), version())),
             }
             query.reply(query.key_expr, answers[type(parsed)]())
 
@@ -218,7 +218,7 @@ def test_trust_and_distrust_reach_the_server(server: FakeServer, capsys):
 
 
 def test_calibration_is_asked_for_and_said(server: FakeServer, client: Client, capsys):
-    assert client.calibrate(wait_s=2.0) == client.calibration(after=3) == CALIBRATION
+    assert client.calibrate(wait_s=2.0) == client.ask(CalibrationQuery(after=3)) == CALIBRATION
     assert client.correct("a", "levelled", zero=0.004, across=-0.01) == CALIBRATION
     assert client.calibrate_automatically("a") == CALIBRATION
     assert sitegrid(server, "calibrate", "--wait", "5") == 0
@@ -236,7 +236,7 @@ def test_calibration_is_asked_for_and_said(server: FakeServer, client: Client, c
     assert sitegrid(server, "calibrate", "a", "--auto", "--json") == 0
     assert server.asked == [
         CalibrateCommand(wait_s=2.0),
-        CalibrationQuery(Freshness(3)),
+        CalibrationQuery(after=3),
         CalibrateCommand("a", 0.004, None, -0.01, reason="levelled"),
         CalibrateCommand("a", auto=True),
         CalibrateCommand(wait_s=5.0),
@@ -274,7 +274,7 @@ def test_machines_are_a_table_for_people(server: FakeServer, capsys):
     assert second.endswith("  measures 1.60 times the resistance that the others do")
     assert sitegrid(server, "query", "--after", "3", "machines", "--json") == 0
     assert json.loads(capsys.readouterr().out) == {"machines": plain(MACHINES)}
-    assert server.asked[-1] == MachinesQuery(Freshness(3))
+    assert server.asked[-1] == MachinesQuery(after=3)
 
 
 def test_changes_are_a_line_each(server: FakeServer, capsys):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
+from argparse import ArgumentParser
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from protocol.queries.answers import Region
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
 from sim.truth import TruthMap
+from sitegrid.commands.plot import add_options
 from sitegrid.pictures.draw import _query, _title, truth_layers
 from tests.unit.records import version
 
@@ -69,23 +70,25 @@ def test_a_map_without_resistance_says_why(resistance: float, grade: float, trac
     assert _title(known, tracks, "samples follow after 90 s") == title
 
 
-def arguments(**given):
-    return Namespace(**{"line": None, "between": None, "set": [], **given})
+def asked(*words: str):
+    parser = ArgumentParser()
+    add_options(parser)
+    return _query(None, parser.parse_args(words))
 
 
 def test_a_drive_is_asked_as_the_options_say():
-    assert _query(arguments()) is None
-    line = _query(arguments(line=[0.0, 1.0, 30.0, 40.0], set=[("machine", "truck"), ("mass", "30000")]))
-    assert line == RouteQuery(((0.0, 1.0), (30.0, 40.0)), replace(MACHINES["truck"], mass_kg=30_000.0), step_m=5.0)
-    assert _query(arguments(between=[0.0, 1.0, 30.0, 40.0], set=[("cost", "time")])) == WayQuery(
-        (0.0, 1.0), (30.0, 40.0), cost="time", step_m=5.0
-    )
-    coarse = _query(arguments(between=[0.0, 1.0, 30.0, 40.0], set=[("step", "10")]))
+    places = ["0", "1", "30", "40"]
+    assert asked() is None
+    line = asked("--line", *places, "--machine", "truck", "--mass", "30000")
+    truck = replace(MACHINES["truck"], mass_kg=30_000.0)
+    assert line == RouteQuery(((0.0, 1.0), (30.0, 40.0)), machine=truck, step_m=5.0)
+    assert asked("--between", *places, "--cost", "time") == WayQuery((0.0, 1.0), (30.0, 40.0), cost="time", step_m=5.0)
+    coarse = asked("--between", *places, "--step", "10")
     assert coarse == WayQuery((0.0, 1.0), (30.0, 40.0), step_m=10.0)
-    long = _query(arguments(line=[0.0, 0.0, 60_000.0, 0.0]))
+    long = asked("--line", "0", "0", "60000", "0")
     assert isinstance(long, RouteQuery)
     assert long.step_m == 60.0, "one step a pixel"
-    with pytest.raises(ConfigError, match="--set: is of a drive"):
-        _query(arguments(set=[("mass", "3")]))
+    with pytest.raises(ConfigError, match="--mass: is of a drive"):
+        asked("--mass", "3")
     with pytest.raises(QueryError, match="parameter `line`: 3 numbers"):
-        _query(arguments(line=[0.0, 1.0, 2.0]))
+        asked("--line", "0", "1", "2")
