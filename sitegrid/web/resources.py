@@ -15,7 +15,7 @@ from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.parameters import WORDS, name_of
 from protocol.queries.request import MapQuery, Parameter, parameters_of
 from protocol.queries.requests import (
-    CalibrationQuery,
+    QUERIES,
     ChangesQuery,
     HistoryQuery,
     InfoQuery,
@@ -25,7 +25,6 @@ from protocol.queries.requests import (
     RegionQuery,
     WhyQuery,
 )
-from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from sitegrid.web import features, roads
 from sitegrid.web.encoding import PIECE, ROOM, answered, as_json, beside, frame, pieces
 from sitegrid.web.resource import GEOJSON, Resource, as_geojson, of_version, version_of
@@ -159,11 +158,8 @@ RESOURCES: dict[str, Resource] = {
     "region": Resource(region, RegionQuery.help, RegionQuery, more=(FORMAT,), media=tuple(REGION_MEDIA.values())),
     "history": Resource(history, HistoryQuery.help, HistoryQuery, follows_now=True),
     "machines": Resource(machines, MachinesQuery.help, MachinesQuery, follows_now=True),
-    "calibration": Resource(as_it_is, CalibrationQuery.help, CalibrationQuery, follows_now=True),
     "changes": Resource(changes, ChangesQuery.help, ChangesQuery, follows_now=True),
     "tiles": Resource(tiles, TilesQuery.help, TilesQuery, without=("place",), media=BINARY, follows_now=True),
-    "segments": Resource(as_it_is, SegmentsQuery.help, SegmentsQuery, follows_now=True),
-    "worklist": Resource(as_it_is, WorklistQuery.help, WorklistQuery, follows_now=True),
     **roads.RESOURCES,
     "features/zones": Resource(zones, "Areas of one kind of ground", TilesQuery, EVERY_TILE, media=GEOJSON),
     "features/changes": Resource(
@@ -171,6 +167,12 @@ RESOURCES: dict[str, Resource] = {
     ),
     "features/machines": Resource(machine_features, "Positions of machines", media=GEOJSON, follows_now=True),
     "features/tracks": Resource(track_features, "Lines that machines drove", media=GEOJSON, follows_now=True),
+}
+# Other queries are answered with the fields of their records.
+RESOURCES |= {
+    name: Resource(as_it_is, query.help, query, follows_now=True)
+    for name, query in QUERIES.items()
+    if name not in (*RESOURCES, "piece", "alive")
 }
 
 
