@@ -240,7 +240,7 @@ class Answers:
             view = self._roads.view(window, self._reach, query.as_of_ns)
         else:
             view = self._view(window, query.as_of_ns)
-        names = self._source.run(lambda state: [name for name in state.machines() if name not in state.facts.excluded])
+        names = self._source.run(_names_in)
         return reasons(view, (window.column, window.row), names, self._site.cell_m, self._config)
 
     def _version(self) -> MapVersion:
@@ -341,6 +341,11 @@ class Answers:
             HistorySpan(first_ns, last_ns, dict(zip(names, of_span, strict=True)))
             for first_ns, last_ns, *of_span in zip(*columns, strict=True)
         )
+
+
+def _names_in(state: MapState) -> list[str]:
+    """Machines whose samples may be in the map."""
+    return [name for name in state.machines() if name not in state.facts.excluded]
 
 
 def _reads_roads(query: MapQuery[Any]) -> bool:

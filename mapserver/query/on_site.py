@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from protocol.errors import QueryError, Refusal
-from protocol.queries.places import Place, where_it_lies
-from protocol.queries.request import MapQuery
-from protocol.queries.requests import HistoryQuery, PointQuery, PointsQuery, RegionQuery, WhyQuery
-from protocol.queries.roads import RoadQuery
-from protocol.queries.route_requests import RouteQuery, WayQuery
+from protocol.queries.parameters import Form
+from protocol.queries.places import Place, around, where_it_lies
+from protocol.queries.request import MapQuery, groups
+from protocol.queries.requests import HistoryQuery, PointQuery, WhyQuery
+from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
 
 
@@ -29,16 +29,21 @@ def check_on_site(query: MapQuery[Any], site: SiteConfig, bounds: Callable[[], S
 
 def _places(query: MapQuery[Any]) -> Mapping[str, Sequence[Place]]:
     """Places by the name of their parameter; of an area the one that is nearest to the origin."""
-    match query:
-        case PointQuery() | HistoryQuery() | WhyQuery():
-            return {"x`, `y": ((query.x_m, query.y_m),)}
-        case PointsQuery():
-            return {"places": query.places}
-        case RegionQuery() | RoadQuery() if area := query.bounds:
-            x_m, y_m = max(area.west_m, min(0.0, area.east_m)), max(area.south_m, min(0.0, area.north_m))
-            return {"polygon" if getattr(query, "area", area) is not area else "bounds": ((x_m, y_m),)}
-        case RouteQuery():
-            return {"line": query.line}
-        case WayQuery():
-            return {"from": (query.start,), "to": (query.end,), "avoid": query.avoid}
-    return {}
+    places: dict[str, Sequence[Place]] = {}
+    for field, group in groups(type(query)):
+        value, one = getattr(query, field.name), group.parameters[0]
+        if isinstance(value, Bounds):
+            places[one.name] = (_nearest(value),)
+        elif one.kind.form is Form.RECTANGLE and value:
+            places["polygon"] = (_nearest(around(value)),)
+        elif one.kind.form is Form.PLACES:
+            places[one.name] = value
+        elif one.kind.form is Form.PLACE:
+            places[one.name] = (value,)
+    if isinstance(query, PointQuery | HistoryQuery | WhyQuery):
+        places["x`, `y"] = ((query.x_m, query.y_m),)
+    return places
+
+
+def _nearest(area: Bounds) -> Place:
+    return max(area.west_m, min(0.0, area.east_m)), max(area.south_m, min(0.0, area.north_m))

@@ -58,8 +58,13 @@ def reasons(
         grade_east=_votes(holds, before, ev.GRADE_EAST, ev.GRADE_CENTRES),
         grade_north=_votes(holds, before, ev.GRADE_NORTH, ev.GRADE_CENTRES),
         sectors=_metres(holds, ev.HEADING),
-        machines=tuple(sorted(name for name in names if bits >> (name_hash(name) >> MACHINE_SHIFT) & 1)),
+        machines=tuple(sorted(name for name in names if bits >> machine_bit(name) & 1)),
     )
+
+
+def machine_bit(name: str) -> int:
+    """Which bit of a cell says that this machine drove over it."""
+    return name_hash(name) >> MACHINE_SHIFT
 
 
 def _one(sums: ev.Evidence, place: int) -> ev.Evidence:

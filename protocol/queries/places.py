@@ -98,6 +98,12 @@ def _check_area(area: Bounds | tuple[Place, ...]) -> None:
 AREA = Group((_BOUNDS, _POLYGON), _read_area, _write_area, _check_area)
 
 
+def around(corners: Sequence[Place]) -> Bounds:
+    """The rectangle around an outline."""
+    x_m, y_m = zip(*corners, strict=True)
+    return Bounds(min(x_m), min(y_m), max(x_m), max(y_m))
+
+
 def where_it_lies(bounds: Sequence[int] | None, cell_m: float) -> str:
     """Where a map lies, and what numbers elsewhere may be; bounds: west, south, east, north in cells, None for none."""
     if not bounds:

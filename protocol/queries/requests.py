@@ -22,7 +22,7 @@ from protocol.queries.parameters import (
     number,
     refusal,
 )
-from protocol.queries.places import AREA, Place, places
+from protocol.queries.places import AREA, Place, around, places
 from protocol.queries.reasons import CellReasons, decode_why, encode_why
 from protocol.queries.request import (
     AskFirst,
@@ -114,10 +114,7 @@ class RegionQuery(Compared[answers.Region], Fresh[answers.Region]):
     @property
     def bounds(self) -> Bounds:
         """The rectangle, or that around the outline."""
-        if isinstance(self.area, Bounds):
-            return self.area
-        x_m, y_m = zip(*self.area, strict=True)
-        return Bounds(min(x_m), min(y_m), max(x_m), max(y_m))
+        return self.area if isinstance(self.area, Bounds) else around(self.area)
 
 
 @dataclass(frozen=True)
