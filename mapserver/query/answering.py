@@ -20,6 +20,7 @@ from mapserver.past.cell_history import CellHistory
 from mapserver.query import roads
 from mapserver.query.areas import cells_to_a_side, finer, inside, means
 from mapserver.query.block_layers import BlockLayers, Look, around_squares
+from mapserver.query.coverage import coverage
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.on_site import check_on_site
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
@@ -41,6 +42,7 @@ from protocol.queries.answers import (
     PointsAnswer,
     Region,
 )
+from protocol.queries.coverage import Coverage, CoverageQuery
 from protocol.queries.map_tiles import TilesAnswer, TilesQuery
 from protocol.queries.reasons import CellReasons
 from protocol.queries.request import Compared, MapQuery, Size
@@ -90,6 +92,7 @@ class Answers:
             PieceQuery: self.piece,
             TilesQuery: self.tiles,
             WhyQuery: self.why,
+            CoverageQuery: self.coverage,
             HistoryQuery: self.history,
             SegmentsQuery: lambda query: roads.segments(self._roads.read, query),
             WorklistQuery: lambda query: roads.worklist(self._roads.read, query),
@@ -242,6 +245,15 @@ class Answers:
             view = self._view(window, query.as_of_ns)
         names = self._source.run(_names_in)
         return reasons(view, (window.column, window.row), names, self._site.cell_m, self._config)
+
+    def coverage(self, query: CoverageQuery) -> Coverage:
+        """How much ground is driven and known."""
+        window = self._site.geometry.window(query.bounds) if query.bounds else None
+        bounds, names = self._source.run(lambda state: (state.grid.bounds(), _names_in(state)))
+        west, south, east, north = bounds or (0, 0, 1, 1)
+        area = window or CellWindow(west, south, east - west, north - south)
+        self._source.run(lambda state: check_past(state, area, self._reach))
+        return coverage(self._view(area, query.as_of_ns), window, names, self._site.cell_m, self._config)
 
     def _version(self) -> MapVersion:
         return self._source.run(lambda state: state.version)

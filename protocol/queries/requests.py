@@ -12,6 +12,7 @@ from typing import Any
 from protocol.queries import answer_codec as codec
 from protocol.queries import answers
 from protocol.queries.calibration import CalibrationAnswer, decode_calibration, encode_calibration
+from protocol.queries.coverage import CoverageQuery
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.parameters import (
     METRES,
@@ -245,6 +246,7 @@ QUERIES: dict[str, type[MapQuery[Any]]] = {
         WayQuery,
         AliveQuery,
         InfoQuery,
+        CoverageQuery,
     )
 }
 

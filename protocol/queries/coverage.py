@@ -1,0 +1,56 @@
+"""How much ground the map knows, how old that is, and who drove it: the query `coverage`, its answer, and its bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_record
+from protocol.queries.parameters import RECTANGLE
+from protocol.queries.request import AsOf, Codec, Fresh, Size, asked
+from protocol.site.geometry import Bounds
+from protocol.wire.codec import pack, unpack
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Ground of an area, in square metres.
+
+    driven_m2: of cells that any machine drove over; known_m2: of those whose resistance is known. driven_since_m2: of
+    cells driven in the last hour, day and week before stamp_ns, by these names. machines_m2: driven by each machine;
+    with more than a few machines on the site, another one's ground may be counted too.
+    """
+
+    store: str
+    merged: int
+    fact: int
+    stamp_ns: int
+    driven_m2: float
+    known_m2: float
+    driven_since_m2: Mapping[str, float]
+    machines_m2: Mapping[str, float]
+
+
+def _encode(answer: Coverage) -> bytes:
+    return pack({"coverage": asdict(answer)})
+
+
+def _decode(data: bytes) -> Coverage:
+    return take_record(Coverage, unpack(data, MAX_REPLY_BYTES, MAX_ITEMS), "coverage")
+
+
+@dataclass(frozen=True)
+class CoverageQuery(AsOf[Coverage], Fresh[Coverage]):
+    """How much ground is driven and known, by age and machine. bounds: in this rectangle; None: in all of the map."""
+
+    bounds: Bounds | None = asked(RECTANGLE, "bounds", "west,south,east,north [m]; default all of the map", None)
+
+    name = "coverage"
+    help = "how much ground is driven and known, by age and machine"
+    codec = Codec(_encode, _decode)
+    size = Size.SEARCH
+
+    @property
+    def is_long(self) -> bool:
+        """See `MapQuery`."""
+        return True
