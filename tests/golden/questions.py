@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand
+from protocol.queries.coverage import CoverageQuery
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.requests import (
     AliveQuery,
@@ -69,6 +70,8 @@ QUESTIONS = (
     ChangesQuery(3),
     InfoQuery(**FRESH),
     AliveQuery(),
+    CoverageQuery(),
+    CoverageQuery(RECTANGLE, as_of_ns=T0, **FRESH),
 )
 COMMANDS = (
     TrustCommand("loader-2", True),
