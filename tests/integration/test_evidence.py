@@ -11,7 +11,8 @@ import pytest
 
 from protocol.arrays import Table
 from protocol.machine.samples import empty
-from protocol.queries.requests import HistoryQuery
+from protocol.queries.requests import HistoryQuery, RegionQuery
+from protocol.site.geometry import Bounds
 from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
@@ -74,7 +75,8 @@ def server(site_run: SiteRun, tmp_path: Path) -> Iterator[Child]:
 
 def resistance(client: Client, **when: Any) -> float:
     """Median of the eastern zone, away from its border."""
-    region = client.region((SIZE * 2 / 3 + 4, 4, SIZE - 4, SIZE - 4), ["resistance"], **when)
+    bounds = Bounds(SIZE * 2 / 3 + 4, 4.0, SIZE - 4.0, SIZE - 4.0)
+    region = client.ask(RegionQuery(bounds, ("resistance",), **when))
     return float(np.nanmedian(region["resistance"]))
 
 

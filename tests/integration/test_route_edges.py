@@ -39,7 +39,7 @@ def numbers(line: tuple[Place, ...]) -> list[str]:
 
 def asked(site: WebSite, kind: str, places: tuple[Place, ...], values: dict[str, str]) -> dict[str, str]:
     """What command and HTTP say of a drive that all three refuse; the command's last line alone."""
-    settings = [word for name, value in values.items() for word in ("--set", f"{name}={value}")]
+    settings = [word for name, value in values.items() for word in (f"--{name.replace('_', '-')}", *value.split(","))]
     refused = command(site, kind, *numbers(places), *settings)
     assert refused.code in (1, 2), refused.out
     text = ";".join(",".join(numbers((place,))) for place in places)
@@ -58,12 +58,12 @@ def asked(site: WebSite, kind: str, places: tuple[Place, ...], values: dict[str,
         ("route", ROAD, {"efficiency": "0"}, lambda c: c.route(ROAD, named(efficiency=0.0)), "efficiency"),
         ("route", ROAD, {"machine": "digger-7"}, lambda c: c.route(ROAD, "digger-7"), "'digger-7' has sent nothing"),
         ("way", ROAD, BLOCKED, lambda c: blocked(c), "no way: `margin` leaves none"),
-        ("way", ROAD, {"max_grade": "0"}, lambda c: c.way(*ROAD, max_grade=0.0), "max_grade"),
+        ("way", ROAD, {"max_grade": "0"}, lambda c: c.ask(WayQuery(*ROAD, max_grade=0.0)), "max_grade"),
         (
             "way",
             ((60.0, 40.0), ROAD[1]),
             {"unknown": "refuse"},
-            lambda c: c.way((60.0, 40.0), ROAD[1], unknown="refuse"),
+            lambda c: c.ask(WayQuery((60.0, 40.0), ROAD[1], unknown="refuse")),
             "parameter `from`: unknown ground",
         ),
     ],

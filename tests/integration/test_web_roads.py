@@ -8,7 +8,7 @@ import numpy as np
 import pyogrio
 import pytest
 
-from protocol.queries.requests import PointQuery
+from protocol.queries.requests import PointQuery, RegionQuery
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
@@ -109,7 +109,8 @@ def test_a_repaired_road_is_read_as_it_is_since(web: WebSite):
     assert why["values"]["resistance"] == pytest.approx(since)
     assert why["before"]["resistance"] == pytest.approx(change.before, rel=0.2)
     bounds = {"bounds": f"{x_m - 2},{y_m - 2},{x_m + 2},{y_m + 2}", "layers": "resistance", "repairs": 1}
-    ours = web.client.region((x_m - 2, y_m - 2, x_m + 2, y_m + 2), ["resistance"], repairs=True)
+    area = Bounds(x_m - 2, y_m - 2, x_m + 2, y_m + 2)
+    ours = web.client.ask(RegionQuery(area, ("resistance",), repairs=True))
     answer = web.get("region", bounds).json["layers"]["resistance"]
     assert np.array_equal(np.array(answer, np.float32), ours["resistance"], equal_nan=True)
     many = web.get("points", {"places": f"{x_m},{y_m}", "layers": "resistance", "repairs": 1}).json
