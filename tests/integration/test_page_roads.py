@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from protocol.queries.roads import WorklistQuery, WorklistRow
-from protocol.queries.route_requests import WayQuery
+from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES
 from tests.integration.browser_tab import Tab, needs_browser, watched
 from tests.integration.hauling_site import DAY_NS, FIRST_NS
@@ -152,7 +152,8 @@ def test_a_line_on_the_map_says_what_its_drive_costs(tab: Tab, web: WebSite):
     panel = opened(tab, "r")
     assert "Click two places or more" in panel.inner_text()
     set_places(tab, (20, 10), (90, 10), (150, 10))
-    drive = web.client.route(places(tab), MACHINES["truck"], step_m=tab.js("sitegrid.route.answer.steps.length_m[0]"))
+    step_m = tab.js("sitegrid.route.answer.steps.length_m[0]")
+    drive = web.client.ask(RouteQuery(tuple(places(tab)), machine=MACHINES["truck"], step_m=step_m))
     totals = panel.locator(".totals").inner_text()
     assert figure(drive.totals.energy_j / 3.6e6) in totals
     assert f"{figure(drive.totals.energy_low_j / 3.6e6)} to {figure(drive.totals.energy_high_j / 3.6e6)}" in totals
