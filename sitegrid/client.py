@@ -5,10 +5,10 @@ It is one module because it is one class: all that a program may ask.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import zenoh
@@ -23,6 +23,7 @@ from protocol.queries.answers import (
     MapInfo,
     PointAnswer,
     Region,
+    SiteInfo,
     TrustAnswer,
 )
 from protocol.queries.calibration import CalibrationAnswer
@@ -30,7 +31,7 @@ from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustComm
 from protocol.queries.map_tiles import TilesAnswer, TilesQuery
 from protocol.queries.origin import SERVER, Origin
 from protocol.queries.pieces import Progress, joined
-from protocol.queries.places import Place
+from protocol.queries.places import Place, around, where_it_lies
 from protocol.queries.request import MapQuery, Request
 from protocol.queries.requests import (
     AliveQuery,
@@ -41,14 +42,23 @@ from protocol.queries.requests import (
     PointQuery,
     RegionQuery,
 )
+from protocol.queries.roads import Segments, Worklist
 from protocol.queries.route_requests import RouteQuery
 from protocol.queries.routing import LOADER, NamedMachine, RouteAnswer, RouteMachine, machine_of
 from protocol.site.geometry import Bounds
+from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.asking import Answered, Asker
+from sitegrid.geo_table import to_geopandas
 from sitegrid.listener import Listener
+from sitegrid.map_region import MapRegion
 from sitegrid.security.join import join
+from sitegrid.times import Time, parse_time
+from sitegrid.watch import AGAIN_S, watch, watch_async
+
+if TYPE_CHECKING:
+    import geopandas
 
 SOLVE_S = 30.0  # that the server has to calibrate a fleet for: a large one on a busy host
 REGION_ATTEMPTS = 3
@@ -65,9 +75,10 @@ class Client:
     Every call may raise QueryError (refused), LinkError (no answer) or MessageError (an answer that cannot be read). A
     question that nobody takes, or whose server ends, is asked again for timeout_s: a restart of router or server shows
     as an answer that comes later.
-    Arguments of several methods: layers: names, or a text of them with commas; none for all. as_of_ns: from samples
-    stamped so or earlier. after: answer once this journal row is merged, and wait for it at most 10 s.
-    Times are stamps, UTC in nanoseconds.
+    Arguments of several methods: layers: names, or a text of them with commas; none for all. as_of: the map from
+    samples of this time or earlier: a stamp in nanoseconds, a `datetime`, ISO 8601, or "-1h" before the newest sample.
+    after: answer once this journal row is merged, and wait for it at most 10 s.
+    Fields that end in _ns are stamps, UTC in nanoseconds; `stamp` makes one of any time.
     """
 
     def __init__(self, session: zenoh.Session, endpoint: str, site: str, timeout_s: float = 10.0) -> None:
@@ -75,6 +86,7 @@ class Client:
         self.origin = SERVER
         self._asker = Asker(session, endpoint, site, timeout_s)
         self._listeners: list[Listener[GroundChange]] = []
+        self._site: SiteInfo | None = None
 
     def ask(self, query: MapQuery[T], *, progress: Progress | None = None) -> T:
         """The whole answer to a query, however many replies it comes in.
@@ -94,21 +106,33 @@ class Client:
         return cast(T, answer)
 
     def point(
-        self, x_m: float, y_m: float, layers: Layers = (), *, as_of_ns: int | None = None, after: int = 0
+        self,
+        x_m: float | None = None,
+        y_m: float | None = None,
+        layers: Layers = (),
+        *,
+        lat: float | None = None,
+        lon: float | None = None,
+        as_of: Time | None = None,
     ) -> PointAnswer:
-        """Layers of the cell at a position in `map`; NaN is unknown."""
-        return self.ask(PointQuery(float(x_m), float(y_m), _names(layers), as_of_ns=as_of_ns, after=after))
+        """Layers of the cell at a position in `map` [m], or in latitude and longitude [deg]; NaN is unknown."""
+        if lat is not None and lon is not None:
+            x_m, y_m = self.to_map(lat, lon)
+        if x_m is None or y_m is None:
+            raise ValueError("a point is x_m and y_m, or lat and lon")
+        query = PointQuery(float(x_m), float(y_m), _names(layers), as_of_ns=self._as_of(as_of))
+        answer = self.ask(query)
+        return replace(answer, note=self._where(not np.isfinite([*answer.values.values()]).any()))
 
     def region(
         self,
         area: Area,
         layers: Layers = (),
         *,
-        as_of_ns: int | None = None,
+        as_of: Time | None = None,
         resolution_m: float | None = None,
-        after: int = 0,
         progress: Progress | None = None,
-    ) -> Region:
+    ) -> MapRegion:
         """Layers of all cells of an area, as arrays with coordinates.
 
         area: cells that a rectangle (west, south, east, north) [m] touches, or those whose centre lies in an outline of
@@ -116,16 +140,17 @@ class Client:
         what is known in it.
         A large region comes in pieces, all of one version of the map; progress: as of `ask`.
         """
-        query = RegionQuery(area_of(area), _names(layers), resolution_m, as_of_ns=as_of_ns, after=after)
-        return self.ask(query, progress=progress)
+        query = RegionQuery(area_of(area), _names(layers), resolution_m, as_of_ns=self._as_of(as_of))
+        region = self._region(query, progress)
+        known = any(np.isfinite(values).any() for values in region.layers.values())
+        return replace(region, note=self._where(not known))
 
     def route(
         self,
         line: Sequence[Place],
         machine: RouteMachine | NamedMachine | str = LOADER,
         *,
-        as_of_ns: int | None = None,
-        after: int = 0,
+        as_of: Time | None = None,
     ) -> RouteAnswer:
         """What a drive along a line of places in `map` [m] costs a machine: energy, time, speed, with 90 % intervals.
 
@@ -133,7 +158,7 @@ class Client:
         """
         places = tuple((float(x), float(y)) for x, y in line)
         driven = machine_of(machine) if isinstance(machine, str) else machine
-        return self.ask(RouteQuery(places, machine=driven, as_of_ns=as_of_ns, after=after))
+        return self.ask(RouteQuery(places, machine=driven, as_of_ns=self._as_of(as_of)))
 
     def info(self, *, after: int = 0) -> MapInfo:
         """State of the map and its server: site, rows journalled and merged, machines, counters, layers."""
@@ -146,6 +171,47 @@ class Client:
     def changes(self, after_id: int = 0) -> list[GroundChange]:
         """Changes of the ground with an id beyond this one: when, where, how many cells, from what to what."""
         return list(self.ask(ChangesQuery(after_id)).changes)
+
+    def watch(self, bounds: Area | None = None, layers: Layers = (), *, again_s: float = AGAIN_S) -> Iterator[Region]:
+        """Regions of what changed in the map, again and again; the first ones are all that there is.
+
+        What they hold is what `region` says then, but for ages, which change with every sample. A map server or router
+        that is away is waited for; what changed meanwhile comes then. End it by `break`.
+        """
+        area = None if bounds is None else area_of(bounds)
+        rectangle = area if area is None or isinstance(area, Bounds) else around(area)
+        names = _names(layers)
+        return watch(self.ask, lambda part: self.ask(RegionQuery(part, names)), rectangle, again_s)
+
+    def watch_async(
+        self, bounds: Area | None = None, layers: Layers = (), *, again_s: float = AGAIN_S
+    ) -> AsyncIterator[Region]:
+        """As `watch`, for `async for`."""
+        return watch_async(self.watch(bounds, layers, again_s=again_s))
+
+    def stamp(self, time: Time) -> int:
+        """A time as a stamp in nanoseconds; ValueError where it is none."""
+        return parse_time(time).stamp("time", lambda: self.info().stamp_ns)
+
+    def site_info(self) -> SiteInfo:
+        """The site: its name, origin, cells, and `crs`. It is asked for once."""
+        if self._site is None:
+            self._site = self.info().site
+        return self._site
+
+    def to_map(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:
+        """Position in `map` [m] of a place on Earth. It needs pyproj."""
+        x_m, y_m, _ = self._projection().to_map(lat_deg, lon_deg, 0.0)
+        return x_m, y_m
+
+    def to_geodetic(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Latitude and longitude [deg] of a position in `map` [m]. It needs pyproj."""
+        lat_deg, lon_deg, _ = self._projection().to_geodetic(x_m, y_m)
+        return lat_deg, lon_deg
+
+    def to_geopandas(self, answer: Segments | Worklist | ChangesAnswer) -> geopandas.GeoDataFrame:
+        """Roads, stretches or changes as a table with geometries in the site's frame. It needs geopandas."""
+        return to_geopandas(answer, self.site_info().crs)
 
     def followers(self) -> list[FollowerState]:
         """Followers that answer, and how far behind the journal each is; LinkError where there is no server either."""
@@ -224,14 +290,26 @@ class Client:
     def _reply(self, query: MapQuery[T]) -> T:
         return query.decode(self._answered(query).data)
 
-    def _region(self, query: RegionQuery, progress: Progress | None) -> Region:
-        for _ in range(REGION_ATTEMPTS - 1):
+    def _where(self, is_empty: bool) -> str:  # noqa: FBT001 - a condition
+        """What to say of an answer in which nothing is known."""
+        info = self.info() if is_empty else None
+        return f"nothing is known here: {where_it_lies(info.bounds, info.site.cell_m)}" if info else ""
+
+    def _as_of(self, time: Time | None) -> int | None:
+        return None if time is None else self.stamp(time)
+
+    def _projection(self) -> Projection:
+        site = self.site_info()
+        return Projection(SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m))
+
+    def _region(self, query: RegionQuery, progress: Progress | None) -> MapRegion:
+        for attempts_left in reversed(range(REGION_ATTEMPTS)):
             try:
-                return joined(self._pieces(query), progress)
-            except QueryError as error:
-                if error.reason != Refusal.EXPIRED:  # else that version of the map is not kept any more: begin again
+                return MapRegion.of(joined(self._pieces(query), progress), self.site_info)
+            except QueryError as error:  # that version of the map is not kept any more: begin again
+                if error.reason != Refusal.EXPIRED or not attempts_left:
                     raise
-        return joined(self._pieces(query), progress)
+        raise AssertionError
 
     def _pieces(self, query: RegionQuery) -> Iterator[Region]:
         """The region, or piece after piece of it, all from whom has the first one."""

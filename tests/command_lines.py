@@ -41,7 +41,7 @@ class Command(NamedTuple):
                 value = given.get(option.dest)
                 is_needed = option.required or option in chosen or not option.option_strings
                 values = [] if value is None else [value]
-                if value is None and is_needed and option.nargs != "?":
+                if value is None and is_needed and (option.nargs != "?" or option.type is float):
                     values = _anything(option)
                 if values:
                     line += [*option.option_strings[-1:], *values]

@@ -229,7 +229,7 @@ def _ask(endpoint: str, speed: float, over: threading.Event) -> None:
                 if (at_s := (time.monotonic() - begin_s) * speed) >= next_past_s:
                     next_past_s = at_s + PAST_S
                     client.ask(HistoryQuery(150.0, 150.0, ("resistance",), span_s=300.0))
-                    client.point(120, 0, as_of_ns=START_NS + round(at_s * 0.5e9))
+                    client.point(120, 0, as_of=START_NS + round(at_s * 0.5e9))
 
 
 @contextmanager

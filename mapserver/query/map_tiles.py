@@ -99,7 +99,8 @@ class Tiles:
         for place in changed | (self._tiles.keys() - squares.keys()):
             tile = squares.setdefault(place, _Square.empty()).tile(place, version.row, version.fact)
             known = self._tiles.get(place)
-            if known is None or (known.planes, known.newest_ns) != (tile.planes, tile.newest_ns):
+            # what evidence came into is another one, though its bytes are not: `Client.watch` reads finer values
+            if not whole or known is None or (known.planes, known.newest_ns) != (tile.planes, tile.newest_ns):
                 self._tiles[place] = tile
         self._squares, self._fact, self._row = squares, version.fact, version.row
         return version, stamp_ns

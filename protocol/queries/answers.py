@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from protocol.arrays import Floats, Floats32
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
@@ -38,16 +40,20 @@ class _OfVersion:
 
 @dataclass(frozen=True)
 class PointAnswer(_OfVersion):
-    """Layer values of the cell with centre (x_m, y_m); NaN is unknown."""
+    """Layer values of the cell with centre (x_m, y_m); NaN is unknown.
+
+    note: where the map lies, from the client, where this place is off it.
+    """
 
     x_m: float
     y_m: float
     values: Mapping[str, float]
     version: MapVersion
     stamp_ns: int
+    note: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PointsAnswer(_OfVersion):
     """Layers of n cells: x_m, y_m (n,) their centres; layers: name -> float32 (n,), NaN where unknown."""
 
@@ -59,6 +65,9 @@ class PointsAnswer(_OfVersion):
 
     def __getitem__(self, layer: str) -> Floats32:
         return self.layers[layer]
+
+    def __repr__(self) -> str:
+        return f"<{len(self.x_m)} places: {', '.join(self.layers)}>"
 
 
 @dataclass(frozen=True)
@@ -78,12 +87,13 @@ class Piece:
     rows: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Region(_OfVersion):
     """A rectangle of cells.
 
     x_m (columns,), y_m (rows,): cell centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
     NaN where unknown; row 0 is the southernmost. piece: where this is a piece of a larger region; None for all of it.
+    note: where the map lies, from the client, where this region is off it.
     """
 
     x_m: Floats
@@ -93,9 +103,17 @@ class Region(_OfVersion):
     version: MapVersion
     stamp_ns: int
     piece: Piece | None = None
+    note: str = ""
 
     def __getitem__(self, layer: str) -> Floats32:
         return self.layers[layer]
+
+    def __repr__(self) -> str:
+        edge = self.bounds
+        known = max((float(np.isfinite(values).mean()) for values in self.layers.values()), default=0.0)
+        size = f"{len(self.x_m)} x {len(self.y_m)} cells of {self.cell_m:g} m"
+        place = f"{edge.west_m:g}..{edge.east_m:g}, {edge.south_m:g}..{edge.north_m:g} m"
+        return f"<{size} at {place}, {known:.0%} known: {', '.join(self.layers)}{self.note and f'; {self.note}'}>"
 
     @property
     def bounds(self) -> Bounds:

@@ -6,7 +6,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from sitegrid.options.values import FOLDER, STAMP_HELP, count, parse_stamp, positive
+from sitegrid.options.values import FOLDER, count, positive, stamp
+from sitegrid.times import STAMP_HELP
 
 HELP = "build a new store from archives, with other parameters"
 EXTRA = "server"
@@ -27,7 +28,7 @@ def add_options(parser: ArgumentParser) -> None:
     add("--without", action="append", default=[], metavar="MACHINE", help="exclude this machine; may be repeated")
     for name, what in (("from", "at or after T"), ("until", "before T")):
         summary = f"only samples with a stamp {what}; T: {STAMP_HELP}"
-        add(f"--{name}", type=parse_stamp, dest=f"{name}_ns", metavar="T", help=summary)
+        add(f"--{name}", type=stamp, dest=f"{name}_ns", metavar="T", help=summary)
     add("--jobs", type=count, default=1, metavar="N", help="fold in N processes (1: this one, on two threads)")
     add("--engine", metavar="ADDRESS", help="fold on a Dask cluster: dask://HOST:PORT of its scheduler")
 

@@ -54,19 +54,21 @@ from sitegrid.client import Client, connect
 from sitegrid.explanations import calibrated, why
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.parameters import add_parameters, dest, given, spread
-from sitegrid.options.values import OutputFile, utc_text
+from sitegrid.options.values import OutputFile
 from sitegrid.process import streams
 from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
 from sitegrid.process.progress import EVERY_S
+from sitegrid.times import utc_text
 
 HELP = "ask the map"
 Answer = tuple[Any, Iterable[str]]  # a table for programs; lines for people
 HISTORY_LAYERS = ("resistance", "confidence", "grade", "visits", "weight")  # of a table for people, unless named
-# Words of a query that are no options: what stands for them in the usage, and how many numbers there are.
+# Words of a query that are no options: what stands for them in the usage, and their names or what each of many is.
+POSITION = ("x_m", "y_m")
 WORDS: dict[str, tuple[str, tuple[str, ...] | str]] = {
-    "point": ("position, in metres", ("x_m", "y_m")),
-    "why": ("position, in metres", ("x_m", "y_m")),
-    "history": ("position, in metres", ("x_m", "y_m")),
+    "point": ("position, in metres", POSITION),
+    "why": ("position, in metres", POSITION),
+    "history": ("position, in metres", POSITION),
     "points": ("positions, in metres", "X_M Y_M"),
     "region": ("west, south, east, north; or the corners x y x y x y ... of an outline", "M"),
     "route": ("places of the line, in metres", "X_M Y_M"),
@@ -100,7 +102,13 @@ def _add_query(queries: Subparsers, cls: type[MapQuery[Any]]) -> None:
             query.add_argument("numbers", type=float, nargs="+", metavar=names, help=what)
         else:
             for name in names:
-                query.add_argument(name, type=float)
+                query.add_argument(name, type=float, nargs="?" if names == POSITION else None)
+        if names == POSITION:
+            for name, help_ in (
+                ("--lat", "latitude [deg], with --lon in place of x_m and y_m"),
+                ("--lon", "longitude"),
+            ):
+                query.add_argument(name, type=float, metavar="DEG", help=help_)
     if cls is RegionQuery:
         query.add_argument("--out", type=OutputFile((".npz",)), help="write coordinates and layers into this .npz file")
     if cls is ChangesQuery:
@@ -133,7 +141,7 @@ def run(arguments: Namespace) -> int:
 
 def _ask(cls: type[MapQuery[Any]], client: Client, arguments: Namespace) -> Answer:
     """Ask the query that the options are of."""
-    vars(arguments).update(_placed(cls, arguments))
+    vars(arguments).update(_placed(cls, arguments, client))
     if cls is HistoryQuery and not arguments.asked_layers and not arguments.json:
         arguments.asked_layers = ",".join(HISTORY_LAYERS)
     query = given(cls, arguments, lambda: client.info().stamp_ns)
@@ -143,9 +151,11 @@ def _ask(cls: type[MapQuery[Any]], client: Client, arguments: Namespace) -> Answ
     return _written(answer, arguments.out, table, lines) if getattr(arguments, "out", None) else (table, lines)
 
 
-def _placed(cls: type[MapQuery[Any]], arguments: Namespace) -> dict[str, Any]:
+def _placed(cls: type[MapQuery[Any]], arguments: Namespace, client: Client) -> dict[str, Any]:
     """Parameters that words of a query are of."""
-    if cls.name in ("point", "why", "history"):
+    if WORDS.get(cls.name, ("", ""))[1] == POSITION:
+        if arguments.lat is not None and arguments.lon is not None:
+            arguments.x_m, arguments.y_m = client.to_map(arguments.lat, arguments.lon)
         return spread({"x": arguments.x_m, "y": arguments.y_m})
     if cls is WayQuery:
         ends = {end: [getattr(arguments, f"{end}_{axis}_m") for axis in "xy"] for end in ("from", "to")}

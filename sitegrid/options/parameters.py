@@ -10,7 +10,8 @@ from typing import Any
 from protocol.queries.parameters import Form, text_of
 from protocol.queries.request import MapQuery, Parameter, parameters_of
 from protocol.queries.requests import parse_query
-from sitegrid.options.values import HELP, parse_time
+from sitegrid.options.values import site_time
+from sitegrid.times import HELP
 
 NUMBERS = {Form.PLACE: 2, Form.PLACES: "+", Form.RECTANGLE: 4}  # of a value, each a word of its own
 SIDES = ("W", "S", "E", "N")
@@ -33,7 +34,7 @@ def _add(parser: ArgumentParser, one: Parameter) -> None:
     if form is Form.FLAG:
         option |= {"action": BooleanOptionalAction}
     elif form is Form.STAMP:
-        option |= {"type": parse_time, "metavar": "TIME"}
+        option |= {"type": site_time, "metavar": "TIME"}
     elif form in NUMBERS:
         option |= {"type": float, "nargs": NUMBERS[form], "metavar": SIDES if form is Form.RECTANGLE else "M"}
     else:

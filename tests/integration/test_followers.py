@@ -162,7 +162,7 @@ def test_two_followers_have_the_map_of_the_server_through_distrust_and_correctio
         client.trust("b", "repaired")
         all_equal(sender.send("c"))
         # ... and of the past, and what is read from the journal alone
-        past = client.point(1.0, 1.0, as_of_ns=client.info().stamp_ns)
+        past = client.point(1.0, 1.0, as_of=client.info().stamp_ns)
         assert client.origin.follower in ("near", "far"), pids
         key = keys.map_query(run.site, "point")
         assert past.version.row == decode_point_row(sender, key, past.stamp_ns)
@@ -234,7 +234,7 @@ def test_the_map_is_read_while_the_server_is_away_and_after_it_is_back(run: Foll
     follower = run.start_follower("near")
     with run.connect() as client:
         kill(server)
-        point = client.point(1.0, 1.0, after=row)
+        point = client.ask(PointQuery(1.0, 1.0, after=row))
         assert point.version.row == row
         assert client.info().server.pid == follower.pid
         with pytest.raises(LinkError, match="no map server"):
@@ -243,8 +243,8 @@ def test_the_map_is_read_while_the_server_is_away_and_after_it_is_back(run: Foll
         later = sender.send()
         assert later > row, f"server pid {again.pid}, follower pid {follower.pid}"
         # What it lacks within its second the server is asked for: `after` means what it always meant.
-        assert client.point(1.0, 1.0, after=later).version.row >= later
-        until(lambda: client.point(1.0, 1.0, after=later) and client.origin.follower == "near", "followed")
+        assert client.ask(PointQuery(1.0, 1.0, after=later)).version.row >= later
+        until(lambda: client.ask(PointQuery(1.0, 1.0, after=later)) and client.origin.follower == "near", "followed")
 
 
 # --- one server and one follower, which tests only ask

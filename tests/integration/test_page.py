@@ -117,9 +117,7 @@ def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab, web: Web
     x_m, y_m = known_place(web)
     column, row = math.floor(x_m), math.floor(y_m)
     other_ns = int(tab.js("String(BigInt(sitegrid.time.other))"))
-    then, now = (
-        web.client.point(x_m, y_m, ["resistance"], as_of_ns=ns).values["resistance"] for ns in (other_ns, None)
-    )
+    then, now = (web.client.point(x_m, y_m, ["resistance"], as_of=ns).values["resistance"] for ns in (other_ns, None))
     shown = tab.js(f"sitegrid.difference.at({column}, {row}, 'difference')")
     assert shown == pytest.approx(math.log(now / then) / math.log(4), abs=0.03)
     tab.page.mouse.move(*tab.pixel_of(x_m, y_m))

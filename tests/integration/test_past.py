@@ -63,7 +63,7 @@ def is_fold_from_the_start(client: Client, sent: Sent, stamp_ns: int, without: s
             grid.fold(rows[rows["stamp_ns"] <= stamp_ns], name)
     window = SITE.geometry.window(AREA)
     expected = read_cells(view_of(grid, window, CONFIG), window, LAYERS, SITE.cell_m, CONFIG)
-    region = client.region(AREA, LAYERS, as_of_ns=stamp_ns)
+    region = client.region(AREA, LAYERS, as_of=stamp_ns)
     assert np.isfinite(expected["resistance"]).sum() > 1000
     return all(np.array_equal(region[name], expected[name], equal_nan=True) for name in LAYERS)
 

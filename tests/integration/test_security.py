@@ -22,6 +22,7 @@ import zenoh
 
 from protocol.errors import LinkError
 from protocol.machine.samples import SAMPLE_DTYPE
+from protocol.queries.requests import PointQuery
 from protocol.site.site_file import load_site
 from protocol.wire import keys
 from protocol.wire.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
@@ -168,7 +169,7 @@ def test_a_follower_with_keys_answers_under_its_own_name_alone(guarded: Guarded)
     follower.expect("ready", PATIENCE_S)
     with connect(guarded.endpoint, SITE, keys=guarded.keys / "guest") as client:
         row = client.info().journalled
-        assert client.point(1.0, 1.0, after=row).version.row == row
+        assert client.ask(PointQuery(1.0, 1.0, after=row)).version.row == row
         assert client.origin.follower == "reader-1", f"follower pid {follower.pid}"
         assert [one.name for one in client.followers()] == ["reader-1"]
     follower.stop()

@@ -12,6 +12,7 @@ import pytest
 import zenoh
 
 from protocol.queries.answers import MapInfo, Region
+from protocol.queries.requests import PointQuery
 from protocol.wire import keys
 from protocol.wire.codec import decode_pose
 from protocol.wire.session import free_endpoint
@@ -58,7 +59,7 @@ def shift(tmp_path_factory: pytest.TempPathFactory) -> Shift:
         with run.connect() as client:
             run.wait_merged(client, 60)
             during = client.info()
-            assert client.point(0.0, 0.0, after=during.journalled).merged >= during.journalled
+            assert client.ask(PointQuery(0.0, 0.0, after=during.journalled)).merged >= during.journalled
             kills = {
                 "server": killed(client, server, run.start_server),
                 "agent": killed(client, agent, lambda: run.start_agent(run.configs[0]), agent.name),

@@ -120,7 +120,7 @@ def test_the_past_is_asked_for_by_time_or_stamp(web: WebSite):
     by_zone = web.get("point", {"x": x_m, "y": y_m, "as_of": "2026-01-01T01:00:20+01:00"}).json
     assert by_stamp["values"] == by_time["values"] == by_zone["values"]
     assert by_stamp["stamp_ns"] == 1_767_225_620_000_000_000
-    point = web.client.point(x_m, y_m, as_of_ns=1_767_225_620_000_000_000)
+    point = web.client.point(x_m, y_m, as_of=1_767_225_620_000_000_000)
     assert all(same(by_time["values"][name], value) for name, value in point.values.items())
     frame = Frame.read(web.get("tiles", {"as_of": "2026-01-01T00:00:20Z"}).body)
     assert frame.head["whole"]

@@ -178,3 +178,19 @@ def test_a_large_map_comes_in_pieces(tmp_path, monkeypatch):
             assert whole.next_place is None
             assert [tile for piece in pieces for tile in piece.tiles] == list(whole.tiles)
             monkeypatch.setattr("mapserver.query.map_tiles.PIECE_BYTES", 3000)
+
+
+def test_evidence_that_no_plane_shows_makes_another_tile_too(tmp_path):
+    """Who watches the map reads finer values where a tile is another one."""
+    base = random_samples(3000, seed=0)
+    with closing(open_writer(tmp_path)) as writer:
+        send(writer, [incoming(base)])
+        answers = answers_of(writer)
+        version = answers.tiles(TilesQuery()).version
+        for number in range(20):
+            row = base[number : number + 1].copy()
+            row["distance_m"] = 0.3
+            send(writer, [incoming(row, spool_id=100 + number)])
+            answer = answers.tiles(TilesQuery(version))
+            assert answer.tiles, number
+            version = answer.version

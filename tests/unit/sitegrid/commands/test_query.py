@@ -243,7 +243,7 @@ def test_answers_that_are_folded_first_are_waited_for_longer(session: Session):
     client = Client(session, "tcp/x", "pit", timeout_s=1.0)  # type: ignore[arg-type]
     client.point(0, 0)
     client.ask(PointQuery(0, 0, after=3, wait_s=5.0))
-    client.point(0, 0, as_of_ns=T0)
+    client.point(0, 0, as_of=T0)
     client.ask(RegionQuery(Bounds(0, 0, 1, 1), minus_ns=T0))
     client.ask(HistoryQuery(0, 0, after=3, wait_s=5.0))
     assert session.timeouts == pytest.approx([1, 6, 1 + PAST_S, 1 + PAST_S, 6 + PAST_S], abs=0.5)
@@ -251,15 +251,15 @@ def test_answers_that_are_folded_first_are_waited_for_longer(session: Session):
 
 def test_the_python_client_passes_every_argument(session: Session):
     client = Client(session, "tcp/x", "pit")  # type: ignore[arg-type]
-    client.point(1, 2, ["a"], as_of_ns=5, after=3)
-    client.region((0, 1, 2, 3), "a, b", as_of_ns=5, after=3)
+    client.point(1, 2, ["a"], as_of=5)
+    client.region((0, 1, 2, 3), "a, b", as_of=5)
     client.region([(0, 0), (3, 0), (0, 3)], resolution_m=2)
-    client.route([(0, 0), (3, 4)], "truck-1", as_of_ns=5, after=3)
+    client.route([(0, 0), (3, 4)], "truck-1", as_of=5)
     assert session.asked == [
-        PointQuery(1.0, 2.0, ("a",), as_of_ns=5, after=3),
-        RegionQuery(Bounds(0, 1, 2, 3), ("a", "b"), as_of_ns=5, after=3),
+        PointQuery(1.0, 2.0, ("a",), as_of_ns=5),
+        RegionQuery(Bounds(0, 1, 2, 3), ("a", "b"), as_of_ns=5),
         RegionQuery(((0.0, 0.0), (3.0, 0.0), (0.0, 3.0)), (), 2.0),
-        RouteQuery(((0.0, 0.0), (3.0, 4.0)), machine=NamedMachine("truck-1"), as_of_ns=5, after=3),
+        RouteQuery(((0.0, 0.0), (3.0, 4.0)), machine=NamedMachine("truck-1"), as_of_ns=5),
     ]
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
 from protocol.machine.readings import MAX_STAMP_NS
-from sitegrid.options.values import SiteTime, parse_time, utc_text
+from sitegrid.options.values import site_time
+from sitegrid.times import SiteTime, utc_text
 
 T0 = 1_750_000_000_000_000_000  # 2025-06-15 15:06:40 UTC
 S = 10**9
@@ -28,22 +29,22 @@ S = 10**9
     ],
 )
 def test_a_time_is_iso_or_a_stamp(text: str, ns: int):
-    assert parse_time(text) == SiteTime(ns)
+    assert site_time(text) == SiteTime(ns)
 
 
 @pytest.mark.parametrize(
     ("text", "s"), [("-90s", 90), ("-30m", 1800), ("-2h", 7200), ("-1.5h", 5400), ("-3d", 259_200), ("-0s", 0)]
 )
 def test_a_time_may_count_back_from_the_sites_now(text: str, s: int):
-    time = parse_time(text)
+    time = site_time(text)
     assert time == SiteTime(-s * S, from_now=True)
     assert time.stamp("--as-of", lambda: T0) == T0 - s * S
 
 
 @given(st.integers(S, MAX_STAMP_NS))
 def test_every_stamp_is_a_time_and_is_shown_to_the_second(ns: int):
-    assert parse_time(str(ns)).stamp("--as-of", lambda: pytest.fail("not needed")) == ns
-    assert parse_time(utc_text(ns)).ns == ns // S * S
+    assert site_time(str(ns)).stamp("--as-of", lambda: pytest.fail("not needed")) == ns
+    assert site_time(utc_text(ns)).ns == ns // S * S
 
 
 @pytest.mark.parametrize(
@@ -60,9 +61,9 @@ def test_every_stamp_is_a_time_and_is_shown_to_the_second(ns: int):
 )
 def test_a_bad_time_is_refused_by_what_it_is(text: str, words: str):
     with pytest.raises(ArgumentTypeError, match=words):
-        parse_time(text)
+        site_time(text)
 
 
 def test_a_time_before_1970_names_its_option():
     with pytest.raises(ConfigError, match="--minus: so long before the site's now, 2025-06-15 15:06:40Z, is before"):
-        parse_time("-99999d").stamp("--minus", lambda: T0)
+        site_time("-99999d").stamp("--minus", lambda: T0)

@@ -1,0 +1,107 @@
+"""A region for notebooks: as a dataset, a table, a plot, with the coordinates and units of the site.
+
+xarray, pandas, matplotlib and pyproj come with the extra `notebook`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from protocol.arrays import AnyArray, Bools
+from protocol.queries.answers import Region, SiteInfo
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyproj
+    import xarray
+
+UNITS = {"grade": "m/m", "heading": "rad", "weight": "m", "age": "s", "changed": "s"}  # by the first word; others: 1
+
+
+@dataclass(frozen=True, repr=False)
+class MapRegion(Region):
+    """A region that knows its site. site: asks for it, once, where it is needed."""
+
+    site: Callable[[], SiteInfo] = field(kw_only=True, compare=False)
+
+    @classmethod
+    def of(cls, region: Region, site: Callable[[], SiteInfo]) -> MapRegion:
+        """A region of a site."""
+        return cls(**{one.name: getattr(region, one.name) for one in fields(Region)}, site=site)
+
+    @property
+    def crs(self) -> pyproj.CRS:
+        """The site's frame: metres east and north of its origin, transverse Mercator."""
+        from pyproj import CRS
+
+        return CRS.from_user_input(self.site().crs)
+
+    @property
+    def transform(self) -> tuple[float, float, float, float, float, float]:
+        """From column and row to `map`, as rasterio's Affine has it; rows go north, from the southernmost."""
+        edge = self.bounds
+        return self.cell_m, 0.0, edge.west_m, 0.0, self.cell_m, edge.south_m
+
+    def to_xarray(self) -> xarray.Dataset:
+        """A dataset of the layers over y and x, with units and the site's frame by the CF conventions."""
+        import xarray
+
+        axes = {
+            name: (name, values, {"units": "m", "standard_name": f"projection_{name}_coordinate", "axis": name.upper()})
+            for name, values in (("y", self.y_m), ("x", self.x_m))
+        }
+        frame = ((), 0, self.crs.to_cf())
+        layers = {
+            name: (("y", "x"), values, {"units": unit_of(name), "grid_mapping": "spatial_ref"})
+            for name, values in self.layers.items()
+        }
+        version = {"site": self.site().name, "store": self.version.store, "journal_row": self.version.row}
+        about = {"Conventions": "CF-1.11", **version, "stamp_ns": self.stamp_ns}
+        return xarray.Dataset(layers, {**axes, "spatial_ref": frame}, about)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """A row for each cell of which any layer is known: x_m, y_m of its centre, and the layers."""
+        import pandas as pd
+
+        y_m, x_m = np.meshgrid(self.y_m, self.x_m, indexing="ij")
+        known: Bools = np.any([np.isfinite(values) for values in self.layers.values()], axis=0)
+        columns: dict[str, AnyArray] = {"x_m": x_m, "y_m": y_m, **self.layers}
+        return pd.DataFrame({name: values[known] for name, values in columns.items()})
+
+    def plot(self, layer: str | None = None, axes: Any = None, **style: Any) -> Any:
+        """Draw one layer with matplotlib, by default the first; returns the axes. style: of `imshow`."""
+        from matplotlib import pyplot as plt
+
+        name, edge = layer or next(iter(self.layers)), self.bounds
+        axes = axes or plt.figure().add_subplot()
+        extent = (edge.west_m, edge.east_m, edge.south_m, edge.north_m)
+        image = axes.imshow(self[name], origin="lower", extent=extent, **{"interpolation": "nearest", **style})
+        axes.set(xlabel="east [m]", ylabel="north [m]", title=f"{self.site().name}: {name}")
+        axes.figure.colorbar(image, ax=axes, label=f"{name} [{unit_of(name)}]")
+        return axes
+
+    def _repr_html_(self) -> str:
+        head = "<tr><th>layer</th><th>known</th><th>least</th><th>mean</th><th>most</th></tr>"
+        rows = (
+            f"<tr><td>{escape(name)}</td>" + "".join(f"<td>{text}</td>" for text in _summary(values)) + "</tr>"
+            for name, values in self.layers.items()
+        )
+        return f"<div>{escape(repr(self))}</div><table>{head}{''.join(rows)}</table>"
+
+
+def unit_of(layer: str) -> str:
+    """The unit of a layer's values."""
+    return "1" if layer.endswith("_class") else UNITS.get(layer.partition("_")[0], "1")
+
+
+def _summary(values: Any) -> tuple[str, str, str, str]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return "0 %", "", "", ""
+    least, mean, most = (f"{end(known):.4g}" for end in (np.min, np.mean, np.max))
+    return f"{known.size / values.size:.0%}", least, mean, most
