@@ -169,7 +169,11 @@ def _placed(cls: type[MapQuery[Any]], arguments: Namespace, client: Client) -> d
 def _record(_: Client, __: Any, answer: Any) -> Answer:
     """An answer that has no table of its own: its fields."""
     table = plain(answer)
-    return table, [f"{name}: {value}" for name, value in table.items()]
+    lines = []
+    for name, value in table.items():
+        parts = value.items() if isinstance(value, dict) else ()
+        lines += [f"{name}{'' if parts else f'  {value}'}", *(f"  {key}  {part}" for key, part in parts)]
+    return table, lines
 
 
 def _point(client: Client, query: PointQuery, point: PointAnswer) -> Answer:
