@@ -305,7 +305,7 @@ class Client:
     def _region(self, query: RegionQuery, progress: Progress | None) -> MapRegion:
         for attempts_left in reversed(range(REGION_ATTEMPTS)):
             try:
-                return MapRegion.of(joined(self._pieces(query), progress), self.site_info)
+                return MapRegion.from_region(joined(self._pieces(query), progress), self.site_info)
             except QueryError as error:  # that version of the map is not kept any more: begin again
                 if error.reason != Refusal.EXPIRED or not attempts_left:
                     raise

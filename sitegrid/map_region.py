@@ -30,7 +30,7 @@ class MapRegion(Region):
     site: Callable[[], SiteInfo] = field(kw_only=True, compare=False)
 
     @classmethod
-    def of(cls, region: Region, site: Callable[[], SiteInfo]) -> MapRegion:
+    def from_region(cls, region: Region, site: Callable[[], SiteInfo]) -> MapRegion:
         """A region of a site."""
         return cls(**{one.name: getattr(region, one.name) for one in fields(Region)}, site=site)
 

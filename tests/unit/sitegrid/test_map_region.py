@@ -24,7 +24,7 @@ VALUES = np.array([[1.0, np.nan, 3.0], [np.nan, np.nan, 6.0]], np.float32)
 def region() -> MapRegion:
     x_m, y_m = np.arange(3) * 2.0 - 9.0, np.arange(2) * 2.0 + 11.0
     layers = {"resistance": VALUES, "age_s": VALUES * 10}
-    return MapRegion.of(Region(x_m, y_m, 2.0, layers, version(17, 3), 5), lambda: site_info(SITE))
+    return MapRegion.from_region(Region(x_m, y_m, 2.0, layers, version(17, 3), 5), lambda: site_info(SITE))
 
 
 def test_a_dataset_has_values_places_units_and_the_frame(region):
