@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
@@ -172,22 +173,24 @@ class Client:
         """Changes of the ground with an id beyond this one: when, where, how many cells, from what to what."""
         return list(self.ask(ChangesQuery(after_id)).changes)
 
-    def watch(self, bounds: Area | None = None, layers: Layers = (), *, again_s: float = AGAIN_S) -> Iterator[Region]:
+    def watch(
+        self, bounds: Area | None = None, layers: Layers = (), *, again_s: float = AGAIN_S, stop: Event | None = None
+    ) -> Iterator[Region]:
         """Regions of what changed in the map, again and again; the first ones are all that there is.
 
         What they hold is what `region` says then, but for ages, which change with every sample. A map server or router
-        that is away is waited for; what changed meanwhile comes then. End it by `break`.
+        that is away is waited for; what changed meanwhile comes then. End it by `break`, or from another thread by `stop`.
         """
         area = None if bounds is None else area_of(bounds)
         rectangle = area if area is None or isinstance(area, Bounds) else around(area)
         names = _names(layers)
-        return watch(self.ask, lambda part: self.ask(RegionQuery(part, names)), rectangle, again_s)
+        return watch(self.ask, lambda part: self.ask(RegionQuery(part, names)), rectangle, again_s, stop or Event())
 
     def watch_async(
-        self, bounds: Area | None = None, layers: Layers = (), *, again_s: float = AGAIN_S
+        self, bounds: Area | None = None, layers: Layers = (), *, again_s: float = AGAIN_S, stop: Event | None = None
     ) -> AsyncIterator[Region]:
         """As `watch`, for `async for`."""
-        return watch_async(self.watch(bounds, layers, again_s=again_s))
+        return watch_async(self.watch(bounds, layers, again_s=again_s, stop=stop))
 
     def stamp(self, time: Time) -> int:
         """A time as a stamp in nanoseconds; ValueError where it is none."""

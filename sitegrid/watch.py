@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from threading import Event
 
 from protocol.errors import LinkError, MessageError, QueryError
 from protocol.queries.answers import MapVersion, Region
@@ -21,14 +22,14 @@ Ask = Callable[[TilesQuery], TilesAnswer]
 Read = Callable[[Bounds], Region]
 
 
-def watch(ask: Ask, read: Read, bounds: Bounds | None, again_s: float) -> Iterator[Region]:
-    """Regions of the tiles that differ, again and again; first of all that there are. Ends never by itself.
+def watch(ask: Ask, read: Read, bounds: Bounds | None, again_s: float, stop: Event) -> Iterator[Region]:
+    """Regions of the tiles that differ, again and again; first of all that there are. Ends when `stop` is set.
 
     ask: for tiles since a version. read: a region. bounds: of what is watched, None for all. A server that is away is
     asked again; a QueryError of another kind than its state ends the watch.
     """
     version: MapVersion | None = None
-    while True:
+    while not stop.is_set():
         began_s = time.monotonic()
         try:
             answer = ask(TilesQuery(version))
@@ -40,13 +41,13 @@ def watch(ask: Ask, read: Read, bounds: Bounds | None, again_s: float) -> Iterat
         except QueryError as error:
             if not error.retry_after_s and error.reason not in ("store", "internal", "overloaded", "expired"):
                 raise
-        time.sleep(max(0.0, again_s - (time.monotonic() - began_s)))
+        stop.wait(max(0.0, again_s - (time.monotonic() - began_s)))
 
 
 async def watch_async(regions: Iterator[Region]) -> AsyncIterator[Region]:
     """The same for programs with an event loop, which does not wait for the server."""
-    while True:
-        yield await asyncio.to_thread(next, regions)
+    while (region := await asyncio.to_thread(next, regions, None)) is not None:
+        yield region
 
 
 def _areas(answer: TilesAnswer, bounds: Bounds | None) -> Iterator[Bounds]:

@@ -47,7 +47,7 @@ class WebSite:
         (folder / "site.toml").write_text(SITE_TOML)
         # What machines of tests measure is what they sent, whenever the solver looks.
         (folder / "server.toml").write_text("[calibration]\nautomatic = false\n")
-        children.start("router", "router", "--listen", self.endpoint).expect("ready", PATIENCE_S)
+        self.router = self.start_router()
         self.server = self.start_server()
         self.web = self.start_web(*words)
         self.machines = [SoakMachine(f"machine-{i}", seed=i) for i in range(machines)]
@@ -55,6 +55,11 @@ class WebSite:
         self.session = open_session(SessionConfig(self.endpoint))
         children.callback(self.session.close)
         self.client: Client = children.enter_context(connect(self.endpoint, NAME, timeout_s=PATIENCE_S))
+
+    def start_router(self) -> Child:
+        child = self.children.start("router", "router", "--listen", self.endpoint)
+        child.expect("ready", PATIENCE_S)
+        return child
 
     def start_server(self) -> Child:
         files = ("--site-file", self.folder / "site.toml", "--config", self.folder / "server.toml")

@@ -2,6 +2,7 @@
 
 from contextlib import closing, suppress
 from itertools import count
+from threading import Event
 
 import numpy as np
 import pytest
@@ -74,7 +75,7 @@ def test_what_was_watched_ends_with_the_bits_of_the_region(tmp_path, bounds):
         area = bounds or Bounds(-192.0, -192.0, 192.0, 192.0)
         size = int(area.north_m - area.south_m), int(area.east_m - area.west_m)
         seen = {name: np.full(size, np.nan, np.float32) for name in LAYERS}
-        regions = watch(site.tiles, site.region, bounds, 0.0)
+        regions = watch(site.tiles, site.region, bounds, 0.0, Event())
         for region in until_enough(regions):
             row, column = int(region.bounds.south_m - area.south_m), int(region.bounds.west_m - area.west_m)
             for name, values in region.layers.items():
@@ -90,4 +91,4 @@ def test_a_question_that_is_refused_ends_the_watch():
         raise QueryError(Refusal.UNKNOWN_LAYER, "layer `x` is not known")
 
     with pytest.raises(QueryError, match="layer `x`"):
-        next(watch(refused, refused, None, 0.0))
+        next(watch(refused, refused, None, 0.0, Event()))
