@@ -179,7 +179,7 @@ class Client:
         """Regions of what changed in the map, again and again; the first ones are all that there is.
 
         What they hold is what `region` says then, but for ages, which change with every sample. A map server or router
-        that is away is waited for; what changed meanwhile comes then. End it by `break`, or from another thread by `stop`.
+        that is away is waited for; what changed meanwhile comes then. End it by `break`, or by `stop`.
         """
         area = None if bounds is None else area_of(bounds)
         rectangle = area if area is None or isinstance(area, Bounds) else around(area)
