@@ -70,7 +70,8 @@ def summary_of(machine: str, report: Mapping[str, Any]) -> str:
     made = _counted(samples, "sample") if samples else "no samples"
     said = [f"{machine}: {_counted(report['readings'], 'reading')}, {made}"]
     if waiting:
-        said.append(f"{_counted(waiting, 'sample')} wait in the spool; the next start sends them")
+        wait, them = ("waits", "it") if waiting == 1 else ("wait", "them")
+        said.append(f"{_counted(waiting, 'sample')} {wait} in the spool; the next start sends {them}")
     elif samples:
         said.append("all are at the map server")
     if not samples or waiting or report["problems"]:

@@ -187,9 +187,7 @@ def _shown(machine: str, site: str, is_stopped: Callable[[], bool], *, is_json: 
 
 
 def _log(machine: str, report: dict[str, Any]) -> None:
-    place, template = (
-        report["pipeline"],
-        "status machine=%s says=%r position_std_m=%s speed_mps=%s samples=%d delivered=%d",
-    )
-    counts = report["samples"], report["acknowledged"]
-    log.info(template, machine, report["says"], place["position_std_m"], place["speed_mps"], *counts)
+    place, counts = report["pipeline"], (report["samples"], report["acknowledged"])
+    std_m, speed_mps = (None if v is None else round(v, 2) for v in (place["position_std_m"], place["speed_mps"]))
+    template = "status machine=%s says=%r position_std_m=%s speed_mps=%s samples=%d delivered=%d"
+    log.info(template, machine, report["says"], std_m, speed_mps, *counts)

@@ -22,22 +22,29 @@ class StatusLine:
 
     def __init__(self, terminal: TextIO) -> None:
         self._terminal, self._text = terminal, ""
-        self._is_whole = True  # what others wrote ends with a line
+        self._begun = ""  # a line that others have not ended
 
     def show(self, text: str) -> None:
         """Show a text, cut to the width of the terminal; an empty one leaves a clean line."""
         self._text = "".join(c if c.isprintable() else " " for c in text)
-        self.write("")
+        self._draw("")
 
     def write(self, text: str) -> int:
-        """Write above the line."""
-        if text:
-            self._is_whole = text.endswith("\n")
-            text = CLEAR + text
+        """Write above the line, once a line is whole."""
+        whole, end, self._begun = (self._begun + text).rpartition("\n")
+        if end:
+            self._draw(whole + end)
+        return len(text)
+
+    def close(self) -> None:
+        """Leave a clean line, behind what others have written."""
+        self._text = ""
+        self._draw(self._begun)
+
+    def _draw(self, above: str) -> None:
         width = self._columns() - 1  # a full line would wrap
         cut = self._text if len(self._text) <= width else f"{self._text[: width - 1]}…"
-        streams.write(self._terminal, text + (CLEAR + cut if self._is_whole else ""))
-        return len(text)
+        streams.write(self._terminal, CLEAR + above + cut)
 
     def flush(self) -> None:
         """Nothing waits."""
@@ -80,6 +87,6 @@ def status_line() -> Iterator[StatusLine]:
         with redirect_stderr(line):
             yield line
     finally:
-        line.show("")
+        line.close()
         for handler in handlers:
             handler.setStream(sys.stderr)

@@ -28,15 +28,15 @@ function rows(agent) {
   const { position_std_m: std, samples, acknowledged, waiting, base, corrections_age_s: age, calibration_std: calibration, heard } = agent;
   return [
     ["Place", std === null ? "not known yet" : `± ${std < 1 ? `${(100 * std).toFixed(0)} cm` : `${std.toFixed(1)} m`}`],
-    samples === null ? null : ["Samples", `${samples} drawn, ${acknowledged ?? 0} delivered`],
+    samples ? ["Samples", `${samples} drawn, ${acknowledged ?? 0} delivered`] : null,
     waiting ? ["In the spool", `${waiting}`] : null,
     heard.length ? ["Sensors", heard.join(", ")] : null,
     base === null ? null : ["Corrections", age === null ? `${base}, none yet` : `${base}, ${age.toFixed(age < 10 ? 1 : 0)} s old`],
-    calibration === null ? null : ["Slope known to", `± ${(100 * calibration).toFixed(2)} %`],
+    samples && calibration !== null ? ["Slope known to", `± ${(100 * calibration).toFixed(2)} %`] : null,
   ];
 }
 
-const sentence = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+const sentence = (text) => (/^[a-z]+[ :,]/.test(text) && !text.includes("://", 2) ? text.charAt(0).toUpperCase() + text.slice(1) : text); // not the name of a sensor or port
 
 export const link = () => ({ panel: "agents" });
 export const restore = (page, parameters) => parameters.get("panel") === "agents";
