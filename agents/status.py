@@ -69,8 +69,8 @@ class Status:
 
     def judge(self, report: Mapping[str, Any]) -> list[Hindrance]:
         """All that hinders the agent now, the worst first. report: of the agent, in plain values."""
-        found = [*self._of_places(report), *_of_delivery(report), *_of_sensors(report), *self._of_ground(report)]
-        return list(dict.fromkeys(found))
+        hindrances = [*self._of_places(report), *_of_delivery(report), *_of_sensors(report), *self._of_ground(report)]
+        return list(dict.fromkeys(hindrances))
 
     def _of_places(self, report: Mapping[str, Any]) -> Iterator[Hindrance]:
         """Why there is no sample, or none for a while."""
@@ -117,9 +117,9 @@ class Status:
     def _to_align(self) -> str:
         """What the heading takes."""
         is_blind = not WHEELS & self._kinds and Imu.kind in self._kinds
-        way_m = UNSIGNED_M if is_blind else DISTANCE_M
+        distance_m = UNSIGNED_M if is_blind else DISTANCE_M
         lacks = "" if SPEEDS & self._kinds else "no wheel speeds and no Doppler velocity: "
-        return f"{lacks}the heading is unknown until the machine has driven {way_m:g} m with GPS fixes"
+        return f"{lacks}the heading is unknown until the machine has driven {distance_m:g} m with GPS fixes"
 
     def _of_ground(self, report: Mapping[str, Any]) -> Iterator[Hindrance]:
         """What samples lack."""
@@ -168,7 +168,7 @@ def _of_sensors(report: Mapping[str, Any]) -> Iterator[Hindrance]:
         yield Hindrance(problem)
 
 
-def described(found: Sequence[Hindrance]) -> dict[str, Any]:
-    """As health has it. says: one sentence, of the worst. problems: all that has to be mended, the worst first."""
-    problems = [hindrance.sentence for hindrance in found if hindrance.is_problem]
-    return {"says": found[0].sentence if found else DRAWS, "problems": problems}
+def described(hindrances: Sequence[Hindrance]) -> dict[str, Any]:
+    """As health has it. status: one sentence, of the worst. problems: all that has to be mended, the worst first."""
+    problems = [hindrance.sentence for hindrance in hindrances if hindrance.is_problem]
+    return {"status": hindrances[0].sentence if hindrances else DRAWS, "problems": problems}

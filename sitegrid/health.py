@@ -8,10 +8,10 @@ from typing import Any
 MOST_PROBLEMS, MOST_SENSORS, MOST_CHARS = 10, 20, 300  # of what is shown of one machine
 
 
-def says_of(values: Mapping[str, Any]) -> str:
+def status_of(values: Mapping[str, Any]) -> str:
     """The sentence of an agent on itself; empty where it has none."""
-    says = values.get("says")
-    return one_line(says) if isinstance(says, str) else ""
+    status = values.get("status")
+    return one_line(status) if isinstance(status, str) else ""
 
 
 def problems_of(values: Mapping[str, Any]) -> list[str]:
@@ -40,7 +40,7 @@ def report_of(values: Mapping[str, Any]) -> dict[str, Any]:
     pipeline, spool, corrections = (table_of(values, name) for name in ("pipeline", "spool", "corrections"))
     heard = values.get("heard")
     return {
-        "says": says_of(values),
+        "status": status_of(values),
         "position_std_m": number_of(pipeline, "position_std_m"),
         "speed_mps": number_of(pipeline, "speed_mps"),
         "samples": number_of(values, "samples"),
@@ -61,7 +61,7 @@ def line_of(machine: str, report: Mapping[str, Any]) -> str:
     parts = [machine, "no place" if std_m is None else f"+-{std_m:.2f} m  {abs(speed_mps):.1f} m/s"]
     if report["samples"]:
         parts.append(f"{report['samples']} samples, {report['acknowledged']} delivered")
-    return "  ".join([*parts, report["says"]])
+    return "  ".join([*parts, report["status"]])
 
 
 def summary_of(machine: str, report: Mapping[str, Any]) -> str:
@@ -75,7 +75,7 @@ def summary_of(machine: str, report: Mapping[str, Any]) -> str:
     elif samples:
         said.append("all are at the map server")
     if not samples or waiting or report["problems"]:
-        said.append(report["says"])
+        said.append(report["status"])
     if report["holdout"]:
         said.append("withheld fixes: " + ", ".join(f"{name} {value}" for name, value in report["holdout"].items()))
     return ". ".join(sentence[0].upper() + sentence[1:] if i else sentence for i, sentence in enumerate(said)) + "."

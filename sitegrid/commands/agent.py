@@ -176,7 +176,7 @@ def _shown(machine: str, site: str, is_stopped: Callable[[], bool], *, is_json: 
     if is_json or not sys.stderr.isatty():
         say({"ready": "agent", "machine": machine, "site": site})
         due = Due()
-        yield lambda report: _log(machine, report) if due.is_due(report["says"]) else None
+        yield lambda report: _log(machine, report) if due.is_due(report["status"]) else None
         return
     if sys.stdout.isatty():
         note(f"{machine} draws the map of {site}; Ctrl-C ends it")
@@ -189,5 +189,5 @@ def _shown(machine: str, site: str, is_stopped: Callable[[], bool], *, is_json: 
 def _log(machine: str, report: dict[str, Any]) -> None:
     place, counts = report["pipeline"], (report["samples"], report["acknowledged"])
     std_m, speed_mps = (None if v is None else round(v, 2) for v in (place["position_std_m"], place["speed_mps"]))
-    template = "status machine=%s says=%r position_std_m=%s speed_mps=%s samples=%d delivered=%d"
-    log.info(template, machine, report["says"], std_m, speed_mps, *counts)
+    template = "status machine=%s status=%r position_std_m=%s speed_mps=%s samples=%d delivered=%d"
+    log.info(template, machine, report["status"], std_m, speed_mps, *counts)

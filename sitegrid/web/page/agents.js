@@ -14,12 +14,12 @@ export async function build(page, signal) {
 }
 
 function card(page, agent) {
-  const silent = agent.age_s > SILENT_S, others = agent.problems.filter((problem) => problem !== agent.says);
+  const silent = agent.age_s > SILENT_S, others = agent.problems.filter((problem) => problem !== agent.status);
   const state = silent ? "off" : agent.problems.length ? "bad" : "", place = page.machines.get(agent.machine);
   const name = element("button", { className: "name", disabled: !place, title: "Show it on the map", onclick: () => page.fly([place.x_m - 30, place.y_m - 30, place.x_m + 30, place.y_m + 30]) }, agent.machine);
   const heading = element("h3", { className: state }, element("i", { className: "dot" }), name, element("small", {}, silent ? `silent for ${Math.round(agent.age_s)} s` : agent.speed_mps === null ? "" : `${Math.abs(agent.speed_mps).toFixed(1)} m/s`));
   return element("section", { className: "part agent" }, heading,
-    agent.says ? element("p", { className: agent.problems.includes(agent.says) ? "say failed" : "say" }, sentence(agent.says)) : null,
+    agent.status ? element("p", { className: agent.problems.includes(agent.status) ? "say failed" : "say" }, sentence(agent.status)) : null,
     others.length ? element("ul", { className: "note problems" }, others.map((problem) => element("li", {}, sentence(problem)))) : null,
     facts(rows(agent)));
 }

@@ -105,7 +105,7 @@ WAITING = SPOOL | {"depth": 312}
 
 
 @pytest.mark.parametrize(
-    ("kinds", "known", "says", "problems"),
+    ("kinds", "known", "sentence", "problems"),
     [
         ((), {}, "calibrating: drive a closed loop, or reverse over your own track", []),
         (("torque",), {}, LACKS, [LACKS]),  # the machine has one, and it is silent
@@ -121,11 +121,11 @@ WAITING = SPOOL | {"depth": 312}
         ),
     ],
 )
-def test_the_worst_hindrance_is_said_and_what_to_mend_is_listed(kinds, known, says: str, problems: list[str]):
+def test_the_worst_hindrance_is_said_and_what_to_mend_is_listed(kinds, known, sentence: str, problems: list[str]):
     pipeline, status, _ = followed(without(*kinds))
     status.sampled()
     shown = described(status.judge(report(pipeline, **{"acknowledged": 1, **known})))
-    assert (shown["says"], shown["problems"]) == (says, problems)
+    assert (shown["status"], shown["problems"]) == (sentence, problems)
 
 
 def test_before_anything_came_in_what_its_drivers_say_counts():
@@ -133,7 +133,7 @@ def test_before_anything_came_in_what_its_drivers_say_counts():
     assert status.judge(report(nothing)) == [Hindrance("waiting for the first readings", is_problem=False)]
     undated = "readings wait for UTC: no receiver has stated date and time"
     assert status.judge(report(nothing, driver_problems=[undated]))[0] == Hindrance(undated)
-    assert described([])["says"] == DRAWS
+    assert described([])["status"] == DRAWS
 
 
 def test_nothing_is_said_of_a_machine_that_has_all_nor_before_the_time():

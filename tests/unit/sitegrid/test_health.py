@@ -6,11 +6,11 @@ import math
 
 import pytest
 
-from sitegrid.health import MOST_CHARS, MOST_PROBLEMS, line_of, problems_of, report_of, says_of, summary_of
+from sitegrid.health import MOST_CHARS, MOST_PROBLEMS, line_of, problems_of, report_of, status_of, summary_of
 
 SAYS = "no torque: slope only"
 REPORT = {
-    "says": SAYS,
+    "status": SAYS,
     "problems": [],
     "readings": 398,
     "samples": 312,
@@ -45,9 +45,9 @@ def test_a_run_ends_in_sentences_with_a_reason(known, sentences: str):
 
 
 def test_what_others_say_may_be_anything():
-    strange = {"says": 7, "problems": "?", "pipeline": 1, "spool": [], "corrections": None, "samples": math.nan}
+    strange = {"status": 7, "problems": "?", "pipeline": 1, "spool": [], "corrections": None, "samples": math.nan}
     for values in ({}, strange):
-        assert (says_of(values), problems_of(values)) == ("", [])
+        assert (status_of(values), problems_of(values)) == ("", [])
         assert set(map(str, report_of(values).values())) == {"", "[]", "None"}
     many = problems_of({"problems": ["a\n\x1b[2Jb " + 10 * MOST_CHARS * "x"] * 99})
     assert len(many) == MOST_PROBLEMS

@@ -185,9 +185,9 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
         (disk.check_spool(SpoolState(0, 0, 0, 0, gone=9), NOW_NS), WARN, "9 are gone; its disk has lost recorded"),
         (disk.check_spool(SpoolState(0, 0, 0, 0, damage="a.db-wal is damaged"), NOW_NS), WARN, "a.db-wal is damaged"),
         (disk.check_health("loader-1", {**HEALTHY, "problems": ["a", "b: old"]}), WARN, "; a; b: old"),
-        (disk.check_health("loader-1", {**HEALTHY, "says": "calibrating"}), PASS, "0 quarantined; calibrating"),
+        (disk.check_health("loader-1", {**HEALTHY, "status": "calibrating"}), PASS, "0 quarantined; calibrating"),
         (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait, 2 of them for the smoother; "),
-        (disk.check_health("loader-1", {"says": 7, "problems": "?"}), PASS, "? samples wait"),
+        (disk.check_health("loader-1", {"status": 7, "problems": "?"}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
         # what others say may be anything
         (disk.check_health("loader-1", {}), PASS, "? samples wait"),
