@@ -31,10 +31,12 @@ def terminal() -> Iterator[tuple[int, TextIO]]:
     os.close(ours)
 
 
-def screen(descriptor: int) -> list[str]:
-    """Lines as a person sees them."""
-    text = os.read(descriptor, 65_536).decode()
-    return [line.rpartition(CLEAR)[2] for line in text.replace("\r\n", "\n").split("\n")]
+def screen(descriptor: int, end: str) -> list[str]:
+    """Lines as a person sees them, up to this end: a terminal may hand over what was written in pieces."""
+    written = b""
+    while not written.endswith(end.encode()):
+        written += os.read(descriptor, 65_536)
+    return [line.rpartition(CLEAR)[2] for line in written.decode().replace("\r\n", "\n").split("\n")]
 
 
 def test_logs_stand_above_the_line_which_is_cut_and_gone_at_the_end(terminal, monkeypatch):
@@ -46,15 +48,15 @@ def test_logs_stand_above_the_line_which_is_cut_and_gone_at_the_end(terminal, mo
         sys.stderr.write("half")
         print(" a line", file=sys.stderr)
         line.show("loader-1\x1b[31m " + 40 * "long ")
-        (*logged, last) = screen(ours)
+        (*logged, last) = screen(ours, "…")
         assert logged == ["a wheel slips", "half a line"]
         assert len(last) == COLUMNS - 1
         assert last.startswith("loader-1 [31m long")
         assert last.endswith("…")
-    assert screen(ours) == [""]
+    assert screen(ours, CLEAR) == [""]
     assert sys.stderr is stream
     logging.getLogger("x").warning("afterwards")
-    assert screen(ours) == ["afterwards", ""]
+    assert screen(ours, "\n") == ["afterwards", ""]
 
 
 def test_a_terminal_that_was_closed_ends_nothing(monkeypatch):
