@@ -19,11 +19,11 @@ from agents.delivery.uplink_thread import Check, Sign, UplinkThread, linger
 from agents.delivery.write_buffer import WriteBuffer
 from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
-from agents.first_sample import FirstSample
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Presence
 from agents.sampling import Samples
+from agents.status import Status, described
 from protocol.errors import StoreError
 from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig
@@ -75,11 +75,12 @@ class Agent:
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
         self._corrections = corrections
         self._unsaved, self._spool_problem = WriteBuffer(), ""
-        self._first_sample, self._clocks = FirstSample(machine), ""
+        self._status, self._clocks, self._unsampled = Status(machine), "", ""
         self._faults: dict[str, str] = {}  # of sensors, as they were last told
         self._readings = 0
         self._samples = 0
         self._newest_ns = 0
+        self._heard_s = self._now_s = 0.0  # when the last readings came in, and now
 
     def run(
         self,
@@ -87,13 +88,20 @@ class Agent:
         is_stopped: Callable[[], bool],
         clock: Callable[[], float] = time.monotonic,
         wait: Callable[[float], object] = time.sleep,
+        show: Callable[[dict[str, Any]], None] = lambda _: None,
     ) -> dict[str, Any]:
-        """Take readings until the stream ends or `is_stopped`; returns a report in plain values."""
-        second_s = moved_s = clock()
+        """Take readings until the stream ends or `is_stopped`; returns a report in plain values.
+
+        show: gets the report each second.
+        """
+        second_s = moved_s = self._heard_s = clock()
         while not is_stopped():
             readings = driver.read(0.2)
             if readings is None:
                 break
+            self._now_s = clock()
+            if readings:
+                self._heard_s = self._now_s
             if self._step(list(readings)):
                 moved_s = clock()
             elif self._pipeline.pose and clock() - moved_s > SILENT_S:
@@ -105,33 +113,39 @@ class Agent:
                 self._consider_offer()
                 self._calibration_file.write(self._pipeline.calibration)
                 self._yield_name()
-                self._tell_what_is_missing()
                 self._tell_faults()
-                self._presence.show_health(self._newest_ns, self.report(driver))
+                self._show(driver, show)
         driver.close()
         self._take(self._pipeline.finish())
-        self._tell_what_is_missing()
         self._write()
         self._calibration_file.write(self._pipeline.calibration)
+        self._show(driver, show)
         delivered = linger(self._is_delivered, wait, clock, 0.0 if is_stopped() else self._config.linger_s)
-        report = {**self.report(driver), "delivered": delivered}
-        self._presence.show_health(self._newest_ns, report)
-        return report
+        return {**self._show(driver, lambda _: None), "delivered": delivered}
 
     def report(self, driver: Driver) -> dict[str, Any]:
         """Health in plain values."""
+        known = self._known(driver)
+        return described(self._status.judge(known)) | known
+
+    def _known(self, driver: Driver) -> dict[str, Any]:
+        """State of all parts."""
         uplink, owner = self._uplink, self._presence.owner
+        spool = {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._unsaved.given_up}
+        self._clocks = self._pipeline.clocks()
         return {
             "host": owner.host,
             "pid": owner.pid,
             "readings": self._readings,
             "samples": self._samples,
-            "no_sample": self._first_sample.why_not,
+            "heard": self._status.heard,
+            "acknowledged": max(self._samples - spool["depth"], 0),
+            "silent_s": round(self._now_s - self._heard_s, 1),
             "clocks": self._clocks,
             "driver": dict(driver.counters()),
             "driver_problems": list(driver.problems()),
             "pipeline": self._pipeline.health(),
-            "spool": {**self._spool.counters(), "unsaved": len(self._unsaved), "given_up": self._unsaved.given_up},
+            "spool": spool,
             "spool_problem": self._spool_problem,
             "spool_damage": self._spool.damage,
             "calibration_problem": self._calibration_file.problem,
@@ -158,7 +172,7 @@ class Agent:
         if readings:
             self._newest_ns = max(self._newest_ns, readings[-1].stamp_ns)
         before = self._pipeline.pose
-        self._first_sample.take(readings)
+        self._status.take(readings)
         self._take(self._pipeline.step(self._holdout.split(readings) if self._holdout else readings))
         if self._holdout:
             self._holdout.compare(self._pipeline)
@@ -171,14 +185,19 @@ class Agent:
         """Have samples written at the end of the second."""
         self._unsaved.add(made.pending, made.final)
         if len(made.pending):
-            self._first_sample.sampled()
+            self._status.sampled()
 
-    def _tell_what_is_missing(self) -> None:
-        before, self._clocks = self._clocks, self._pipeline.clocks()
-        if why := self._first_sample.judge(self._pipeline.health, self._clocks):
+    def _show(self, driver: Driver, show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+        """Show a report, which it returns, to whoever wants to see it; log why samples are missing, once."""
+        clocks, report = self._clocks, self.report(driver)
+        if (why := self._status.unsampled) and not self._unsampled:
             log.warning("samples are missing why=%r", why)
-        if self._clocks and not before:
+        if self._clocks and not clocks:
             log.warning("clocks are apart why=%r", self._clocks)
+        self._unsampled = why
+        self._presence.show_health(self._newest_ns, report)
+        show(report)
+        return report
 
     def _tell_faults(self) -> None:
         """Log what is wrong with sensors, as it begins and as it ends."""

@@ -109,6 +109,7 @@ class Pipeline:
             "wheel_scale": localiser.wheel_scale,
             "faults": self.faults,
             "position_std_m": std_m,
+            "speed_mps": pose.speed_mps if pose else None,
             "counters": dict(self._counters + self._positioning.counters),
             "withheld": dict(self._sampler.withheld),
             "without_resistance": dict(self._sampler.without_resistance),

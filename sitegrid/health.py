@@ -1,16 +1,91 @@
-"""What an agent's health says of its sensors; of another version, its values may be anything."""
+"""What an agent's health says in words; of another version, its values may be anything."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-MOST_FAULTS, MOST_CHARS = 10, 200  # of what is shown of one machine
+MOST_PROBLEMS, MOST_SENSORS, MOST_CHARS = 10, 20, 300  # of what is shown of one machine
 
 
-def faults_of(values: Mapping[str, Any]) -> list[str]:
-    """Sentences on sensors that do not count or contradict others, with the sensors' names."""
-    pipeline = values.get("pipeline")
-    faults = pipeline.get("faults") if isinstance(pipeline, Mapping) else None
-    named = list(faults.items())[:MOST_FAULTS] if isinstance(faults, Mapping) else []
-    return [f"{name} {fault}"[:MOST_CHARS] for name, fault in named]
+def status_of(values: Mapping[str, Any]) -> str:
+    """The sentence of an agent on itself; empty where it has none."""
+    status = values.get("status")
+    return one_line(status) if isinstance(status, str) else ""
+
+
+def problems_of(values: Mapping[str, Any]) -> list[str]:
+    """What has to be mended, a sentence each, the worst first."""
+    problems = values.get("problems")
+    return [one_line(str(problem)) for problem in problems[:MOST_PROBLEMS]] if isinstance(problems, list) else []
+
+
+def table_of(values: Mapping[str, Any], *names: str) -> Mapping[str, Any]:
+    """A table in tables; empty where there is none."""
+    for name in names:
+        table = values.get(name)
+        values = table if isinstance(table, Mapping) else {}
+    return values
+
+
+def number_of(values: Mapping[str, Any], name: str) -> float | None:
+    """A finite number; None where there is none."""
+    value = values.get(name)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18
+    return value if is_number else None
+
+
+def report_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What a page shows of an agent beside its problems; None of what it does not say."""
+    pipeline, spool, corrections = (table_of(values, name) for name in ("pipeline", "spool", "corrections"))
+    heard = values.get("heard")
+    return {
+        "status": status_of(values),
+        "position_std_m": number_of(pipeline, "position_std_m"),
+        "speed_mps": number_of(pipeline, "speed_mps"),
+        "samples": number_of(values, "samples"),
+        "acknowledged": number_of(values, "acknowledged"),
+        "waiting": number_of(spool, "depth"),
+        "silent_s": number_of(values, "silent_s"),
+        "heard": [one_line(str(name)) for name in heard[:MOST_SENSORS]] if isinstance(heard, list) else [],
+        "base": one_line(str(corrections["base"])) if "base" in corrections else None,
+        "corrections_age_s": number_of(corrections, "age_s"),
+        "calibration_std": number_of(table_of(pipeline, "ground", "calibration"), "zero_std"),
+    }
+
+
+def line_of(machine: str, report: Mapping[str, Any]) -> str:
+    """One line for people: how sure its place is, its speed, its samples, and the sentence."""
+    pipeline = report["pipeline"]
+    std_m, speed_mps = pipeline["position_std_m"], pipeline["speed_mps"]
+    parts = [machine, "no place" if std_m is None else f"+-{std_m:.2f} m  {abs(speed_mps):.1f} m/s"]
+    if report["samples"]:
+        parts.append(f"{report['samples']} samples, {report['acknowledged']} delivered")
+    return "  ".join([*parts, report["status"]])
+
+
+def summary_of(machine: str, report: Mapping[str, Any]) -> str:
+    """How an agent's run ended, in sentences: what it read and made, what waits, and why."""
+    samples, waiting = report["samples"], report["spool"]["depth"] + report["spool"]["unsaved"]
+    made = _counted(samples, "sample") if samples else "no samples"
+    said = [f"{machine}: {_counted(report['readings'], 'reading')}, {made}"]
+    if waiting:
+        wait, them = ("waits", "it") if waiting == 1 else ("wait", "them")
+        said.append(f"{_counted(waiting, 'sample')} {wait} in the spool; the next start sends {them}")
+    elif samples:
+        said.append("all are at the map server")
+    if not samples or waiting or report["problems"]:
+        said.append(report["status"])
+    if report["holdout"]:
+        said.append("withheld fixes: " + ", ".join(f"{name} {value}" for name, value in report["holdout"].items()))
+    return ". ".join(sentence[0].upper() + sentence[1:] if i else sentence for i, sentence in enumerate(said)) + "."
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}" + ("" if n == 1 else "s")
+
+
+def one_line(text: str) -> str:
+    """Text of others on one line, and not too long."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text[: 4 * MOST_CHARS]).split())
+    return line if len(line) <= MOST_CHARS else f"{line[: MOST_CHARS - 1]}…"

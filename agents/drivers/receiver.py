@@ -40,7 +40,7 @@ class Receiver:
         self._transport: Transport | None = None
         self._problem = ""  # of the link
         self._bauds = list(dict.fromkeys((baud or BAUDS[0], *BAUDS)))  # the one in use comes first
-        self._retry_s = 0.0
+        self._retry_s, self._was_fixed = 0.0, False
         self._heard_s = self._framed_s = self._fixed_s = self._now_s()
 
     def read(self, timeout_s: float) -> Sequence[Observed] | None:
@@ -112,7 +112,7 @@ class Receiver:
         elif is_live and now_s - self._framed_s > TRY_S:
             self._try_another()
         if not self._line.has_fixes or (self._line.seen and self._line.seen.utc_ns):
-            self._fixed_s = now_s
+            self._fixed_s, self._was_fixed = now_s, True
 
     def _watch_silence(self) -> None:
         if not self._transport or self._now_s() - self._heard_s <= SILENT_S:
@@ -149,7 +149,9 @@ class Receiver:
     def _why_unfixed(self) -> str:
         seen = self._line.seen
         if self._now_s() - self._fixed_s <= NO_FIX_S:
-            return ""
+            if not seen or self._was_fixed:
+                return ""
+            return "waiting for its date" if seen.values else f"no fix yet: {seen.satellites} satellites"
         if not seen:
             return "it sends no positions: switch on GGA and RMC, or NAV-PVT"
         undated = "it sends positions without a date: switch on RMC, or ZDA"

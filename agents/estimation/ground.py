@@ -159,6 +159,7 @@ class GroundEstimator:
             "payload_kg": self._balancer.payload_kg,
             "skid_steers": self._skid_steering.is_so,
             "calibration": {
+                "calibrates": self._config.calibrate,
                 "zero": applied.zero,
                 "zero_std": math.sqrt(applied.covariance[0][0]),
                 "scale": applied.scale,

@@ -202,6 +202,7 @@ def _problems(agents: Mapping[str, ReceivedHealth]) -> Metric:
         tables = {name: health.values.get(name) for name in ("uplink", "corrections")}
         parts = {
             **{part: table.get("problem") for part, table in tables.items() if isinstance(table, Mapping)},
+            "receivers": health.values.get("driver_problems"),
             "clocks": health.values.get("clocks"),
             "spool": health.values.get("spool_problem"),
             "disk": health.values.get("spool_damage"),

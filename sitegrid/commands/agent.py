@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
+import sys
 import time
 from argparse import ArgumentParser, Namespace
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,9 +21,11 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire.session import SessionConfig, open_session
+from sitegrid.health import line_of, summary_of
 from sitegrid.options.groups import add_network
 from sitegrid.options.values import OutputFile, not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
+from sitegrid.process.status_line import Due, status_line
 from sitegrid.security.join import join, reply_check, signer
 
 if TYPE_CHECKING:
@@ -30,9 +35,11 @@ if TYPE_CHECKING:
     from agents.drivers import Driver
     from protocol.wire.owners import Owner
 
+log = logging.getLogger("sitegrid.status")
 HELP = "run the localisation agent of one machine"
 EXTRA = "agent"
 KEPT = OutputFile(makes_folder=True)
+Show = Callable[[dict[str, Any]], None]
 LINK_S = 1.0  # how long to wait for the router before starting without it
 
 
@@ -80,9 +87,9 @@ def run(arguments: Namespace) -> int:
         corrections = None if log else _corrections(joined, driver)
         agent = _agent(arguments, joined, corrections)
         opened.callback(agent.close)
-        say({"ready": "agent", "machine": machine.name, "site": site.name})
-        report = agent.run(driver, stop.is_set, wait=stop.wait)
-    say({"ended": plain(report)}) if arguments.json else note(_summary(machine.name, report))
+        show = opened.enter_context(_shown(machine.name, site.name, stop.is_set, is_json=arguments.json))
+        report = agent.run(driver, stop.is_set, wait=stop.wait, show=show)
+    say({"ended": plain(report)}) if arguments.json else note(summary_of(machine.name, report))
     return 0 if report.get("delivered", True) or stop.is_set() else 1
 
 
@@ -163,7 +170,24 @@ def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Dri
     return open_sources(joined.config.driver, joined.machine, lambda: (time.time_ns(), time.monotonic_ns()))
 
 
-def _summary(machine: str, report: dict[str, Any]) -> str:
-    line = f"{machine}: {report['readings']} readings, {report['samples']} samples"
-    withheld = f", withheld fixes {report['holdout']}" if report["holdout"] else ""
-    return f"{line}, delivered {report['delivered']}{withheld}"
+@contextmanager
+def _shown(machine: str, site: str, is_stopped: Callable[[], bool], *, is_json: bool) -> Iterator[Show]:
+    """Say that it is ready, and how it does: on a terminal for people, else for programs."""
+    if is_json or not sys.stderr.isatty():
+        say({"ready": "agent", "machine": machine, "site": site})
+        due = Due()
+        yield lambda report: _log(machine, report) if due.is_due(report["status"]) else None
+        return
+    if sys.stdout.isatty():
+        note(f"{machine} draws the map of {site}; Ctrl-C ends it")
+    else:
+        say({"ready": "agent", "machine": machine, "site": site})
+    with status_line() as line:
+        yield lambda report: line.show("" if is_stopped() else line_of(machine, report))
+
+
+def _log(machine: str, report: dict[str, Any]) -> None:
+    place, counts = report["pipeline"], (report["samples"], report["acknowledged"])
+    std_m, speed_mps = (None if v is None else round(v, 2) for v in (place["position_std_m"], place["speed_mps"]))
+    template = "status machine=%s status=%r position_std_m=%s speed_mps=%s samples=%d delivered=%d"
+    log.info(template, machine, report["status"], std_m, speed_mps, *counts)

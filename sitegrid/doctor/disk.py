@@ -20,7 +20,7 @@ from protocol.errors import StoreError
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
 from sitegrid.doctor import Finding, Level
-from sitegrid.health import faults_of
+from sitegrid.health import problems_of, status_of, table_of
 
 FREE_FAIL, FREE_WARN = 64 * 2**20, 2**30
 WAITING_S = 3600.0  # samples that are older have not been taken for long
@@ -118,24 +118,15 @@ def check_spool(state: SpoolState, now_ns: int) -> Finding:
 
 def check_health(machine: str, values: Mapping[str, Any]) -> Finding:
     """A running agent, by the values of its health report: of another version, they may be anything."""
-    spool = _table_of(values, "spool")
+    spool, status = table_of(values, "spool"), status_of(values)
     counts = [f"{spool.get(key, '?')} {word}" for key, word in (("depth", "samples wait"), ("dropped", "were dropped"))]
     waits = f"{counts[0]}, {spool.get('pending', '?')} of them for the smoother"
     message = f"{machine} runs: {waits}; {counts[1]}, {spool.get('put_aside', '?')} quarantined"
-    named = ("no_sample", "clocks", "spool_problem", "calibration_problem", "spool_damage")
-    of_parts = [_table_of(values, part).get("problem") for part in ("uplink", "corrections")]
-    receivers = values.get("driver_problems")
-    problems = [*of_parts, *map(values.get, named), *faults_of(values)]
-    problems += receivers if isinstance(receivers, list) else []
-    advice = "; ".join(str(problem) for problem in problems if problem)
     message += f", {spool['gone']} are gone" if spool.get("gone") else ""
+    problems = problems_of(values)
+    message += f"; {status}" if status and status not in problems else ""
     lost = any(spool.get(key) for key in ("dropped", "put_aside", "gone"))
-    return Finding(Level.WARN if advice or lost else Level.PASS, "spool", message, advice)
-
-
-def _table_of(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    table = values.get(name)
-    return table if isinstance(table, Mapping) else {}
+    return Finding(Level.WARN if problems or lost else Level.PASS, "spool", message, "; ".join(problems))
 
 
 @dataclass(frozen=True)

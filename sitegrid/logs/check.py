@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.first_sample import UNIT, WHEELS
+from agents.status import UNIT, WHEELS
 from protocol.arrays import Floats, Ints
 from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.clock_watch import GAP_NS

@@ -15,10 +15,11 @@ _VALUE = re.compile(r"(?:^| )(\w+)=%[^a-zA-Z%]*[a-zA-Z]")
 
 
 def start_logging(*, verbose: bool) -> None:
-    """Log warnings to standard error; with `verbose` also what happens."""
+    """Log warnings and status to standard error; with `verbose` also what happens."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(TextFormatter() if sys.stderr.isatty() else JsonFormatter())
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
+    logging.getLogger("sitegrid.status").setLevel(logging.INFO)  # what a process says of itself is never too much
 
 
 class TextFormatter(logging.Formatter):

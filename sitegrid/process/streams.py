@@ -32,18 +32,18 @@ def complete() -> None:
 
 def write_out(text: str) -> None:
     """Write lines to standard output."""
-    _write(sys.stdout, f"{text}\n")
+    write(sys.stdout, f"{text}\n")
 
 
 def write_error(text: str) -> None:
     """Write lines to standard error."""
-    _write(sys.stderr, f"{text}\n")
+    write(sys.stderr, f"{text}\n")
 
 
 def flush() -> None:
     """Write what others, as argparse, have left in the buffers."""
     for stream in (sys.stdout, sys.stderr):
-        _write(stream, "")
+        write(stream, "")
 
 
 def is_open() -> bool:
@@ -56,7 +56,8 @@ def problem() -> str:
     return next(filter(None, _problems), "")
 
 
-def _write(stream: TextIO, text: str) -> None:
+def write(stream: TextIO, text: str) -> None:
+    """Write at once, as it is."""
     try:
         stream.write(text)
         stream.flush()

@@ -1,18 +1,19 @@
-"""Machines as pages see them: where each is, where it was, what its sensors lack. Any thread may ask."""
+"""Machines as pages see them: where each is, where it was, what it says of itself. Any thread may ask."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from operator import itemgetter
 from typing import Any
 
 from protocol.errors import MessageError, Refusal
 from protocol.wire.heard import Heard
 from protocol.wire.messages import Health, Pose
-from sitegrid.health import faults_of
+from sitegrid.health import problems_of, report_of
 from sitegrid.web.values import plain
 
 MOST_POSES, TRACK_STEP_NS = 600, 10**9  # of a track: ten minutes of site time
@@ -22,9 +23,10 @@ SILENT_S = 120.0  # a machine that said nothing for so long is left out
 
 @dataclass
 class _Machine:
-    pose: Pose
+    pose: Pose | None = None
+    pose_s: float = 0.0  # when it came in
     track: deque[Pose] = field(default_factory=deque)
-    faults: Sequence[str] = ()
+    health: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Machines:
@@ -43,10 +45,8 @@ class Machines:
         """Take a pose; MessageError where there are too many machines for another one."""
         with self._lock:
             known = self._heard.get(pose.machine)
-            machine = known or _Machine(pose)
-            machine.pose, track = pose, machine.track
-            if not self._heard.hear(pose.machine, machine):
-                raise MessageError(Refusal.OVERLOADED, f"{len(self._heard)} others spoke lately", field="machine")
+            machine = self._hear(pose.machine)
+            machine.pose, machine.pose_s, track = pose, self._clock(), machine.track
             self.heard += 1
             if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
                 track.append(pose)
@@ -56,10 +56,9 @@ class Machines:
                     each.track.popleft()
 
     def on_health(self, health: Health) -> None:
-        """Take what the sensors of a machine lack, whose pose is known."""
+        """Take what a machine says of itself; MessageError as of a pose."""
         with self._lock:
-            if machine := self._heard.get(health.machine):
-                machine.faults = faults_of(health.values)
+            self._hear(health.machine).health = health.values
 
     def on_findings(self, findings: Mapping[str, str]) -> None:
         """Take what the map server says of machines, a sentence each."""
@@ -67,20 +66,42 @@ class Machines:
             self._findings = findings
 
     def poses(self) -> list[dict[str, Any]]:
-        """Newest pose of each machine that said anything lately, and how old it is."""
+        """Newest pose of each machine that said anything lately, how old it is, and what has to be mended."""
         with self._lock:
             now_s = self._clock()
-            heard = [
-                (machine.pose, now_s - heard_s, [*machine.faults, *filter(None, [self._findings.get(name)])])
-                for name, machine, heard_s in self._heard.items()
-            ]
+            known = [(m.pose, now_s - m.pose_s, self._faults(name, m)) for name, m, _ in self._heard.items() if m.pose]
         return [
             plain({**asdict(pose), "age_s": round(age_s, 3), "faults": faults})
-            for pose, age_s, faults in heard
+            for pose, age_s, faults in known
             if age_s < SILENT_S
         ]
+
+    def reports(self) -> list[dict[str, Any]]:
+        """What each machine that spoke lately says of itself, by name."""
+        with self._lock:
+            now_s = self._clock()
+            known = [
+                {
+                    **report_of(m.health),
+                    "machine": name,
+                    "age_s": round(now_s - s, 1),
+                    "problems": self._faults(name, m),
+                }
+                for name, m, s in self._heard.items()
+                if m.health and now_s - s < SILENT_S
+            ]
+        return sorted(map(plain, known), key=itemgetter("machine"))
 
     def tracks(self) -> dict[str, list[Pose]]:
         """Where each machine was, oldest first."""
         with self._lock:
-            return {name: list(machine.track) for name, machine, _ in self._heard.items()}
+            return {name: list(machine.track) for name, machine, _ in self._heard.items() if machine.track}
+
+    def _hear(self, name: str) -> _Machine:
+        machine = self._heard.get(name) or _Machine()
+        if not self._heard.hear(name, machine):
+            raise MessageError(Refusal.OVERLOADED, f"{len(self._heard)} others spoke lately", field="machine")
+        return machine
+
+    def _faults(self, name: str, machine: _Machine) -> list[str]:
+        return [*problems_of(machine.health), *filter(None, [self._findings.get(name)])]

@@ -105,6 +105,13 @@ async def machines(feed: SiteFeed, query: MachinesQuery, _: Parameters) -> Respo
     return await as_json({"machines": (await feed.answer_to(query)).machines})
 
 
+async def agents(feed: SiteFeed, _: None, __: Parameters) -> Response:
+    """What machines say of themselves: those that said so while somebody looks."""
+    async with feed.watched():
+        await feed.heard()
+        return await as_json({"agents": feed.reports()})
+
+
 async def changes(feed: SiteFeed, query: ChangesQuery, _: Parameters) -> Response:
     """Changes of the ground."""
     return await as_json({"changes": (await feed.answer_to(query)).changes})
@@ -158,6 +165,7 @@ RESOURCES: dict[str, Resource] = {
     "region": Resource(region, RegionQuery.help, RegionQuery, more=(FORMAT,), media=tuple(REGION_MEDIA.values())),
     "history": Resource(history, HistoryQuery.help, HistoryQuery, follows_now=True),
     "machines": Resource(machines, MachinesQuery.help, MachinesQuery, follows_now=True),
+    "agents": Resource(agents, "What each machine says of itself: what it lacks, what waits", follows_now=True),
     "changes": Resource(changes, ChangesQuery.help, ChangesQuery, follows_now=True),
     "tiles": Resource(tiles, TilesQuery.help, TilesQuery, without=("place",), media=BINARY, follows_now=True),
     **roads.RESOURCES,

@@ -140,6 +140,10 @@ class SiteFeed:
         """Newest pose of each machine that said anything lately, and how old it is."""
         return self._machines.poses()
 
+    def reports(self) -> list[dict[str, Any]]:
+        """What each machine that spoke lately says of itself."""
+        return self._machines.reports()
+
     def poses_text(self) -> str:
         """The poses as pages are told of them, made once for all; empty for none."""
         now_s = time.monotonic()

@@ -22,6 +22,7 @@ MOST_OPTIONS = 60
 PLANTED = {
     "Layers: the laboratory": ("sitegrid/proof/delivery.py", "import lab.paper"),
     "An agent never sees": ("agents/pipeline.py", "import sim.state"),
+    "An agent is light": ("agents/presence.py", "import cv2"),
     "The client needs": ("sitegrid/client.py", "import mapserver.config"),
     "Layers of the map server": ("mapserver/evidence/cells.py", "import mapserver.journal.rows"),
     "Layers of an agent": ("agents/dead_reckoning.py", "import agents.sampling"),

@@ -13,8 +13,8 @@ from protocol.machine.samples import empty
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.requests import WhyQuery
 from protocol.wire import keys
-from protocol.wire.codec import encode_batch, encode_pose
-from protocol.wire.messages import Pose, SampleBatch
+from protocol.wire.codec import encode_batch, encode_health, encode_pose
+from protocol.wire.messages import Health, Pose, SampleBatch
 from sitegrid.process.children import Children
 from tests.integration.browser_tab import WAIT_MS, Tab, axe_script, needs_browser, watched
 from tests.integration.site_run import kill
@@ -76,6 +76,29 @@ def test_a_click_says_why(tab: Tab, web: WebSite):
     assert "cell=" in tab.page.url or tab.until("location.search.includes('cell=')") is None
     tab.page.keyboard.press("Escape")
     assert panel.is_hidden()
+
+
+def test_a_click_on_a_machine_says_how_it_does(tab: Tab, web: WebSite):
+    status, fault = "samples wait for the map server (312 held)", "/dev/ttyACM0: no such port"
+    values = {
+        "status": status,
+        "problems": [status, fault],
+        "heard": ["gps-1"],
+        "corrections": {"base": "base-1", "age_s": 2.0},
+    }
+    web.session.put(keys.health(NAME, "no-place-9"), encode_health(Health("no-place-9", web.now_ns, values)))
+    x_m, y_m = known_place(web)
+    web.session.put(keys.pose(NAME, "here-1"), encode_pose(Pose("here-1", web.now_ns, x_m, y_m, *[0.01] * 5)))
+    web.session.put(keys.health(NAME, "here-1"), encode_health(Health("here-1", web.now_ns, {"status": "calibrating"})))
+    tab.until("sitegrid.machines.has('here-1')")
+    tab.page.mouse.click(*tab.pixel_of(x_m, y_m))
+    panel = tab.page.locator("#panel .agent")
+    panel.first.wait_for(timeout=WAIT_MS)
+    assert panel.first.inner_text().startswith("here-1")
+    text = panel.filter(has_text="no-place-9").inner_text()
+    assert all(words in text for words in (status[1:], fault, "not known yet", "base-1, 2.0 s old", "gps-1"))
+    tab.page.keyboard.press("a")
+    assert tab.page.locator("#panel").is_hidden()
 
 
 def test_ground_where_nobody_was_says_so(tab: Tab):

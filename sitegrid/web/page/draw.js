@@ -1,7 +1,7 @@
 // Everything on the map that is not a tile: ground, plan, machines, changed areas, cross, scale.
 import { span } from "./palette.js";
 
-const SILENT_S = 8, TRACK_S = 60;
+const SILENT_S = 8, TRACK_S = 60, LABEL_CHARS = 40;
 
 export function inkOf(element) {
   const style = getComputedStyle(element);
@@ -81,9 +81,12 @@ export function drawMachine(context, view, machine, now_s, shows, ink, labels) {
   context.fillStyle = grey ? ink.faint : ink.text;
   context.fill();
   context.restore();
-  const state = machine.trusted === false ? " · not used" : silent ? ` · silent ${span(now_s - machine.seen_s)}` : (machine.faults ?? []).map((fault) => ` · ${fault.split(":")[0]}`).join("");
+  const state = machine.trusted === false ? " · not used" : silent ? ` · silent ${span(now_s - machine.seen_s)}` : hindered(machine.faults?.[0]);
   drawLabel(context, machine.machine + state, x, y, ink, grey, labels, view.margins[0] - 16);
 }
+
+// What hinders a machine most, as far as a label has room for it.
+const hindered = (fault) => (fault ? ` · ${fault.length > LABEL_CHARS ? `${fault.slice(0, LABEL_CHARS - 1)}…` : fault}` : "");
 
 function drawTrack(context, view, machine, now_s, colour, ink) {
   const points = machine.track.filter((point) => now_s - point.seen_s < TRACK_S);

@@ -25,6 +25,7 @@ const HOLD_PX = 14; // beside the line between two times, where it can be taken
 const SAID_MS = 6000; // how long what just failed is shown
 const AGAIN_MS = 2000; // before a panel that could not be read is asked for again
 const NEAR_M = 5, ROOM_M = 15; // around a machine: what is in sight, and what is made so where it leaves that
+const ARROW_PX = 14; // around a machine's arrow: a click there is for the machine, not for the ground
 const REST_MS = 120; // a pointer that stays so long asks for the value
 
 const asked = new URLSearchParams(location.search);
@@ -292,7 +293,7 @@ function closePanel() {
 
 const togglePanel = (name) => (page.panel === name ? closePanel() : openPanel(name));
 function showTools() {
-  for (const name of ["work", "route"]) byId(`open-${name}`).setAttribute("aria-pressed", page.panel === name);
+  for (const name of ["agents", "work", "route"]) byId(`open-${name}`).setAttribute("aria-pressed", page.panel === name);
 }
 
 const cellAt = (left, top) => view.toSite(left, top).map((v) => Math.floor(v / page.map.cell_m));
@@ -302,7 +303,19 @@ const mapAt = (left) => (besides() && left < divider() ? page.time.otherMap : pa
 
 // A place that was chosen: the panel's, or a cell to explain.
 function choose(left, top) {
-  if (!page.panel || !PANELS[page.panel].pick?.(page, view.toSite(left, top), [left, top])) explain(left, top);
+  if (page.panel && PANELS[page.panel].pick?.(page, view.toSite(left, top), [left, top])) return;
+  const machine = machineAt(left, top);
+  if (!machine) return void explain(left, top);
+  page.agents.chosen = machine;
+  openPanel("agents");
+}
+
+// The machine that is drawn there.
+function machineAt(left, top) {
+  if (!page.shows.machines || page.time.at !== null) return null;
+  const away = ({ x_m, y_m }) => { const [x, y] = view.toScreen(x_m, y_m); return Math.hypot(x - left, y - top); };
+  const nearest = [...page.machines.values()].sort((a, b) => away(a) - away(b))[0];
+  return nearest && away(nearest) < ARROW_PX ? nearest.machine : null;
 }
 
 function explain(left, top) {
@@ -342,7 +355,7 @@ async function showValue(left, top) {
 }
 
 // --- keys
-const KEYS = [["1 to 5", "Layer"], ["M T G P U O", "Show and hide"], ["Arrows, + −", "Move, zoom"], ["0", "Fit the site"], ["W, R", "Where to send the grader, what a drive costs"], ["Enter", "Explain the cell at the cross"], ["Space, [ ]", "Play, step in time"], ["L", "Back to now"], ["C", "Compare two times"], ["D", "Light or dark"], ["Esc", "Close"]];
+const KEYS = [["1 to 5", "Layer"], ["M T G P U O", "Show and hide"], ["Arrows, + −", "Move, zoom"], ["0", "Fit the site"], ["W, R, A", "Where to send the grader, what a drive costs, how machines do"], ["Enter", "Explain the cell at the cross"], ["Space, [ ]", "Play, step in time"], ["L", "Back to now"], ["C", "Compare two times"], ["D", "Light or dark"], ["Esc", "Close"]];
 function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || /^(select|textarea)$/i.test(event.target.tagName)) return;
   const inField = event.target.type === "number"; // its keys are its own, but for the one that closes
@@ -365,6 +378,7 @@ function onKey(event) {
   else if (key === "C") page.time.nextMode();
   else if (key === "W") togglePanel("work");
   else if (key === "R") togglePanel("route");
+  else if (key === "A") togglePanel("agents");
   else if (key === "D") setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
   else if (key === "?") help();
   else if (key === "Escape" && page.panel) closePanel();
@@ -468,7 +482,6 @@ const on = {
     keepInSight();
     page.received = performance.now();
     buildLegend();
-    panelAges();
     page.redraw();
   },
   poses(poses) {
@@ -509,7 +522,7 @@ async function start() {
   addEventListener("afterprint", () => printed(false));
   addEventListener("keydown", onKey);
   addEventListener("resize", () => { if (!view.moved) fit(); page.time.drawStrip(); page.redraw(); });
-  for (const name of ["work", "route"]) byId(`open-${name}`).onclick = () => togglePanel(name);
+  for (const name of ["agents", "work", "route"]) byId(`open-${name}`).onclick = () => togglePanel(name);
   byId("fit").onclick = fit;
   byId("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
   byId("keys").onclick = help;
@@ -518,7 +531,7 @@ async function start() {
   byId("plan-file").onchange = async (event) => { try { page.picture = await readPlan([...event.target.files]); setShow("plan", true); } catch (error) { say("This picture cannot be shown", error.message); } event.target.value = ""; };
   byId("drawer").onclick = () => { const open = byId("rail").classList.toggle("full"); byId("drawer").setAttribute("aria-expanded", open); };
   requestAnimationFrame(frames);
-  setInterval(() => { showStatus(); page.redraw(); panelFailed(); }, 1000);
+  setInterval(() => { showStatus(); page.redraw(); panelAges(); panelFailed(); }, 1000);
   await chooseSite();
 }
 

@@ -7,9 +7,10 @@
 //   press(page, key)               takes a key; false: it is the page's
 //   link(page), restore(page, parameters)   what a link holds of it; whether a link has it open
 //   wholeSite                      while it is open, the site is fitted beside it, unless somebody moved the view
-//   everySeconds                   how often it is made anew while the map changes
+//   everySeconds                   how often it is made anew
+import * as agents from "./agents.js";
 import * as route from "./route.js";
 import * as why from "./why.js";
 import * as work from "./work.js";
 
-export const PANELS = { why, work, route };
+export const PANELS = { why, work, route, agents };

@@ -58,10 +58,17 @@ BEYOND_BASE |= {"scipy", "agents", "mapserver", "sim", "lab"}
     [
         ("sitegrid.door; sitegrid.door.build_parser()", {"sitegrid", "zenoh"}, BEYOND_BASE),
         ("sitegrid.client, sitegrid.security.join, sitegrid.commands.router", {"sitegrid"}, {"cryptography"}),
+        (
+            "sitegrid.commands.agent, agents.agent, agents.config, agents.drivers.sources, agents.drivers.replay",
+            {"agents", "scipy"},
+            BEYOND_BASE - {"agents", "scipy"},
+        ),
         ("sitegrid.logs.check, sitegrid.logs.run", {"agents", "scipy"}, BEYOND_BASE - {"agents", "scipy", "pyproj"}),
     ],
 )
-def test_whoever_asks_for_help_joins_with_keys_or_reads_a_log_needs_no_more_than_that(imports, needed, not_needed):
+def test_whoever_asks_for_help_joins_with_keys_runs_an_agent_or_reads_a_log_needs_no_more_than_that(
+    imports, needed, not_needed
+):
     code = f"import sys, {imports}; print(*sorted(sys.modules))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     packages = {name.partition(".")[0] for name in output.split()}

@@ -184,10 +184,10 @@ def follower(name: str = "a", store: str = "", behind_s: float = 0.2) -> Followe
         (spool(0, quarantined=2), WARN, "table `quarantine`"),
         (disk.check_spool(SpoolState(0, 0, 0, 0, gone=9), NOW_NS), WARN, "9 are gone; its disk has lost recorded"),
         (disk.check_spool(SpoolState(0, 0, 0, 0, damage="a.db-wal is damaged"), NOW_NS), WARN, "a.db-wal is damaged"),
-        (disk.check_health("loader-1", {**HEALTHY, "no_sample": "no GPS fixes"}), WARN, "; no GPS fixes"),
-        (disk.check_health("loader-1", {**HEALTHY, "corrections": {"problem": "b: old"}}), WARN, "b: old"),
+        (disk.check_health("loader-1", {**HEALTHY, "problems": ["a", "b: old"]}), WARN, "; a; b: old"),
+        (disk.check_health("loader-1", {**HEALTHY, "status": "calibrating"}), PASS, "0 quarantined; calibrating"),
         (disk.check_health("loader-1", HEALTHY), PASS, "loader-1 runs: 3 samples wait, 2 of them for the smoother; "),
-        (disk.check_health("loader-1", {**HEALTHY, "uplink": {"problem": "no answer"}}), WARN, "; no answer"),
+        (disk.check_health("loader-1", {"status": 7, "problems": "?"}), PASS, "? samples wait"),
         (disk.check_health("loader-1", {**HEALTHY, "spool": {"depth": 3, "dropped": 1}}), WARN, "1 were dropped"),
         # what others say may be anything
         (disk.check_health("loader-1", {}), PASS, "? samples wait"),
@@ -438,7 +438,7 @@ def test_clock_and_version_of_the_server_are_compared(site: Site, capsys, monkey
 
 
 def test_a_running_agent_is_heard(site: Site, capsys):
-    health = encode_health(Health("loader-1", NOW_NS, {"spool": {"depth": 9}, "uplink": {"problem": "no answer"}}))
+    health = encode_health(Health("loader-1", NOW_NS, {"spool": {"depth": 9}, "problems": ["no answer"]}))
     done = threading.Event()
 
     def tell() -> None:

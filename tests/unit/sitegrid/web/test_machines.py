@@ -42,3 +42,16 @@ def test_a_machine_that_is_silent_is_left_out_and_faults_are_those_of_known_ones
     now_s = SILENT_S + 1
     assert [p["machine"] for p in known.poses()] == ["loader-2"]
     assert set(known.tracks()) == {"loader-1", "loader-2"}
+
+
+def test_a_machine_without_a_place_says_what_it_lacks():
+    known = Machines(lambda: 0.0)
+    values = {"status": "no fix yet: 4 satellites", "problems": ["no fix yet: 4 satellites"], "heard": ["imu"]}
+    known.on_health(Health("loader-2", 1, values | {"corrections": {"base": "b", "age_s": 1.5}}))
+    known.on_pose(pose("loader-1", 0))
+    known.on_findings({"loader-2": "rolls harder"})
+    (report,) = known.reports()
+    assert (report["machine"], report["status"], report["base"]) == ("loader-2", "no fix yet: 4 satellites", "b")
+    assert report["problems"] == ["no fix yet: 4 satellites", "rolls harder"]
+    assert [p["machine"] for p in known.poses()] == ["loader-1"]
+    assert set(known.tracks()) == {"loader-1"}
