@@ -1,7 +1,8 @@
 """Bytes into frames: finds its way again after broken bytes, and loses no whole frame among broken ones.
 
-A frame that seems to begin is a candidate until its end has come: what begins inside of it is a candidate too. So a
-spoiled length hides nothing, and a whole frame is out as soon as its last byte is in.
+A frame that seems to begin is a candidate until its end has come: what begins inside of it is a candidate too, and is
+judged by its own checksum alone. So neither a spoiled length nor a checksum that fits by chance hides a whole frame,
+which is out as soon as its last byte is in.
 """
 
 import json
@@ -52,17 +53,16 @@ class Framer:
         self._between = between
         self._buffer = bytearray()
         self._open: list[int] = []  # candidates whose end has not come
+        self._read: list[tuple[int, int]] = []  # whole frames whose bytes an open candidate still needs
         self._searched = 0  # up to where candidates are known
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that these bytes make whole."""
-        buffer, done = self._buffer, 0
+        """The frames that these bytes make whole, by their ends."""
+        buffer, frames = self._buffer, list[Frame]()
         buffer += data
         candidates = [*self._open, *(match.start() for match in self._sync.finditer(buffer, self._searched))]
-        frames, self._open = list[Frame](), []
+        self._open = []
         for start in candidates:
-            if start < done:
-                continue
             name, framing = self._by_first[buffer[start]]
             end = framing.end(buffer, start)
             if end is None or end - start > framing.most:
@@ -71,19 +71,25 @@ class Framer:
                 self._open.append(start)
             elif framing.is_whole(frame := bytes(buffer[start:end])):
                 frames.append(Frame(name, frame, len(buffer) - end))
-                self._count_broken(done, start)
-                self._open, done = [], end
-        self._forget(done)
+                self._read.append((start, end))
+        self._forget()
+        frames.sort(key=lambda frame: -frame.after)
         return frames
 
-    def _forget(self, done: int) -> None:
-        """Drop the bytes that no candidate needs, nor a sync that is cut."""
-        cut = self._cut_sync.search(self._buffer, max(done, len(self._buffer) - self._longest))
-        searched = cut.start() if cut else len(self._buffer)
+    def _forget(self) -> None:
+        """Drop the bytes that no candidate needs, nor a sync that is cut; count those that were in no frame."""
+        buffer = self._buffer
+        cut = self._cut_sync.search(buffer, max(0, len(buffer) - self._longest))
+        searched = cut.start() if cut else len(buffer)
         first = min([searched, *self._open])
-        self._count_broken(done, first)
-        del self._buffer[:first]
+        counted = 0
+        for start, end in sorted(self._read):
+            self._count_broken(counted, min(start, first))
+            counted = max(counted, min(end, first))
+        self._count_broken(counted, first)
+        del buffer[:first]
         self._open = [start - first for start in self._open]
+        self._read = [(max(start - first, 0), end - first) for start, end in self._read if end > first]
         self._searched = searched - first
 
     def _count_broken(self, begin: int, end: int) -> None:
