@@ -14,6 +14,8 @@ from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.machine.machine_config import machine_toml
 from protocol.site.site_config import NAME, site_toml
+from sim.receivers.ports import driver_toml
+from sim.receivers.receiver import WRITERS, wire
 from sim.scenario.file import check, load_scenario
 from sim.scenario.tables import MAX_MACHINES, FleetConfig, Scenario
 
@@ -26,7 +28,8 @@ class SimConfig:
 
     scenario: a name of `sim/scenario/`, or the path of a TOML file. machines: of the scenario's first fleet. names: of
     all machines. seconds: simulated time, 0 runs until stopped. preset, drive_mps, gps, imu, attitude, payload: of
-    every fleet. speed: times real time, 0 as fast as possible.
+    every fleet. speed: times real time, 0 as fast as possible. receivers: what they speak on ports, `ubx` or `nmea`;
+    empty: their readings are in bundles, like all others.
     """
 
     scenario: str = "paper_site"
@@ -43,10 +46,15 @@ class SimConfig:
     attitude: tuple[int, ...] | None = None
     payload: bool | None = None
     speed: float = 1.0
+    receivers: str = ""
 
     def __post_init__(self) -> None:
         require_between(self, 0, 1000, "speed")
         require_between(self, 1, MAX_MACHINES, "machines")
+        if self.receivers not in ("", *WRITERS):
+            raise ValueError(f"receivers: {self.receivers!r} is none of {', '.join(WRITERS)}")
+        if self.receivers and self.speed != 1:
+            raise ValueError(f"speed: receivers state the time, so with them it is 1, not {self.speed:g}")
         for name in (self.site, *(self.names or ())):
             if name is not None and not NAME.fullmatch(name):
                 raise ValueError(f"site, names: {name!r} is not a name (lower-case letters, digits, - and _)")
@@ -62,7 +70,8 @@ def resolve(config: SimConfig) -> Scenario:
     scenario = load_scenario(config.scenario)
     where = f"scenario {config.scenario}"
     names = ("preset", "drive_mps", "gps", "imu", "attitude", "payload")
-    fleets = tuple(_replace(fleet, where, **_given(config, *names)) for fleet in scenario.fleet)
+    given = _given(config, *names) | ({"doppler": True} if config.receivers else {})
+    fleets = tuple(_replace(fleet, where, **given) for fleet in scenario.fleet)
     if config.machines is not None:
         fleets = (_replace(fleets[0], where, count=config.machines), *fleets[1:])
     count = sum(fleet.size for fleet in fleets)
@@ -75,15 +84,22 @@ def resolve(config: SimConfig) -> Scenario:
     return scenario
 
 
-def write_configs(config: SimConfig, folder: Path) -> list[Path]:
-    """Write `site.toml` and `<machine>.toml` for the agents, nothing of the truth; returns those of the machines."""
+def write_configs(config: SimConfig, folder: Path, ports: Path | None = None) -> list[Path]:
+    """Write `site.toml` and `<machine>.toml` for the agents, nothing of the truth; returns those of the machines.
+
+    ports: the folder of the receivers' ports, where they speak on any; agents read them there.
+    """
     scenario = resolve(config)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "site.toml").write_text(site_toml(scenario.site), encoding="utf-8")
-    machines = {folder / f"{rig.machine.name}.toml": rig.machine for rig in scenario.rigs()}
-    for path, machine in machines.items():
-        path.write_text(machine_toml(machine), encoding="utf-8")
-    return list(machines)
+    paths = []
+    for rig in scenario.rigs():
+        path, wirings = folder / f"{rig.machine.name}.toml", wire(rig, config.receivers) if ports else []
+        added = tuple(sensor for wiring in wirings for sensor in wiring.added)
+        text = machine_toml(replace(rig.machine, sensors=(*rig.machine.sensors, *added)))
+        path.write_text(text + (driver_toml(ports, wirings, rig.machine) if ports else ""), encoding="utf-8")
+        paths.append(path)
+    return paths
 
 
 def _given(config: SimConfig, *names: str) -> dict[str, Any]:

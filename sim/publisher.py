@@ -20,6 +20,8 @@ from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle
 from protocol.wire.session import SessionConfig, open_session
 from sim.config import SimConfig
+from sim.receivers.ports import Ports
+from sim.receivers.receiver import wire
 from sim.recorder import write_truth
 from sim.simulator import Simulator
 
@@ -93,21 +95,26 @@ def run(
     clock: Callable[[], float] = time.monotonic,
     on_progress: Callable[[float], None] | None = None,
     truth_dir: Path | None = None,
+    ports_dir: Path | None = None,
     wait_s: float = WAIT_S,
 ) -> SimReport:
     """Simulate and publish until `config.seconds` are over or `stop` is set.
 
-    Waits first until every machine has a subscriber, at most wait_s, else a LinkError. on_progress gets the
-    simulated time about five times a second. The truth is written at the end, whatever ends the run.
+    Waits first until every machine has a subscriber, at most wait_s, else a LinkError; not with ports_dir, the folder
+    of the receivers' ports: they speak whether anybody listens or not. on_progress gets the simulated time about five
+    times a second. The truth is written at the end, whatever ends the run.
     """
-    with contextlib.closing(Simulator(config)) as simulator, _streams(simulator, session_config) as streams:
+    with contextlib.ExitStack() as opened:
+        simulator = opened.enter_context(contextlib.closing(Simulator(config)))
+        streams = opened.enter_context(_streams(simulator, session_config))
+        ports = opened.enter_context(contextlib.closing(_ports(simulator, ports_dir))) if ports_dir else None
         progress = throttled(on_progress, clock) if on_progress else None
-        if missing := _await_subscribers(streams, wait_s, stop, clock):
+        if not ports and (missing := _await_subscribers(streams, wait_s, stop, clock)):
             problem = f"nobody listens to machine {missing[0]} of site {simulator.site.name}"
             advice = f"start its agent with `sitegrid agent`, within {wait_s:g} s"
             raise LinkError(session_config.endpoint, f"{problem}: {advice}")
         try:
-            report = _drive(simulator, streams, stop, clock, progress)
+            report = _drive(simulator, streams, ports, stop, clock, progress)
         finally:
             if truth_dir:
                 write_truth(truth_dir, simulator)
@@ -117,6 +124,7 @@ def run(
 def _drive(
     simulator: Simulator,
     streams: list[Stream],
+    ports: Ports | None,
     stop: threading.Event,
     clock: Callable[[], float],
     progress: Callable[[float], None] | None,
@@ -130,7 +138,8 @@ def _drive(
         step = simulator.advance()
         pace.wait(simulator.simulated_s)  # a bundle is due when its span is over
         for stream in streams:
-            stream.put(tuple(step[stream.machine]))
+            sensed = step[stream.machine]
+            stream.put(ports.send(stream.machine, sensed) if ports else tuple(sensed))
         bundles += 1
         readings += sum(map(len, step.values()))
         if progress:
@@ -138,6 +147,11 @@ def _drive(
     wall_s = clock() - start
     stopped = planned is None or bundles < planned
     return SimReport(len(simulator.machines), simulator.simulated_s, wall_s, bundles, readings, pace.late_s, stopped)
+
+
+def _ports(simulator: Simulator, folder: Path) -> Ports:
+    format_ = simulator.config.receivers
+    return Ports(folder, {rig.machine.name: wire(rig, format_) for rig in simulator.scenario.rigs()})
 
 
 @contextlib.contextmanager

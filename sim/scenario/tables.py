@@ -66,7 +66,8 @@ class FleetConfig:
 
     routes: taken in turn; other_way: every second round of turns is driven in the opposite direction. start: share of
     the cycle at which the first begins. gps, imu, attitude: numbers of the sensors, as the machine's URDF has them.
-    payload: whether they weigh what they carry; None: if it changes on a route of theirs.
+    payload: whether they weigh what they carry; None: if it changes on a route of theirs. doppler: whether their
+    receivers state velocities.
     """
 
     name: str
@@ -81,6 +82,7 @@ class FleetConfig:
     imu: tuple[int, ...] = (3,)
     attitude: tuple[int, ...] = ()
     payload: bool | None = None
+    doppler: bool = False
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -177,7 +179,8 @@ class Scenario:
         for fleet, name in zip(fleets, self.machine_names, strict=True):
             model, preset = load_model(fleet.model), self.preset(fleet.preset)
             payload = self._loads(fleet) if fleet.payload is None else fleet.payload
-            config = machine_config(name, model, preset, fleet.gps, fleet.imu, fleet.attitude, payload=payload)
+            sensors = fleet.gps, fleet.imu, fleet.attitude
+            config = machine_config(name, model, preset, *sensors, payload=payload, doppler=fleet.doppler)
             if model.skid_grip and self.world != "fast":
                 raise ValueError(f'fleet: {fleet.name}: machines that skid-steer need world = "fast"')
             rigs.append(Rig(config, model, preset, faults.get(name, Faults())))

@@ -1,4 +1,4 @@
-"""GPS receivers: slow and white errors, outages, antennas on their lever arms."""
+"""GPS receivers: slow and white errors of fixes, Doppler velocities, outages, antennas on their lever arms."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.site_config import Projection
-from sim.sensors.frames import map_from_base
+from sim.sensors.frames import cross, map_from_base
 from sim.sensors.noise import Draws, GaussMarkov, generator, site_generator
 from sim.sensors.presets import BASE_RATE_HZ, GpsNoise
 from sim.sensors.sensor_group import SensorGroup, SensorUnit
@@ -18,33 +18,63 @@ AXES = np.array([1.0, 1.0, 5 / 3])  # heights are this much worse
 LEAST_M2 = 1e-4  # no receiver states a smaller variance
 
 
-class GpsGroup(SensorGroup):
-    """Receivers. They state their total variances; errors run on while they are silent."""
+class AntennaGroup(SensorGroup):
+    """What receivers make of antennas; nothing for outage_s of every outage_period_s."""
+
+    def __init__(self, units: Sequence[SensorUnit], seed: int) -> None:
+        super().__init__(units)
+        noises = [unit.rig.preset.gps for unit in units]
+        self._lever_m = self.per_unit(lambda unit: unit.sensor.mount.xyz_m)[:, None]
+        self._outage_s, self._period_s = np.array([(noise.outage_s, noise.outage_period_s) for noise in noises]).T
+        self._phase_s = self._period_s * self.per_unit(lambda unit: _phase(unit, seed))
+
+    def valid(self, steps: Ints) -> Bools:
+        """False while a receiver is lost."""
+        time_s = steps[:, None] * STEP_S + self._phase_s
+        valid: Bools = time_s % self._period_s >= self._outage_s - 1e-9
+        return valid
+
+    def attitude(self, rows: Ints, states: FleetState) -> list[Floats]:
+        """Yaw, pitch and roll."""
+        return [self.pick(angle, rows) for angle in (states.yaw_rad, states.pitch_rad, states.roll_rad)]
+
+
+class VelocityGroup(AntennaGroup):
+    """Velocities of antennas by Doppler shift: white errors. Machines go where they head: there is no side slip."""
+
+    def __init__(self, units: Sequence[SensorUnit], seed: int) -> None:
+        super().__init__(units, seed)
+        self._std_mps = np.array([unit.rig.preset.gps.velocity_std_mps for unit in units])
+        self._draws = Draws([unit.rng for unit in units], 2)
+
+    def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
+        """East and north, and their variances."""
+        speed = self.pick(states.speed_mps, rows)
+        ahead = np.stack([speed, np.zeros_like(speed), np.zeros_like(speed)])
+        of_antenna = ahead + cross(self.pick(states.rates_radps, rows), self._lever_m)
+        velocity = map_from_base(of_antenna, *self.attitude(rows, states))[:2]
+        velocity += self._std_mps * self._draws.next_rows(len(steps))
+        return np.concatenate([velocity, np.broadcast_to(self._std_mps**2, velocity.shape)])
+
+
+class GpsGroup(AntennaGroup):
+    """Fixes of receivers. They state their total variances; errors run on while they are silent."""
 
     def __init__(self, units: Sequence[SensorUnit], seed: int, projection: Projection) -> None:
-        super().__init__(units)
+        super().__init__(units, seed)
         self._projection = projection
         noises = [unit.rig.preset.gps for unit in units]
         self._errors = ReceiverErrors(noises, [unit.machine for unit in units], [unit.rng for unit in units], seed)
-        self._lever_m = self.per_unit(lambda unit: unit.sensor.mount.xyz_m)[:, None]
         self._off_m = self.per_unit(lambda unit: unit.rig.faults.antenna_off_m)[:, None]
-        self._outage_s, self._period_s = np.array([(noise.outage_s, noise.outage_period_s) for noise in noises]).T
-        self._phase_s = self._period_s * self.per_unit(lambda unit: _phase(unit, seed))
 
     def read(self, steps: Ints, rows: Ints, states: FleetState) -> Floats:
         """Latitude, longitude, height and the stated variances."""
         lever = self._lever_m + self._off_m * self.faulty(steps)
-        attitude = [self.pick(angle, rows) for angle in (states.yaw_rad, states.pitch_rad, states.roll_rad)]
         base = np.stack([self.pick(place, rows) for place in (states.x_m, states.y_m, states.z_m)])
         slow, white = self._errors.run(steps)
-        fixes = self._projection.to_geodetic_many(*(base + map_from_base(lever, *attitude) + (slow + white)))
+        antenna = base + map_from_base(lever, *self.attitude(rows, states))
+        fixes = self._projection.to_geodetic_many(*(antenna + (slow + white)))
         return np.concatenate([fixes, np.broadcast_to(self._errors.stated_m2[:, None], base.shape)])
-
-    def valid(self, steps: Ints) -> Bools:
-        """False for outage_s of every outage_period_s."""
-        time_s = steps[:, None] * STEP_S + self._phase_s
-        valid: Bools = time_s % self._period_s >= self._outage_s - 1e-9
-        return valid
 
 
 class ReceiverErrors:
@@ -111,6 +141,6 @@ class CommonDrift:
 
 def _phase(unit: SensorUnit, seed: int) -> float:
     """Where in its outage period a receiver starts, 0..1: in turn on one machine, machines independently."""
-    receivers = [sensor for sensor in unit.rig.machine.sensors if sensor.kind == "gps"]
+    receivers = [sensor for sensor in unit.rig.machine.sensors if sensor.kind == unit.sensor.kind]
     turn = receivers.index(unit.sensor) / len(receivers)
     return float(generator(seed, unit.machine, "outage").uniform()) + turn

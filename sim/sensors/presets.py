@@ -19,6 +19,7 @@ from protocol.site.site_config import NAME
 LIBRARY = Path(__file__).parent / "presets.toml"
 BASE_RATE_HZ = 100  # of the world; sensors read at every so many of its steps
 
+SAME_NOISE = {"brake_force": "brake", "gps_velocity": "gps"}  # kinds whose errors stand in the table of another
 BRAKE_READINGS = {"nothing": "", "switch": "brake", "share": "brake", "force": "brake_force"}  # and their kinds
 
 # What values may be, lowest and highest.
@@ -58,7 +59,7 @@ class GpsNoise(SensorErrors):
 
     scale: multiplies drift and white noise alike. machine_share: share of the drift's variance that the receivers of
     one machine have in common; site_share: the part of it that all receivers of the site have in common. The receiver
-    is silent for outage_s of every outage_period_s.
+    is silent for outage_s of every outage_period_s. velocity_std_mps: of its Doppler velocity, white, per axis.
     """
 
     drift_std_m: NotNegative
@@ -69,6 +70,7 @@ class GpsNoise(SensorErrors):
     site_share: Share
     outage_s: NotNegative
     outage_period_s: Positive
+    velocity_std_mps: Positive
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -198,7 +200,7 @@ class Preset:
 
     def rate_hz(self, kind: str) -> int:
         """How often sensors of a kind read."""
-        return int(getattr(self, "brake" if kind == "brake_force" else kind).rate_hz)
+        return int(getattr(self, SAME_NOISE.get(kind, kind)).rate_hz)
 
 
 @cache

@@ -59,11 +59,13 @@ def machine_config(
     attitude: tuple[int, ...],
     *,
     payload: bool = False,
+    doppler: bool = False,
 ) -> MachineConfig:
     """Describe a machine of a kind as its agent knows it; sensors by the numbers that the model's URDF gives them.
 
-    attitude: IMUs that also say their orientation. payload: whether it weighs what it carries. Fast sensors stand
-    first: readings of one stamp then have the same order live, in bundles and in log folders.
+    attitude: IMUs that also say their orientation. payload: whether it weighs what it carries. doppler: whether its
+    receivers state velocities. Fast sensors stand first: readings of one stamp then have the same order live, in
+    bundles and in log folders.
     """
     ticks = preset.encoder.ticks_per_rev
     sensors = [_inertial("imu", number, model) for number in imu]
@@ -71,6 +73,8 @@ def machine_config(
     sensors += [SensorConfig("torque", "torque"), SensorConfig("wheels", "encoder", ticks_per_rev=ticks)]
     sensors += [] if model.skid_grip else [SensorConfig("articulation", "articulation")]
     sensors += [_receiver(number, model, preset.gps) for number in gps]
+    mounts = model.gps_mounts()
+    sensors += [SensorConfig(f"doppler-{number}", "gps_velocity", mounts[number - 1]) for number in gps if doppler]
     sensors += [SensorConfig("payload", "payload")] if payload else []
     sensors += [SensorConfig("brake", kind)] if (kind := BRAKE_READINGS[preset.brake.reads]) else []
     payload_x_m, _, payload_z_m = np.round(model.payload_centre_m, 2).tolist()  # no finer than a data sheet

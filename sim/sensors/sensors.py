@@ -17,7 +17,7 @@ from protocol.machine.readings import BrakeForce, Reading
 from protocol.rotations import quaternion_from_rpy
 from protocol.site.site_config import Projection
 from sim.sensors.frames import compose, cross, rotation, seen_turned, turned
-from sim.sensors.gps import GpsGroup
+from sim.sensors.gps import GpsGroup, VelocityGroup
 from sim.sensors.noise import Draws, GaussMarkov, generator
 from sim.sensors.rigs import Rig
 from sim.sensors.sensor_group import GroupReadings, SensorGroup, SensorUnit
@@ -257,6 +257,8 @@ def _group(kind: str, units: Sequence[SensorUnit], seed: int, projection: Projec
     """Sensors of one kind; the seed is for what those of one machine or site have in common."""
     if kind == "gps":
         return GpsGroup(units, seed, projection)
+    if kind == "gps_velocity":
+        return VelocityGroup(units, seed)
     return ImuGroup(units, seed) if kind == "imu" else _GROUPS[kind](units)
 
 

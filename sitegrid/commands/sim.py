@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 HELP = "run the simulator: machines drive and publish sensor readings"
 EXTRA = "sim"
-OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site")
+OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site", "receivers")
 ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
 
@@ -41,6 +41,9 @@ def add_options(parser: ArgumentParser) -> None:
     ):
         add(f"--{name}", type=kind, help=f"{what} (overrides the config file)")
     add("--site", help="name of the site in keys (overrides the config file)")
+    ports = "folder for the ports on which the machines' receivers speak; what they do not carry is published"
+    add("--ports", type=FOLDER, help=ports)
+    add("--receivers", choices=("ubx", "nmea"), help="what they speak there (default ubx)")
     add("--truth", type=FOLDER, help="folder for the true map and the true tracks")
     add("--record", type=FOLDER, help="folder for log folders, one per machine; nothing is published then")
     add("--all-sensors", action="store_true", help="use every GPS receiver and IMU of the machines")
@@ -59,7 +62,7 @@ def run(arguments: Namespace) -> int:
     if arguments.write_configs:
         from sim.config import write_configs
 
-        agents = write_configs(config, arguments.write_configs)
+        agents = write_configs(config, arguments.write_configs, arguments.ports)
         written = [str(arguments.write_configs / "site.toml"), *map(str, agents)]
         say({"configs": written}) if arguments.json else note("\n".join(written))
     if arguments.picture:
@@ -69,8 +72,10 @@ def run(arguments: Namespace) -> int:
     if arguments.write_configs or arguments.picture:
         return 0
     settings = join(arguments.endpoint, arguments.keys, role="sim", site=resolve(config).site.name)
+    if arguments.ports:
+        settings = dataclasses.replace(settings, wait_s=-1)  # receivers speak before anybody asks a router for the rest
     tell = (lambda s: say({"simulated_s": round(s, 1)})) if arguments.json else None
-    report = publish(config, settings, stop, on_progress=tell, truth_dir=arguments.truth)
+    report = publish(config, settings, stop, on_progress=tell, truth_dir=arguments.truth, ports_dir=arguments.ports)
     true = f"; the truth is in {arguments.truth}" if arguments.truth else ""
     line = f"simulated {report.simulated_s:g} s of {report.machines} machines: {report.readings} readings{true}"
     say({"ended": dataclasses.asdict(report)}) if arguments.json else note(line)
@@ -106,7 +111,12 @@ def _config(arguments: Namespace) -> SimConfig:
         over["names"] = None
     if arguments.all_sensors:
         over |= ALL_SENSORS
+    if arguments.ports and not config.receivers:
+        over.setdefault("receivers", "ubx")
     try:
-        return dataclasses.replace(config, **over)
+        config = dataclasses.replace(config, **over)
+        if config.receivers and not arguments.ports:
+            raise ValueError("receivers: they speak on ports, so say where: --ports FOLDER")
+        return config
     except ValueError as error:
         raise ConfigError("sitegrid sim", str(error)) from None

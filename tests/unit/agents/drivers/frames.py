@@ -1,4 +1,4 @@
-"""Bytes as receivers send them, made by libraries that others wrote; and a source whose values are known."""
+"""Bytes as receivers send them, by the simulator's writers, which oracles check; and a source of known values."""
 
 from __future__ import annotations
 
@@ -12,14 +12,35 @@ import pytest
 from pyubx2 import GET, UBXMessage
 
 from agents.drivers import Observed
+from sim.receivers.ubx import NavPvt, esf_meas
 from tests.paths import SHARED_DATA
 
 TEN = 1_795_688_127  # 2026-11-26 10:15:27 UTC [s]
-DATE = {"year": 2026, "month": 11, "day": 26, "hour": 10, "min": 15, "second": 27}
-VALID = {"validDate": 1, "validTime": 1, "fullyResolved": 1, "gnssFixOk": 1, "fixType": 3}
-ACCURACY = {"hAcc": 14, "vAcc": 19, "sAcc": 35, "numSV": 24, "carrSoln": 2, "diffSoln": 1}
-MOTION = {"velN": 120, "velE": 2150, "velD": -3, "gSpeed": 2153, "headMot": 86.8}
-PLACE = {"lon": 8.4005678, "lat": 49.0101234, "height": 157_300, "hMSL": 110_200}
+PVT = NavPvt(
+    itow_ms=382_545_000,
+    year=2026,
+    month=11,
+    day=26,
+    hour=10,
+    minute=15,
+    second=27,
+    valid=7,
+    fix_type=3,
+    flags=1 | 1 << 1 | 2 << 6,
+    satellites=24,
+    lon_1e7=84_005_678,
+    lat_1e7=490_101_234,
+    height_mm=157_300,
+    sea_height_mm=110_200,
+    north_mmps=120,
+    east_mmps=2150,
+    down_mmps=-3,
+    speed_mmps=2153,
+    course_1e5=8_680_000,
+    horizontal_acc_mm=14,
+    vertical_acc_mm=19,
+    speed_acc_mmps=35,
+)
 RMC = "GNRMC,101527.20,A,4900.6074040,N,00824.0340680,E,4.179,86.80,261126,,,R,V"
 GGA = "GNGGA,101527.20,4900.6074040,N,00824.0340680,E,4,17,0.60,110.2,M,47.1,M,1.0,0001"
 TPV = {
@@ -37,14 +58,6 @@ TPV = {
 }
 
 
-def nmea(text: str) -> bytes:
-    """A sentence with its checksum."""
-    checksum = 0
-    for byte in text.encode():
-        checksum ^= byte
-    return f"${text}*{checksum:02X}\r\n".encode()
-
-
 def report(values: dict[str, Any]) -> bytes:
     """As gpsd sends it."""
     return json.dumps(values, separators=(",", ":")).encode() + b"\r\n"
@@ -54,15 +67,14 @@ def ubx(name: str, **values: Any) -> bytes:
     return UBXMessage(name.partition("-")[0], name, GET, **values).serialize()
 
 
-def pvt(**values: Any) -> bytes:
-    return ubx("NAV-PVT", **{"iTOW": 382_545_000, **DATE, **VALID, **ACCURACY, **MOTION, **PLACE, **values})
+def pvt(**values: int) -> bytes:
+    """NAV-PVT with other values, by the names of NavPvt."""
+    return PVT._replace(**values).frame()
 
 
 def esf(tag: int, *data: tuple[int, int]) -> bytes:
-    """ESF-MEAS of these data types and their fields, with the time that repeats the tag."""
-    words = [(kind << 24) | (value & 0xFFFFFF) for kind, value in data]
-    payload = b"".join(word.to_bytes(4, "little") for word in (tag, (len(words) << 11) | 1 << 3, *words, tag))
-    return UBXMessage(0x10, 0x02, GET, payload=payload).serialize()
+    """ESF-MEAS of these data types and their fields."""
+    return esf_meas(tag, data)
 
 
 def spoiled(frames: list[bytes], seed: int = 1) -> tuple[bytes, int]:

@@ -17,7 +17,9 @@ from agents.drivers.formats.nmea import NmeaDecoder
 from agents.drivers.formats.ubx import UbxDecoder
 from agents.drivers.line import Line
 from protocol.machine.machine_config import SensorConfig
-from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, esf, nmea, pvt, recording, report, spoiled, ubx
+from sim.receivers.nmea import sentence as nmea
+from sim.receivers.ubx import frame as framed
+from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, esf, pvt, recording, report, spoiled, ubx
 
 GST = "GNGST,101527.20,0.8,0.021,0.014,12.0,0.020,0.015,0.03"
 SENSORS = {
@@ -61,21 +63,36 @@ def test_a_frame_is_out_with_its_last_byte_whatever_lengths_before_it_promise() 
     assert [out.data for out in framer.feed(frame[-1:])] == [frame]
 
 
+BY_CHANCE = b"\xb5b" + bytes.fromhex("050102008a23b562")  # a frame whose checksum is how the next one begins
+
+
+@pytest.mark.parametrize("piece", [1, 5, 1 << 20])
+def test_a_false_frame_whose_checksum_fits_by_chance_hides_no_whole_one(piece: int) -> None:
+    """The false one shares two bytes with the next; a third, with a length too long, has both inside."""
+    whole = ubx("NAV-EOE", iTOW=5)
+    around = framed(5, 1, BY_CHANCE[:-2] + whole)
+    framer, stream = Framer(FRAMINGS), BY_CHANCE[:-2] + whole + b"abc" + around
+    read = [f.data for at in range(0, len(stream), piece) for f in framer.feed(stream[at : at + piece])]
+    assert read == [BY_CHANCE, whole, BY_CHANCE, whole, around]
+    assert framer.broken == 3
+
+
 # --- against the oracles ---------------------------------------------------------------------------------------------
 
 
 def test_nav_pvt_has_what_the_oracle_reads() -> None:
     draw = random.Random(3)
     for _ in range(100):
-        place = {"lat": round(draw.uniform(-90, 90), 7), "lon": round(draw.uniform(-180, 180), 7)}
-        motion = {name: draw.randrange(-20_000, 20_000) for name in ("velN", "velE", "height")}
-        accuracy = {name: draw.randrange(1, 10**5) for name in ("hAcc", "vAcc", "sAcc")}
+        place = {"lat_1e7": draw.randrange(-9 * 10**8, 9 * 10**8), "lon_1e7": draw.randrange(-18 * 10**8, 18 * 10**8)}
+        motion = {name: draw.randrange(-20_000, 20_000) for name in ("north_mmps", "east_mmps", "height_mm")}
+        stated = ("horizontal_acc_mm", "vertical_acc_mm", "speed_acc_mmps")
+        accuracy = {name: draw.randrange(1, 10**5) for name in stated}
         frame = pvt(**place, **motion, **accuracy, nano=draw.randrange(-9, 9))
         oracle, (fix, moving) = pyubx2.UBXReader.parse(frame), messages(UbxDecoder(), frame)
         variances = [(std / 1e3) ** 2 for std in (oracle.hAcc, oracle.hAcc, oracle.vAcc)]
         assert fix.values == pytest.approx((oracle.lat, oracle.lon, oracle.height / 1e3, *variances), abs=1e-9)
-        stated = oracle.velE / 1e3, oracle.velN / 1e3, (oracle.sAcc / 1e3) ** 2, (oracle.sAcc / 1e3) ** 2
-        assert moving.values == pytest.approx(stated)
+        known = oracle.velE / 1e3, oracle.velN / 1e3, (oracle.sAcc / 1e3) ** 2, (oracle.sAcc / 1e3) ** 2
+        assert moving.values == pytest.approx(known)
         assert fix.utc_ns == moving.utc_ns == TEN * 10**9 + oracle.nano
         assert (fix.quality, fix.satellites) == ("fixed", 24)
 
@@ -162,13 +179,13 @@ def test_a_leap_second_is_the_next_minute_and_a_week_that_rolled_over_is_this_on
     decoder = NmeaDecoder()
     messages(decoder, nmea(RMC.replace("101527.20", "235960.00").replace("261126", "311226")))
     assert fix_at(decoder, "000000.00") == stamp(2027, 1, 1)
-    assert messages(UbxDecoder(), pvt(hour=23, min=59, second=60))[0].utc_ns == stamp(2026, 11, 27)
+    assert messages(UbxDecoder(), pvt(hour=23, minute=59, second=60))[0].utc_ns == stamp(2026, 11, 27)
     old = datetime.fromtimestamp(TEN - 2 * 1024 * WEEK_NS // 10**9, UTC)
     made = messages(UbxDecoder(), pvt(year=old.year, month=old.month, day=old.day))
     assert made[0].utc_ns == TEN * 10**9 >= EARLIEST_NS
     messages(decoder, nmea(RMC.replace("261126", f"{old:%d%m%y}")))
     assert fix_at(decoder, "101528.00") == (TEN + 1) * 10**9
-    assert messages(UbxDecoder(), pvt(fullyResolved=0))[0].utc_ns == 0, "leap seconds are not known yet"
+    assert messages(UbxDecoder(), pvt(valid=3))[0].utc_ns == 0, "leap seconds are not known yet"
 
 
 @pytest.mark.parametrize(("after_ms", "utc_ms"), [(5, 200), (60, 200), (95, 300)])
@@ -189,14 +206,14 @@ def test_zeros_are_no_accuracy() -> None:
     fix = last(messages(NmeaDecoder(), nmea(RMC), nmea("GNGST,101527.20,,,,,0.0,0.0,0.0"), nmea(GGA)), FIX)
     assert fix.values[3:] == pytest.approx((0.012**2, 0.012**2, 0.024**2)), "by HDOP"
     line = Line("ubx", {"fix": SENSORS["fix"]})
-    assert [value.sensor for value in line.feed(pvt(hAcc=0), 1)] == [""]
+    assert [value.sensor for value in line.feed(pvt(horizontal_acc_mm=0), 1)] == [""]
     assert line.counters["without_value"] == 1
 
 
 @pytest.mark.parametrize(
     "frame",
     [
-        *(pvt(fixType=0), pvt(gnssFixOk=0), pvt(fixType=1), report({"class": "TPV", "mode": 1})),
+        *(pvt(fix_type=0), pvt(flags=0), pvt(fix_type=1), report({"class": "TPV", "mode": 1})),
         *(nmea(GGA.replace(",E,4,", f",E,{quality},")) for quality in (0, 6, 8)),
         nmea("GNGGA,,,,,,0,00,99.99,,,,,,"),
     ],

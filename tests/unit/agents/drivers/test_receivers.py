@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 import pty
 import random
@@ -11,8 +10,7 @@ import threading
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import astuple, replace
-from datetime import UTC, datetime
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +26,12 @@ from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import joined
 from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder, Gps, Imu, Reading
+from protocol.machine.readings import Gps, Reading
+from sim.receivers.nmea import sentence as nmea
+from sim.receivers.receiver import Receiver as SimulatedReceiver
+from sim.receivers.receiver import Wiring
 from tests.patience import until
-from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, Script, esf, nmea, pvt, report, spoiled
+from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, Script, esf, pvt, report, spoiled
 from tests.unit.agents.drivers.test_formats import SENSORS
 from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, drive
 
@@ -399,36 +400,18 @@ SEEN = replace(VEHICLE, sensors=tuple(s for s in VEHICLE.sensors if s.kind != "t
 LATE_NS = {"gps": 60_000_000, "encoder": 8_000_000, "imu": 5_000_000}  # until a message is there
 
 
-def in_bytes(reading: Reading) -> bytes:
-    """As a u-blox receiver sends it, rounded as it rounds."""
-    tag = reading.stamp_ns // 10**6 % 2**32
-    match reading:
-        case Gps():
-            seconds = datetime.fromtimestamp(reading.stamp_ns // 10**9, UTC)
-            date = {"year": seconds.year, "month": seconds.month, "day": seconds.day}
-            time = {"hour": seconds.hour, "min": seconds.minute, "second": seconds.second}
-            place = {"lat": reading.lat_deg, "lon": reading.lon_deg, "height": round(reading.height_m * 1e3)}
-            accuracy = {"hAcc": round(reading.var_e_m2**0.5 * 1e3), "vAcc": round(reading.var_u_m2**0.5 * 1e3)}
-            return pvt(**date, **time, nano=reading.stamp_ns % 10**9, **place, **accuracy)
-        case Imu():
-            rates = [round(math.degrees(rate) * 4096) for rate in astuple(reading)[2:5]]
-            forces = [round(force * 1024) for force in astuple(reading)[5:]]
-            return esf(tag, *zip((14, 13, 5, 16, 17, 18), rates + forces, strict=True))
-        case Encoder():
-            return esf(tag, (8, int(reading.left_ticks)), (9, int(reading.right_ticks)))
-    raise AssertionError(reading)
-
-
 @pytest.mark.slow
 def test_a_drive_through_bytes_is_the_same_drive() -> None:
     """Whatever the links delay, and wherever the host's clock stands."""
     made, (imu, wheels, gps) = drive(LEGS, SEEN), SEEN.sensors
-    line = Line("ubx", {"fix": gps, "imu": imu, "wheels": wheels})
+    feeds = {"fix": gps, "imu": imu, "wheels": wheels}
+    line, spoken = Line("ubx", feeds), SimulatedReceiver(Wiring("gps-1", "ubx", 10**9, feeds))
+    frames = [spoken.speak([reading]) for reading in made.readings]
     draw = random.Random(7)
     arrived = sorted(
         (r.stamp_ns - START_NS + LATE_NS[r.kind] + draw.randrange(3_000_000), i) for i, r in enumerate(made.readings)
     )
-    pieces = [line.feed(in_bytes(made.readings[i]), 5 * 10**12 + came_ns) for came_ns, i in arrived]
+    pieces = [line.feed(frames[i], 5 * 10**12 + came_ns) for came_ns, i in arrived]
     readings, _ = played(line=pieces)
     assert len(readings) > 0.99 * len(made.readings)
     direct, through = (Pipeline(SITE, SEEN, PipelineConfig()) for _ in range(2))

@@ -1,0 +1,94 @@
+"""Ports of simulated receivers: pseudo terminals, under names in a folder, as serial ports are under /dev/serial."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import tty
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from protocol.errors import ConfigError
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Reading
+from sim.receivers.receiver import Receiver, Wiring, carried
+
+
+class Port:
+    """A pseudo terminal. Bytes that nobody listens to are lost, as on a wire."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises ConfigError where a file has the name."""
+        self._path = path
+        self._end, listener = os.openpty()
+        tty.setraw(listener)
+        os.set_blocking(self._end, False)
+        self._name = name = os.ttyname(listener)
+        os.close(listener)  # from now on the system tells whether somebody listens
+        try:
+            if path.is_symlink():
+                path.unlink()  # of a simulator that was killed
+            path.symlink_to(name)
+        except OSError as error:
+            os.close(self._end)
+            raise ConfigError(path, f"no port can be there ({error.strerror}): choose another folder") from None
+
+    def write(self, data: bytes) -> None:
+        """Send to whoever listens; what does not fit into the system's buffer is lost."""
+        ready = select.poll()
+        ready.register(self._end, select.POLLOUT)
+        if any(event & select.POLLOUT and not event & select.POLLHUP for _, event in ready.poll(0)):
+            with suppress(BlockingIOError):
+                os.write(self._end, data)
+
+    def close(self) -> None:
+        """Unplug it."""
+        if self._path.is_symlink() and str(self._path.readlink()) == self._name:
+            self._path.unlink()
+        os.close(self._end)
+
+
+class Ports:
+    """The ports of all machines of a simulation. folder: is made if need be."""
+
+    def __init__(self, folder: Path, machines: Mapping[str, Sequence[Wiring]]) -> None:
+        self._receivers: dict[str, list[tuple[Receiver, Port]]] = {}
+        self._carried = {name: carried(wirings) for name, wirings in machines.items()}
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            for name, wirings in machines.items():
+                opened = self._receivers.setdefault(name, [])
+                for wiring in wirings:
+                    opened.append((Receiver(wiring), Port(folder / wiring.name)))
+        except ConfigError:
+            self.close()
+            raise
+
+    def send(self, machine: str, readings: Sequence[Reading]) -> tuple[Reading, ...]:
+        """Send what the machine's receivers carry over their ports; returns all other readings."""
+        for receiver, port in self._receivers[machine]:
+            port.write(receiver.speak(readings))
+        return tuple(reading for reading in readings if reading.sensor not in self._carried[machine])
+
+    def close(self) -> None:
+        """Unplug all."""
+        for _, port in (each for opened in self._receivers.values() for each in opened):
+            port.close()
+
+
+def driver_toml(folder: Path, wirings: Sequence[Wiring], machine: MachineConfig) -> str:
+    """[[driver]] tables of an agent that reads these ports, and from bundles what no receiver carries."""
+    tables = [(w.format, str(folder / w.name), {key: s.name for key, s in w.feeds.items()}) for w in wirings]
+    rest = {s.name: s.name for s in machine.sensors if s.name not in carried(wirings)}
+    if rest:
+        tables.append(("zenoh", "sensors", rest))
+    return "".join(
+        f"\n[[driver]]\nkind = {json.dumps(kind)}\naddress = {json.dumps(address)}\nfeeds = {_inline(feeds)}\n"
+        for kind, address, feeds in tables
+    )
+
+
+def _inline(feeds: Mapping[str, str]) -> str:
+    return "{ " + ", ".join(f"{key} = {json.dumps(name)}" for key, name in feeds.items()) + " }"
