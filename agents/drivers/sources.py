@@ -108,8 +108,6 @@ class Sources:
         """Readings of a value, and of those that waited for the time that it states."""
         if not value.sensor:
             self._time_base.take(clock, value.utc_ns, value.host_ns)
-        elif value.utc_ns and not self._time_base.believes(value.utc_ns, value.host_ns):
-            return []
         if self._time_base.utc_ns(value.host_ns) is None:
             self._untied.append(value)
             if len(self._untied) > UNTIED:
@@ -121,6 +119,8 @@ class Sources:
         return [reading for v in values if v.sensor and (reading := self._reading(v))]
 
     def _reading(self, value: Observed) -> Reading | None:
+        if value.utc_ns and not self._time_base.believes(value.utc_ns, value.host_ns):
+            return None
         stamp_ns = value.utc_ns or self._time_base.utc_ns(value.host_ns) or 0
         try:
             return parse_reading(value.kind, value.sensor, stamp_ns, value.values)

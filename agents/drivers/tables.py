@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 
-from agents.drivers import Source
+from agents.drivers import Driver, Source
 from agents.drivers.formats import STREAMS
 from agents.drivers.formats.framing import GPSD
 from agents.drivers.line import DECODERS, Line, split_stream
@@ -12,6 +12,7 @@ from agents.drivers.receiver import Receiver
 from agents.drivers.sources import Sources
 from agents.drivers.time_base import TimeBase
 from agents.drivers.transports import split_address
+from agents.drivers.zenoh import ZENOH, BundleSource
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import QUANTITIES, MachineConfig, SensorConfig
 
@@ -22,14 +23,14 @@ PLUG_INS = "sitegrid.drivers"  # group of entry points
 class DriverConfig:
     """One [[driver]]: a port that is listened to.
 
-    kind: `nmea`, `ubx`, `gpsd`, or the name of a plug-in. address: a serial port (`/dev/ttyACM0`), `tcp://HOST:PORT`,
-    `udp://[HOST]:PORT`, or a file of recorded bytes. baud: of a serial port; 0 finds it. feeds: the sensor that takes
-    each stream, one of STREAMS; `gp:fix` is that of one NMEA talker, or gpsd device, among several. options: of a
-    plug-in.
+    kind: `nmea`, `ubx`, `gpsd`, `zenoh`, or the name of a plug-in. address: a serial port (`/dev/ttyACM0`),
+    `tcp://HOST:PORT`, `udp://[HOST]:PORT`, or a file of recorded bytes; of `zenoh` none. baud: of a serial port; 0
+    finds it. feeds: the sensor that takes each stream, one of STREAMS; `gp:fix` is that of one NMEA talker, or gpsd
+    device, among several; of `zenoh` a stream is a sensor's name in the bundles. options: of a plug-in.
     """
 
     kind: str
-    address: str
+    address: str = ""
     baud: int = 0
     feeds: Mapping[str, str] = field(default_factory=dict, hash=False)
     options: Mapping[str, str] = field(default_factory=dict, hash=False)
@@ -37,12 +38,20 @@ class DriverConfig:
     def __post_init__(self) -> None:
         if self.kind not in (known := known_kinds()):
             raise ValueError(f"kind: {self.kind!r} is none of {', '.join(known)}")
+        if self.kind == ZENOH and (self.address or self.baud or self.options):
+            raise ValueError("address, baud, options: zenoh has none, its bundles come on the machine's own key")
+        if self.kind != ZENOH:
+            self._check_address()
+        if self.kind in DECODERS:
+            self._check_feeds()
+
+    def _check_address(self) -> None:
         if not self.address or not self.address.isprintable():
             raise ValueError(f"address: {self.address!r} is neither a port, tcp://HOST:PORT, udp://:PORT nor a file")
         if not 0 <= self.baud <= 10_000_000:
             raise ValueError(f"baud: {self.baud} is no baud; 0 finds it")
-        if self.kind not in DECODERS:
-            return
+
+    def _check_feeds(self) -> None:
         if self.options:
             raise ValueError(f"options: of plug-ins alone, {self.kind} has none")
         if "://" in self.address:
@@ -51,6 +60,11 @@ class DriverConfig:
             if split_stream(key)[1] not in STREAMS:
                 raise ValueError(f"feeds: {key!r} is no stream; there are {', '.join(STREAMS)}")
 
+    @property
+    def name(self) -> str:
+        """Its address, or its kind where it has none."""
+        return self.address or self.kind
+
 
 # Of a plug-in: makes the source of a table; raises ValueError where the table is wrong.
 Factory = Callable[[DriverConfig, MachineConfig], Source]
@@ -58,12 +72,12 @@ Factory = Callable[[DriverConfig, MachineConfig], Source]
 
 def known_kinds() -> list[str]:
     """Ours, then plug-ins that are installed."""
-    return [*DECODERS, *(plug_in.name for plug_in in entry_points(group=PLUG_INS))]
+    return [*DECODERS, ZENOH, *(plug_in.name for plug_in in entry_points(group=PLUG_INS))]
 
 
 def check_drivers(drivers: Sequence[DriverConfig], machine: MachineConfig, where: str) -> None:
     """Refuse tables that do not fit each other or the machine; raises ConfigError."""
-    addresses = [driver.address for driver in drivers]
+    addresses = [driver.name for driver in drivers]
     fed = [name for driver in drivers for name in driver.feeds.values()]
     for names, what in ((addresses, "two listen at"), (fed, "two streams feed")):
         if twice := next((name for name in names if names.count(name) > 1), None):
@@ -91,18 +105,27 @@ def _misfit(driver: DriverConfig, stream: str, sensor: SensorConfig) -> str:
 
 
 def open_sources(
-    drivers: Sequence[DriverConfig], machine: MachineConfig, host_utc: Callable[[], tuple[int, int]]
+    drivers: Sequence[DriverConfig],
+    machine: MachineConfig,
+    host_utc: Callable[[], tuple[int, int]],
+    bundles: Callable[[], Driver],
 ) -> Sources:
-    """Begin to listen. host_utc: the host's UTC and monotonic clock [ns], where no receiver states the time."""
+    """Begin to listen.
+
+    host_utc: the host's UTC and monotonic clock [ns], where no receiver states the time. bundles: listens to the
+    machine's key `sensors`.
+    """
     time_base = TimeBase()
     if not any(driver.kind in DECODERS for driver in drivers):
         time_base.take("host", *host_utc())
-    return Sources({driver.address: _open(driver, machine) for driver in drivers}, time_base)
+    return Sources({driver.name: _open(driver, machine, bundles) for driver in drivers}, time_base)
 
 
-def _open(driver: DriverConfig, machine: MachineConfig) -> Source:
+def _open(driver: DriverConfig, machine: MachineConfig, bundles: Callable[[], Driver]) -> Source:
+    feeds = {key: sensor for key, name in driver.feeds.items() if (sensor := machine.sensor(name))}
+    if driver.kind == ZENOH:
+        return BundleSource(bundles(), feeds)
     if driver.kind in DECODERS:
-        feeds = {key: sensor for key, name in driver.feeds.items() if (sensor := machine.sensor(name))}
         return Receiver(driver.address, driver.baud, driver.kind, Line(driver.kind, feeds))
     plug_in = next(iter(entry_points(group=PLUG_INS, name=driver.kind)))
     try:

@@ -1,16 +1,20 @@
-"""Readings over Zenoh: bundles of a simulated machine or a remote driver."""
+"""Readings over Zenoh: bundles of a simulated machine or a remote driver, alone or beside receivers."""
 
 import queue
+import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import zenoh
 
+from agents.drivers import Driver, Observed
 from protocol.errors import MessageError
-from protocol.machine.readings import Reading
+from protocol.machine.machine_config import SensorConfig
+from protocol.machine.readings import Reading, columns
 from protocol.wire import keys
 from protocol.wire.codec import decode_bundle
 
+ZENOH = "zenoh"  # kind of a [[driver]] table
 QUEUE_BUNDLES = 4000  # 200 s of bundles; beyond it bundles are dropped and counted
 
 
@@ -72,3 +76,43 @@ class ZenohDriver:
         if counter > self._newest + 1 and self._newest:
             self._counters["bundles_missing"] += counter - self._newest - 1
         self._newest = counter
+
+
+class BundleSource:
+    """Source of what no receiver carries: readings of these sensors in bundles. feeds: the sensor of each name there.
+
+    Their stamps are UTC, and are believed as those of receivers are.
+    """
+
+    def __init__(
+        self, bundles: Driver, feeds: Mapping[str, SensorConfig], clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._bundles, self._feeds, self._clock_ns = bundles, feeds, clock_ns
+        self._counters: Counter[str] = Counter()
+
+    def read(self, timeout_s: float) -> Sequence[Observed] | None:
+        """Values of the next bundle."""
+        readings = self._bundles.read(timeout_s)
+        return None if readings is None else [value for reading in readings if (value := self._observed(reading))]
+
+    def counters(self) -> Mapping[str, int]:
+        """Those of bundles, and readings of another kind than the sensor's."""
+        return {**self._bundles.counters(), **dict(self._counters)}
+
+    def problems(self) -> Sequence[str]:
+        """None: who publishes is not known."""
+        return ()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._bundles.close()
+
+    def _observed(self, reading: Reading) -> Observed | None:
+        sensor = self._feeds.get(reading.sensor)
+        if sensor is None:
+            return None
+        if sensor.kind != reading.kind:
+            self._counters["refused_reading_wrong_kind"] += 1
+            return None
+        values = tuple(getattr(reading, name) for name in columns(reading.kind))
+        return Observed(sensor.name, reading.kind, values, self._clock_ns(), reading.stamp_ns)

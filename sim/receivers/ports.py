@@ -80,15 +80,15 @@ class Ports:
 
 def driver_toml(folder: Path, wirings: Sequence[Wiring], machine: MachineConfig) -> str:
     """[[driver]] tables of an agent that reads these ports, and from bundles what no receiver carries."""
-    tables = [(w.format, str(folder / w.name), {key: s.name for key, s in w.feeds.items()}) for w in wirings]
-    rest = {s.name: s.name for s in machine.sensors if s.name not in carried(wirings)}
-    if rest:
-        tables.append(("zenoh", "sensors", rest))
-    return "".join(
-        f"\n[[driver]]\nkind = {json.dumps(kind)}\naddress = {json.dumps(address)}\nfeeds = {_inline(feeds)}\n"
-        for kind, address, feeds in tables
-    )
+    tables = [
+        f"kind = {json.dumps(w.format)}\naddress = {json.dumps(str(folder.absolute() / w.name))}\n"
+        + _feeds({stream: sensor.name for stream, sensor in w.feeds.items()})
+        for w in wirings
+    ]
+    if rest := {s.name: s.name for s in machine.sensors if s.name not in carried(wirings)}:
+        tables.append('kind = "zenoh"\n' + _feeds(rest))
+    return "".join(f"\n[[driver]]\n{table}" for table in tables)
 
 
-def _inline(feeds: Mapping[str, str]) -> str:
-    return "{ " + ", ".join(f"{key} = {json.dumps(name)}" for key, name in feeds.items()) + " }"
+def _feeds(feeds: Mapping[str, str]) -> str:
+    return "feeds = { " + ", ".join(f"{key} = {json.dumps(name)}" for key, name in feeds.items()) + " }\n"

@@ -15,7 +15,8 @@ from sim.sensors.sensor_group import SensorGroup, SensorUnit
 from sim.state import STEP_S, FleetState
 
 AXES = np.array([1.0, 1.0, 5 / 3])  # heights are this much worse
-LEAST_M2 = 1e-4  # no receiver states a smaller variance
+LEAST_M2 = 1e-4  # no receiver states a smaller variance,
+LEAST_M2PS2 = 1e-6  # nor one of a velocity
 
 
 class AntennaGroup(SensorGroup):
@@ -54,7 +55,7 @@ class VelocityGroup(AntennaGroup):
         of_antenna = ahead + cross(self.pick(states.rates_radps, rows), self._lever_m)
         velocity = map_from_base(of_antenna, *self.attitude(rows, states))[:2]
         velocity += self._std_mps * self._draws.next_rows(len(steps))
-        return np.concatenate([velocity, np.broadcast_to(self._std_mps**2, velocity.shape)])
+        return np.concatenate([velocity, np.broadcast_to(np.maximum(self._std_mps**2, LEAST_M2PS2), velocity.shape)])
 
 
 class GpsGroup(AntennaGroup):

@@ -70,7 +70,7 @@ class GpsNoise(SensorErrors):
     site_share: Share
     outage_s: NotNegative
     outage_period_s: Positive
-    velocity_std_mps: Positive
+    velocity_std_mps: NotNegative
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -165,9 +165,13 @@ def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Dri
 
     if log:
         return Replay(log, arguments.speed, time.monotonic, time.sleep)
-    if not joined.config.driver:
+
+    def bundles() -> ZenohDriver:
         return ZenohDriver(joined.session, joined.site.name, joined.machine.name)
-    return open_sources(joined.config.driver, joined.machine, lambda: (time.time_ns(), time.monotonic_ns()))
+
+    if not joined.config.driver:
+        return bundles()
+    return open_sources(joined.config.driver, joined.machine, lambda: (time.time_ns(), time.monotonic_ns()), bundles)
 
 
 @contextmanager

@@ -50,10 +50,12 @@ def rig(
     only: str | None = None,
     *,
     payload: bool = False,
+    doppler: bool = False,
     faults: Faults = Faults(),  # noqa: B008 - frozen
 ) -> Rig:
     """A loader with these sensors. only: leave all other kinds out."""
-    machine = machine_config("loader", LOADER, preset, tuple(gps), tuple(imu), tuple(attitude), payload=payload)
+    numbers = tuple(gps), tuple(imu), tuple(attitude)
+    machine = machine_config("loader", LOADER, preset, *numbers, payload=payload, doppler=doppler)
     kept = tuple(s for s in machine.sensors if only in (None, s.kind))
     return Rig(replace(machine, sensors=kept), LOADER, preset, faults)
 

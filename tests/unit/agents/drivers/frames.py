@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from pyubx2 import GET, UBXMessage
 
-from agents.drivers import Observed
+from agents.drivers import Driver, Observed
 from sim.receivers.ubx import NavPvt, esf_meas
 from tests.paths import SHARED_DATA
 
@@ -97,6 +97,10 @@ def recording(name: str) -> Path:
     if not path.is_file():
         pytest.skip(f"the recording is not beside the project (../shared/data/recordings/{name})")
     return path
+
+
+def no_bundles() -> Driver:
+    raise AssertionError("no table is of kind zenoh")
 
 
 class Script:

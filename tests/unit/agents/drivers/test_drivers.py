@@ -10,15 +10,20 @@ from agents.agent import Agent, Places
 from agents.config import AgentConfig
 from agents.delivery.audit import read_audit
 from agents.delivery.uplink import UplinkConfig
+from agents.drivers import Observed
 from agents.drivers.replay import Replay
-from agents.drivers.zenoh import ZenohDriver
+from agents.drivers.sources import Sources
+from agents.drivers.time_base import TimeBase
+from agents.drivers.zenoh import BundleSource, ZenohDriver
 from protocol.machine.log_folder import open_log, write_log
-from protocol.machine.readings import Articulation, Imu, Reading
+from protocol.machine.machine_config import SensorConfig
+from protocol.machine.readings import Articulation, Imu, Reading, Torque
 from protocol.units import GRAVITY_MPS2
 from protocol.wire import keys
 from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from tests.unit.agents.drivers.frames import Script
 from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, changed_sensor, drive, thinned
 
 
@@ -202,6 +207,23 @@ def test_driver_hears_no_other_machine(sessions: tuple[Any, Any], stream: Stream
     assert other.read()
     assert stream.driver.read(0.0) == ()
     other.close()
+
+
+def test_bundles_beside_a_receiver_give_what_their_table_feeds_at_the_receiver_s_time() -> None:
+    """Values wait for its first fix; what it does not believe, and a reading of another kind, is counted."""
+    late = Articulation("articulation", START_NS + 5 * 10**9, 0.5)
+    span = [Torque("torque", START_NS, 7.0), reading(0), Torque("articulation", START_NS, 7.0)]
+    feeds = {"articulation": SensorConfig("joint", "articulation")}
+    source = BundleSource(Given(span, [late]), feeds, lambda: 10**12)
+    pieces = [source.read(0.0), source.read(0.0), [Observed("", "", (), 10**12, START_NS)]]
+    assert source.read(0.0) is None
+    assert source.counters() == {"given": 1, "refused_reading_wrong_kind": 1}
+    sources, readings = Sources({"bundles": Script(pieces)}, TimeBase()), list[Reading]()
+    while (piece := sources.read(5.0)) is not None:
+        readings += piece
+    sources.close()
+    assert readings == [Articulation("joint", START_NS, 0.0)]
+    assert sources.counters()["stamp_refused"] == 1
 
 
 # --- the agent around them -------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from sim.receivers.nmea import sentence as nmea
 from sim.receivers.receiver import Receiver as SimulatedReceiver
 from sim.receivers.receiver import Wiring
 from tests.patience import until
-from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, Script, esf, pvt, report, spoiled
+from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, Script, esf, no_bundles, pvt, report, spoiled
 from tests.unit.agents.drivers.test_formats import SENSORS
 from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, drive
 
@@ -134,7 +134,7 @@ def sender(stream: bytes, greeted: bytes = b"") -> Iterator[str]:
 def read_all(config: DriverConfig, machine: MachineConfig, n: int) -> list[Reading]:
     """Readings of one table as an agent takes them."""
     readings: list[Reading] = []
-    with closing(open_sources([config], machine, lambda: (1, 1))) as sources:
+    with closing(open_sources([config], machine, lambda: (1, 1), no_bundles)) as sources:
         until(lambda: readings.extend(sources.read(0.05) or ()) or len(readings) >= n, "readings")
     return readings
 
@@ -177,7 +177,9 @@ def test_a_file_is_read_to_its_end_as_fast_as_the_agent_is(tmp_path: Path) -> No
     path = tmp_path / "drive.nmea"
     path.write_bytes(b"".join(epochs(500)))
     readings: list[Reading] = []
-    with closing(open_sources([DriverConfig("nmea", str(path), feeds=FEEDS)], MACHINE, lambda: (1, 1))) as sources:
+    with closing(
+        open_sources([DriverConfig("nmea", str(path), feeds=FEEDS)], MACHINE, lambda: (1, 1), no_bundles)
+    ) as sources:
         while (piece := sources.read(1.0)) is not None:
             readings += piece
     assert len(readings) == 2 * 500

@@ -9,7 +9,7 @@ from agents.drivers.tables import DriverConfig, known_kinds, open_sources
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Payload
-from tests.unit.agents.drivers.frames import Script
+from tests.unit.agents.drivers.frames import Script, no_bundles
 
 MACHINE = """
 [machine]
@@ -26,10 +26,11 @@ kind = "attitude"
 @pytest.mark.parametrize(
     ("keys", "problem"),
     [
-        ({"kind": "nme"}, "kind: 'nme' is none of nmea, ubx, gpsd"),
+        ({"kind": "nme"}, "kind: 'nme' is none of nmea, ubx, gpsd, zenoh"),
         ({"address": "tcp://10.0.0.7"}, "address: 'tcp://10.0.0.7' is neither tcp://HOST:PORT nor"),
         ({"address": ""}, "address: '' is neither a port"),
         ({"baud": -3}, "baud: -3 is no baud; 0 finds it"),
+        ({"kind": "zenoh"}, "zenoh has none, its bundles come on the machine's own key"),
         ({"options": {"a": "b"}}, "options: of plug-ins alone, ubx has none"),
         ({"feeds": {"fixes": "gps-1"}}, "'fixes' is no stream; there are fix, velocity, heading, imu, wheels"),
         ({"feeds": {"fix": "gps-2"}}, "feeds.fix: no [[sensor]] is named 'gps-2'"),
@@ -73,7 +74,7 @@ def test_a_plug_in_is_a_kind_and_without_receivers_its_time_is_the_host_s_as_it_
     machine = MachineConfig("loader-1", sensors=(SensorConfig("scale-1", "payload"),))
     table = DriverConfig("scale", "canister", options={"kg": "1200"})
     utc_ns = 1_795_688_127 * 10**9
-    driver, readings = open_sources([table], machine, lambda: (utc_ns, 3 * 10**9)), []
+    driver, readings = open_sources([table], machine, lambda: (utc_ns, 3 * 10**9), no_bundles), []
     while (piece := driver.read(5.0)) is not None:
         readings += piece
     driver.close()

@@ -97,3 +97,16 @@ def test_antennas_sit_on_their_lever_arms() -> None:
     np.testing.assert_allclose(nose_up[0, 1], 50 + 0.8 * math.cos(0.2) - 3.35 * math.sin(0.2), atol=1e-5)
     left_up = to_map(groups([one], still(20, 1, **place, roll_rad=0.2))["gps"].values)[0]
     np.testing.assert_allclose(left_up[0, 0], 100 + 3.35 * math.sin(0.2), atol=1e-5)
+
+
+def test_velocities_are_those_of_antennas_also_on_a_turning_machine() -> None:
+    """Ahead at 2 m/s to the north, turning left by 0.5 rad/s: antennas ahead go west too, one at the left is slower."""
+    preset = noisy("gps", velocity_std_mps=0.05)
+    turning = {"speed_mps": 2.0, "yaw_rad": math.pi / 2, "rates_radps": (0.0, 0.0, 0.5)}
+    motion = groups([rig(preset, gps=(1, 2), only="gps_velocity", doppler=True)], still(40_000, **turning))[
+        "gps_velocity"
+    ]
+    expected = [(-0.5 * 0.8, 2.0), (-0.5 * 0.3, 2.0 - 0.5 * 0.6)]
+    np.testing.assert_allclose(motion.values[..., :2].mean(axis=0), expected, atol=0.004, err_msg=f"seed {SEED}")
+    check_deviation(motion.values[:, 0, 0] - expected[0][0], 0.05, len(motion.values))
+    assert (motion.values[..., 2:] == 0.05**2).all()
