@@ -70,19 +70,17 @@ class Stream:
 
 
 class Pace:
-    """Holds simulated time back to `speed` times the clock's; speed 0 never waits. The first step may take long."""
+    """Holds simulated time back to `speed` times the clock's; speed 0 never waits."""
 
     def __init__(self, speed: float, stop: threading.Event, clock: Callable[[], float]) -> None:
         self._speed, self._stop, self._clock = speed, stop, clock
-        self._start: float | None = None
+        self._start = clock()
         self.late_s = 0.0
 
     def wait(self, simulated_s: float) -> None:
         """Wait until this simulated time is due, or the run is stopped."""
         if not self._speed:
             return
-        if self._start is None:
-            self._start = self._clock() - simulated_s / self._speed
         early_s = self._start + simulated_s / self._speed - self._clock()
         self.late_s = max(self.late_s, -early_s)
         if early_s > 0:

@@ -81,8 +81,8 @@ class Line:
         sensor = self._feeds.get((message.source, message.stream))
         if sensor is None:
             return None
-        values = _stated(message, sensor)
-        if any(map(math.isnan, values)):
+        values = message.values
+        if any(map(math.isnan, values)) and any(map(math.isnan, values := _stated(message, sensor))):
             self._counters["without_value"] += 1
             return None
         return Observed(sensor.name, STREAMS[message.stream], values, host_ns, message.utc_ns)

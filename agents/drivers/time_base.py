@@ -52,11 +52,14 @@ class TimeBase:
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
         self._ties: dict[str, ClockTie] = {}
+        self._ahead_ns: int | None = None  # by the receiver of least delay; each value is stamped by it
 
     def take(self, clock: str, utc_ns: int, host_ns: int) -> None:
         """Take in UTC as a receiver stated it in a message that came at `host_ns`."""
         tie = self._ties.setdefault(clock, ClockTie())
         tie.take(utc_ns, host_ns)
+        offsets = list(self._offsets().values())
+        self._ahead_ns = max(ns for ns in offsets if abs(ns - offsets[0]) <= APART_NS)
         self.counters["clock_set"] = sum(tie.steps for tie in self._ties.values())
 
     def believes(self, utc_ns: int, host_ns: int) -> bool:
@@ -75,9 +78,7 @@ class TimeBase:
 
     def utc_ns(self, host_ns: int) -> int | None:
         """UTC at a time of the host's clock, by the receiver of least delay; None until one has stated it."""
-        offsets = list(self._offsets().values())
-        near = [ns for ns in offsets if abs(ns - offsets[0]) <= APART_NS]
-        return host_ns + max(near) if near else None
+        return None if self._ahead_ns is None else host_ns + self._ahead_ns
 
     def _offsets(self) -> dict[str, int]:
         """Of the clocks that are still heard, first the one that counts."""

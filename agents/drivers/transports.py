@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 MOST_BYTES = 1 << 16  # of a datagram, which is read whole or cut
-TOGETHER_S = 0.01  # bytes of so long are read at once: to wake up costs more than a frame; times are the senders' own
+TOGETHER_S = 0.02  # bytes of so long are read at once: to wake up costs more than a frame; times are the senders' own
 CONNECT_S = 1.0  # a machine's own network answers in milliseconds
 WRITE_S = 1.0  # for a piece of what is sent, at any baud
 BITS = 10  # of a byte on a serial line: start, eight, stop

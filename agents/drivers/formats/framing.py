@@ -73,7 +73,8 @@ class Framer:
                 frames.append(Frame(name, frame, len(buffer) - end))
                 self._read.append((start, end))
         self._forget()
-        frames.sort(key=lambda frame: -frame.after)
+        if len(frames) > 1:
+            frames.sort(key=lambda frame: -frame.after)
         return frames
 
     def _forget(self) -> None:
@@ -84,9 +85,11 @@ class Framer:
         first = min([searched, *self._open])
         counted = 0
         for start, end in sorted(self._read):
-            self._count_broken(counted, min(start, first))
+            if counted < min(start, first):
+                self._count_broken(counted, min(start, first))
             counted = max(counted, min(end, first))
-        self._count_broken(counted, first)
+        if counted < first:
+            self._count_broken(counted, first)
         del buffer[:first]
         self._open = [start - first for start in self._open]
         self._read = [(max(start - first, 0), end - first) for start, end in self._read if end > first]

@@ -95,21 +95,25 @@ class UbxDecoder:
 
     def _inertial(self, tagged: Iterable[tuple[int, int]]) -> Iterator[Message]:
         """Readings of all six axes, at the middle of their times."""
+        axes = self._axes
         for word, tag_ns in tagged:
             axis = word >> 24 & 63
             if axis not in _SCALES:
                 continue
-            self._axes[axis] = tag_ns, ((word & 0xFFFFFF ^ SIGN) - SIGN) * _SCALES[axis]
-            if len(self._axes) < len(_SCALES):
+            axes[axis] = tag_ns, ((word & 0xFFFFFF ^ SIGN) - SIGN) * _SCALES[axis]
+            if len(axes) < len(_SCALES):
                 continue
-            tags, values = zip(*(self._axes[a] for a in _SCALES), strict=True)
-            if max(tags) - min(tags) <= TOGETHER_NS:
-                yield Message(formats.IMU, "", 0, values, (min(tags) + max(tags)) // 2)
-                self._axes.clear()
+            first_ns, last_ns = min(axes.values())[0], max(axes.values())[0]
+            if last_ns - first_ns <= TOGETHER_NS:
+                values = tuple([axes[a][1] for a in _SCALES])
+                yield Message(formats.IMU, "", 0, values, (first_ns + last_ns) // 2)
+                axes.clear()
 
     def _ticks(self, words: Sequence[int], tag_ns: int) -> Sequence[Message]:
         present = {kind: word for word in words if 6 <= (kind := word >> 24 & 63) <= 10}
-        for left, right in AXLES if present else ():
+        if not present:
+            return ()
+        for left, right in AXLES:
             if left in present and right in present:
                 ticks = [self._counted(wheel, present[wheel]) for wheel in dict.fromkeys((left, right))]
                 return (Message(formats.WHEELS, "", 0, (float(ticks[0]), float(ticks[-1])), tag_ns),)
