@@ -1,7 +1,6 @@
 """All sensors of all machines: true states in, raw readings out, as columns; reading objects only on demand.
 
-Beside GPS: IMUs, and the attitude and heading references in them, on either frame of articulated machines; wheel
-encoders, drive torque, brakes, angle of the joint, weight of what is carried.
+Beside GPS: IMUs, attitude and heading references on either frame, wheels, torque, brakes, joint, payload.
 """
 
 from __future__ import annotations
@@ -255,10 +254,8 @@ _GROUPS: dict[str, type[SensorGroup]] = {
 
 def _group(kind: str, units: Sequence[SensorUnit], seed: int, projection: Projection) -> SensorGroup:
     """Sensors of one kind; the seed is for what those of one machine or site have in common."""
-    if kind == "gps":
-        return GpsGroup(units, seed, projection)
-    if kind == "gps_velocity":
-        return VelocityGroup(units, seed)
+    if kind in ("gps", "gps_velocity"):
+        return GpsGroup(units, seed, projection) if kind == "gps" else VelocityGroup(units, seed)
     return ImuGroup(units, seed) if kind == "imu" else _GROUPS[kind](units)
 
 
