@@ -73,7 +73,9 @@ def test_impossible_sensor_is_refused(change):
 
 def test_every_option_of_a_machine_is_written_and_read_back():
     body = {
-        f.name: 1.25 + i / 16 for i, f in enumerate(dataclasses.fields(MachineConfig)) if f.name not in ("name", "sensors")
+        f.name: 1.25 + i / 16
+        for i, f in enumerate(dataclasses.fields(MachineConfig))
+        if f.name not in ("name", "sensors")
     }
     machine = MachineConfig("a", **{**body, "mass_kg": 2500.0, "machine_share": 0.5, "skid_steers": True})
     assert parse_machine(tomllib.loads(machine_toml(machine))["machine"], (), "x") == machine

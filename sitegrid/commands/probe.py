@@ -1,0 +1,36 @@
+"""`sitegrid probe`: listens to ports and addresses, and says what talks there."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+
+from sitegrid.options.values import positive
+from sitegrid.process.lifetime import note, say, tell
+
+HELP = "listen to serial ports and addresses, and say what talks there"
+EXTRA = "receivers"
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    ports = "serial port, tcp://HOST:PORT, udp://[HOST]:PORT, gpsd, or a file (default: all serial ports)"
+    parser.add_argument("ports", nargs="*", metavar="PORT", help=ports)
+    parser.add_argument("--seconds", type=positive, default=5.0, help="how long to listen (default %(default)s)")
+
+
+def run(arguments: Namespace) -> int:
+    """Listen and tell; 1 where nothing talks that a driver reads."""
+    from agents.drivers.transports import serial_ports
+    from sitegrid.setup.listening import address_of, listen_to
+    from sitegrid.setup.summary import NO_PORT, blocks, missing, streams_of
+
+    addresses = [address_of(port) for port in arguments.ports] or serial_ports()
+    if addresses and not arguments.json:
+        note(f"listening at {', '.join(addresses)}")
+    every = listen_to(addresses, arguments.seconds)
+    lacks = missing(streams_of(every))
+    if arguments.json:
+        say({"ports": [heard.table() for heard in every], "missing": lacks})
+    else:
+        tell(*(blocks(every) or [NO_PORT]), *(lacks.values() if every else ()))
+    return 0 if any(heard.kind for heard in every) else 1
