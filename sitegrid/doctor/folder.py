@@ -38,9 +38,11 @@ def examine_folder(path: Path) -> list[Finding]:
     findings = [Finding(Level.PASS, "files", f"site {site.name}, machine {machine.name}: both files are whole")]
     findings += [*check_sensors(machine, config), _store(folder, site)]
     spool, runs = _spool(folder)
-    receivers = [skipped("receiver", "an agent reads them")] if runs else _receivers(site, config)
-    taken = [] if runs else [f"{port} ({name})" for name, port in PORTS.items() if not is_free(port)]
-    return [*findings, spool, disk.check_disk("folder", disk.free_bytes(path)), *receivers, check_ports(taken)]
+    findings += [spool, disk.check_disk("folder", disk.free_bytes(path))]
+    if runs:
+        return [*findings, *(skipped(check, "an agent runs in this folder") for check in ("receiver", "ports"))]
+    taken = [f"{port} ({name})" for name, port in PORTS.items() if not is_free(port)]
+    return [*findings, *_receivers(site, config), check_ports(taken)]
 
 
 def _store(folder: Folder, site: SiteConfig) -> Finding:
@@ -129,7 +131,7 @@ def check_origin(site: SiteConfig, heard: Heard) -> Finding:
 def check_ports(taken: list[str]) -> Finding:
     """Whether the usual ports are free."""
     if taken:
-        return Finding(Level.WARN, "ports", f"taken: {', '.join(taken)}", "`sitegrid up` takes others, or runs already")
+        return Finding(Level.WARN, "ports", f"taken: {', '.join(taken)}", "`sitegrid up` takes others")
     return Finding(Level.PASS, "ports", "those of router and page are free")
 
 

@@ -73,7 +73,7 @@ def _hear(transport: Transport, ear: Ear, seconds: float) -> str:
             end_s = time.monotonic() + seconds
         elif not ear.frames and ear.n_bytes:
             end_s = min(end_s, time.monotonic() + TRY_S)
-        if not is_greeted and ear.hears(GPSD):
+        if transport.is_live and not is_greeted and ear.hears(GPSD):
             transport.write(GREETING)
             is_greeted = True
     return ""
