@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agents.localisation.antennas import Trial
 from agents.positioning import PipelineConfig, Positioning
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Gps, Reading
@@ -72,6 +73,17 @@ def test_two_antennas_that_sit_otherwise_than_stated_are_named(
 def test_fixes_of_metres_name_nothing_before_their_error_has_faded() -> None:
     readings = noisy_fixes(drive(S_BEND * 2, TRUE).readings, ALONE, off_m=2.5)
     assert not problems(mounted(REAR, FRONT), readings)
+    assert [minutes_until_named(apart_m) for apart_m in (2.0, 3.0)] == [7, 3], "as docs/receivers.md says"
+
+
+def minutes_until_named(apart_m: float) -> int:
+    """Of two antennas that are exchanged, a stretch every three seconds; variances are those of both on both axes."""
+    variance = 2 * 2 * ALONE**2
+    trial = Trial(apart_m, white=0.25 * variance, slow=0.75 * variance, slow_s=45.0)
+    while trial.wrong is None:
+        trial.shown, trial.n = -15 * apart_m + 0j, 15
+        trial.finish(1 + 0j, 3.0)
+    return int(trial.driven_s / 60)
 
 
 @pytest.mark.parametrize(("off_deg", "sentence"), [(0, ""), (30, ""), (180, "exchange its two antennas"), (90, "left")])
