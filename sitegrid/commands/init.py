@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+import shlex
 import sys
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable
@@ -49,7 +51,9 @@ def run(arguments: Namespace) -> int:
     model = _answer(arguments.model, "--model", f"Kind of machine ({', '.join(files.models())})", "", _model)
     machine = _answer(arguments.machine, "--machine", "Name of the machine", f"{model}-1", _name)
     site, origin = "", tuple(0.0 for _ in files.ORIGIN)
-    if not folder.site_file.exists():
+    if folder.site_file.exists():
+        note(f"{folder.site_file} is there, and kept as it is")
+    else:
         site = _answer(arguments.site, "--site", "Name of the site", _as_name(folder.path), _name)
         no_fix = "No receiver has a fix. Place that is x = y = 0: LAT,LON[,HEIGHT]"
         origin = arguments.origin or files.origin_of(every) or _answer(None, "--origin", no_fix, "", parse_origin)
@@ -59,7 +63,7 @@ def run(arguments: Namespace) -> int:
         say({"written": [str(path) for path in written], "missing": lacks})
         return 0
     tell(f"written: {', '.join(map(str, written))}", *lacks.values())
-    tell(f"Measure what has a comment in {folder.agent_file}. Then: sitegrid doctor {folder.path}")
+    tell(f"Measure what has a comment in {folder.agent_file}. Then: sitegrid doctor {shlex.quote(str(folder.path))}")
     return 0
 
 
@@ -68,7 +72,9 @@ def parse_origin(text: str) -> tuple[float, ...]:
     try:
         lat, lon, height = map(float, (text + ",0" if text.count(",") == 1 else text).split(","))
     except ValueError:
-        raise ArgumentTypeError(f"{text!r} is not LAT,LON[,HEIGHT] in degrees and metres, as 49.01,8.4,120") from None
+        lat = lon = height = math.nan
+    if not math.isfinite(lat + lon + height):
+        raise ArgumentTypeError(f"{text!r} is not LAT,LON[,HEIGHT] in degrees and metres, as 49.01,8.4,120")
     return lat, lon, height
 
 

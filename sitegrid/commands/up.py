@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import threading
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
@@ -62,7 +63,7 @@ def run(arguments: Namespace) -> int:
                 _watch(running, stop, problems.tell)
     except KeyboardInterrupt:
         pass
-    note(f"all is ended; `sitegrid up {arguments.folder}` goes on from here")
+    note(f"all is ended; `sitegrid up {shlex.quote(str(arguments.folder))}` goes on from here")
     return 0
 
 

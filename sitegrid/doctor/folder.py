@@ -33,8 +33,7 @@ def examine_folder(path: Path) -> list[Finding]:
     try:
         site, machine, config = folder.load()
     except SitegridError as error:
-        makes = "" if folder.agent_file.exists() else "`sitegrid init` makes such a folder"
-        return [Finding(Level.FAIL, "files", str(error), makes)]
+        return [Finding(Level.FAIL, "files", str(error))]
     findings = [Finding(Level.PASS, "files", f"site {site.name}, machine {machine.name}: both files are whole")]
     findings += [*check_sensors(machine, config), _store(folder, site)]
     spool, runs = _spool(folder)

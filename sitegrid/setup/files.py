@@ -77,6 +77,9 @@ class Folder:
 
     def load(self) -> tuple[SiteConfig, MachineConfig, AgentConfig]:
         """Read both files as server and agent do; raises ConfigError."""
+        for path in (self.site_file, self.agent_file):
+            if not path.exists():
+                raise ConfigError(path, "no such file; `sitegrid init` makes it")
         site, (machine, config) = load_site(self.site_file), load_agent(self.agent_file)
         if machine is None:
             raise ConfigError(self.agent_file, "no [machine] is described; `sitegrid init` makes such a file")

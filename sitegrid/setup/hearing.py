@@ -28,7 +28,7 @@ PROMISED = {
 }
 # Formats that no driver reads, by how their messages begin.
 FOREIGN = {b"$@": "SBF (Septentrio)", b"\xaaD\x12": "NovAtel's binary", b"\xa0\xa2": "SiRF's binary"}
-MANY = 3  # such beginnings are no chance
+MANY, MOST_BETWEEN = 3, 2000  # such beginnings, and bytes from one to the next, are no chance
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class Ear:
         if not self.n_bytes:
             return "nothing comes: is it powered, wired, and set to send here?"
         foreign, n = max(self._foreign.items(), key=lambda item: item[1])
-        if n >= MANY:
+        if n >= MANY and self.n_bytes <= n * MOST_BETWEEN:
             return f"it sends {foreign}, which no driver reads: set it to send NMEA, or UBX"
         return "bytes come, but neither NMEA, UBX, gpsd's nor RTCM3 at any baud: is it a receiver, set to send those?"
 

@@ -130,6 +130,9 @@ def test_any_bytes_in_any_pieces_are_heard_without_an_error(pieces: int) -> None
     for at in range(0, len(stream), pieces):
         ear.feed(stream[at : at + pieces], 10**12 + at)
     assert ear.heard("x").table()["messages"]["ubx NAV-PVT"] >= 0
+    noise = Ear()
+    noise.feed(draw.randbytes(400_000) + b"$@" * 9, 10**12)
+    assert "neither NMEA" in noise.heard("x").problem, "no format is read into noise"
 
 
 def test_addresses_and_files_are_heard_at_once_and_gpsd_is_asked(tmp_path: Path) -> None:
