@@ -23,12 +23,11 @@ from protocol.site.site_config import Projection
 STRETCH_M = 10.0  # long enough for a course within some degrees
 STRAIGHT = 0.85  # of the way that a stretch must be long, from end to end
 APART_M = 0.5  # of two antennas: if less, reflections alone may turn the vector between them
-GAP_NS = 2_000_000_000  # between two fixes, beyond which no place between them is known
+GAP_NS = 1_500_000_000  # between two fixes, beyond which no place beside them is known
 DUE_NS = 200_000_000  # between two headings that are used
 WRONG = 0.75  # of |z - 1|: 45 degrees, which no bend and no iron in the machine makes
 SIGMA = 3.0
 LEAST = 3  # stretches
-KEPT = 200  # stretches, then older ones count less
 
 
 @dataclass
@@ -42,19 +41,18 @@ class Trial:
     shown: complex = 0j  # sum over this stretch
     n: int = 0
     total: complex = 0j  # sum of z over the stretches
-    stretches: float = 0.0
-    values: float = 0.0
+    stretches: int = 0
+    values: int = 0
     driven_s: float = 0.0
 
     def finish(self, course: complex, seconds: float) -> None:
         """End a stretch of this course, a unit vector; 0: it shows nothing."""
         if course and self.n:
-            halve = 0.5 if self.stretches >= KEPT else 1.0
             z = self.shown / self.n * course.conjugate() * self.expected.conjugate() / abs(self.expected) ** 2
-            self.total = halve * self.total + z
-            self.stretches = halve * self.stretches + 1
-            self.values = halve * self.values + self.n
-            self.driven_s = halve * self.driven_s + seconds
+            self.total += z
+            self.stretches += 1
+            self.values += self.n
+            self.driven_s += seconds
         self.shown, self.n = 0j, 0
 
     @property
@@ -88,7 +86,6 @@ class Antennas:
         self._base_from_sensor = {s.name: s.mount.frame_from_sensor() for s in compasses}
         self._trials |= {name: Trial() for name in self._base_from_sensor}
         self._track: deque[tuple[int, complex]] = deque(maxlen=2)  # newest fixes of the reference
-        self._waiting: deque[tuple[int, str, complex]] = deque(maxlen=20)  # of others, for the next of the reference
         self._begin: tuple[int, complex, float, float] | None = None  # of the stretch: stamp, place, travel, distance
         self._variance = (0.0, 0.0)  # of the reference: white and slow
         self._due_ns = dict.fromkeys(self._base_from_sensor, 0)
@@ -125,26 +122,21 @@ class Antennas:
             trial = self._trials[sensor.name]
             trial.white, trial.slow = white + self._variance[0], slow + self._variance[1]
             trial.slow_s = sensor.drift_time_s
-            self._waiting.append((fix.stamp_ns, sensor.name, complex(x, y)))
-            self._match()
+            if (reference_m := self._reference_at(fix.stamp_ns)) is not None:
+                self._show(sensor.name, complex(x, y) - reference_m)
             return
         self._variance = white, slow
         self._track.append((fix.stamp_ns, complex(x, y)))
-        self._match()
         self._follow(fix.stamp_ns, complex(x, y), dead_reckoning)
 
-    def _match(self) -> None:
-        """Compare fixes of others with the reference's place at their times."""
+    def _reference_at(self, stamp_ns: int) -> complex | None:
+        """The reference's place by its newest two fixes; a bend of a second shifts it by centimetres."""
         if len(self._track) < 2:
-            return
+            return None
         (from_ns, from_m), (to_ns, to_m) = self._track
-        for _ in range(len(self._waiting)):
-            stamp_ns, name, place_m = self._waiting.popleft()
-            if stamp_ns > to_ns:
-                self._waiting.append((stamp_ns, name, place_m))
-            elif from_ns <= stamp_ns and 0 < to_ns - from_ns <= GAP_NS:
-                share = (stamp_ns - from_ns) / (to_ns - from_ns)
-                self._show(name, place_m - from_m - share * (to_m - from_m))
+        if not 0 < to_ns - from_ns <= GAP_NS or abs(stamp_ns - to_ns) > GAP_NS:
+            return None
+        return to_m + (to_m - from_m) * (stamp_ns - to_ns) / (to_ns - from_ns)
 
     def _show(self, name: str, vector: complex) -> None:
         trial = self._trials[name]

@@ -41,13 +41,13 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Listen, ask, write."""
     from sitegrid.setup import files
-    from sitegrid.setup.summary import blocks, missing, streams_of
+    from sitegrid.setup.summary import block, missing
 
     folder = files.Folder(arguments.folder)
     if folder.agent_file.exists():
         raise ConfigError(folder.agent_file, "is there already, and stays as it is: edit it, or name another folder")
     every = _receivers(arguments)
-    note("\n".join(blocks(every)))
+    note("\n".join(line for heard in every for line in block(heard)))
     model = _answer(arguments.model, "--model", f"Kind of machine ({', '.join(files.models())})", "", _model)
     machine = _answer(arguments.machine, "--machine", "Name of the machine", f"{model}-1", _name)
     site, origin = "", tuple(0.0 for _ in files.ORIGIN)
@@ -58,7 +58,7 @@ def run(arguments: Namespace) -> int:
         no_fix = "No receiver has a fix. Place that is x = y = 0: LAT,LON[,HEIGHT]"
         origin = arguments.origin or files.origin_of(every) or _answer(None, "--origin", no_fix, "", parse_origin)
     written = files.write(folder, files.site_text(site, origin), files.agent_text(machine, model, every))
-    lacks = missing(streams_of(every))
+    lacks = missing(every)
     if arguments.json:
         say({"written": [str(path) for path in written], "missing": lacks})
         return 0

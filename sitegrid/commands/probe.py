@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from sitegrid.options.values import positive
-from sitegrid.process.lifetime import note, say, tell
+from sitegrid.process.lifetime import note, plain, say, tell
 
 HELP = "listen to serial ports and addresses, and say what talks there"
 EXTRA = "receivers"
@@ -22,15 +22,16 @@ def run(arguments: Namespace) -> int:
     """Listen and tell; 1 where nothing talks that a driver reads."""
     from agents.drivers.transports import serial_ports
     from sitegrid.setup.listening import address_of, listen_to
-    from sitegrid.setup.summary import NO_PORT, blocks, missing, streams_of
+    from sitegrid.setup.summary import NO_PORT, block, missing
 
     addresses = [address_of(port) for port in arguments.ports] or serial_ports()
     if addresses and not arguments.json:
         note(f"listening at {', '.join(addresses)}")
     every = listen_to(addresses, arguments.seconds)
-    lacks = missing(streams_of(every))
+    lacks = missing(every)
     if arguments.json:
-        say({"ports": [heard.table() for heard in every], "missing": lacks})
+        say({"ports": plain(every), "missing": lacks})
     else:
-        tell(*(blocks(every) or [NO_PORT]), *(lacks.values() if every else ()))
+        lines = [line for heard in every for line in block(heard)]
+        tell(*lines, *lacks.values()) if every else tell(NO_PORT)
     return 0 if any(heard.kind for heard in every) else 1

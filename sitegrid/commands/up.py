@@ -16,10 +16,9 @@ import zenoh
 from protocol.errors import MessageError
 from protocol.wire import keys
 from protocol.wire.codec import decode_health
-from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, free_endpoint, open_session
+from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, free_endpoint, is_free, open_session
 from sitegrid.process.children import Child, Children, ProcessError
 from sitegrid.process.lifetime import note, say, stop_flag
-from sitegrid.setup.ports import PAGE, ROUTER, is_free
 
 if TYPE_CHECKING:
     from sitegrid.setup.files import Folder
@@ -69,6 +68,8 @@ def run(arguments: Namespace) -> int:
 
 def _start(folder: Folder, site: str, children: Children) -> tuple[str, str, list[Child]]:
     """Start every part; returns the router's endpoint, the page's address, and the processes."""
+    from sitegrid.setup.files import PAGE, ROUTER
+
     endpoint, page = DEFAULT_ENDPOINT, PAGE
     if not is_free(ROUTER):
         endpoint = free_endpoint()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from pathlib import Path
 
@@ -13,14 +12,11 @@ from agents.drivers.transports import open_transport, why_closed
 from protocol.errors import SitegridError, StoreError
 from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import Projection, SiteConfig
+from protocol.wire.session import is_free
 from sitegrid.doctor import Finding, Level, disk, skipped
-from sitegrid.setup.files import Folder
+from sitegrid.setup.files import PORTS, Folder
 from sitegrid.setup.hearing import Heard
 from sitegrid.setup.listening import listen_to
-from sitegrid.setup.ports import PAGE, ROUTER, is_free
-from sitegrid.setup.summary import missing
-
-PORTS = {"router": ROUTER, "page": PAGE}
 
 LISTEN_S = 2.5  # receivers send each second
 FAR_M = 5000.0  # of an origin: it works, and few sites are so large
@@ -40,7 +36,7 @@ def examine_folder(path: Path) -> list[Finding]:
     findings += [spool, disk.check_disk("folder", disk.free_bytes(path))]
     if runs:
         return [*findings, *(skipped(check, "an agent runs in this folder") for check in ("receiver", "ports"))]
-    taken = [f"{port} ({name})" for name, port in PORTS.items() if not is_free(port)]
+    taken = [str(port) for port in PORTS if not is_free(port)]
     return [*findings, *_receivers(site, config), check_ports(taken)]
 
 
@@ -70,7 +66,7 @@ def _receivers(site: SiteConfig, config: AgentConfig) -> list[Finding]:
     drivers = [driver for driver in config.driver if driver.kind in DECODERS]
     heard = listen_to([driver.address for driver in drivers], LISTEN_S)
     findings = [check_receiver(driver, at_port) for driver, at_port in zip(drivers, heard, strict=True)]
-    findings += [check_origin(site, at_port) for at_port in heard if at_port.fix][:1]
+    findings += [check_origin(site, at_port.place) for at_port in heard if at_port.place][:1]
     for address in set(config.corrections.ports) - {driver.address for driver in config.driver}:
         try:
             open_transport(address, config.corrections.baud).close()
@@ -90,8 +86,7 @@ def check_sensors(machine: MachineConfig, config: AgentConfig) -> list[Finding]:
         if sensor.kind == "gps" and not any(sensor.mount.xyz_m):
             advice = "measure it by tape: ahead, left and up of the point on the ground below the rear axle's middle"
             findings.append(Finding(Level.WARN, "sensors", f"{sensor.name}: its mount is 0, 0, 0", advice))
-    lacks = missing({split_stream(key)[1] for driver in config.driver for key in driver.feeds})
-    return findings or [Finding(Level.PASS, "sensors", "; ".join(["each is fed", *lacks.values()]))]
+    return findings or [Finding(Level.PASS, "sensors", "each is fed")]
 
 
 def check_receiver(driver: DriverConfig, heard: Heard) -> Finding:
@@ -112,19 +107,17 @@ def check_receiver(driver: DriverConfig, heard: Heard) -> Finding:
     return Finding(Level.WARN if heard.problem else Level.PASS, "receiver", where + (heard.problem or _fix_of(heard)))
 
 
-def check_origin(site: SiteConfig, heard: Heard) -> Finding:
-    """Whether a fix is near the site's origin."""
-    assert heard.fix, "asked of a place alone"
-    lat_deg, lon_deg, height_m, *_ = heard.fix.values
+def check_origin(site: SiteConfig, place: tuple[float, ...]) -> Finding:
+    """Whether a receiver's place is near the site's origin."""
+    lat_deg, lon_deg, height_m = place
     x_m, y_m, _ = Projection(site).to_map(lat_deg, lon_deg, height_m)
     away_m = max(abs(x_m), abs(y_m))
     if away_m <= FAR_M:
         return Finding(Level.PASS, "origin", f"{away_m:.0f} m from here")
-    away = f"{away_m / 1000:.0f} km" if math.isfinite(away_m) else "on the other side of the Earth"
+    refused = "" if away_m <= site.extent_m else ", so all fixes are refused (extent_m)"
     advice = f"a site of this place has origin_lat_deg = {lat_deg:.6f}, origin_lon_deg = {lon_deg:.6f}, and a new store"
-    if away_m <= site.extent_m:
-        return Finding(Level.WARN, "origin", f"{away} from here", advice)
-    return Finding(Level.FAIL, "origin", f"{away} from here, so all fixes are refused (extent_m)", advice)
+    level = Level.FAIL if refused else Level.WARN
+    return Finding(level, "origin", f"{away_m / 1000:.0f} km from here{refused}", advice)
 
 
 def check_ports(taken: list[str]) -> Finding:
@@ -136,5 +129,5 @@ def check_ports(taken: list[str]) -> Finding:
 
 def _fix_of(heard: Heard) -> str:
     """What comes there, in a few words."""
-    fix = f"; {heard.fix.quality}, {heard.fix.satellites} satellites" if heard.fix else ""
+    fix = f"; {heard.quality}, {heard.satellites} satellites" if heard.place else ""
     return f"{heard.kind} feeds {', '.join(heard.streams)}{fix}"

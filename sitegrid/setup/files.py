@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,8 +21,10 @@ from protocol.errors import ConfigError, SitegridError
 from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
+from protocol.wire.session import DEFAULT_ENDPOINT
 from sitegrid.setup.hearing import Heard
 
+PORTS = ROUTER, PAGE = int(DEFAULT_ENDPOINT.rpartition(":")[2]), 8080  # where router and page usually listen
 MODELS = Path(__file__).with_name("models.toml")
 ORIGIN = ("origin_lat_deg", "origin_lon_deg", "origin_height_m")
 PLACES = (6, 6, 1)  # decimals of an origin: a tenth of a metre; what it is matters less than that all have the same
@@ -44,36 +45,13 @@ HOW = {
 }
 
 
-@dataclass(frozen=True)
 class Folder:
-    """Where the files and data of a set-up lie."""
+    """Where a set-up has its files: the site, the machine with its receivers, what is mapped, what waits, logs."""
 
-    path: Path
-
-    @property
-    def site_file(self) -> Path:
-        """The site."""
-        return self.path / "site.toml"
-
-    @property
-    def agent_file(self) -> Path:
-        """The machine, its sensors and receivers."""
-        return self.path / "agent.toml"
-
-    @property
-    def store(self) -> Path:
-        """Data of the map server."""
-        return self.path / "store"
-
-    @property
-    def spool(self) -> Path:
-        """Samples that the map server has not acknowledged."""
-        return self.path / "spool.db"
-
-    @property
-    def logs(self) -> Path:
-        """What each process says."""
-        return self.path / "logs"
+    def __init__(self, path: Path) -> None:
+        self.path, self.logs = path, path / "logs"
+        self.site_file, self.agent_file = path / "site.toml", path / "agent.toml"
+        self.store, self.spool = path / "store", path / "spool.db"
 
     def load(self) -> tuple[SiteConfig, MachineConfig, AgentConfig]:
         """Read both files as server and agent do; raises ConfigError."""
@@ -95,8 +73,8 @@ def models() -> dict[str, dict[str, Any]]:
 
 def origin_of(every: Sequence[Heard]) -> tuple[float, ...]:
     """The first place that a receiver states: latitude, longitude, height; empty where none does."""
-    places = (heard.fix.values for heard in every if heard.fix)
-    return tuple(round(value, n) for value, n in zip(next(places, ()), PLACES, strict=False))
+    place = next((heard.place for heard in every if heard.place), ())
+    return tuple(round(value, n) for value, n in zip(place, PLACES, strict=False))
 
 
 def site_text(name: str, origin: Sequence[float]) -> str:

@@ -7,7 +7,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from agents.corrections.rtcm import RTCM, RTCM_FRAMING, message_number
 from agents.drivers.formats import FIX, HEADING, STREAMS, VELOCITY, Message
@@ -36,7 +35,8 @@ class Heard:
     """What came over a line.
 
     kind: of the [[driver]] that reads it; empty where none does. messages: how often each comes [Hz]. streams: what it
-    can feed. fix: the newest one that is a place. utc_ns: 0 where it states no time. problem: what hinders it.
+    can feed. place: latitude, longitude [deg], height [m] of the newest fix; empty without one. accuracy_m: its
+    standard deviation, None where that is not stated. utc_ns: 0 where it states no time. problem: what hinders it.
     """
 
     address: str
@@ -44,31 +44,12 @@ class Heard:
     baud: int = 0
     messages: Mapping[str, float] = field(default_factory=dict)
     streams: tuple[str, ...] = ()
-    fix: Message | None = None
+    place: tuple[float, ...] = ()
+    accuracy_m: float | None = None
+    quality: str = ""
+    satellites: int = 0
     utc_ns: int = 0
     problem: str = ""
-
-    @property
-    def accuracy_m(self) -> float | None:
-        """Standard deviation of the fix, east or north; None where it is not stated."""
-        std_m = math.sqrt((self.fix.values[3] + self.fix.values[4]) / 2) if self.fix else math.nan
-        return None if math.isnan(std_m) else std_m
-
-    def table(self) -> dict[str, Any]:
-        """As JSON has it."""
-        fix = self.fix
-        place = dict(zip(("lat_deg", "lon_deg", "height_m"), fix.values, strict=False)) if fix else {}
-        more = {"quality": fix.quality, "satellites": fix.satellites, "accuracy_m": self.accuracy_m} if fix else {}
-        return {
-            "address": self.address,
-            "kind": self.kind,
-            "baud": self.baud,
-            "messages": dict(self.messages),
-            "streams": list(self.streams),
-            "fix": {**place, **more},
-            "utc_ns": self.utc_ns,
-            "problem": self.problem,
-        }
 
 
 class Ear:
@@ -114,8 +95,11 @@ class Ear:
             one, *_ = senders = sorted(self._senders)
             several = f'{", ".join(senders)} send positions over one line: feed each by its own, as "{one}:fix"'
             problem = problem or several
-        fix = self._seen if self._seen and self._seen.values else None
-        return Heard(address, kind, baud, rates, streams, fix, self._utc_ns, problem)
+        fix = self._seen or Message(FIX, "", 0)
+        std_m = math.sqrt(sum(fix.values[3:5]) / 2)
+        stated_m = std_m if std_m > 0 else None  # NaN is not stated
+        shown = (fix.values[:3], stated_m, fix.quality, fix.satellites)
+        return Heard(address, kind, baud, rates, streams, *shown, self._utc_ns, problem)
 
     def _decode(self, frame: Frame, host_ns: int) -> None:
         try:

@@ -191,10 +191,10 @@ def test_the_doctor_looks_at_data_and_ports_and_leaves_a_running_agent_its_recei
     made = Folder(tmp_path / "quarry")
     made.store.mkdir()
     with socket.create_server(("127.0.0.1", 0)) as server:
-        monkeypatch.setattr(folder, "PORTS", {"page": server.getsockname()[1]})
+        monkeypatch.setattr(folder, "PORTS", (server.getsockname()[1],))
         shown = "\n".join(map(str, examine_folder(made.path)))
     assert re.search("FAIL  store .*holds no journal", shown)
-    assert re.search(r"WARN  ports .*taken: \d+ \(page\); `sitegrid up` takes others", shown)
+    assert re.search(r"WARN  ports .*taken: \d+; `sitegrid up` takes others", shown)
     with closing(Spool(made.spool, SpoolConfig())):
         shown = "\n".join(map(str, examine_folder(made.path)))
     assert re.search("-     receiver .*an agent runs in this folder", shown)

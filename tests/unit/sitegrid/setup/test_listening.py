@@ -22,7 +22,7 @@ from agents.drivers.transports import serial_ports, why_closed
 from protocol.errors import ConfigError
 from sitegrid.setup.hearing import Ear, Heard
 from sitegrid.setup.listening import address_of, listen, listen_to
-from sitegrid.setup.summary import blocks, missing, streams_of
+from sitegrid.setup.summary import block, missing
 from tests.unit.agents.drivers.frames import GGA, RMC, TPV, esf, nmea, pvt, report, ubx
 
 IMU = esf(5, *((kind, 4) for kind in (14, 13, 5, 16, 17, 18)))
@@ -99,7 +99,7 @@ def test_what_talks_on_a_serial_port_is_named(tmp_path: Path, case: str) -> None
         heard = listen(port, 0.4, (115_200, 9600))
     assert (heard.kind, heard.streams, bool(heard.problem)) == (kind, streams, bool(problem))
     assert problem in heard.problem
-    (first, *lines) = blocks([heard])
+    (first, *lines) = block(heard)
     assert first == port
     assert all(line.startswith("  ") for line in lines)
 
@@ -114,10 +114,10 @@ def test_a_fix_is_told_with_place_time_accuracy_and_rate() -> None:
     for i in range(11):
         ear.feed(pvt() + IMU + IMU, 10**12 + i * 10**8)
     heard = ear.heard("/dev/ttyACM0", 38_400)
-    text = "\n".join(blocks([heard]))
+    text = "\n".join(block(heard))
     for told in ("38400 baud", "NAV-PVT 10 Hz", "ESF-MEAS 21 Hz", "fixed, 24 satellites", "0.014 m", "10:15:27 UTC"):
         assert told in text
-    assert heard.table()["fix"]["lat_deg"] == pytest.approx(49.0101234)
+    assert heard.place[0] == pytest.approx(49.0101234)
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 10_000])
@@ -129,7 +129,7 @@ def test_any_bytes_in_any_pieces_are_heard_without_an_error(pieces: int) -> None
     )
     for at in range(0, len(stream), pieces):
         ear.feed(stream[at : at + pieces], 10**12 + at)
-    assert ear.heard("x").table()["messages"]["ubx NAV-PVT"] >= 0
+    assert ear.heard("x").messages["ubx NAV-PVT"] >= 0
     noise = Ear()
     noise.feed(draw.randbytes(400_000) + b"$@" * 9, 10**12)
     assert "neither NMEA" in noise.heard("x").problem, "no format is read into noise"
@@ -216,5 +216,5 @@ def test_ports_go_by_the_names_that_survive_replugging(tmp_path: Path) -> None:
 def test_what_is_missing_is_said_for_position_slope_and_resistance(
     streams: tuple[str, ...], sentences: tuple[str, ...]
 ) -> None:
-    said = missing(streams_of([Heard("a", "ubx", streams=streams)])).values()
+    said = missing([Heard("a", "ubx", streams=streams)]).values()
     assert all(want in one for want, one in itertools.zip_longest(sentences, said, fillvalue="-"))
