@@ -6,6 +6,8 @@ from pathlib import Path
 from agents.corrections.delivery import CorrectionsConfig
 from agents.delivery.spool import SpoolConfig
 from agents.delivery.uplink import UplinkConfig
+from agents.drivers.formats.framing import GPSD
+from agents.drivers.formats.gpsd import GPSD_PORT
 from agents.drivers.tables import DriverConfig, check_drivers
 from agents.holdout import HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
@@ -39,6 +41,10 @@ class AgentConfig:
     def __post_init__(self) -> None:
         if self.linger_s < 0:
             raise ValueError("linger_s: negative")
+        gpsd = {driver.address for driver in self.driver if driver.kind == GPSD}
+        for port in self.corrections.ports:
+            if port in gpsd or (port.startswith("tcp://") and port.endswith(f":{GPSD_PORT}")):
+                raise ValueError(f"corrections.ports: {port} is gpsd, which takes none: name the receiver's own port")
         if self.pipeline.localisation.smoothing_s > MOST_LAG_S:
             problem = f"at most {MOST_LAG_S:g} s: the map server would take the clock for wrong"
             raise ValueError(f"pipeline.localisation.lag_s: {problem}")

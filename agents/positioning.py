@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.ground import EstimationConfig
+from agents.localisation.antennas import Antennas
 from agents.localisation.filters.belief import DivergedError, PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.imu_steps import Sensed
@@ -57,6 +58,7 @@ class Positioning:
         self._counters: Counter[str] = Counter()
         is_default = config.localisation.profile == "default"  # the paper's method judges no wheels
         self.judge = WheelJudge(self._machine, self._projection) if is_default else None
+        self._antennas = Antennas(self._machine, self._projection)
         self._start()
 
     @property
@@ -80,7 +82,8 @@ class Positioning:
     @property
     def faults(self) -> dict[str, str]:
         """What is wrong with sensors that do not count, or contradict others: a sentence by sensor."""
-        return (self.judge.problems if self.judge else {}) | self.localiser.watch.problem
+        of_wheels = self.judge.problems if self.judge else {}
+        return of_wheels | self._antennas.problems | self.localiser.watch.problem
 
     @property
     def clocks_s(self) -> dict[str, float]:
@@ -168,6 +171,7 @@ class Positioning:
             return None
         for reading, sensor in heard:
             self.dead_reckoning.update(reading, sensor)
+            self._antennas.take(reading, sensor, self.dead_reckoning)
         try:
             poses = self.localiser.update(heard, self.dead_reckoning) if heard else []
         except (DivergedError, HeadingRefutedError) as error:
@@ -193,6 +197,7 @@ class Positioning:
         self.dead_reckoning = DeadReckoning(self._machine, self._config.slip, weighs=weighs)
         self.localiser = Localiser(self._machine, self._projection, self._config, is_weighed=self._is_weighed())
         self.poses = PoseHistory()
+        self._antennas.restart()
         if self.judge:
             self.judge.restart()
 

@@ -34,9 +34,17 @@ def _end(buffer: bytes | bytearray, start: int) -> int | None:
     return start + int.from_bytes(buffer[start + 1 : start + AROUND], "big") + 2 * AROUND
 
 
+RTCM_FRAMING = Framing(bytes([PREAMBLE]), MOST_BYTES, _end, lambda frame: not crc24q(frame))
+
+
 def rtcm_framer() -> Framer:
     """Cuts a stream of bytes into frames; all bytes between them are broken ones."""
-    return Framer({RTCM: Framing(bytes([PREAMBLE]), MOST_BYTES, _end, lambda frame: not crc24q(frame))}, between=b"")
+    return Framer({RTCM: RTCM_FRAMING}, between=b"")
+
+
+def message_number(frame: bytes) -> int:
+    """The number of the message in a whole frame: 1005 has a base's place, 1074 to 1137 its observations."""
+    return int.from_bytes(frame[AROUND : AROUND + 2], "big") >> 4
 
 
 def whole_frames(data: bytes) -> list[bytes]:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from agents.drivers import Observed
+from agents.drivers.formats import Message
 from agents.drivers.formats.framing import GPSD
 from agents.drivers.formats.gpsd import GREETING
 from agents.drivers.line import Line
@@ -148,14 +149,11 @@ class Receiver:
 
     def _why_unfixed(self) -> str:
         seen = self._line.seen
-        if self._now_s() - self._fixed_s <= NO_FIX_S:
-            if not seen or self._was_fixed:
-                return ""
-            return "waiting for its date" if seen.values else f"no fix yet: {seen.satellites} satellites"
-        if not seen:
-            return "it sends no positions: switch on GGA and RMC, or NAV-PVT"
-        undated = "it sends positions without a date: switch on RMC, or ZDA"
-        return undated if seen.values else f"no fix, {seen.satellites} satellites: its antenna needs open sky"
+        if self._now_s() - self._fixed_s > NO_FIX_S:
+            return why_unplaced(seen)
+        if not seen or self._was_fixed:
+            return ""
+        return "waiting for its date" if seen.values else f"no fix yet: {seen.satellites} satellites"
 
     def _tell(self, problem: str) -> None:
         """Log what is wrong, as it begins and as it ends."""
@@ -165,3 +163,12 @@ class Receiver:
 
     def _now_s(self) -> float:
         return self._clock_ns() * 1e-9
+
+
+def why_unplaced(seen: Message | None) -> str:
+    """Why the newest fix of a receiver is no place, in a sentence; empty where it is one."""
+    if not seen:
+        return "it sends no positions: switch on GGA and RMC, or NAV-PVT"
+    if not seen.values:
+        return f"no fix, {seen.satellites} satellites: its antenna needs open sky"
+    return "" if seen.utc_ns else "it sends positions without a date: switch on RMC, or ZDA"

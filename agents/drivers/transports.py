@@ -85,10 +85,20 @@ def split_address(address: str) -> tuple[str, str, int]:
 def why_closed(error: OSError) -> str:
     """Why a link cannot be opened and what to do, in one sentence."""
     if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
-        there = sorted(str(p) for name in ("ttyACM*", "ttyUSB*", "ttyAMA*") for p in Path("/dev").glob(name))
+        there = serial_ports()
         return f"no such port; there {'are ' + ', '.join(there) if there else 'is none: plug it in'}"
+    if error.errno == errno.EISDIR or "configure port" in str(error):
+        return "it is no serial port, nor a file"
     number = error.errno or 0
     return WHY.get(SAME.get(number, number), error.strerror or str(error))
+
+
+def serial_ports(devices: Path = Path("/dev")) -> list[str]:
+    """Serial ports of this host, by the names that survive replugging where they have one."""
+    named = sorted((devices / "serial" / "by-id").glob("*"))
+    plain = [port for name in ("ttyACM*", "ttyUSB*", "ttyAMA*") for port in sorted(devices.glob(name))]
+    known = {port.resolve() for port in named}
+    return [str(port) for port in (*named, *(port for port in plain if port.resolve() not in known))]
 
 
 def _bound(host: str, port: int) -> socket.socket:

@@ -42,6 +42,8 @@ NOT_NEGATIVE = (
 )
 MOST_KG = 500_000.0  # of a machine, and of what it carries: a sample states the sum
 LIGHT_KG, LONG_M = 500.0, 1.5  # no machine with a wheelbase this long is so light: its mass was written in tonnes
+FAR_M = 30.0  # of a mount: larger than any machine on wheels or tracks
+MOST_RADIUS_M = 3.0  # of a wheel: the largest tyre there is has 2.05 m
 MAX_EARLY_S = 10.0  # a stamp that is further behind its reading is no delay, but another clock
 
 
@@ -51,6 +53,11 @@ class Mount:
 
     xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if far_m := next((v for v in self.xyz_m if not abs(v) <= FAR_M), 0.0):
+            in_m = f"if that is mm, write {far_m / 1000:g}, if cm, {far_m / 100:g}"
+            raise ValueError(f"xyz_m: {far_m:g} m is off any machine; {in_m}")
 
     def frame_from_sensor(self) -> Floats:
         """Rotation matrix (3, 3) from the sensor into the frame that carries it, `base_link` or `front_link`."""
@@ -166,8 +173,9 @@ class MachineConfig:
         if not NAME.fullmatch(self.name):
             raise ValueError(f"name: {self.name!r} is not a name (lower-case letters, digits, - and _)")
         self._check_mass()
-        if self.wheel_radius_m <= 0:
-            raise ValueError("wheel_radius_m must be positive")
+        if not 0 < self.wheel_radius_m <= MOST_RADIUS_M:
+            problem = f"{self.wheel_radius_m:g} is not above 0 and up to {MOST_RADIUS_M:g}"
+            raise ValueError(f"wheel_radius_m: {problem}; if that is mm, write {self.wheel_radius_m / 1000:g}")
         if self.rotating_mass_factor < 1:
             raise ValueError("rotating_mass_factor: below 1")
         if self.machine_share is not None and not 0 <= self.machine_share <= 1:

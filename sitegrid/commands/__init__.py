@@ -12,5 +12,5 @@ GROUPS = {
     "ask": ("query", "calibrate", "trust", "distrust"),
     "look": ("plot", "log"),
     "keep": ("backup", "restore", "verify", "accept", "fold"),
-    "help": ("doctor", "keys"),
+    "set up": ("probe", "init", "up", "doctor", "keys"),
 }

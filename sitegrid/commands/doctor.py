@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 from pathlib import Path
 
-from sitegrid.doctor import Level
+from sitegrid.doctor import Finding, Level
 from sitegrid.options.groups import add_network
 from sitegrid.process.lifetime import say, tell
 
@@ -16,6 +16,8 @@ EXTRA = "server"  # for --store alone
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
+    folder = "folder of `sitegrid init`: its files, ports, place and data are checked, and nothing else"
+    parser.add_argument("folder", type=Path, nargs="?", metavar="FOLDER", help=folder)
     add_network(parser)
     parser.add_argument("--site", help="name of the site (default: that of the site file or the keys, else paper)")
     parser.add_argument("--site-file", type=Path, help="site file, to compare with the map server's (site.toml)")
@@ -27,10 +29,18 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> int:
     """Check what is given; 1 where something does not work."""
-    from sitegrid.doctor.examine import examine
-
-    findings = examine(arguments)
+    findings = _findings(arguments)
     ok = all(finding.level != Level.FAIL for finding in findings)
     table = {"ok": ok, "findings": [asdict(finding) for finding in findings]}
     say(table) if arguments.json else tell(*findings)
     return 0 if ok else 1
+
+
+def _findings(arguments: Namespace) -> list[Finding]:
+    if arguments.folder:
+        from sitegrid.doctor.folder import examine_folder
+
+        return examine_folder(arguments.folder)
+    from sitegrid.doctor.examine import examine
+
+    return examine(arguments)

@@ -18,6 +18,7 @@ from typing import Any
 from protocol.errors import SitegridError
 
 END_S = 8.0  # after SIGTERM; then it is killed
+END_BYTES = 4096  # of a log, where its last line is
 Meanwhile = Callable[[dict[str, Any]], None]
 
 
@@ -72,6 +73,16 @@ class Child:
                 raise ProcessError(self.name, f"ended with {self.code} instead of printing `{key}`{see}")
             self._meanwhile(line)
         raise ProcessError(self.name, f"did not print `{key}` within {silent_s:g} s")
+
+    def last_words(self) -> str:
+        """What it logged last, as its error; empty where it logged nothing."""
+        lines = Path(self._errors.name).read_bytes()[-END_BYTES:].splitlines() if self._errors else []
+        last = lines[-1].decode(errors="replace") if lines else ""
+        try:
+            table = json.loads(last)
+        except ValueError:
+            return last
+        return str(table.get("error") or table.get("event") or last) if isinstance(table, dict) else last
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal, if it still runs."""

@@ -13,6 +13,7 @@ from typing import Any
 from agents.drivers import formats
 from agents.drivers.formats import Message
 
+GPSD_PORT = 2947  # where it listens
 GREETING = b'?WATCH={"enable":true,"json":true};\n'  # asks for reports
 QUALITIES = {1: "autonomous", 2: "differential", 3: "fixed", 4: "float"}  # by `status`
 PLANE, SPACE = 2, 3  # `mode` of a fix in two and three dimensions

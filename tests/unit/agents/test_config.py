@@ -107,6 +107,12 @@ def test_samples_that_are_late_by_the_lag_are_no_wrong_clock_to_the_server() -> 
         ),
         ("[[sensor]]\nname = 'g'\nkind = 'gps'", "without a"),
         ("sensor = 3", "sensor"),
+        ("[machine]\nname = 'a'\n[[sensor]]\nname = 'g'\nkind = 'gps'\nmount = { xyz_m = [0, 0, 3350] }", "write 3.35"),
+        ("[corrections]\nbase = 'b'\nports = ['tcp://10.0.0.7:2947']", "2947 is gpsd, which takes none"),
+        (
+            "[corrections]\nbase = 'b'\nports = ['tcp://a:1']\n[[driver]]\nkind = 'gpsd'\naddress = 'tcp://a:1'",
+            "tcp://a:1 is gpsd, which takes none",
+        ),
     ],
 )
 def test_bad_option_is_refused_by_name_and_file(tmp_path: Path, text: str, problem: str) -> None:

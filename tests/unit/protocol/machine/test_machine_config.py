@@ -28,11 +28,24 @@ def test_mount_turns_axes(rpy_deg, axis, expected):
 
 @pytest.mark.parametrize(
     "change",
-    [{"name": "A"}, {"mass_kg": 0.0}, {"wheel_radius_m": -1.0}, {"rotating_mass_factor": 0.9}, {"sensors": (GPS, GPS)}],
+    [
+        {"name": "A"},
+        {"mass_kg": 0.0},
+        {"wheel_radius_m": -1.0},
+        {"wheel_radius_m": 750.0},
+        {"rotating_mass_factor": 0.9},
+        {"sensors": (GPS, GPS)},
+    ],
 )
 def test_impossible_machine_is_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         dataclasses.replace(MACHINE, **change)
+
+
+@pytest.mark.parametrize("xyz_m", [(800.0, 0.0, 3350.0), (0.0, 0.0, -3350.0), (0.0, float("nan"), 0.0)])
+def test_a_lever_arm_off_the_machine_is_refused(xyz_m):
+    with pytest.raises(ValueError, match=r"xyz_m: .* is off any machine; if that is mm, write (0.8|-3.35|nan)"):
+        Mount(xyz_m)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +73,9 @@ def test_impossible_sensor_is_refused(change):
 
 def test_every_option_of_a_machine_is_written_and_read_back():
     body = {
-        f.name: 1.25 + i for i, f in enumerate(dataclasses.fields(MachineConfig)) if f.name not in ("name", "sensors")
+        f.name: 1.25 + i / 16
+        for i, f in enumerate(dataclasses.fields(MachineConfig))
+        if f.name not in ("name", "sensors")
     }
     machine = MachineConfig("a", **{**body, "mass_kg": 2500.0, "machine_share": 0.5, "skid_steers": True})
     assert parse_machine(tomllib.loads(machine_toml(machine))["machine"], (), "x") == machine

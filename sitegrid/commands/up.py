@@ -1,0 +1,140 @@
+"""`sitegrid up`: router, map server, page and agent of one folder on this host, each its own process, until Ctrl-C."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import threading
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import zenoh
+
+from protocol.errors import MessageError
+from protocol.wire import keys
+from protocol.wire.codec import decode_health
+from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, free_endpoint, is_free, open_session
+from sitegrid.process.children import Child, Children, ProcessError
+from sitegrid.process.lifetime import note, say, stop_flag
+
+if TYPE_CHECKING:
+    from sitegrid.setup.files import Folder
+
+HELP = "run router, map server, page and agent of a folder that `sitegrid init` has made, on this host"
+EXTRA = "receivers,server,web"
+READY_S = 300.0  # without a word, until a process counts as stuck; a first start compiles for a minute
+COUNT = re.compile(r"\d+")
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of the command."""
+    here = "folder with site.toml and agent.toml, where data and logs are kept too (default: this one)"
+    parser.add_argument("folder", type=Path, nargs="?", default=Path(), metavar="FOLDER", help=here)
+
+
+def run(arguments: Namespace) -> int:
+    """Run all until a signal comes, which is 0, or one of them ends by itself, which is 1."""
+    from sitegrid.setup.files import Folder
+
+    folder = Folder(arguments.folder)
+    site, machine, _ = folder.load()
+    stop = stop_flag(None)  # it has children to end
+    folder.logs.mkdir(exist_ok=True)
+
+    def meanwhile(line: dict[str, Any]) -> None:
+        if "note" in line:
+            note(str(line["note"]))
+        if stop.is_set():
+            raise KeyboardInterrupt
+
+    try:
+        with Children(folder.logs, meanwhile) as children:
+            endpoint, url, running = _start(folder, site.name, children)
+            if arguments.json:
+                say({"ready": "up", "endpoint": endpoint, "url": url})
+            else:
+                note(f"the map is at {url} until Ctrl-C; data and logs: {folder.path.absolute()}")
+                note(f"  sitegrid query --endpoint {endpoint} --site {site.name} machines")
+            with closing(_Problems(endpoint, site.name, machine.name)) as problems:
+                _watch(running, stop, problems.tell)
+    except KeyboardInterrupt:
+        pass
+    note(f"all is ended; `sitegrid up {shlex.quote(str(arguments.folder))}` goes on from here")
+    return 0
+
+
+def _start(folder: Folder, site: str, children: Children) -> tuple[str, str, list[Child]]:
+    """Start every part; returns the router's endpoint, the page's address, and the processes."""
+    from sitegrid.setup.files import PAGE, ROUTER
+
+    endpoint, page = DEFAULT_ENDPOINT, PAGE
+    if not is_free(ROUTER):
+        endpoint = free_endpoint()
+        note(f"port {ROUTER} is taken, perhaps by another router: this one listens at {endpoint}")
+    if not is_free(PAGE):
+        page = 0
+        note(f"port {PAGE} is taken: the page takes another one")
+    at, site_file = ("--endpoint", endpoint), ("--site-file", folder.site_file)
+    parts = {
+        "router": ("--listen", endpoint),
+        "server": (*at, *site_file, "--store", folder.store),
+        "web": (*at, "--site", site, "--listen", page),
+        "agent": (*at, *site_file, "--config", folder.agent_file, "--spool", folder.spool),
+    }
+    running, url = list[Child](), ""
+    for name, words in parts.items():
+        note(f"{name} starts")
+        child = children.start(name, name, *words, "--json")
+        url = str(_ready(child).get("url", url))
+        running.append(child)
+    return endpoint, url, running
+
+
+def _ready(child: Child) -> dict[str, Any]:
+    """What a process says once it is ready; ProcessError with its own words where it ends instead."""
+    try:
+        return child.expect("ready", READY_S)
+    except ProcessError:
+        if child.code is None or not (words := child.last_words()):
+            raise
+        raise ProcessError(child.name, words) from None
+
+
+def _watch(running: list[Child], stop: threading.Event, tell: Callable[[], None]) -> None:
+    """Wait for a signal; ProcessError where a process ends before, but an agent whose recording has ended."""
+    while not stop.wait(0.25):
+        tell()
+        for child in [child for child in running if child.code is not None]:
+            if child.code or child.name != "agent":
+                why = child.last_words() or "it logged nothing"
+                raise ProcessError(child.name, f"ended with {child.code}, so all is ended: {why}")
+            note("agent: its recording has ended; the map stays")
+            running.remove(child)
+
+
+class _Problems:
+    """Says what hinders the agent, by its health, as that changes; counts alone are no change."""
+
+    def __init__(self, endpoint: str, site: str, machine: str) -> None:
+        self._machine, self._told = machine, ""
+        self._session = open_session(SessionConfig(endpoint))
+        self._health = self._session.declare_subscriber(keys.health(site, machine), zenoh.handlers.RingChannel(1))
+
+    def tell(self) -> None:
+        """Say what is new."""
+        from sitegrid.doctor.disk import check_health
+
+        if not (sample := self._health.try_recv()):
+            return
+        with suppress(MessageError):
+            advice = check_health(self._machine, decode_health(sample.payload.to_bytes()).values).advice
+            if COUNT.sub("", advice) != COUNT.sub("", self._told):
+                self._told = advice
+                note(f"{self._machine}: {advice or 'nothing hinders it any more'}")
+
+    def close(self) -> None:
+        """Leave the network."""
+        self._session.close()  # type: ignore[no-untyped-call]

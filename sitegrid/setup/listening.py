@@ -1,0 +1,79 @@
+"""Listens to ports, addresses and files for a while: opens them, and tries the usual bauds until frames come."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+from agents.drivers.formats.framing import GPSD
+from agents.drivers.formats.gpsd import GPSD_PORT, GREETING
+from agents.drivers.receiver import BAUDS, TRY_S
+from agents.drivers.transports import Transport, open_transport, split_address, why_closed
+from protocol.errors import ConfigError
+from sitegrid.setup.hearing import Ear, Heard
+
+POLL_S = 0.1
+MOST_FILE_BYTES = 1 << 22  # of a recording: an hour of a receiver
+
+
+def address_of(text: str) -> str:
+    """An address as [[driver]] has it, `gpsd` for that of this host; ConfigError where it is none."""
+    address = f"tcp://127.0.0.1:{GPSD_PORT}" if text == GPSD else text
+    if "://" in address:
+        try:
+            split_address(address)
+        except ValueError as error:
+            raise ConfigError(text, str(error).removeprefix("address: ")) from None
+        return address
+    return str(Path(address).absolute())
+
+
+def listen_to(addresses: Sequence[str], seconds: float, bauds: Sequence[int] = BAUDS) -> list[Heard]:
+    """What talks at these addresses, all at once. seconds: from the first frame, or of silence."""
+    if not addresses:
+        return []
+    with ThreadPoolExecutor(len(addresses)) as pool:
+        return list(pool.map(lambda address: listen(address, seconds, bauds), addresses))
+
+
+def listen(address: str, seconds: float, bauds: Sequence[int] = BAUDS) -> Heard:
+    """What talks at one address; on a serial port at the first baud with frames."""
+    ear, is_serial = Ear(), "://" not in address
+    for baud in bauds if is_serial else bauds[:1]:
+        ear = Ear()
+        try:
+            with closing(open_transport(address, baud)) as transport:
+                is_serial = is_serial and transport.is_live
+                broke = _hear(transport, ear, seconds)
+        except OSError as error:
+            return Heard(address, problem=why_closed(error))
+        if ear.frames or not ear.n_bytes or not is_serial:
+            break
+    heard = ear.heard(address, baud if is_serial and ear.frames else 0)
+    return replace(heard, problem=f"the link broke ({broke})") if broke and not heard.kind else heard
+
+
+def _hear(transport: Transport, ear: Ear, seconds: float) -> str:
+    """Listen until it is time; returns why the link broke, empty if it did not."""
+    end_s, is_greeted = time.monotonic() + max(seconds, TRY_S), False
+    while (left_s := end_s - time.monotonic()) > 0:
+        try:
+            data = transport.read(min(left_s, POLL_S))
+        except OSError as error:
+            return error.strerror or str(error)
+        if data is None or ear.n_bytes > MOST_FILE_BYTES:
+            break
+        was_heard = bool(ear.frames)
+        ear.feed(data, time.monotonic_ns() if transport.is_live else None)
+        if ear.frames and not was_heard:
+            end_s = time.monotonic() + seconds
+        elif not ear.frames and ear.n_bytes:
+            end_s = min(end_s, time.monotonic() + TRY_S)
+        if transport.is_live and not is_greeted and ear.hears(GPSD):
+            transport.write(GREETING)
+            is_greeted = True
+    return ""
