@@ -28,8 +28,8 @@ def add_options(parser: ArgumentParser) -> None:
     """Options of the command. What is not given is asked for on a terminal."""
     add = parser.add_argument
     add("folder", type=Path, metavar="FOLDER", help="is made, where it is not there")
-    ports = "where a receiver is, as `sitegrid probe` has it; may be repeated (default: all serial ports)"
-    add("--port", action="append", default=[], dest="ports", help=ports)
+    ports = "where receivers are, as `sitegrid probe` has it (default: all serial ports)"
+    add("--port", nargs="+", action="extend", default=[], dest="ports", metavar="PORT", help=ports)
     add("--site", metavar="NAME", help="name of the site (default: that of the folder)")
     add("--machine", metavar="NAME", help="name of the machine (default: its model, and -1)")
     add("--model", help="loader, truck, excavator (its carrier), roller or pickup")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 import shlex
+import sys
 import threading
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,10 @@ from protocol.errors import MessageError
 from protocol.wire import keys
 from protocol.wire.codec import decode_health
 from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, free_endpoint, is_free, open_session
+from sitegrid.health import line_of, status_of
 from sitegrid.process.children import Child, Children, ProcessError
 from sitegrid.process.lifetime import note, say, stop_flag
+from sitegrid.process.status_line import StatusLine, status_line
 
 if TYPE_CHECKING:
     from sitegrid.setup.files import Folder
@@ -58,8 +61,9 @@ def run(arguments: Namespace) -> int:
             else:
                 note(f"the map is at {url} until Ctrl-C; data and logs: {folder.path.absolute()}")
                 note(f"  sitegrid query --endpoint {endpoint} --site {site.name} machines")
-            with closing(_Problems(endpoint, site.name, machine.name)) as problems:
-                _watch(running, stop, problems.tell)
+            shown = status_line() if sys.stderr.isatty() and not arguments.json else nullcontext()
+            with shown as line, closing(_Status(endpoint, site.name, machine.name, line)) as status:
+                _watch(running, stop, status.tell)
     except KeyboardInterrupt:
         pass
     note(f"all is ended; `sitegrid up {shlex.quote(str(arguments.folder))}` goes on from here")
@@ -115,25 +119,25 @@ def _watch(running: list[Child], stop: threading.Event, tell: Callable[[], None]
             running.remove(child)
 
 
-class _Problems:
-    """Says what hinders the agent, by its health, as that changes; counts alone are no change."""
+class _Status:
+    """Shows what the agent's health says of itself: on a terminal in a line that changes, elsewhere each change."""
 
-    def __init__(self, endpoint: str, site: str, machine: str) -> None:
-        self._machine, self._told = machine, ""
+    def __init__(self, endpoint: str, site: str, machine: str, line: StatusLine | None) -> None:
+        self._machine, self._line, self._told = machine, line, ""
         self._session = open_session(SessionConfig(endpoint))
         self._health = self._session.declare_subscriber(keys.health(site, machine), zenoh.handlers.RingChannel(1))
 
     def tell(self) -> None:
         """Say what is new."""
-        from sitegrid.doctor.disk import check_health
-
         if not (sample := self._health.try_recv()):
             return
         with suppress(MessageError):
-            advice = check_health(self._machine, decode_health(sample.payload.to_bytes()).values).advice
-            if COUNT.sub("", advice) != COUNT.sub("", self._told):
-                self._told = advice
-                note(f"{self._machine}: {advice or 'nothing hinders it any more'}")
+            values = decode_health(sample.payload.to_bytes()).values
+            if self._line:
+                self._line.show(line_of(self._machine, values))
+            elif COUNT.sub("", said := status_of(values)) != COUNT.sub("", self._told):
+                self._told = said
+                note(f"{self._machine}: {said}")
 
     def close(self) -> None:
         """Leave the network."""

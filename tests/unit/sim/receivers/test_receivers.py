@@ -37,7 +37,7 @@ class Driven:
                 self.readings += span
                 self.sent = [data + each.speak(span) for data, each in zip(self.sent, receivers, strict=True)]
 
-    def of(self, wiring: Wiring, stream: str) -> list[Reading]:
+    def readings_of(self, wiring: Wiring, stream: str) -> list[Reading]:
         return [reading for reading in self.readings if reading.sensor == wiring.feeds[stream].name]
 
 
@@ -66,7 +66,7 @@ def test_the_oracle_reads_fixes_of_ubx_as_they_were_measured_to_their_last_digit
         read = by_pyubx2(data, "NAV-PVT")
         located = [message for message in read if message.fixType]
         assert 0 < len(read) - len(located) < 10, "an outage is said"
-        fixes, motions = ubx.of(wiring, "fix"), ubx.of(wiring, "velocity")
+        fixes, motions = ubx.readings_of(wiring, "fix"), ubx.readings_of(wiring, "velocity")
         for message, fix, motion in zip(located, fixes, motions, strict=True):
             assert isinstance(fix, Gps)
             assert isinstance(motion, GpsVelocity)
@@ -83,7 +83,7 @@ def test_the_oracle_reads_fixes_of_ubx_as_they_were_measured_to_their_last_digit
 def test_the_oracle_reads_imu_and_wheels_in_their_units(ubx: Driven) -> None:
     read, wiring = by_pyubx2(ubx.sent[0], "ESF-MEAS"), ubx.wirings[0]
     inertial = [message for message in read if message.numMeas == 6]
-    for message, imu in zip(inertial, ubx.of(wiring, "imu"), strict=True):
+    for message, imu in zip(inertial, ubx.readings_of(wiring, "imu"), strict=True):
         fields = [(getattr(message, f"dataField_{i:02}") ^ 1 << 23) - (1 << 23) for i in range(1, 7)]
         assert [getattr(message, f"dataType_{i:02}") for i in range(1, 7)] == [14, 13, 5, 16, 17, 18]
         measured = [math.degrees(rate) * 2**12 for rate in astuple(imu)[2:5]] + [f * 2**10 for f in astuple(imu)[5:]]
@@ -91,7 +91,7 @@ def test_the_oracle_reads_imu_and_wheels_in_their_units(ubx: Driven) -> None:
         assert message.timeTag == imu.stamp_ns // 10**6 % 2**32
     wheels = [(m.dataType_01, m.dataType_02, m.dataField_01, m.dataField_02) for m in read if m.numMeas == 2]
     signed = [[w & 0x7FFFFF for w in words[2:]] for words in wheels]
-    ticks = [reading.left_ticks for reading in ubx.of(wiring, "wheels") if isinstance(reading, Encoder)]
+    ticks = [reading.left_ticks for reading in ubx.readings_of(wiring, "wheels") if isinstance(reading, Encoder)]
     steps = [0.0, *(abs(b - a) for a, b in pairwise(ticks))]
     assert [left for left, _ in signed] == list(accumulate(map(int, steps)))
     assert {words[:2] for words in wheels} == {(8, 9)}
@@ -125,7 +125,7 @@ def test_the_oracle_reads_sentences_as_they_were_measured_to_their_last_digit(nm
         located = [
             each for each in zip(*(read[n] for n in ("GGA", "RMC", "GST", "VTG")), strict=True) if each[0].quality
         ]
-        fixes, motions = nmea.of(wiring, "fix"), nmea.of(wiring, "velocity")
+        fixes, motions = nmea.readings_of(wiring, "fix"), nmea.readings_of(wiring, "velocity")
         for (gga, rmc, gst, vtg), fix, motion in zip(located, fixes, motions, strict=True):
             assert isinstance(fix, Gps)
             assert isinstance(motion, GpsVelocity)
@@ -149,7 +149,7 @@ def test_an_agent_reads_every_reading_that_a_receiver_carries(format_: str) -> N
         line = Line(format_, wiring.feeds)
         counted = [value.sensor for value in line.feed(data, 10**15) if value.sensor]
         for stream, sensor in wiring.feeds.items():
-            assert counted.count(sensor.name) == len(driven.of(wiring, stream)), stream
+            assert counted.count(sensor.name) == len(driven.readings_of(wiring, stream)), stream
         assert line.counters["bytes_broken"] == 0
         assert 0 < line.counters["no_fix"] < 10
         assert "malformed" not in line.counters

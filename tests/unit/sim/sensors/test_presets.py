@@ -57,7 +57,7 @@ def test_every_value_has_its_range(kind: str) -> None:
 
 def test_outage_cannot_be_longer_than_its_period() -> None:
     with pytest.raises(ValueError, match="outage_s"):
-        GpsNoise(5, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 11.0, 10.0)
+        GpsNoise(5, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 11.0, 10.0, 0.1)
 
 
 # --- machines --------------------------------------------------------------------------------------------------------
