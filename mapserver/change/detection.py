@@ -278,8 +278,8 @@ def _doubt(
     for index, timed in enumerate(pages):
         known = timed.page.cells
         bits[:, index, known["cell"]] = known["visits"], known["machines"]
-    index, variance = np.arange(len(pages))[:, None], np.zeros(len(cells))
-    for side in ((index >= first) & (index < cut), index >= cut):
+    page, variance = np.arange(len(pages))[:, None], np.zeros(len(cells))
+    for side in ((page >= first) & (page < cut), page >= cut):
         std = ev.DOUBT_MOST * np.where(side, doubt, 0.0).sum(axis=0) / np.where(side, weight, 0.0).sum(axis=0)
         passes, machines = np.bitwise_count(np.bitwise_or.reduce(np.where(side, bits[:, :, cells], 0), axis=1))
         variance += std**2 * (MACHINE_SHARE / machines + (1 - MACHINE_SHARE) / passes)
