@@ -2,8 +2,8 @@
 
 For every cell, evidence is cut in two between two of its pages by time. The cut that explains it best (two kinds of
 ground are more likely than one, by the log-likelihood ratio of their histograms) is a change if the two histograms have
-little in common (total variation) and their medians differ by more than what machines differ by among themselves. What
-comes after a cut is cut again, so that the last of several changes counts.
+little in common (total variation) and their medians differ by more than what machines differ by among themselves, and
+by more than what their samples state. What comes after a cut is cut again, so that the last of several changes counts.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ BINS = (
     1.5  # least difference of their medians, in bins (22 % of c_rr, 0.031 of gradient): medians are no finer than one
 )
 LEAST_C_RR = 0.005  # likewise, on concrete, by what machines' zeros are off by; from 0.023 on bins ask for more
+SIGMAS = 3.0  # least difference of the medians, in the deviations that samples state: a site has hundreds of stretches
+MACHINE_SHARE = 0.5  # of the variance that samples state: zero and scale before calibration, which all passes share
 WEIGHT_M = 0.3  # least evidence on either side of a cut: a sample's vote in a cell beside its own is no pass
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
 LEAST_SHARE = 0.5  # of a square of size_m that changed, where all else in it is not known
@@ -95,8 +97,13 @@ def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
         votes = _histograms(votes_of_pages, ends, part, cells)
         left = np.arange(len(cells))
         for _ in range(MOST_CHANGES):
-            cut, kind = _best_cut(votes[:, :, left], last.first[cells[left]], centres, least_step)
-            changed = cut > last.first[cells[left]]
+            first = last.first[cells[left]]
+            cut, kind, step = _best_cut(votes[:, :, left], first, centres, least_step)
+            changed = cut > first
+            if part == ev.RESISTANCE and changed.any():
+                changed[changed] = step[changed] > SIGMAS * _doubt(
+                    pages, votes_of_pages, ends, cells[left[changed]], first[changed], cut[changed]
+                )
             left, cut, kind = left[changed], cut[changed], kind[changed]
             last.first[cells[left]] = cut
             last.kind[cells[left]] = kind if part == ev.RESISTANCE else np.nan
@@ -244,14 +251,36 @@ def _histograms(votes: NDArray[np.uint64], ends: Ints, part: slice, cells: Ints)
     return metres
 
 
-def _best_cut(votes: Floats, first: Ints, centres: Floats, least_step: float) -> tuple[Ints, Floats]:
+def _best_cut(votes: Floats, first: Ints, centres: Floats, least_step: float) -> tuple[Ints, Floats, Floats]:
     """Index of the page (cells,) at which the ground changed, the given first page where it did not.
 
     votes: (pages, bins, cells); pages before `first` do not count. centres (bins,): their values; medians differ by
-    least_step or more. Also returns the median (cells,) after it, in bins.
+    least_step or more. Also returns the median (cells,) after it, in bins, and by what values the medians differ.
     """
     best, variation, before, after = likeliest_cuts(votes, first, WEIGHT_M)
     values_before, values_after = (np.interp(median, np.arange(len(centres)), centres) for median in (before, after))
-    apart = (np.abs(before - after) >= BINS) & (np.abs(values_before - values_after) >= least_step)
-    changed = (best > 0) & (variation > VARIATION) & apart
-    return np.where(changed, best, first), after
+    step = np.abs(values_before - values_after)
+    changed = (best > 0) & (variation > VARIATION) & (np.abs(before - after) >= BINS) & (step >= least_step)
+    return np.where(changed, best, first), after, step
+
+
+def _doubt(
+    pages: Sequence[TimedPage], packed: NDArray[np.uint64], ends: Ints, cells: Ints, first: Ints, cut: Ints
+) -> Floats:
+    """Standard deviation (cells,) of c_rr after a cut less that before it, by what samples state.
+
+    packed, ends: as of `packed_votes`. More metres of one pass make a side no surer: they err alike, by how an estimate
+    settles behind a brake or a bend. Nor do more passes of one machine take off its own share: zero, scale and load.
+    """
+    weight = weights(packed, ends, ev.RESISTANCE.start, ev.RESISTANCE.stop)[:, cells]
+    doubt = weights(packed, ends, ev.DOUBT, ev.DOUBT + 1)[:, cells]
+    bits = np.zeros((2, len(pages), ev.CELLS), np.uint64)
+    for index, timed in enumerate(pages):
+        known = timed.page.cells
+        bits[:, index, known["cell"]] = known["visits"], known["machines"]
+    page, variance = np.arange(len(pages))[:, None], np.zeros(len(cells))
+    for side in ((page >= first) & (page < cut), page >= cut):
+        std = ev.DOUBT_MOST * np.where(side, doubt, 0.0).sum(axis=0) / np.where(side, weight, 0.0).sum(axis=0)
+        passes, machines = np.bitwise_count(np.bitwise_or.reduce(np.where(side, bits[:, :, cells], 0), axis=1))
+        variance += std**2 * (MACHINE_SHARE / machines + (1 - MACHINE_SHARE) / passes)
+    return np.sqrt(variance)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-SCHEMA = 4  # of everything below; a snapshot of another schema is folded again from the journal
+SCHEMA = 5  # of everything below; a snapshot of another schema is folded again from the journal
 
 CELLS = BLOCK_CELLS * BLOCK_CELLS  # of a block
 WEIGHT_UNITS_PER_M = 4096
@@ -33,7 +33,10 @@ RESISTANCE = slice(0, RESISTANCE_BINS)
 GRADE_EAST = slice(RESISTANCE.stop, RESISTANCE.stop + GRADE_BINS)
 GRADE_NORTH = slice(GRADE_EAST.stop, GRADE_EAST.stop + GRADE_BINS)
 HEADING = slice(GRADE_NORTH.stop, GRADE_NORTH.stop + SECTORS)
-COUNTS = HEADING.stop
+# One count: metres of the c_rr votes, times the standard deviation that their samples state as a share of DOUBT_MOST.
+DOUBT = HEADING.stop
+DOUBT_MOST = 0.032  # larger deviations count as this one [-]: three of it are half of what tells sand from concrete
+COUNTS = DOUBT + 1
 
 VISITS, MACHINES = 0, 1  # the two bitmaps
 SHARE_ONE = 256  # a vote is split between two neighbouring bins in 1/256

@@ -1,6 +1,6 @@
 """Pages: the evidence of one block over a span of time, packed and never changed.
 
-Of the 106 counts of a cell about ten are not zero. A page keeps those alone, with bitmaps and newest stamp of its
+Of the 107 counts of a cell about ten are not zero. A page keeps those alone, with bitmaps and newest stamp of its
 cells. What stays in memory is more compact still: about 45 bytes per cell and page. As nothing changes pages, readers
 and snapshots take them without a copy.
 """

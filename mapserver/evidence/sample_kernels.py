@@ -21,6 +21,7 @@ from mapserver.evidence.fold_config import (
 )
 from mapserver.evidence.fold_kernels import BLOCK_BITS, BUCKET_BITS, HALF
 
+_DOUBT_PER_UNIT = ev.SHARE_ONE / ev.DOUBT_MOST
 _R_LAST, _G_LAST = ev.RESISTANCE_BINS - 2, ev.GRADE_BINS - 2
 _R_PER_LOG = len(RESISTANCE_STEPS) / np.log(ev.RESISTANCE_CENTRES[-1] / ev.RESISTANCE_CENTRES[0])
 _R_OFFSET = 0.5 - np.log(ev.RESISTANCE_CENTRES[0]) * _R_PER_LOG
@@ -218,14 +219,16 @@ def split(rows: Any, names: Any, bins: Any, shares: Any, bits: Any, stamps: Any)
     """What rows vote for.
 
     names (n,): hashes of machines. Fills bins (n, 4): of resistance, grade east and grade north, -1 for no vote, and
-    sector of the heading; shares (n, 3) of the bin above, in 1/256; bits (n, 2): one of the visit and one of the
-    machine (a multiplicative hash takes the top six bits); stamps (n,).
+    sector of the heading; shares (n, 4): of the bin above, in 1/256, and the stated standard deviation of c_rr in 1/256
+    of DOUBT_MOST; bits (n, 2): one of the visit and one of the machine (a multiplicative hash takes the top six bits);
+    stamps (n,).
     """
     for k in range(len(rows)):
         row = rows[k]
         bins[k, 0], shares[k, 0] = _split_resistance(np.float64(row.c_rr))
         bins[k, 1], shares[k, 1] = _split_grade(np.float64(row.grade_e))
         bins[k, 2], shares[k, 2] = _split_grade(np.float64(row.grade_n))
+        shares[k, 3] = _doubt(np.float64(row.c_rr_var))
         bins[k, 3] = np.int64(np.floor(np.float64(row.heading_rad) / _SECTOR_RAD + 0.5)) % _SECTORS
         visit = (names[k] + np.uint64(row.stamp_ns // VISIT_NS)) * _HASH
         bits[k, 0], bits[k, 1] = np.uint64(1) << (visit >> np.uint64(58)), np.uint64(1) << (names[k] >> np.uint64(58))
@@ -244,6 +247,12 @@ def _split_resistance(c_rr: float) -> tuple[int, Any]:
         place -= 1
     lower = min(place // _ONE, _R_LAST)
     return lower, np.uint32(place - lower * _ONE)
+
+
+@numba.njit(cache=True, nogil=True)
+def _doubt(variance: float) -> Any:
+    """Standard deviation in 1/256 of DOUBT_MOST, rounded up, which it is at most; of no variance, all of it."""
+    return np.uint32(np.ceil(np.sqrt(variance) * _DOUBT_PER_UNIT) if variance < ev.DOUBT_MOST**2 else _ONE)
 
 
 @numba.njit(cache=True, nogil=True)

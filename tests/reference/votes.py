@@ -27,7 +27,7 @@ class Votes:
 
     place: (n, 2) position; inverse: (n, 3) inverse covariance xx, 2 xy, yy; reach: (n,) half the stencil's edge, in
     cells around the one that the sample lies in; weight: (n,); bins, shares: (n, 3) for resistance, grade east, grade
-    north; sector, stamp_ns, bucket: (n,); bits: (n, 2) one bit set in each.
+    north; doubt (n,) in 1/256 of DOUBT_MOST; sector, stamp_ns, bucket: (n,); bits: (n, 2) one bit set in each.
     """
 
     place: Floats
@@ -36,6 +36,7 @@ class Votes:
     weight: Ints
     bins: Ints
     shares: Ints
+    doubt: Ints
     sector: Ints
     stamp_ns: Ints
     bucket: Ints
@@ -62,11 +63,17 @@ def prepare(rows: Table, machine: str, cell_m: float, config: FoldConfig) -> Vot
         weight=np.rint(rows["distance_m"].astype(np.float64) * ev.WEIGHT_UNITS_PER_M).astype(np.int64),
         bins=np.stack([lower for lower, _ in pairs], axis=1),
         shares=np.stack([share for _, share in pairs], axis=1),
+        doubt=_doubt(rows["c_rr_var"].astype(np.float64)),
         sector=sector % ev.SECTORS,
         stamp_ns=rows["stamp_ns"].copy(),
         bucket=rows["stamp_ns"] // config.bucket_ns,
         bits=_bits(rows["stamp_ns"], machine),
     )
+
+
+def _doubt(variance: Floats) -> Ints:
+    std = np.sqrt(np.fmin(variance, ev.DOUBT_MOST**2))  # fmin: what states none is at its most
+    return np.ceil(std * (ev.SHARE_ONE / ev.DOUBT_MOST)).astype(np.int64)
 
 
 def split_resistance(c_rr: Floats) -> tuple[Ints, Ints]:

@@ -6,6 +6,8 @@ import pytest
 
 from mapserver.change.detection import (
     BINS,
+    MACHINE_SHARE,
+    SIGMAS,
     VARIATION,
     WEIGHT_M,
     ChangeConfig,
@@ -102,6 +104,22 @@ def test_medians_nearer_than_bins_are_no_change():
 )
 def test_concrete_does_not_change_by_what_zeros_of_machines_differ(old, new, change):
     assert firsts(passes(old, new)) == [change]
+
+
+@pytest.mark.parametrize(("machines", "passes_each"), [(1, 1), (1, 4), (3, 1), (3, 4)])
+def test_a_change_is_more_than_its_samples_state_by_machines_and_by_passes(machines, passes_each):
+    old, new = ev.RESISTANCE_CENTRES[[8, 12]].tolist()
+    shared = MACHINE_SHARE / machines + (1 - MACHINE_SHARE) / (machines * passes_each)
+    limit = (new - old) / (SIGMAS * np.sqrt(2 * shared))
+    x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
+    for std, change in ((0.9 * limit, 1), (1.1 * limit, 0)):
+        grid = Grid(1.0, FoldConfig(keep_buckets=100))
+        for number in range(2 * passes_each):
+            ground = {"c_rr": old if number < passes_each else new, "c_rr_var": std**2}
+            rows = samples(256, x_m=x, y_m=y, stamp_ns=NOW_NS + number * HOUR_NS, cov_xx_m2=0, cov_yy_m2=0, **ground)
+            for machine in "abc"[:machines]:
+                grid.fold(rows, machine)
+        assert firsts(grid.pages([(0, 0)])[0]) == [change * passes_each]
 
 
 def two_passes(*grounds: dict[float, float]) -> list[TimedPage]:

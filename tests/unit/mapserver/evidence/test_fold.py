@@ -32,6 +32,7 @@ sample = st.fixed_dictionaries({
     "correlation": st.floats(-1, 1),
     "distance_m": st.one_of(st.floats(0, 100), st.sampled_from([0.0, 1e-5, 0.5 / UNITS, 1.5 / UNITS, 100.0])),
     "c_rr": st.one_of(st.floats(-1, 5, width=32), st.floats(0, 0.5, width=32), unknown),
+    "c_rr_var": st.one_of(st.floats(0, 2e-3), st.sampled_from([0.0, 1e-4, 0.03, 100.0])),
     "grade_e": st.one_of(st.floats(-5, 5, width=32), st.floats(-0.625, 0.625, width=32), unknown),
     "heading_rad": st.floats(-7, 7, width=32),
     "stamp_ns": st.integers(NOW_NS - 5 * HOUR_NS, NOW_NS + 5 * HOUR_NS),
@@ -44,7 +45,7 @@ def admitted(drawn: list[dict[str, float]], shrunk: float = 1.0):
     x, y = column.pop("std_x") * shrunk, column.pop("std_y") * shrunk
     column["cov_xy_m2"] = 0.999 * column.pop("correlation") * x * y
     rows = samples(len(drawn), cov_xx_m2=x * x, cov_yy_m2=y * y, grade_n=-0.7 * column["grade_e"], **column)
-    rows["c_rr_var"] = np.where(np.isnan(rows["c_rr"]), np.nan, 1e-4)
+    rows["c_rr_var"] = np.where(np.isnan(rows["c_rr"]), np.nan, column["c_rr_var"])
     rows["grade_var"] = np.where(np.isnan(rows["grade_e"]), np.nan, 1e-4)
     check_samples(rows, 20_000.0)
     return rows
