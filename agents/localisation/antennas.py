@@ -150,12 +150,12 @@ class Antennas:
             self._begin = now
             return
         begin_ns, begin_m, travel_m, distance_m = self._begin
-        way_m, ahead_m = place_m - begin_m, dead_reckoning.travel_m - travel_m
+        chord_m, ahead_m = place_m - begin_m, dead_reckoning.travel_m - travel_m
         driven_m = dead_reckoning.distance_m - distance_m
-        if abs(way_m) < STRETCH_M and driven_m < STRETCH_M / STRAIGHT:
+        if abs(chord_m) < STRETCH_M and driven_m < STRETCH_M / STRAIGHT:
             return
-        is_straight = abs(way_m) >= STRAIGHT * driven_m and abs(ahead_m) >= STRAIGHT * abs(way_m)
-        course = way_m / abs(way_m) * math.copysign(1.0, ahead_m) if is_straight else 0j
+        is_straight = abs(chord_m) >= STRAIGHT * driven_m and abs(ahead_m) >= STRAIGHT * abs(chord_m)
+        course = chord_m / abs(chord_m) * math.copysign(1.0, ahead_m) if is_straight else 0j
         self._finish(course, (stamp_ns - begin_ns) * 1e-9)
         self._begin = now
 

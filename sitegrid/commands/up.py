@@ -63,7 +63,7 @@ def run(arguments: Namespace) -> int:
                 note(f"  sitegrid query --endpoint {endpoint} --site {site.name} machines")
             shown = status_line() if sys.stderr.isatty() and not arguments.json else nullcontext()
             with shown as line, closing(_Status(endpoint, site.name, machine.name, line)) as status:
-                _watch(running, stop, status.tell)
+                _watch(running, stop, status.show)
     except KeyboardInterrupt:
         pass
     note(f"all is ended; `sitegrid up {shlex.quote(str(arguments.folder))}` goes on from here")
@@ -107,10 +107,10 @@ def _ready(child: Child) -> dict[str, Any]:
         raise ProcessError(child.name, words) from None
 
 
-def _watch(running: list[Child], stop: threading.Event, tell: Callable[[], None]) -> None:
+def _watch(running: list[Child], stop: threading.Event, show: Callable[[], None]) -> None:
     """Wait for a signal; ProcessError where a process ends before, but an agent whose recording has ended."""
     while not stop.wait(0.25):
-        tell()
+        show()
         for child in [child for child in running if child.code is not None]:
             if child.code or child.name != "agent":
                 why = child.last_words() or "it logged nothing"
@@ -123,20 +123,20 @@ class _Status:
     """Shows what the agent's health says of itself: on a terminal in a line that changes, elsewhere each change."""
 
     def __init__(self, endpoint: str, site: str, machine: str, line: StatusLine | None) -> None:
-        self._machine, self._line, self._told = machine, line, ""
+        self._machine, self._line, self._shown = machine, line, ""
         self._session = open_session(SessionConfig(endpoint))
         self._health = self._session.declare_subscriber(keys.health(site, machine), zenoh.handlers.RingChannel(1))
 
-    def tell(self) -> None:
+    def show(self) -> None:
         """Say what is new."""
         if not (sample := self._health.try_recv()):
             return
-        with suppress(MessageError):
+        with suppress(MessageError, KeyError, TypeError):  # of another version
             values = decode_health(sample.payload.to_bytes()).values
             if self._line:
                 self._line.show(line_of(self._machine, values))
-            elif COUNT.sub("", said := status_of(values)) != COUNT.sub("", self._told):
-                self._told = said
+            elif COUNT.sub("", said := status_of(values)) != COUNT.sub("", self._shown):
+                self._shown = said
                 note(f"{self._machine}: {said}")
 
     def close(self) -> None:

@@ -115,8 +115,8 @@ def test_a_fix_is_told_with_place_time_accuracy_and_rate() -> None:
         ear.feed(pvt() + IMU + IMU, 10**12 + i * 10**8)
     heard = ear.heard("/dev/ttyACM0", 38_400)
     text = "\n".join(block(heard))
-    for told in ("38400 baud", "NAV-PVT 10 Hz", "ESF-MEAS 21 Hz", "fixed, 24 satellites", "0.014 m", "10:15:27 UTC"):
-        assert told in text
+    for part in ("38400 baud", "NAV-PVT 10 Hz", "ESF-MEAS 21 Hz", "fixed, 24 satellites", "0.014 m", "10:15:27 UTC"):
+        assert part in text
     assert heard.place[0] == pytest.approx(49.0101234)
 
 
