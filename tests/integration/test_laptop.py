@@ -16,7 +16,7 @@ from protocol.wire.codec import decode_health
 from sitegrid import connect
 from sitegrid.process.children import Child, Children
 from tests.patience import PATIENCE_S, until
-from tests.unit.agents.drivers.frames import PLACE, pvt
+from tests.unit.agents.drivers.frames import PVT, pvt
 from tests.unit.sitegrid.setup.test_listening import IMU, on_a_port
 
 pytestmark = pytest.mark.processes
@@ -29,10 +29,17 @@ def driving(begun_s: float) -> bytes:
     """What a receiver sends now on a machine that drives east."""
     passed_s = round(time.monotonic() - begun_s, 3)
     at = BEGIN + timedelta(seconds=passed_s)
-    date = {"year": at.year, "month": at.month, "day": at.day, "hour": at.hour, "min": at.minute, "second": at.second}
-    east = PLACE["lon"] + SPEED_MPS * passed_s * EAST_PER_M
-    moves = {"velE": round(SPEED_MPS * 1e3), "velN": 0, "lon": east, "nano": at.microsecond * 1000}
-    return pvt(**date, **moves, iTOW=round(passed_s * 1e3)) + IMU
+    date = {
+        "year": at.year,
+        "month": at.month,
+        "day": at.day,
+        "hour": at.hour,
+        "minute": at.minute,
+        "second": at.second,
+    }
+    lon_1e7 = PVT.lon_1e7 + round(SPEED_MPS * passed_s * EAST_PER_M * 1e7)
+    moves = {"east_mmps": round(SPEED_MPS * 1e3), "north_mmps": 0, "lon_1e7": lon_1e7, "nano": at.microsecond * 1000}
+    return pvt(**date, **moves, itow_ms=round(passed_s * 1e3)) + IMU
 
 
 def children_of(parent: Child) -> dict[str, int]:

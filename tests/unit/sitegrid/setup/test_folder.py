@@ -13,13 +13,14 @@ from typing import Any
 import pytest
 
 from agents.delivery.spool import Spool, SpoolConfig
+from sim.receivers.nmea import sentence as nmea
 from sitegrid import cli
 from sitegrid.doctor import Level, folder
 from sitegrid.doctor.folder import examine_folder
 from sitegrid.setup import files
 from sitegrid.setup.files import Folder, models
 from sitegrid.setup.hearing import Heard
-from tests.unit.agents.drivers.frames import PLACE, TPV, nmea, pvt, report, ubx
+from tests.unit.agents.drivers.frames import TPV, pvt, report, ubx
 from tests.unit.sitegrid.setup.test_listening import IMU, INDOORS
 
 GNSS = ("fix", "velocity")
@@ -38,6 +39,7 @@ def init(path: Path, *words: str | Path) -> int:
     return cli.main(["init", str(path / "quarry"), "--seconds", "0.1", *map(str, words)])
 
 
+@pytest.mark.slow
 def test_a_folder_is_made_and_the_doctor_finds_nothing(tmp_path: Path, recording: Path, capsys: Any) -> None:
     assert init(tmp_path, "--port", recording, *MODEL) == 0
     site, machine, config = Folder(tmp_path / "quarry").load()
@@ -168,8 +170,8 @@ def test_the_doctor_says_of_a_folder_what_is_wrong(tmp_path: Path, recording: Pa
         ((INDOORS + IMU) * 3, Level.WARN, "no fix, 3 satellites"),
         (b"", Level.FAIL, "nothing comes"),
         (pvt(), Level.WARN, "nothing comes for imu; switch its messages on"),
-        (pvt(**{**PLACE, "lat": 49.1}) + IMU, Level.WARN, "10 km from here"),
-        (pvt(**{**PLACE, "lat": 59.0}) + IMU, Level.FAIL, "so all fixes are refused (extent_m); a site of this place"),
+        (pvt(lat_1e7=491_000_000) + IMU, Level.WARN, "10 km from here"),
+        (pvt(lat_1e7=590_000_000) + IMU, Level.FAIL, "so all fixes are refused (extent_m); a site of this place"),
         (ubx("NAV-DOP") * 3, Level.FAIL, "it sends no positions"),
         (report(TPV), Level.FAIL, 'it sends GPSD; say `kind = "gpsd"`'),
         (nmea("GNGLL,4900.6,N,00824.0,E,101527.2,A,R"), Level.FAIL, "switch on GGA and RMC"),

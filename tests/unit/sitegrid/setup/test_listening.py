@@ -20,13 +20,14 @@ import pytest
 
 from agents.drivers.transports import serial_ports, why_closed
 from protocol.errors import ConfigError
+from sim.receivers.nmea import sentence as nmea
 from sitegrid.setup.hearing import Ear, Heard
 from sitegrid.setup.listening import address_of, listen, listen_to
 from sitegrid.setup.summary import block, missing
-from tests.unit.agents.drivers.frames import GGA, RMC, TPV, esf, nmea, pvt, report, ubx
+from tests.unit.agents.drivers.frames import GGA, RMC, TPV, esf, pvt, report, ubx
 
 IMU = esf(5, *((kind, 4) for kind in (14, 13, 5, 16, 17, 18)))
-INDOORS = pvt(fixType=0, gnssFixOk=0, numSV=3)
+INDOORS = pvt(fix_type=0, flags=0, satellites=3)
 BASE = b"\xd3\x00\x00\x47\xea\x4b"  # RTCM3, the shortest frame
 NOISE = random.Random(4).randbytes(200)
 
