@@ -170,7 +170,7 @@ class Agent:
         """Take in readings; returns whether they made a new pose."""
         self._readings += len(readings)
         if readings:
-            self._newest_ns = max(self._newest_ns, readings[-1].stamp_ns)
+            self._newest_ns = readings[-1].stamp_ns
         before = self._pipeline.pose
         self._status.take(readings)
         self._take(self._pipeline.step(self._holdout.split(readings) if self._holdout else readings))

@@ -149,7 +149,7 @@ class Pipeline:
         if self._positioning.localiser.is_proven:
             made += self._place(poses)
         stamp_ns = readings[0][0].stamp_ns
-        self._newest_ns = max(self._newest_ns, stamp_ns)
+        self._newest_ns = stamp_ns if restarts else max(self._newest_ns, stamp_ns)  # a clock may be set back
         dead_reckoning, belief = self._positioning.dead_reckoning, self._positioning.localiser.belief
         speed_mps, known_c_rr, newest = float(belief.x[SPEED]) if belief else None, self._known_c_rr(), self.pose
         if mass_kg := self._estimator.estimated_mass_kg:

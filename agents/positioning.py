@@ -153,7 +153,7 @@ class Positioning:
                 continue
             if decision is Decision.RESTART:
                 concluded += self.conclude()
-                smoothed += self._restart()
+                smoothed += self._restart(forgets_times=True)
                 taken, restarts = [], True
             taken.append((reading, self._sensors[reading.sensor]))
         if not taken:
@@ -182,8 +182,13 @@ class Positioning:
             poses, restarts = [], True
         return Accepted(heard or taken, poses, smoothed + self.localiser.take_smoothed(), restarts, off_m, concluded)
 
-    def _restart(self) -> list[SmoothedPose]:
-        """Start again, and keep the counts; returns the smoothed poses that remained."""
+    def _restart(self, *, forgets_times: bool = False) -> list[SmoothedPose]:
+        """Start again, and keep the counts; returns the smoothed poses that remained.
+
+        forgets_times: stamps of before say nothing of those to come.
+        """
+        if self.judge and forgets_times:
+            self.judge.forget_times()
         if self.localiser.is_aligned:  # a start that was configured is far behind by now
             self._config = replace(self._config, start=())
         self._counters.update(self.localiser.counters)

@@ -6,7 +6,7 @@ those of the accelerometer the other way round needs no fixes to be judged. One 
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -106,13 +106,19 @@ class WheelJudge:
         self._base_from_imu = used[0].mount.frame_from_sensor().tolist() if used else []
         self._other_way = False
         self.fall: Fall | None = None
-        self._wheels: dict[str, _Wheel] = {}
         self._stretches: dict[tuple[str, str], Stretches] = {}
-        self._placed: dict[str, tuple[int, complex]] = {}  # by velocities
         self._pinned: dict[str, tuple[float, float]] = {}  # the last fix of each receiver
         self._sums, self._imu_ns = (0.0, 0.0, 0.0), 0  # integrals of force ahead and pitch rate, and their time
         self._angle_rad = self._before_rad = 0.0  # turned so far, and until dead reckoning began anew
+        self.forget_times()
+
+    def forget_times(self) -> None:
+        """Begin anew with every stamp, as after a pause or where the clock was set; verdicts stay."""
+        self._wheels: dict[str, _Wheel] = {}
+        self._placed: dict[str, tuple[int, complex]] = {}  # by velocities
         self._turned, self._moves_ns = (0, 0.0), -PAUSE_NS
+        for stretches in self._stretches.values():
+            stretches.forget_times()
 
     def restart(self) -> None:
         """Go on with a dead reckoning that begins anew."""
@@ -128,12 +134,10 @@ class WheelJudge:
         """Judge by readings of one stamp before dead reckoning has them; those that count. factor_of: of variances."""
         self._angle_rad = angle_rad = self._before_rad + reckoned.angle_rad
         for reading, sensor in readings:
-            if isinstance(reading, Imu):
-                if reading.sensor == self._imu:
-                    self._feel(reading)
-            elif isinstance(reading, WheelReading):
-                if sensor.provides("speed"):
-                    self._roll(reading, sensor, angle_rad)
+            if isinstance(reading, Imu) and reading.sensor == self._imu:
+                self._feel(reading)
+            elif isinstance(reading, WheelReading) and sensor.provides("speed"):
+                self._roll(reading, sensor, angle_rad)
             elif isinstance(reading, Gps | GpsVelocity):
                 self._place(reading, sensor, angle_rad, math.sqrt(max(factor_of(reading.sensor), 1.0)))
         self._stand(readings[0][0].stamp_ns, reckoned)
@@ -206,7 +210,7 @@ class WheelJudge:
 
     def _place(self, reading: Gps | GpsVelocity, sensor: SensorConfig, angle_rad: float, worse: float) -> None:
         """Compare each wheel sensor with a receiver, whose standard deviation is so many times worse than it says."""
-        now_ns, (ahead_m, left_m, _) = reading.stamp_ns, sensor.mount.xyz_m
+        now_ns, lever_m = reading.stamp_ns, complex(*sensor.mount.xyz_m[:2])
         fix_m = self._integrated(reading) if isinstance(reading, GpsVelocity) else self._fixed(reading)
         if fix_m is None:
             return
@@ -215,7 +219,6 @@ class WheelJudge:
             if now_ns - wheel.reading.stamp_ns > PAUSE_NS:
                 stretches.interrupt()
                 continue
-            lever_m = complex(ahead_m, left_m)
             now = Place(now_ns, fix_m, wheel.place_m, wheel.distance_m, wheel.rolled_m, angle_rad, lever_m)
             begin = stretches.begin or now
             if run := stretches.add(now, worse * _std_m(reading, sensor, (now_ns - begin.stamp_ns) * 1e-9)):
@@ -257,12 +260,10 @@ class WheelJudge:
         needed = NEEDED if self._imu else 2 * NEEDED
         if kind in (Kind.AGREES, Kind.UNCLEAR) or run.count < needed or fault or not self._is_doubtful(wheel, run, now):
             return
-        if not any(other.agreed_ns > run.begin.stamp_ns for other in self._beside(name)):
+        beside = (stretches for (_, wheels), stretches in self._stretches.items() if wheels == name)
+        if not any(other.agreed_ns > run.begin.stamp_ns for other in beside):
             seconds = (now.stamp_ns - run.begin.stamp_ns) * 1e-9
             self._condemn(name, _fault(wheel, run, now), Fall(run.off_m, run.off_m / seconds, is_headed=True))
-
-    def _beside(self, name: str) -> Iterator[Stretches]:
-        return (stretches for (_, wheels), stretches in self._stretches.items() if wheels == name)
 
     def _is_doubtful(self, wheel: _Wheel, run: Run, now: Place) -> bool:
         """Whether the IMU contradicts the wheels too, or there is none."""
@@ -289,7 +290,6 @@ def _fault(wheel: _Wheel, run: Run, now: Place) -> Fault:
 
 
 def _repeats(wheel: _Wheel, run: Run) -> bool:
-    """Whether the sensor has read the same speed since a run began."""
     return wheel.changed_ns <= run.begin.stamp_ns
 
 

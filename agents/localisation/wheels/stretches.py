@@ -89,12 +89,16 @@ class Stretches:
     """Compares one wheel sensor with one receiver. begin: where the stretch begins that lasts."""
 
     def __init__(self) -> None:
+        self._usual = 0.0  # way by fixes over way by wheels; 0 as long as they never agreed
+        self.forget_times()
+
+    def forget_times(self) -> None:
+        """Begin anew with every stamp; the usual ratio is none of the clock's."""
         self.begin: Place | None = None
         self.agreed_ns = 0
         self._run: Run | None = None
         self._last_m, self._ended_ns = 0j, 0  # of the newest stretch
         self._turn = 0j  # from the dead-reckoned frame into `map`, of length 1
-        self._usual = 0.0  # way by fixes over way by wheels; 0 as long as they never agreed
 
     def interrupt(self) -> None:
         """Begin anew with the next place: nobody knows what happened meanwhile."""

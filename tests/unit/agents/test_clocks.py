@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from dataclasses import replace
 from functools import cache
 
@@ -10,7 +11,8 @@ import pytest
 
 from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
-from agents.positioning import PipelineConfig, Positioning
+from agents.positioning import Accepted, PipelineConfig, Positioning
+from agents.sampling import Samples, joined
 from agents.status import Status
 from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import Reading
@@ -21,6 +23,8 @@ SECOND, DAY, YEARS = 10**9, 86_400, 20 * 365 * 86_400
 EKF = PipelineConfig(LocalisationConfig("ekf"))
 MADE = drive([Leg(4, 0.5), Leg(8), Leg(4, 0, 0.25), Leg(8), Leg(4, 0, -0.3), Leg(32)], VEHICLE)
 READINGS = thinned(MADE.readings)
+SENSORS = sorted({r.sensor for r in READINGS})
+LEAPS_S = (0.0, 0.3, 2.0, 61.0, 3600.0, DAY, YEARS)
 
 
 def shifted(readings: list[Reading], ahead_s: float, *sensors: str) -> list[Reading]:
@@ -120,3 +124,60 @@ def test_an_offset_that_refuses_nothing_is_named_by_the_motion() -> None:
 def test_a_live_agent_says_why_it_takes_no_larger_delay() -> None:
     with pytest.raises(ValueError, match=r"gps-1: delay_s must be between -10 and 0\.4: a live agent cannot wait"):
         SensorConfig("gps-1", "gps", delay_s=18.0)
+
+
+class WatchedPipeline(Pipeline):
+    """Counts the readings that count, and keeps those that the last restart began with."""
+
+    accepted = 0
+    restarted: tuple[Reading, ...] = ()
+
+    def _take_one(self, accepted: Accepted) -> list[Samples]:
+        self.accepted += len(accepted.readings)
+        if accepted.restarts:
+            self.restarted = tuple(reading for reading, _ in accepted.readings)
+        return super()._take_one(accepted)
+
+
+def leaping(rng: random.Random) -> list[Reading]:
+    """The clock of all sensors, or of one, is set again and again."""
+    off_s, leaps, readings = dict.fromkeys(SENSORS, 0.0), set(rng.sample(range(len(READINGS)), 5)), []
+    for i, reading in enumerate(READINGS):
+        if i in leaps:
+            off_s |= dict.fromkeys(rng.choice((SENSORS, SENSORS, [rng.choice(SENSORS)])), rng.choice(LEAPS_S))
+            off_s = {name: rng.choice((-1, 1)) * s if rng.random() < 0.5 else s for name, s in off_s.items()}
+        readings += shifted([reading], off_s[reading.sensor], reading.sensor)
+    return readings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_clocks_that_leap_never_end_an_agent(seed: int) -> None:
+    """Each reading counts or is counted as refused; what is sampled has a place and a covariance."""
+    readings, pipeline = leaping(random.Random(seed)), WatchedPipeline(SITE, VEHICLE, EKF)
+    made = [pipeline.step(readings[i : i + 15]) for i in range(0, len(readings), 15)]
+    pipeline.clocks()
+    for rows in joined([*made, pipeline.finish()]):
+        xx, xy, yy = (rows[f"cov_{axes}_m2"] for axes in ("xx", "xy", "yy"))
+        assert all(np.isfinite(rows[name]).all() for name in ("x_m", "y_m", "heading_rad", "speed_mps"))
+        assert ((xx > 0) & (xx * yy > xy**2)).all()
+    counters = pipeline.health()["counters"]
+    refused = sum(counters.get(f"reading_{why}", 0) for why in ("late", "ahead", "duplicate"))
+    assert pipeline.accepted + refused == len(readings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("leap_s", [-3600.0, 3600.0, -DAY])
+def test_a_clock_that_was_set_is_a_start_anew(leap_s: float) -> None:
+    """Nothing timed from before counts: samples are those of an agent that starts there, bit for bit."""
+    before, after = READINGS[:1500], iter(shifted(READINGS[1500:], leap_s, *SENSORS))
+    pipeline = WatchedPipeline(SITE, VEHICLE, EKF)
+    pipeline.step(before)
+    while not pipeline.restarted:
+        pipeline.step([held := next(after)])
+    fresh, rest = Pipeline(SITE, VEHICLE, EKF, pipeline.calibration), list(after)
+    fresh.step([*pipeline.restarted, held])
+    made, expected = (joined([each.step(rest), each.finish()]) for each in (pipeline, fresh))
+    assert len(expected.final) > 20
+    for rows, right in zip(made, expected, strict=True):
+        assert np.array_equal(rows[-len(right) :].view(np.uint8), right.view(np.uint8))
