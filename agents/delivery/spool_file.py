@@ -105,7 +105,7 @@ def run_ends(mark: Mapping[str, int]) -> list[RunEnd]:
 
 
 def runs_cut_short(there: Iterable[RunEnd], mark: Mapping[str, int]) -> list[tuple[RunEnd, int]]:
-    """Runs that went further than the file says, each with how many of its samples are gone.
+    """Runs that went further than the file says, each with how many samples are gone that nobody acknowledged.
 
     there: the file's runs, in order. Only its last one can be short, and those after it are not there at all.
     """
@@ -114,7 +114,6 @@ def runs_cut_short(there: Iterable[RunEnd], mark: Mapping[str, int]) -> list[tup
     short = []
     for end in run_ends(mark):
         kept = last.recorded if end.spool_id == last.spool_id else 0
-        gone = end.recorded - max(kept, end.acknowledged)
-        if end.spool_id not in known and gone > 0:
-            short.append((end, gone))
+        if end.spool_id not in known and end.recorded > kept:
+            short.append((end, max(0, end.recorded - max(kept, end.acknowledged))))
     return short

@@ -79,6 +79,8 @@ def _scan_frames(log: bytes, page: int, order: str, salts: bytes, before: AnyArr
     frames = np.frombuffer(log, np.uint8, n * size, HEADER).reshape(n, size)
     is_present: Bools = np.all(frames[:, _SALTS] == np.frombuffer(salts, np.uint8), axis=1)
     n = int(is_present.nonzero()[0].max(initial=-1)) + 1
+    if n < 1:
+        return LogScan()
     frames, is_present = frames[:n], is_present[:n]
     is_sound = is_present & np.concatenate([*_are_sound(frames, order, before), np.zeros(0, np.bool_)])
     is_commit: Bools = np.any(frames[:, 4:8], axis=1)

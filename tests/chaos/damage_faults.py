@@ -61,7 +61,7 @@ def _database(site: ChaosSite, victim: str) -> Path:
     return site.folder / "store" / JOURNAL_FILE if victim == SERVER else site.folder / "spool" / f"{victim}.db"
 
 
-def _flip(database: Path, rng: random.Random) -> None:
+def flip(database: Path, rng: random.Random) -> None:
     """Flip a bit of the part of a log that SQLite would take; none where there is no such part."""
     log = database.with_name(f"{database.name}-wal")
     content = bytearray(log.read_bytes()) if log.exists() else bytearray()
@@ -82,7 +82,7 @@ def _flip_copies(site: ChaosSite, victim: str, rng: random.Random, n: int) -> Co
         for path in database.parent.glob(f"{database.name}*"):
             shutil.copy(path, folder / path.name)
         if i:
-            _flip(folder / database.name, rng)
+            flip(folder / database.name, rng)
         try:
             samples, counted = look(folder / database.name, site)
         except StoreError as error:
@@ -118,7 +118,7 @@ def _flip_and_start(site: ChaosSite, victim: str, database: Path, rng: random.Ra
     """Flip a bit and start the process again; where it refuses to start, as it may, put the files back as they were."""
     kept = site.folder / "kept"
     shutil.copytree(database.parent, kept)
-    _flip(database, rng)
+    flip(database, rng)
     site.start(victim)
     verdict = "started"
     if (words := site.words_of_refusal(victim)) is not None:

@@ -117,7 +117,7 @@ class RealServer:
         self._site = site
         self._now_ns = now_ns
         self._plan = FaultPlan()
-        self._open()
+        self.open()
         self.back_up()
 
     def take(self, group: list[Incoming], plan: FaultPlan) -> list[Ack | Refused]:
@@ -129,7 +129,7 @@ class RealServer:
             return self._store.commit(group)
         except Killed:
             self.close()
-            self._open()
+            self.open()
             raise
         finally:
             self._plan.disarm()
@@ -142,7 +142,7 @@ class RealServer:
         self.close()
         shutil.rmtree(self._folder)
         shutil.copytree(self._backup, self._folder)
-        self._open()
+        self.open()
 
     def samples(self) -> Iterator[JournalledSample]:
         for row in self._journal.read():
@@ -156,7 +156,7 @@ class RealServer:
     def _journal(self) -> SqliteJournal:
         return self._store.journal
 
-    def _open(self) -> None:
+    def open(self) -> None:
         self._plan = FaultPlan()
         self._store = Store(JournalLocation(self._folder), self._site, ServerConfig(), self._now_ns)
         path = self._folder / JOURNAL_FILE

@@ -16,7 +16,7 @@ from typing import Any
 
 from mapserver.journal.journal import ROWS_AT_ONCE, UnwrittenError
 from mapserver.journal.rows import JournalRow, Progress, SpoolKey, Watermark
-from mapserver.journal.shortfall import EVENT, ROW, compare, marked, spool_name
+from mapserver.journal.shortfall import EVENT, ROW, Shortfall, compare, marked, spool_name
 from mapserver.journal.sqlite.reader import SCHEMA, TABLES, SqliteQueries
 from mapserver.journal.table_writer import (
     Line,
@@ -117,6 +117,11 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 self._changed[EVENT] = lines[-1][0]
                 self._put_meta("event", lines[-1][0])
             return self._last_event()
+
+    def note_shortfall(self, shortfall: Shortfall) -> None:
+        """See `Journal`; in the file itself, as further damage of the log would take it away."""
+        super().note_shortfall(shortfall)
+        self._write("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def follow_archive(self, row: int, watermarks: Mapping[SpoolKey, Watermark]) -> None:
         """Have a new journal go on after an archive with rows up to `row`, and spools up to these watermarks."""

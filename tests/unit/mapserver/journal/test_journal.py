@@ -379,6 +379,17 @@ def test_what_is_gone_is_remembered_until_it_is_sent_again_or_declared_lost(fold
         assert journal.watermark("loader-1", 7).lost == before["loader-1"] - SAMPLES
 
 
+def test_further_damage_of_the_log_leaves_what_was_named_before(folder, tmp_path):
+    cut_short(folder)
+    with closing(open_journal(folder)) as journal:
+        before = gone_of(journal)
+        send(journal, "loader-1", journal.watermark("loader-1", 7).seq + 1)
+        again = Path(shutil.copytree(folder, tmp_path / "again"))
+    cut_short(again, 0.0)
+    with closing(open_journal(again)) as journal:
+        assert gone_of(journal) == before
+
+
 def test_decisions_that_are_gone_are_named(folder):
     cut_short(folder, 0.3)
     with closing(open_journal(folder)) as journal:

@@ -92,6 +92,14 @@ def test_a_flip_in_the_header_is_damage(tmp_path, db):
         assert held.frames > 4
 
 
+def test_a_log_of_any_length_with_a_damaged_header_holds_nothing(tmp_path, db):
+    fill(db, random.Random(3), 3)
+    log = log_of(tmp_path)
+    for end in range(HEADER, len(log), 1000):
+        for at in (0, 11, 24):  # what tells a log, the size of its pages, the checksum
+            assert scan(flipped(log[:end], at, 0)).recovered == 0
+
+
 def test_a_torn_tail_is_no_damage(tmp_path, db):
     """Each part of the last transaction, in any order, may be missing after a power cut."""
     rng = random.Random(4)
