@@ -67,9 +67,10 @@ class ClockOffsets:
     """Keeps what each sensor of a machine shows of its motion. kept_s: for how long, None for all of it."""
 
     def __init__(self, machine: MachineConfig, site: SiteConfig, kept_s: float | None = None) -> None:
-        projection, kept = Projection(site), None if kept_s is None else round(kept_s / STEP_S)
+        projection, kept_ns = Projection(site), math.inf if kept_s is None else kept_s * 1e9
         self._sensors = {s.name: s for s in machine.sensors if s.use}
-        self._motions = {s.name: motion for s in machine.sensors if (motion := _motion(s, machine, projection, kept))}
+        motions = {s.name: _motion(s, machine, projection, kept_ns) for s in machine.sensors}
+        self._motions = {name: motion for name, motion in motions.items() if motion}
 
     def take(self, readings: Iterable[Reading]) -> None:
         """Take in readings, those of each sensor in the order of their stamps."""
@@ -124,12 +125,12 @@ class _Signals:
 class _Motion:
     """What one sensor shows: places [m] of a receiver, else how far it rolled [m] and turned [rad]."""
 
-    def __init__(self, sensor: SensorConfig, projection: Projection, metres: float, kept: int | None) -> None:
+    def __init__(self, sensor: SensorConfig, projection: Projection, metres: float, kept_ns: float) -> None:
         """metres: per tick of an encoder."""
         self.sensor = sensor
         self._projection, self._metres = projection, metres
         self._up = sensor.mount.frame_from_sensor()[2].tolist()
-        self._kept: deque[tuple[int, float, float]] = deque(maxlen=kept)
+        self._kept, self._kept_ns = deque[tuple[int, float, float]](), kept_ns
         self.last_ns = 0
         self._last: Reading | None = None
         self._first = self._second = 0.0
@@ -150,6 +151,8 @@ class _Motion:
         if isinstance(reading, Gps):
             self._first, self._second, _ = self._projection.to_map(reading.lat_deg, reading.lon_deg, reading.height_m)
         self._kept.append((stamp_ns, self._first, self._second))
+        while stamp_ns - self._kept[0][0] > self._kept_ns:  # not by number: stamps that leap would span months
+            self._kept.popleft()
 
     def _advance(self, reading: Reading, last: Reading | None, dt_s: float) -> None:
         if isinstance(reading, Imu):
@@ -195,12 +198,12 @@ class _Motion:
         return shown
 
 
-def _motion(sensor: SensorConfig, machine: MachineConfig, projection: Projection, kept: int | None) -> _Motion | None:
+def _motion(sensor: SensorConfig, machine: MachineConfig, projection: Projection, kept_ns: float) -> _Motion | None:
     """Of a sensor that shows motion."""
     shows = sensor.mode == ABSOLUTE if sensor.kind == Gps.kind else sensor.frame == BASE
     if not (sensor.use and shows and KINDS[sensor.kind] in SHOWING):
         return None
-    return _Motion(sensor, projection, 2 * math.pi * machine.wheel_radius_m / sensor.ticks_per_rev, kept)
+    return _Motion(sensor, projection, 2 * math.pi * machine.wheel_radius_m / sensor.ticks_per_rev, kept_ns)
 
 
 def _change(values: Floats, steps: int) -> Floats:

@@ -48,7 +48,7 @@ class Machines:
             machine = self._hear(pose.machine)
             machine.pose, machine.pose_s, track = pose, self._clock(), machine.track
             self.heard += 1
-            if not track or pose.stamp_ns >= track[-1].stamp_ns + TRACK_STEP_NS:
+            if not track or abs(pose.stamp_ns - track[-1].stamp_ns) >= TRACK_STEP_NS:  # its clock may be set back
                 track.append(pose)
             most = min(MOST_POSES, MOST_IN_ALL // len(self._heard))
             for each in [machine] if known else self._heard:
