@@ -2,9 +2,12 @@
 
 from protocol.errors import ConfigError, LinkError, MessageError, QueryError, SitegridError
 from protocol.queries.answers import (
+    ChangesAnswer,
     FollowerState,
     GroundChange,
+    HistoryAnswer,
     HistorySpan,
+    MachinesAnswer,
     MachineState,
     MapInfo,
     MapVersion,
@@ -17,6 +20,7 @@ from protocol.queries.answers import (
     TrustAnswer,
 )
 from protocol.queries.calibration import CalibrationAnswer, CorrectedSpan, MachineCalibration
+from protocol.queries.coverage import Coverage, CoverageQuery
 from protocol.queries.map_tiles import MapTile, TilesAnswer, TilesQuery
 from protocol.queries.origin import Origin
 from protocol.queries.reasons import CellReasons, Votes
@@ -48,6 +52,7 @@ from protocol.site.site_config import KnownGround
 from protocol.version import package_version
 from sitegrid.client import Client, connect
 from sitegrid.listener import Listener
+from sitegrid.map_region import MapRegion
 
 __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]
@@ -61,4 +66,5 @@ __all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __all__ += ["QUERIES", "CalibrationQuery", "ChangesQuery", "HistoryQuery", "InfoQuery", "MachinesQuery"]
 __all__ += ["PointQuery", "PointsQuery", "RegionQuery", "RouteQuery", "SegmentsQuery", "TilesQuery", "WayQuery"]
 __all__ += ["WhyQuery", "WorklistQuery"]
+__all__ += ["ChangesAnswer", "Coverage", "CoverageQuery", "HistoryAnswer", "MachinesAnswer", "MapRegion"]
 __version__ = package_version()

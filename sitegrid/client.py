@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import zenoh
@@ -57,9 +57,6 @@ from sitegrid.map_region import MapRegion
 from sitegrid.security.join import join
 from sitegrid.times import Time, parse_time
 from sitegrid.watch import AGAIN_S, watch, watch_async
-
-if TYPE_CHECKING:
-    import geopandas
 
 SOLVE_S = 30.0  # that the server has to calibrate a fleet for: a large one on a busy host
 REGION_ATTEMPTS = 3
@@ -121,9 +118,7 @@ class Client:
             x_m, y_m = self.to_map(lat, lon)
         if x_m is None or y_m is None:
             raise ValueError("a point is x_m and y_m, or lat and lon")
-        query = PointQuery(float(x_m), float(y_m), _names(layers), as_of_ns=self._as_of(as_of))
-        answer = self.ask(query)
-        return replace(answer, note=self._where(not np.isfinite([*answer.values.values()]).any()))
+        return self.ask(PointQuery(float(x_m), float(y_m), _names(layers), as_of_ns=self._as_of(as_of)))
 
     def region(
         self,
@@ -142,9 +137,7 @@ class Client:
         A large region comes in pieces, all of one version of the map; progress: as of `ask`.
         """
         query = RegionQuery(area_of(area), _names(layers), resolution_m, as_of_ns=self._as_of(as_of))
-        region = self._region(query, progress)
-        known = any(np.isfinite(values).any() for values in region.layers.values())
-        return replace(region, note=self._where(not known))
+        return self._region(query, progress)
 
     def route(
         self,
@@ -202,6 +195,11 @@ class Client:
             self._site = self.info().site
         return self._site
 
+    def where(self) -> str:
+        """Where the map lies, in a sentence: for who finds nothing at a place."""
+        info = self.info()
+        return where_it_lies(info.bounds, info.site.cell_m)
+
     def to_map(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:
         """Position in `map` [m] of a place on Earth. It needs pyproj."""
         x_m, y_m, _ = self._projection().to_map(lat_deg, lon_deg, 0.0)
@@ -212,8 +210,8 @@ class Client:
         lat_deg, lon_deg, _ = self._projection().to_geodetic(x_m, y_m)
         return lat_deg, lon_deg
 
-    def to_geopandas(self, answer: Segments | Worklist | ChangesAnswer) -> geopandas.GeoDataFrame:
-        """Roads, stretches or changes as a table with geometries in the site's frame. It needs geopandas."""
+    def to_geopandas(self, answer: Segments | Worklist | ChangesAnswer) -> Any:
+        """Roads, stretches or changes as a GeoDataFrame in the site's frame. It needs geopandas."""
         return to_geopandas(answer, self.site_info().crs)
 
     def followers(self) -> list[FollowerState]:
@@ -293,11 +291,6 @@ class Client:
     def _reply(self, query: MapQuery[T]) -> T:
         return query.decode(self._answered(query).data)
 
-    def _where(self, is_empty: bool) -> str:  # noqa: FBT001 - a condition
-        """What to say of an answer in which nothing is known."""
-        info = self.info() if is_empty else None
-        return f"nothing is known here: {where_it_lies(info.bounds, info.site.cell_m)}" if info else ""
-
     def _as_of(self, time: Time | None) -> int | None:
         return None if time is None else self.stamp(time)
 
@@ -308,7 +301,7 @@ class Client:
     def _region(self, query: RegionQuery, progress: Progress | None) -> MapRegion:
         for attempts_left in reversed(range(REGION_ATTEMPTS)):
             try:
-                return MapRegion.from_region(joined(self._pieces(query), progress), self.site_info)
+                return MapRegion.from_region(joined(self._pieces(query), progress), self.site_info, self.where)
             except QueryError as error:  # that version of the map is not kept any more: begin again
                 if error.reason != Refusal.EXPIRED or not attempts_left:
                     raise

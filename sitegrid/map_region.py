@@ -25,14 +25,19 @@ UNITS = {"grade": "m/m", "heading": "rad", "weight": "m", "age": "s", "changed":
 
 @dataclass(frozen=True, repr=False)
 class MapRegion(Region):
-    """A region that knows its site. site: asks for it, once, where it is needed."""
+    """A region that knows its site. site, where: ask for it, and where the map lies, where that is needed."""
 
     site: Callable[[], SiteInfo] = field(kw_only=True, compare=False)
+    where: Callable[[], str] = field(kw_only=True, compare=False)
 
     @classmethod
-    def from_region(cls, region: Region, site: Callable[[], SiteInfo]) -> MapRegion:
+    def from_region(cls, region: Region, site: Callable[[], SiteInfo], where: Callable[[], str]) -> MapRegion:
         """A region of a site."""
-        return cls(**{one.name: getattr(region, one.name) for one in fields(Region)}, site=site)
+        return cls(**{one.name: getattr(region, one.name) for one in fields(Region)}, site=site, where=where)
+
+    def __repr__(self) -> str:
+        known = any(np.isfinite(values).any() for values in self.layers.values())
+        return super().__repr__() if known else f"{super().__repr__()[:-1]}; {self.where()}>"
 
     @property
     def crs(self) -> pyproj.CRS:

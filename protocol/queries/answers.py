@@ -40,17 +40,13 @@ class _OfVersion:
 
 @dataclass(frozen=True)
 class PointAnswer(_OfVersion):
-    """Layer values of the cell with centre (x_m, y_m); NaN is unknown.
-
-    note: where the map lies, from the client, where this place is off it.
-    """
+    """Layer values of the cell with centre (x_m, y_m); NaN is unknown."""
 
     x_m: float
     y_m: float
     values: Mapping[str, float]
     version: MapVersion
     stamp_ns: int
-    note: str = ""
 
 
 @dataclass(frozen=True, repr=False)
@@ -93,7 +89,6 @@ class Region(_OfVersion):
 
     x_m (columns,), y_m (rows,): cell centres in `map`, growing east and north. layers: name -> float32 (rows, columns),
     NaN where unknown; row 0 is the southernmost. piece: where this is a piece of a larger region; None for all of it.
-    note: where the map lies, from the client, where this region is off it.
     """
 
     x_m: Floats
@@ -103,7 +98,6 @@ class Region(_OfVersion):
     version: MapVersion
     stamp_ns: int
     piece: Piece | None = None
-    note: str = ""
 
     def __getitem__(self, layer: str) -> Floats32:
         return self.layers[layer]
@@ -113,7 +107,7 @@ class Region(_OfVersion):
         known = max((float(np.isfinite(values).mean()) for values in self.layers.values()), default=0.0)
         size = f"{len(self.x_m)} x {len(self.y_m)} cells of {self.cell_m:g} m"
         place = f"{edge.west_m:g}..{edge.east_m:g}, {edge.south_m:g}..{edge.north_m:g} m"
-        return f"<{size} at {place}, {known:.0%} known: {', '.join(self.layers)}{self.note and f'; {self.note}'}>"
+        return f"<{size} at {place}, {known:.0%} known: {', '.join(self.layers)}>"
 
     @property
     def bounds(self) -> Bounds:

@@ -96,7 +96,7 @@ def test_asked_for_the_map_is_that_of_a_first_fold_everywhere(site: SiteRun):
         after = client.region((0, 0, 120, 60), ("resistance",))
         assert after.version.fact == answer["fact"]
         assert not np.array_equal(before["resistance"], after["resistance"], equal_nan=True)
-        then = client.region((0, 0, 120, 60), ("resistance",), as_of_ns=info.stamp_ns)
+        then = client.region((0, 0, 120, 60), ("resistance",), as_of=info.stamp_ns)
         assert np.array_equal(then["resistance"], after["resistance"], equal_nan=True), "the past has the facts of now"
         assert then.version.fact == answer["fact"]
     server.stop()

@@ -74,6 +74,9 @@ def test_everything_that_a_client_meets_stands_under_sitegrid():
     methods = [method for name, method in vars(sitegrid.Client).items() if not name.startswith("_")]
     hints = [get_type_hints(method).get("return") for method in methods if callable(method)]
     answers = {part.__name__ for hint in hints for part in (hint, *get_args(hint)) if isinstance(part, type)}
-    assert {"MapInfo", "MachineState", "GroundChange", "Region", "HistorySpan", "TrustAnswer"} <= answers
-    assert answers - {"NoneType", "list", "tuple"} <= {*sitegrid.__all__}
+    assert {"MapInfo", "MachineState", "GroundChange", "MapRegion", "Region", "TrustAnswer"} <= answers
+    assert {part for part in answers if part[0].isupper()} - {"Any", "NoneType"} <= {*sitegrid.__all__}
+    for query in sitegrid.QUERIES.values():
+        (answer,) = {part for base in query.__orig_bases__ for part in get_args(base)} or {query}
+        assert {query.__name__, answer.__name__} - {"PieceQuery", "AliveQuery"} <= {*sitegrid.__all__}, query
     assert all(getattr(sitegrid, name) for name in (*sitegrid.__all__, "__version__"))

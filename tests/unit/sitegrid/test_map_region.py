@@ -1,5 +1,6 @@
 """Answers in the forms of notebooks keep values, places, units and the frame."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -24,7 +25,9 @@ VALUES = np.array([[1.0, np.nan, 3.0], [np.nan, np.nan, 6.0]], np.float32)
 def region() -> MapRegion:
     x_m, y_m = np.arange(3) * 2.0 - 9.0, np.arange(2) * 2.0 + 11.0
     layers = {"resistance": VALUES, "age_s": VALUES * 10}
-    return MapRegion.from_region(Region(x_m, y_m, 2.0, layers, version(17, 3), 5), lambda: site_info(SITE))
+    return MapRegion.from_region(
+        Region(x_m, y_m, 2.0, layers, version(17, 3), 5), lambda: site_info(SITE), lambda: "the map lies elsewhere"
+    )
 
 
 def test_a_dataset_has_values_places_units_and_the_frame(region):
@@ -56,6 +59,8 @@ def test_a_place_lies_where_pyproj_and_the_transform_say(region):
 def test_it_says_what_it_is_and_draws_itself(region):
     assert repr(region) == "<3 x 2 cells of 2 m at -10..-4, 10..14 m, 50% known: resistance, age_s>"
     assert "<td>resistance</td><td>50%</td><td>1</td><td>3.333</td><td>6</td>" in region._repr_html_()
+    empty = replace(region, layers={"resistance": np.full_like(VALUES, np.nan)})
+    assert repr(empty).endswith("0% known: resistance; the map lies elsewhere>")
     axes = region.plot("age_s")
     assert axes.get_title() == "pit: age_s"
     assert axes.images[0].get_extent() == [-10.0, -4.0, 10.0, 14.0]
