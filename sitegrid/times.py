@@ -64,6 +64,14 @@ def utc_text(stamp_ns: int) -> str:
     return (_EPOCH + timedelta(seconds=stamp_ns // 10**9)).strftime("%Y-%m-%d %H:%M:%SZ")
 
 
+def iso(stamp_ns: int) -> str | None:
+    """A stamp as ISO 8601 in UTC; None for 0, which is never."""
+    if not stamp_ns:
+        return None
+    seconds, rest_ns = divmod(stamp_ns, 10**9)
+    return f"{_EPOCH + timedelta(seconds=seconds):%Y-%m-%dT%H:%M:%S}.{rest_ns:09d}Z"
+
+
 def _iso_ns(text: str) -> int:
     try:
         return _ns(datetime.fromisoformat(text))

@@ -12,11 +12,13 @@ from starlette.responses import Response
 
 from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion
-from protocol.queries.parameters import Form, number, text_of
+from protocol.queries.parameters import Form, name_of, number, text_of
 from protocol.queries.request import Fresh, MapQuery, Parameter, parameters_of
 from protocol.queries.requests import parse_query
+from sitegrid.features.feature import Collection, geojson
+from sitegrid.features.gdal import flat_geobuf
 from sitegrid.web import values
-from sitegrid.web.encoding import as_json, beside
+from sitegrid.web.encoding import answered, as_json
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters
 
@@ -25,7 +27,8 @@ LAT_LON = (
     Parameter("lat", "latitude [deg], with lon in place of x and y", number(-90.0, 90.0)),
     Parameter("lon", "longitude [deg]", number(-360.0, 360.0)),  # some programs count on beyond 180
 )
-GEOJSON = ("application/geo+json",)
+FEATURE_FORMAT = Parameter("format", "geojson, or fgb: FlatGeobuf", name_of())
+FEATURE_MEDIA = {"geojson": "application/geo+json", "fgb": "application/flatgeobuf"}
 
 
 @dataclass(frozen=True)
@@ -91,9 +94,27 @@ def _parsed(query: type[MapQuery[Any]], parameters: Parameters) -> MapQuery[Any]
     return parse_query(query.name, texts)
 
 
-async def as_geojson(make: Callable[..., Any], *arguments: Any) -> Response:
-    """A collection of features, as `make` makes it of these arguments."""
-    return await as_json(await beside(make, *arguments), GEOJSON[0])
+def of_features(
+    answer: Answer,
+    summary: str,
+    query: type[MapQuery[Any]] | None = None,
+    without: tuple[str, ...] = (),
+    *,
+    follows_now: bool = True,
+) -> Resource:
+    """A resource that answers with features."""
+    return Resource(answer, summary, query, without, (FEATURE_FORMAT,), tuple(FEATURE_MEDIA.values()), follows_now)
+
+
+async def as_features(feed: SiteFeed, more: Parameters, name: str, collection: Collection) -> Response:
+    """Features in the format that was asked for. name: of their layer."""
+    kind = more.get(FEATURE_FORMAT.name, "geojson")
+    if kind not in FEATURE_MEDIA:
+        raise values.bad(Refusal.OUT_OF_RANGE, f"parameter `{FEATURE_FORMAT.name}`: {FEATURE_FORMAT.help}")
+    projection = await feed.projection()
+    if kind == "fgb":
+        return await answered(flat_geobuf(collection, projection, name), FEATURE_MEDIA[kind])
+    return await as_json(geojson(collection, projection), FEATURE_MEDIA[kind])
 
 
 def of_version(response: Response, version: MapVersion) -> Response:

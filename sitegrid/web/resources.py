@@ -25,9 +25,12 @@ from protocol.queries.requests import (
     RegionQuery,
     WhyQuery,
 )
-from sitegrid.web import features, roads
+from sitegrid.features.feature import Collection
+from sitegrid.features.kinds import CHANGE, MACHINE, tracks
+from sitegrid.features.zones import zones
+from sitegrid.web import roads
 from sitegrid.web.encoding import PIECE, ROOM, answered, as_json, beside, frame, pieces
-from sitegrid.web.resource import GEOJSON, Resource, as_geojson, of_version, version_of
+from sitegrid.web.resource import Resource, as_features, of_features, of_version, version_of
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters, bad
 
@@ -129,33 +132,34 @@ async def tiles(feed: SiteFeed, query: TilesQuery, _: Parameters) -> Response:
     return Response(await beside(frame, answer), media_type="application/octet-stream")
 
 
-async def zones(feed: SiteFeed, query: TilesQuery, _: Parameters) -> Response:
+async def zone_features(feed: SiteFeed, query: TilesQuery, more: Parameters) -> Response:
     """Areas of one kind of ground, as features."""
-    info_now = await feed.info()
-    return await as_geojson(features.zones, await feed.answer_to(query), info_now.boundaries, await feed.projection())
+    boundaries = (await feed.info()).boundaries
+    return await as_features(feed, more, "zones", zones(await feed.answer_to(query), boundaries))
 
 
-async def change_features(feed: SiteFeed, query: ChangesQuery, _: Parameters) -> Response:
+async def change_features(feed: SiteFeed, query: ChangesQuery, more: Parameters) -> Response:
     """Changes of the ground, as features."""
-    return await as_geojson(features.changes, (await feed.answer_to(query)).changes, await feed.projection())
+    return await as_features(feed, more, "changes", Collection(CHANGE, (await feed.answer_to(query)).changes))
 
 
-async def machine_features(feed: SiteFeed, _: None, __: Parameters) -> Response:
+async def machine_features(feed: SiteFeed, _: None, more: Parameters) -> Response:
     """Where machines are, as features: those that said so while somebody looks."""
     async with feed.watched():
         await feed.heard()
-        return await as_geojson(features.machines, feed.poses(), await feed.projection())
+        return await as_features(feed, more, "machines", Collection(MACHINE, feed.poses()))
 
 
-async def track_features(feed: SiteFeed, _: None, __: Parameters) -> Response:
+async def track_features(feed: SiteFeed, _: None, more: Parameters) -> Response:
     """Where machines drove while somebody looked, as features."""
     async with feed.watched():
         await feed.heard()
-        return await as_geojson(features.tracks, feed.tracks(), await feed.projection())
+        return await as_features(feed, more, "tracks", tracks(feed.tracks()))
 
 
 FORMAT = Parameter("format", "json or npz", name_of())
 BINARY = ("application/octet-stream",)
+ZONES = "Areas of one kind of ground"
 EVERY_TILE = tuple(parameters_of(TilesQuery))
 RESOURCES: dict[str, Resource] = {
     "info": Resource(info, InfoQuery.help, InfoQuery, follows_now=True),
@@ -169,12 +173,10 @@ RESOURCES: dict[str, Resource] = {
     "changes": Resource(changes, ChangesQuery.help, ChangesQuery, follows_now=True),
     "tiles": Resource(tiles, TilesQuery.help, TilesQuery, without=("place",), media=BINARY, follows_now=True),
     **roads.RESOURCES,
-    "features/zones": Resource(zones, "Areas of one kind of ground", TilesQuery, EVERY_TILE, media=GEOJSON),
-    "features/changes": Resource(
-        change_features, "Changes of the ground as areas", ChangesQuery, ("after",), media=GEOJSON, follows_now=True
-    ),
-    "features/machines": Resource(machine_features, "Positions of machines", media=GEOJSON, follows_now=True),
-    "features/tracks": Resource(track_features, "Lines that machines drove", media=GEOJSON, follows_now=True),
+    "features/zones": of_features(zone_features, ZONES, TilesQuery, EVERY_TILE, follows_now=False),
+    "features/changes": of_features(change_features, "Changes of the ground as areas", ChangesQuery, ("after",)),
+    "features/machines": of_features(machine_features, "Positions of machines"),
+    "features/tracks": of_features(track_features, "Lines that machines drove"),
 }
 # Other queries are answered with the fields of their records.
 RESOURCES |= {

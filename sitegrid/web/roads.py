@@ -9,29 +9,30 @@ from starlette.responses import Response
 from protocol.queries.answers import MapVersion
 from protocol.queries.roads import Segments, SegmentsQuery, Worklist, WorklistQuery
 from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
-from sitegrid.web import features
+from sitegrid.features.feature import Collection
+from sitegrid.features.kinds import REPAIR, SEGMENT, WORK
 from sitegrid.web.encoding import as_json
-from sitegrid.web.resource import GEOJSON, Resource, as_geojson, of_version, version_of
+from sitegrid.web.resource import Resource, as_features, of_features, of_version, version_of
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.values import Parameters
 
 
-async def segment_features(feed: SiteFeed, query: SegmentsQuery, _: Parameters) -> Response:
+async def segment_features(feed: SiteFeed, query: SegmentsQuery, more: Parameters) -> Response:
     """Roads as lines."""
     answer = await feed.answer_to(query)
-    return _of_map(await as_geojson(features.segments, answer.segments, await feed.projection()), answer)
+    return _of_map(await as_features(feed, more, "segments", Collection(SEGMENT, answer.segments)), answer)
 
 
-async def worklist_features(feed: SiteFeed, query: WorklistQuery, _: Parameters) -> Response:
+async def worklist_features(feed: SiteFeed, query: WorklistQuery, more: Parameters) -> Response:
     """Stretches where work pays, as lines."""
     answer = await feed.answer_to(query)
-    return _of_map(await as_geojson(features.worklist, answer.rows, await feed.projection()), answer)
+    return _of_map(await as_features(feed, more, "worklist", Collection(WORK, answer.rows)), answer)
 
 
-async def repair_features(feed: SiteFeed, query: WorklistQuery, _: Parameters) -> Response:
+async def repair_features(feed: SiteFeed, query: WorklistQuery, more: Parameters) -> Response:
     """Stretches whose ground changed, as lines."""
     answer = await feed.answer_to(query)
-    return _of_map(await as_geojson(features.repairs, answer.changes, await feed.projection()), answer)
+    return _of_map(await as_features(feed, more, "repairs", Collection(REPAIR, answer.changes)), answer)
 
 
 async def drive(feed: SiteFeed, query: LineQuery, _: Parameters) -> Response:
@@ -45,13 +46,9 @@ async def drive(feed: SiteFeed, query: LineQuery, _: Parameters) -> Response:
 
 REPAIRS = "Stretches that were repaired or became worse, as lines"
 RESOURCES: dict[str, Resource] = {
-    "features/segments": Resource(segment_features, "Roads as lines", SegmentsQuery, media=GEOJSON, follows_now=True),
-    "features/worklist": Resource(
-        worklist_features, "The worklist as lines", WorklistQuery, media=GEOJSON, follows_now=True
-    ),
-    "features/repairs": Resource(
-        repair_features, REPAIRS, WorklistQuery, ("limit", "efficiency"), media=GEOJSON, follows_now=True
-    ),
+    "features/segments": of_features(segment_features, "Roads as lines", SegmentsQuery),
+    "features/worklist": of_features(worklist_features, "The worklist as lines", WorklistQuery),
+    "features/repairs": of_features(repair_features, REPAIRS, WorklistQuery, ("limit", "efficiency")),
     "route": Resource(drive, RouteQuery.help, RouteQuery),
     "way": Resource(drive, WayQuery.help, WayQuery),
 }

@@ -20,13 +20,14 @@ from protocol.queries.answers import GroundChange, MachineState, MapInfo, MapVer
 from protocol.queries.map_tiles import MapTile, TilesAnswer, TilesQuery
 from protocol.queries.request import MapQuery
 from protocol.queries.requests import ChangesQuery, InfoQuery, MachinesQuery, RegionQuery
-from protocol.site.site_config import MAX_EXTENT_M, Projection, SiteConfig
+from protocol.site.site_config import MAX_EXTENT_M, Projection
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, receive_pose
 from protocol.wire.messages import Health, Pose
 from sitegrid.asking import is_answered
 from sitegrid.client import Client
 from sitegrid.explanations import rolls
+from sitegrid.features.feature import projection_of
 from sitegrid.listener import Listener
 from sitegrid.web.encoding import Cache
 from sitegrid.web.machines import Machines
@@ -66,6 +67,7 @@ class SiteFeed:
         self._machines = Machines()
         self._listener: Listener[Pose] | None = None
         self._health: Listener[Health] | None = None
+        self._listens_s = 0.0  # since when, of the event loop's clock
         self._known: tuple[frozenset[tuple[int, int]], MapVersion | None] = frozenset(), None
         self._info: tuple[float, MapInfo] | None = None
         self._projection: Projection | None = None
@@ -95,7 +97,7 @@ class SiteFeed:
     async def projection(self) -> Projection:
         """From latitude and longitude to the site's frame."""
         if self._projection is None:
-            self._projection = Projection(_site_of(await self.info()))
+            self._projection = projection_of(await self.info())
         return self._projection
 
     async def tiles_as_of(self, as_of_ns: int) -> TilesAnswer:
@@ -153,9 +155,9 @@ class SiteFeed:
         return self._poses_text[1]
 
     async def heard(self) -> None:
-        """Wait until a machine says where it is, for a moment."""
+        """Wait until a machine says where it is, but no longer than HEARD_S since somebody listens."""
         loop = asyncio.get_running_loop()
-        end_s = loop.time() + HEARD_S
+        end_s = (self._listens_s or loop.time()) + HEARD_S
         while not self._machines and (left_s := end_s - loop.time()) > 0:
             await asyncio.wait([self.moved], timeout=left_s)
 
@@ -193,6 +195,7 @@ class SiteFeed:
             self._listener = await self.ask(Listener, self.client.session, key, self._pose, self._machines.on_pose)
             key = keys.health_all(self.name)
             self._health = await self.ask(Listener, self.client.session, key, receive_health, self._machines.on_health)
+            self._listens_s = asyncio.get_running_loop().time()
             self._looking = asyncio.create_task(self._look_for_server())
         next_state_s = 0.0
         idle_s = 0.0
@@ -284,8 +287,3 @@ def receive_health(key: str, data: bytes) -> Health:
 
 def _is_newer(tile: MapTile, version: MapVersion) -> bool:
     return tile.row > version.row or tile.fact > version.fact
-
-
-def _site_of(info: MapInfo) -> SiteConfig:
-    site = info.site
-    return SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m, site.cell_m)

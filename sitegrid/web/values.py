@@ -18,6 +18,7 @@ from starlette.responses import Response
 
 from protocol.errors import LinkError, QueryError, Refusal, SitegridError
 from protocol.machine.readings import MAX_STAMP_NS
+from sitegrid.times import iso
 
 Parameters = Mapping[str, str]
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -57,14 +58,6 @@ def check_known(parameters: Parameters, known: tuple[str, ...]) -> None:
     if unknown := sorted(set(parameters) - set(known)):
         takes = ", ".join(known) or "none"
         raise bad(Refusal.UNKNOWN_PARAMETER, f"parameter `{unknown[0][:40]}` is not known; known: {takes}")
-
-
-def iso(stamp_ns: int) -> str | None:
-    """A stamp as ISO 8601 in UTC; None for 0, which is never."""
-    if not stamp_ns:
-        return None
-    seconds, rest_ns = divmod(stamp_ns, 10**9)
-    return f"{_EPOCH + timedelta(seconds=seconds):%Y-%m-%dT%H:%M:%S}.{rest_ns:09d}Z"
 
 
 def plain(value: Any) -> Any:

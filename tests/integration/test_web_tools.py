@@ -20,6 +20,7 @@ from protocol.site.ground_classes import BOUNDARIES, ZONES
 from protocol.site.site_config import Projection
 from protocol.site.site_file import load_site
 from sitegrid.client import Client
+from sitegrid.web.resources import RESOURCES
 from tests.integration.web_site import NAME, WebSite
 from tests.patience import PATIENCE_S, until
 
@@ -150,6 +151,21 @@ def test_gdal_opens_zones_that_are_valid_and_hold_what_they_name(web: WebSite, p
         assert set(kinds_here) <= kinds
         seen |= set(kinds_here)
     assert len(seen) > 1
+
+
+FEATURES = [name for name in RESOURCES if name.startswith("features/")]
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_flat_geobuf_has_the_features_of_geojson_and_names_its_columns_though_it_is_empty(web: WebSite, name):
+    url, plain = f"{web.url}api/v1/sites/{NAME}/{name}?format=fgb", web.get(name).json["features"]
+    meta, _, shapes, columns = pyogrio.raw.read(url)
+    assert web.get(name, {"format": "fgb"}).headers["content-type"] == "application/flatgeobuf"
+    assert meta["geometry_type"] in ("Point", "MultiLineString", "MultiPolygon")
+    assert (meta["crs"], len(shapes), len(columns)) == ("EPSG:4326", len(plain), len(meta["fields"]))
+    assert [set(one["properties"]) for one in plain] == [set(meta["fields"])] * len(plain)
+    assert len(meta["fields"]) > 1
+    assert web.get(name, {"format": "kml"}).status == 400
 
 
 def test_text_is_deflated_for_who_takes_it_and_tiles_are_not_deflated_twice(web: WebSite):

@@ -11,7 +11,10 @@ from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer
 from protocol.site.ground_classes import BOUNDARIES
 from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire.messages import Pose
-from sitegrid.web import features
+from sitegrid.features import kinds
+from sitegrid.features import zones as module
+from sitegrid.features.feature import Collection, geojson
+from sitegrid.features.zones import zones as zones_of
 from sitegrid.web.encoding import pieces
 
 SITE = SiteConfig("pit", 49.01, 8.4)
@@ -26,6 +29,11 @@ def answer(c_rr: np.ndarray, x: int = 0, y: int = 0) -> TilesAnswer:
     )
 
 
+def features(collection: Collection) -> list[dict[str, Any]]:
+    """As the web server sends them."""
+    return json.loads(b"".join(pieces(geojson(collection, PROJECTION))))["features"]
+
+
 def area_m2(ring: list[list[float]]) -> float:
     xy = np.array([PROJECTION.to_map(lat, lon, 0)[:2] for lon, lat in ring])
     return float(abs(np.sum(xy[:-1, 0] * xy[1:, 1] - xy[1:, 0] * xy[:-1, 1])) / 2)
@@ -35,7 +43,7 @@ def test_areas_follow_the_edges_of_cells_with_their_holes():
     ground = np.full((64, 64), np.nan)
     ground[10:30, 20:40] = 0.02
     ground[15:20, 25:30] = 0.25
-    zones = json.loads(b"".join(pieces(features.zones(answer(ground, -1, 2), BOUNDARIES, PROJECTION))))["features"]
+    zones = features(zones_of(answer(ground, -1, 2), BOUNDARIES))
     assert [zone["properties"]["name"] for zone in zones] == ["gravel", "sand"]
     gravel, sand = (zone["geometry"]["coordinates"] for zone in zones)
     assert len(gravel) == 2, "an outline and a hole"
@@ -53,7 +61,7 @@ def test_zones_cost_what_is_known_wherever_it_lies(far: list[tuple[int, int]], m
     whole = answer(np.full((64, 64), 0.02)).tiles[0]
     tiles = tuple(replace(whole, x=x, y=y) for x, y in far)
     cells = 0
-    classes = features._classes
+    classes = module._classes
 
     def counted(*given: Any) -> Any:
         nonlocal cells
@@ -61,9 +69,8 @@ def test_zones_cost_what_is_known_wherever_it_lies(far: list[tuple[int, int]], m
         cells += image.size
         return image, corner
 
-    monkeypatch.setattr(features, "_classes", counted)
-    made = features.zones(replace(answer(np.zeros((64, 64))), tiles=tiles), BOUNDARIES, PROJECTION)
-    zones = json.loads(b"".join(pieces(made)))["features"]
+    monkeypatch.setattr(module, "_classes", counted)
+    zones = features(zones_of(replace(answer(np.zeros((64, 64))), tiles=tiles), BOUNDARIES))
     assert sum(area_m2(zone["geometry"]["coordinates"][0]) for zone in zones) == pytest.approx(
         64**2 * len(far), rel=0.2
     )
@@ -72,7 +79,7 @@ def test_zones_cost_what_is_known_wherever_it_lies(far: list[tuple[int, int]], m
 
 def test_a_change_is_a_rectangle_with_its_times():
     change = GroundChange(3, 10**9, 2 * 10**9, (0.0, 0.0, 10.0, 20.0), 200, 0.02, None, None, None)
-    (feature,) = features.changes([change], PROJECTION)["features"]
+    (feature,) = features(Collection(kinds.CHANGE, [change]))
     assert area_m2(feature["geometry"]["coordinates"][0]) == pytest.approx(200, rel=1e-4)
     assert feature["properties"]["first_time"] == "1970-01-01T00:00:01.000000000Z"
     assert feature["properties"]["resistance_after"] is None
@@ -80,7 +87,7 @@ def test_a_change_is_a_rectangle_with_its_times():
 
 def test_a_track_is_a_line_in_the_order_of_time():
     poses = [Pose("loader-1", 10**9 * i, 10.0 * i, 0.0, 0.0, 3.0, 1.0, 0.0, 1.0) for i in range(1, 4)]
-    (feature,) = features.tracks({"loader-1": poses, "loader-2": poses[:1]}, PROJECTION)["features"]
+    (feature,) = features(kinds.tracks({"loader-1": poses, "loader-2": poses[:1]}))
     line = [PROJECTION.to_map(lat, lon, 0)[0] for lon, lat in feature["geometry"]["coordinates"]]
     assert line == pytest.approx([10.0, 20.0, 30.0], abs=1e-3)
     assert feature["properties"]["machine"] == "loader-1"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sitegrid.web.meridian import geometry
+from sitegrid.features.meridian import geometry
 
 
 def placed(ring: list[tuple[float, float]]) -> list[list[float]]:

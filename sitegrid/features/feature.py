@@ -1,0 +1,87 @@
+"""Features: geometries in `map` [m] with properties of declared types; GeoJSON (RFC 7946) of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from protocol.arrays import Floats
+from protocol.queries.answers import MapInfo
+from protocol.site.site_config import Projection, SiteConfig
+from sitegrid.features.meridian import geometry
+from sitegrid.times import iso
+
+Time = datetime  # the type of a field of times: ISO 8601 in UTC, from a stamp
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What all features of a collection are, also of an empty one: so programs know its columns.
+
+    geometry: Point, LineString or Polygon. lines: corners (n, 2) in `map` [m] of an item: of a place one, of a line
+    its places, of an area its closed rings. fields: type of each property, and where an item has it: names of
+    attributes, keys and indices with dots between them. A property may be None.
+    """
+
+    geometry: str
+    lines: Callable[[Any], list[Floats]]
+    fields: Mapping[str, tuple[type, str]]
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Items of one kind; they may be made as they are iterated over, once."""
+
+    kind: Kind
+    items: Iterable[Any]
+
+    def properties(self, item: Any) -> dict[str, Any]:
+        """Properties of an item."""
+        table = {
+            name: (field_type, reduce(_part, path.split("."), item))
+            for name, (field_type, path) in self.kind.fields.items()
+        }
+        return {name: iso(value) if field_type is Time else value for name, (field_type, value) in table.items()}
+
+
+def _part(item: Any, name: str) -> Any:
+    if isinstance(item, Mapping):
+        return item[name]
+    return item[int(name)] if name.isdigit() else getattr(item, name)
+
+
+def projection_of(info: MapInfo) -> Projection:
+    """From the frame of a site to latitude and longitude."""
+    site = info.site
+    return Projection(SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m))
+
+
+def geojson(collection: Collection, projection: Projection) -> dict[str, Any]:
+    """As GeoJSON, in longitude and latitude [deg]; its features are made as they are iterated over."""
+    return {"type": "FeatureCollection", "features": _geojson(collection, projection)}
+
+
+def _geojson(collection: Collection, projection: Projection) -> Iterator[dict[str, Any]]:
+    for item in collection.items:
+        shape = shape_of(collection.kind, item, projection)
+        yield {"type": "Feature", "geometry": shape, "properties": collection.properties(item)}
+
+
+def shape_of(kind: Kind, item: Any, projection: Projection | None) -> dict[str, Any]:
+    """Its geometry as GeoJSON has it: longitude, latitude [deg], cut at the 180th meridian; without projection in m."""
+    lines = [_degrees(line, projection) if projection else line.tolist() for line in kind.lines(item)]
+    nested: Any = lines if kind.geometry == "Polygon" else lines[0]
+    nested = nested[0] if kind.geometry == "Point" else nested
+    return geometry(kind.geometry, nested) if projection else {"type": kind.geometry, "coordinates": nested}
+
+
+def _degrees(line: Floats, projection: Projection) -> list[list[float]]:
+    x_m, y_m = np.asarray(line, np.float64).T
+    lat_deg, lon_deg, _ = projection.to_geodetic_many(x_m, y_m, np.zeros(len(x_m)))
+    corners: list[list[float]] = np.stack([lon_deg, lat_deg], axis=1).round(8).tolist()
+    return corners

@@ -1,0 +1,114 @@
+"""Kinds of features of what a site has: changes, machines, tracks, roads and work on them. Ground: `zones.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from protocol.arrays import Floats
+from protocol.wire.messages import Pose
+from sitegrid.features.feature import Collection, Kind, Time
+
+
+def _line(item: Any) -> list[Floats]:
+    return [np.array(item.line, np.float64)]
+
+
+def _rectangle(item: Any) -> list[Floats]:
+    west, south, east, north = item.bounds
+    return [np.array([(west, south), (east, south), (east, north), (west, north), (west, south)])]
+
+
+def _floats(*names: str) -> dict[str, tuple[type, str]]:
+    return {name: (float, name) for name in names}
+
+
+# Of `GroundChange`: rectangles around changes of the ground.
+CHANGE = Kind(
+    "Polygon",
+    _rectangle,
+    {
+        "id": (int, "id"),
+        "first_time": (Time, "first_ns"),
+        "last_time": (Time, "last_ns"),
+        "cells": (int, "cells"),
+        **_floats("resistance_before", "resistance_after"),
+    },
+)
+# Of poses as tables.
+MACHINE = Kind(
+    "Point",
+    lambda pose: [np.array([(pose["x_m"], pose["y_m"])])],
+    {
+        "machine": (str, "machine"),
+        **_floats("heading_rad", "speed_mps"),
+        "stamp_time": (Time, "stamp_ns"),
+        **_floats("age_s"),
+    },
+)
+# Of tables: machine, line (n, 2), first_ns, last_ns.
+TRACK = Kind(
+    "LineString",
+    lambda track: [track["line"]],
+    {"machine": (str, "machine"), "first_time": (Time, "first_ns"), "last_time": (Time, "last_ns")},
+)
+# Of `RoadSegment`, in the direction that is the first of each pair, which becomes two: few programs read lists.
+SEGMENT = Kind(
+    "LineString",
+    _line,
+    {
+        "id": (str, "id"),
+        **_floats("length_m", "resistance", "resistance_std", "grade", "trend", "unmeasured"),
+        "guessed": (bool, "guessed"),
+        "machines": (int, "machines"),
+        **{
+            f"{name}{end}": (float, f"{name}.{index}")
+            for name in ("passes_ph", "tonnes_ph")
+            for index, end in enumerate(("", "_back"))
+        },
+    },
+)
+# Of `WorklistRow`; of what is lost its value, `_low` and `_high` (90 %).
+WORK = Kind(
+    "LineString",
+    lambda row: _line(row.segment),
+    {
+        "rank": (int, "rank"),
+        **{
+            f"{name}{end}": (float, f"{name}.{index}")
+            for name in ("kwh_ph", "litres_ph", "seconds_ph")
+            for index, end in enumerate(("", "_low", "_high"))
+        },
+        "since_time": (Time, "since_ns"),
+        "resistance_before": (float, "before"),
+        "saved_kwh_ph": (float, "saved_kwh_ph"),
+        **{name: (field_type, f"segment.{path}") for name, (field_type, path) in SEGMENT.fields.items()},
+    },
+)
+# Of `RoadChange`: repaired, or become worse.
+REPAIR = Kind(
+    "LineString",
+    _line,
+    {
+        "id": (str, "id"),
+        "first_time": (Time, "first_ns"),
+        "seen_time": (Time, "seen_ns"),
+        "resistance_before": (float, "before"),
+        "resistance_after": (float, "after"),
+        "saved_kwh_ph": (float, "saved_kwh_ph"),
+    },
+)
+
+
+def tracks(tracks_of: Mapping[str, Sequence[Pose]]) -> Collection:
+    """Lines that machines drove, made as they are iterated over."""
+    return Collection(TRACK, _tracks(tracks_of))
+
+
+def _tracks(tracks_of: Mapping[str, Sequence[Pose]]) -> Iterator[dict[str, Any]]:
+    for name, poses in tracks_of.items():
+        if len(poses) > 1:
+            line = np.array([(pose.x_m, pose.y_m) for pose in poses])
+            yield {"machine": name, "line": line, "first_ns": poses[0].stamp_ns, "last_ns": poses[-1].stamp_ns}
