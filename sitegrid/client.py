@@ -6,7 +6,6 @@ It is one module because it is one class: all that a program may ask.
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Any, TypeVar, cast
@@ -14,7 +13,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import zenoh
 
-from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec
 from protocol.queries.answers import (
     ChangesAnswer,
@@ -29,9 +27,8 @@ from protocol.queries.answers import (
 )
 from protocol.queries.calibration import CalibrationAnswer
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand
-from protocol.queries.map_tiles import TilesAnswer, TilesQuery
 from protocol.queries.origin import SERVER, Origin
-from protocol.queries.pieces import Progress, joined
+from protocol.queries.pieces import Progress
 from protocol.queries.places import Place, around, where_it_lies
 from protocol.queries.request import MapQuery, Request
 from protocol.queries.requests import (
@@ -39,7 +36,6 @@ from protocol.queries.requests import (
     ChangesQuery,
     InfoQuery,
     MachinesQuery,
-    PieceQuery,
     PointQuery,
     RegionQuery,
 )
@@ -57,9 +53,9 @@ from sitegrid.map_region import MapRegion
 from sitegrid.security.join import join
 from sitegrid.times import Time, parse_time
 from sitegrid.watch import AGAIN_S, watch, watch_async
+from sitegrid.whole_answers import whole_answer
 
 SOLVE_S = 30.0  # that the server has to calibrate a fleet for: a large one on a busy host
-REGION_ATTEMPTS = 3
 Layers = str | Sequence[str]
 Area = Bounds | tuple[float, float, float, float] | Sequence[Place]
 T = TypeVar("T")
@@ -91,16 +87,9 @@ class Client:
 
         progress: called with each piece of a large region, as (here, of all).
         """
-        answer: Any
-        match query:
-            case RegionQuery():
-                answer = self._region(query, progress)
-            case TilesQuery():
-                answer = self._tiles(query)
-            case ChangesQuery():
-                answer = self._changes(query)
-            case _:
-                answer = self._reply(query)
+        answer: Any = whole_answer(query, self._answered, progress)
+        if isinstance(query, RegionQuery):
+            answer = MapRegion.from_region(answer, self.site_info, self.where)
         return cast(T, answer)
 
     def point(
@@ -137,7 +126,7 @@ class Client:
         A large region comes in pieces, all of one version of the map; progress: as of `ask`.
         """
         query = RegionQuery(area_of(area), _names(layers), resolution_m, as_of_ns=self._as_of(as_of))
-        return self._region(query, progress)
+        return cast(MapRegion, self.ask(query, progress=progress))
 
     def route(
         self,
@@ -283,13 +272,10 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _answered(self, query: MapQuery[Any], *, at: Origin | None = None) -> Answered:
+    def _answered(self, query: MapQuery[Any], at: Origin | None = None) -> Answered:
         answered = self._asker.ask(query, at=at)
         self.origin = answered.origin  # of the last answer of any thread: nothing here goes on with it
         return answered
-
-    def _reply(self, query: MapQuery[T]) -> T:
-        return query.decode(self._answered(query).data)
 
     def _as_of(self, time: Time | None) -> int | None:
         return None if time is None else self.stamp(time)
@@ -297,42 +283,6 @@ class Client:
     def _projection(self) -> Projection:
         site = self.site_info()
         return Projection(SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m))
-
-    def _region(self, query: RegionQuery, progress: Progress | None) -> MapRegion:
-        for attempts_left in reversed(range(REGION_ATTEMPTS)):
-            try:
-                return MapRegion.from_region(joined(self._pieces(query), progress), self.site_info, self.where)
-            except QueryError as error:  # that version of the map is not kept any more: begin again
-                if error.reason != Refusal.EXPIRED or not attempts_left:
-                    raise
-        raise AssertionError
-
-    def _pieces(self, query: RegionQuery) -> Iterator[Region]:
-        """The region, or piece after piece of it, all from whom has the first one."""
-        answered = self._answered(query)
-        yield (first := query.decode(answered.data))
-        if first.piece:
-            for number in range(1, first.piece.count):
-                piece = PieceQuery(first.piece.cursor, number)
-                yield piece.decode(self._answered(piece, at=answered.origin).data)
-
-    def _tiles(self, query: TilesQuery) -> TilesAnswer:
-        """Tiles in several replies. What changes meanwhile may be in it, and differs since the answer's version."""
-        first = answer = self._reply(query)
-        tiles = list(first.tiles)
-        while answer.next_place:
-            answer = self._reply(replace(query, place=answer.next_place))
-            if _goes_back(first, answer):
-                return self._tiles(replace(query, since=None, place=None))
-            tiles += answer.tiles
-        return replace(first, tiles=tuple(tiles), next_place=None)
-
-    def _changes(self, query: ChangesQuery) -> ChangesAnswer:
-        answer = self._reply(query)
-        if len(answer.changes) < answer_codec.MAX_CHANGES:
-            return answer
-        rest = self._changes(ChangesQuery(answer.changes[-1].id))
-        return replace(rest, changes=answer.changes + rest.changes)
 
     def _command(self, command: Request[T], wait_s: float) -> T:
         key = keys.admin(self.site, command.name)
@@ -354,13 +304,6 @@ def area_of(area: Area) -> Bounds | tuple[Place, ...]:
 def _names(layers: Layers) -> tuple[str, ...]:
     names = layers.split(",") if isinstance(layers, str) else layers
     return tuple(name.strip() for name in names if name.strip())
-
-
-def _goes_back(first: TilesAnswer, answer: TilesAnswer) -> bool:
-    """Whether another store, or a process that is behind the first one, answers the rest of the tiles."""
-    before, now = first.version, answer.version
-    same = (before.store, first.whole) == (now.store, answer.whole)
-    return not same or now.row < before.row or now.fact < before.fact
 
 
 def connect(

@@ -66,6 +66,13 @@ class Following:
         """Follow from now on."""
         self._thread.start()
 
+    def read_once(self) -> None:
+        """Read what is there now, on the caller's thread, in place of following it; StoreError where that fails."""
+        with self.location.reader() as reader:
+            self._require_fit(reader)
+            complete_s = reader.complete_s()
+            self._look(reader, reader.state(), complete_s)
+
     def run(self, work: Callable[[Replica], T]) -> T:
         """Have `work` done with the replica as it is; QueryError where there is none."""
         with self._lock:

@@ -42,6 +42,13 @@ from sitegrid.refold.work import Fold, FoldTask, PartWork, code_digest, fold_par
 def run(arguments: Namespace) -> int:
     """Fold once and print what became of the samples."""
     raise_interrupts()  # what is not complete is removed, or kept on purpose
+    summary = fold(arguments)
+    say(summary) if arguments.json else tell(*_lines(summary))
+    return 0
+
+
+def fold(arguments: Namespace) -> dict[str, Any]:
+    """Fold once; what became of the samples."""
     selection = Selection(
         from_ns=arguments.from_ns or 0,
         to_ns=MAX_STAMP_NS if arguments.until_ns is None else arguments.until_ns - 1,
@@ -63,9 +70,7 @@ def run(arguments: Namespace) -> int:
             raise ConfigError("--without", problem)
         if not planned.kept.total():
             raise ConfigError("sitegrid fold", f"no sample is left: {json.dumps(planned.excluded)} are excluded")
-        summary = _build(arguments, sources, planned, site, engine)
-    say(summary) if arguments.json else tell(*_lines(summary))
-    return 0
+        return _build(arguments, sources, planned, site, engine)
 
 
 def _engine(arguments: Namespace, parts: int) -> AbstractContextManager[Engine]:

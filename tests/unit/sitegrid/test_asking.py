@@ -19,7 +19,8 @@ from protocol.wire.codec import pack
 from protocol.wire.messages import VERSION
 from sitegrid import asking
 from sitegrid.asking import Asker, preferred
-from sitegrid.client import REGION_ATTEMPTS, Client
+from sitegrid.client import Client
+from sitegrid.whole_answers import REGION_ATTEMPTS
 from tests.unit.records import STORE, map_info, version
 
 POINT = codec.encode_point(PointAnswer(0.5, 1.5, {"visits": 2.0}, version(17, 3), 5))

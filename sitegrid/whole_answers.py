@@ -1,0 +1,87 @@
+"""The whole answer to a query, however many replies it comes in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, TypeVar, cast
+
+from protocol.errors import QueryError, Refusal
+from protocol.queries import answer_codec
+from protocol.queries.answers import ChangesAnswer, Region
+from protocol.queries.map_tiles import TilesAnswer, TilesQuery
+from protocol.queries.origin import Origin
+from protocol.queries.pieces import Progress, joined
+from protocol.queries.request import MapQuery
+from protocol.queries.requests import ChangesQuery, PieceQuery, RegionQuery
+from sitegrid.asking import Answered
+
+REGION_ATTEMPTS = 3
+Ask = Callable[[MapQuery[Any], Origin | None], Answered]  # one reply, from a certain process where one is named
+T = TypeVar("T")
+
+
+def whole_answer(query: MapQuery[T], ask: Ask, progress: Progress | None = None) -> T:
+    """All of an answer; progress: called with each piece of a large region, as (here, of all)."""
+    answer: Any
+    match query:
+        case RegionQuery():
+            answer = _region(query, ask, progress)
+        case TilesQuery():
+            answer = _tiles(query, ask)
+        case ChangesQuery():
+            answer = _changes(query, ask)
+        case _:
+            answer = _reply(query, ask)
+    return cast(T, answer)
+
+
+def _reply(query: MapQuery[T], ask: Ask) -> T:
+    return query.decode(ask(query, None).data)
+
+
+def _region(query: RegionQuery, ask: Ask, progress: Progress | None) -> Region:
+    for _ in range(REGION_ATTEMPTS - 1):
+        try:
+            return joined(_pieces(query, ask), progress)
+        except QueryError as error:
+            if error.reason != Refusal.EXPIRED:  # else that version of the map is not kept any more: begin again
+                raise
+    return joined(_pieces(query, ask), progress)
+
+
+def _pieces(query: RegionQuery, ask: Ask) -> Iterator[Region]:
+    """The region, or piece after piece of it, all from whom has the first one."""
+    answered = ask(query, None)
+    yield (first := query.decode(answered.data))
+    if first.piece:
+        for number in range(1, first.piece.count):
+            piece = PieceQuery(first.piece.cursor, number)
+            yield piece.decode(ask(piece, answered.origin).data)
+
+
+def _tiles(query: TilesQuery, ask: Ask) -> TilesAnswer:
+    """Tiles in several replies. What changes meanwhile may be in it, and differs since the answer's version."""
+    first = answer = _reply(query, ask)
+    tiles = list(first.tiles)
+    while answer.next_place:
+        answer = _reply(replace(query, place=answer.next_place), ask)
+        if _goes_back(first, answer):
+            return _tiles(replace(query, since=None, place=None), ask)
+        tiles += answer.tiles
+    return replace(first, tiles=tuple(tiles), next_place=None)
+
+
+def _changes(query: ChangesQuery, ask: Ask) -> ChangesAnswer:
+    answer = _reply(query, ask)
+    if len(answer.changes) < answer_codec.MAX_CHANGES:
+        return answer
+    rest = _changes(ChangesQuery(answer.changes[-1].id), ask)
+    return replace(rest, changes=answer.changes + rest.changes)
+
+
+def _goes_back(first: TilesAnswer, answer: TilesAnswer) -> bool:
+    """Whether another store, or a process that is behind the first one, answers the rest of the tiles."""
+    before, now = first.version, answer.version
+    same = (before.store, first.whole) == (now.store, answer.whole)
+    return not same or now.row < before.row or now.fact < before.fact
