@@ -1,0 +1,99 @@
+"""One file written: its form by its name, what it holds, and all that is refused before anything is written."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import BinaryIO
+
+from protocol.errors import ConfigError
+from protocol.files import whole_file
+from sitegrid.export.maps import opened, version_of
+from sitegrid.export.wanted import Wanted, parse_wanted
+from sitegrid.options.values import OutputFile
+from sitegrid.process.lifetime import raise_interrupts, return_large_blocks, say, tell
+from sitegrid.times import iso
+
+FEATURES = ("zones", "segments", "worklist", "repairs", "changes", "tracks")
+OF_MACHINES = ("segments", "worklist", "repairs", "tracks", "samples")  # --machine can choose from these
+Write = Callable[[BinaryIO, Wanted, Sequence[str]], Mapping[str, int]]
+
+
+@dataclass(frozen=True)
+class Form:
+    """A form of files.
+
+    writer: module of this package and function. holds: what it can hold, at most `most` of it at once. usual: unless
+    named; a file that holds one of several has none.
+    """
+
+    writer: tuple[str, str]
+    holds: tuple[str, ...]
+    usual: tuple[str, ...] = ()
+    most: int = 1
+
+    def write(self) -> Write:
+        """The function that writes it; ModuleNotFoundError names what is not installed."""
+        module, name = self.writer
+        function: Write = getattr(import_module(f"sitegrid.export.{module}"), name)
+        return function
+
+
+TABLES = ("cells", "samples", *FEATURES)
+FORMS = {
+    ".tif": Form(("raster", "write_tif"), ("cells",), ("cells",)),
+    ".gpkg": Form(("vectors", "write_gpkg"), FEATURES, FEATURES, len(FEATURES)),
+    ".geojson": Form(("vectors", "write_geojson"), FEATURES),
+    ".fgb": Form(("vectors", "write_fgb"), FEATURES),
+    ".dxf": Form(("vectors", "write_dxf"), FEATURES, ("zones", "segments"), len(FEATURES)),
+    ".parquet": Form(("tables", "write_parquet"), TABLES),
+    ".csv": Form(("tables", "write_csv"), ("cells", "samples"), ("cells",)),
+    ".tum": Form(("samples", "write_tum"), ("tracks",), ("tracks",)),
+    ".html": Form(("report", "write_html"), ("report",), ("report",)),
+}
+
+
+def run(arguments: Namespace) -> int:
+    """Write the file, and say what it holds."""
+    raise_interrupts()  # what is not complete is removed
+    return_large_blocks()
+    path = OutputFile(tuple(FORMS))(str(arguments.file))
+    form = FORMS[path.suffix.lower()]
+    what = chosen(form, path, arguments)
+    write = form.write()
+    with opened(arguments) as site:
+        wanted = parse_wanted(arguments, site)
+        try:
+            with whole_file(path) as file:
+                counts = write(file, wanted, what)
+        except OSError as error:  # of a full disk, which names no file
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+    table = {"file": str(path), "site": wanted.info.site.name, "holds": counts, **version_of(wanted.info)}
+    holds = ", ".join(f"{count} {name}" for name, count in counts.items())
+    then = iso(wanted.roads.as_of_ns or wanted.info.stamp_ns)
+    say(table) if arguments.json else tell(f"{path}: {holds} of {wanted.info.site.name}, as of {then}")
+    return 0
+
+
+def chosen(form: Form, path: Path, arguments: Namespace) -> Sequence[str]:
+    """What the file will hold; ConfigError where it cannot, or where an option would do nothing."""
+    named = (path.stem,) if path.stem in form.holds else form.usual
+    if not arguments.store and not arguments.what:  # of a running site only the map is known
+        named = tuple(name for name in named if name != "tracks") or named
+    what: Sequence[str] = arguments.what or named
+    if not what or not set(what) <= set(form.holds) or len(set(what)) > form.most:
+        every = ", ".join(form.holds)
+        one_of = "one of" if form.most == 1 else "some of"
+        example = form.holds[0] + path.suffix
+        raise ConfigError(path, f"holds {one_of} {every}: name it with --what, or name the file {example}")
+    for option, value, those in (
+        ("--machine", arguments.asked_machine, OF_MACHINES),
+        ("--layers", arguments.asked_layers, ("cells",)),
+        ("--resolution", arguments.asked_resolution, ("cells", "report")),
+    ):
+        if value and (others := set(what) - set(those)):
+            raise ConfigError(option, f"is of {', '.join(those)} alone, not of {min(others)}: see --what")
+    return tuple(dict.fromkeys(what))

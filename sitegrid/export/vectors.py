@@ -1,0 +1,90 @@
+"""Features as files of GIS and CAD: GeoPackage, FlatGeobuf, GeoJSON, DXF."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import BinaryIO
+
+from protocol.arrays import Floats
+from protocol.errors import StoreError
+from sitegrid.export.collections import COLLECTIONS
+from sitegrid.export.styles import style_of
+from sitegrid.export.wanted import Wanted
+from sitegrid.features.feature import Collection, Kind
+from sitegrid.features.gdal import LAT_LON, columns, in_memory, write
+
+ENTITY = Kind("LineString", lambda entity: [entity[1]], {"Layer": (str, "0")})  # of DXF
+# QGIS 3.22 warns of the version that GDAL writes by default.
+GPKG_VERSION = "1.3"
+# As QGIS makes it (its documentation: "Saving styles in a database").
+STYLES = """
+CREATE TABLE layer_styles (
+    id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, f_table_catalog TEXT, f_table_schema TEXT, f_table_name TEXT,
+    f_geometry_column TEXT, styleName TEXT, styleQML TEXT, styleSLD TEXT, useAsDefault BOOLEAN, description TEXT,
+    owner TEXT, ui TEXT, update_time DATETIME DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ', 'now')));
+INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES ('layer_styles', 'attributes', 'layer_styles');
+"""
+STYLE = """INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,
+    styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')"""
+
+
+def write_gpkg(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, int]:
+    """A layer for each of these, in the site's frame, with a style that QGIS applies by itself."""
+    tables = {name: columns(COLLECTIONS[name](wanted)) for name in what}
+    with TemporaryDirectory(prefix="sitegrid-export-") as folder:
+        path = Path(folder) / "map.gpkg"
+        try:
+            for name, table in tables.items():
+                options = {} if path.exists() else {"dataset_options": {"VERSION": GPKG_VERSION}}
+                write(path, "GPKG", table, name, wanted.info.site.crs, **options)
+            _add_styles(path, {name: style_of(name, wanted.info.boundaries) for name in what})
+        except (RuntimeError, sqlite3.Error) as error:  # pyogrio's errors have no other base
+            raise StoreError(folder, f"{error}; make room there, or have TMPDIR name another place") from None
+        with path.open("rb") as made:
+            shutil.copyfileobj(made, file)
+    return {name: len(table.shapes) for name, table in tables.items()}
+
+
+def _add_styles(path: Path, styles: Mapping[str, str]) -> None:
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.executescript(STYLES)
+        connection.executemany(STYLE, [(name, name, style) for name, style in styles.items()])
+
+
+def write_geojson(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, int]:
+    """GeoJSON in longitude and latitude."""
+    return _in_degrees("GeoJSON", file, wanted, what[0])
+
+
+def write_fgb(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, int]:
+    """FlatGeobuf in longitude and latitude."""
+    return _in_degrees("FlatGeobuf", file, wanted, what[0])
+
+
+def _in_degrees(driver: str, file: BinaryIO, wanted: Wanted, what: str) -> dict[str, int]:
+    table = columns(COLLECTIONS[what](wanted), wanted.projection)
+    file.write(in_memory(driver, table, what, LAT_LON))
+    return {what: len(table.shapes)}
+
+
+def write_dxf(file: BinaryIO, wanted: Wanted, what: Sequence[str]) -> dict[str, int]:
+    """Lines in metres of the site's frame, as CAD wants them; areas by their outlines, each kind on a layer."""
+    collections = {name: COLLECTIONS[name](wanted) for name in what}
+    entities = {name: list(_entities(name, collection)) for name, collection in collections.items()}
+    table = columns(Collection(ENTITY, [entity for some in entities.values() for entity in some]))
+    file.write(in_memory("DXF", table, "entities", wanted.info.site.crs))
+    return {f"lines of {name}": len(some) for name, some in entities.items()}
+
+
+def _entities(name: str, collection: Collection) -> Iterator[tuple[str, Floats]]:
+    """Lines with the names of their layers."""
+    for item in collection.items:
+        properties = collection.properties(item)
+        kind = properties.get("name") or properties.get("machine") if name in ("zones", "tracks") else ""
+        for line in collection.kind.lines(item):
+            yield f"{name} {kind}".strip(), line

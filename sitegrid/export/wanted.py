@@ -1,0 +1,103 @@
+"""What is wanted of a map: which part of it, as of when; the queries that follow from it."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NoReturn
+
+import numpy as np
+
+from protocol.errors import ConfigError, QueryError, Refusal
+from protocol.queries.answers import MapInfo, Region
+from protocol.queries.places import where_it_lies
+from protocol.queries.requests import InfoQuery, RegionQuery
+from protocol.queries.roads import SegmentsQuery, Worklist, WorklistQuery
+from protocol.site.geometry import Bounds
+from protocol.site.site_config import Projection
+from sitegrid.export.maps import OpenMap
+from sitegrid.features.feature import projection_of
+from sitegrid.options.parameters import dest, given
+
+SMALLER = "give --bounds, fewer --layers, or --resolution"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """cells, roads: the queries of what is wanted; roads.bounds is None for the whole map."""
+
+    map: OpenMap
+    info: MapInfo
+    cells: RegionQuery
+    roads: SegmentsQuery
+
+    @cached_property
+    def projection(self) -> Projection:
+        """From the site's frame to latitude and longitude."""
+        return projection_of(self.info)
+
+    def region(self, query: RegionQuery | None = None) -> Region:
+        """The layers of its cells, or of what another query names; refused where none is known."""
+        try:
+            region: Region = self.map.ask(query or self.cells)
+        except QueryError as error:
+            if error.reason != Refusal.TOO_LARGE:
+                raise
+            raise QueryError(error.reason, f"{error}; {SMALLER}") from None
+        if not any(np.isfinite(values).any() for values in region.layers.values()):
+            nothing_there(self.info)
+        return region
+
+    def worklist(self, limit: int = 1000) -> Worklist:
+        """Where work on them pays."""
+        roads = self.roads
+        query = WorklistQuery(as_of_ns=roads.as_of_ns, bounds=roads.bounds, machine=roads.machine, limit=limit)
+        answer: Worklist = self.map.ask(query)
+        return answer
+
+
+def parse_wanted(arguments: Namespace, opened: OpenMap) -> Wanted:
+    """Parse the options; QueryError or ConfigError says what is wrong with which."""
+    info: MapInfo = opened.ask(InfoQuery())
+    if not info.bounds:
+        nothing_there(info)
+    whole = [edge * info.site.cell_m for edge in info.bounds]
+    now_ns: Callable[[], int] = lambda: info.stamp_ns  # noqa: E731
+    try:
+        roads: Any = given(SegmentsQuery, _only(arguments, "as_of", "bounds", "machine"), now_ns)
+        of_cells = _only(arguments, "as_of", "bounds", "layers", "resolution")
+        of_cells.asked_bounds = of_cells.asked_bounds or whole
+        cells: Any = given(RegionQuery, of_cells, now_ns)
+    except ValueError as error:
+        raise ConfigError("--bounds", str(error)) from None
+    if roads.bounds and not meet(roads.bounds, Bounds(*whole)):
+        nothing_there(info)
+    return Wanted(opened, info, cells, roads)
+
+
+def _only(arguments: Namespace, *names: str) -> Namespace:
+    return Namespace(**{dest(name): getattr(arguments, dest(name)) for name in names})
+
+
+def meet(one: Bounds, other: Bounds) -> bool:
+    """Whether two rectangles have ground in common."""
+    apart = one.east_m <= other.west_m or one.west_m >= other.east_m
+    return not (apart or one.north_m <= other.south_m or one.south_m >= other.north_m)
+
+
+def nothing_there(info: MapInfo) -> NoReturn:
+    """Refuse what would be an empty file."""
+    problem = f"nothing is known there and then: {where_it_lies(info.bounds, info.site.cell_m)}"
+    raise ConfigError(f"site {info.site.name}", problem)
+
+
+def coarser(wanted: Wanted, most: int) -> RegionQuery:
+    """The query of its cells in larger ones, where there are more than so many to a side."""
+    if wanted.cells.resolution_m:
+        return wanted.cells
+    bounds, cell_m = wanted.cells.bounds, wanted.info.site.cell_m
+    longest_m = max(bounds.east_m - bounds.west_m, bounds.north_m - bounds.south_m)
+    count = int(np.ceil(longest_m / cell_m / most))
+    return replace(wanted.cells, resolution_m=count * cell_m if count > 1 else None)
