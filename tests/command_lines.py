@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from sitegrid.cli import main
 from sitegrid.door import build_parser
+from sitegrid.options.values import OutputFile
 
 Given = dict[str, str]  # value of each option by its destination
 
@@ -95,7 +96,8 @@ def _anything(option: Action) -> list[str]:
         return ["1", "2", "3", "4"]  # two places
     if option.type is float:
         return ["2" if option.dest in ("east_m", "north_m", "to_x_m") else "1"]
-    return [str(next(iter(option.choices))) if option.choices else "nothing-of-the-sort"]
+    suffix = option.type.suffixes[0] if isinstance(option.type, OutputFile) and option.type.suffixes else ""
+    return [str(next(iter(option.choices))) if option.choices else f"nothing-of-the-sort{suffix}"]
 
 
 COMMANDS = _commands(build_parser())

@@ -11,19 +11,20 @@ from protocol.queries.roads import SegmentsQuery
 from sitegrid.commands.fold import archive_place
 from sitegrid.options.groups import add_network, add_site
 from sitegrid.options.parameters import add_parameters
-from sitegrid.options.values import names
+from sitegrid.options.values import OutputFile, names
 
 HELP = "write the map, roads or samples into a file for QGIS, CAD, notebooks or people"
 EXTRA = "export"
 BESIDE = {"numba": "server", "prometheus_client": "server", "scipy": "server"}
+FORMS = (".tif", ".gpkg", ".geojson", ".fgb", ".parquet", ".csv", ".dxf", ".tum", ".html")
 OF_CELLS = ("as_of", "layers", "resolution")  # parameters of a region that are options here
 
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add = parser.add_argument
-    forms = ".tif, .gpkg, .geojson, .fgb, .parquet, .csv, .dxf, .tum or .html"
-    add("file", type=Path, metavar="FILE", help=f"file to write; its form: {forms}")
+    forms = f"{', '.join(FORMS[:-1])} or {FORMS[-1]}"
+    add("file", type=OutputFile(FORMS), metavar="FILE", help=f"file to write; its form: {forms}")
     what = "what it holds, comma-separated: cells, zones, segments, worklist, repairs, changes, tracks, samples, report"
     add("--what", type=names, help=f"{what} (default: that which FILE is named after, else that of its form)")
     add_network(parser)

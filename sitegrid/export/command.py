@@ -13,7 +13,6 @@ from protocol.errors import ConfigError
 from protocol.files import whole_file
 from sitegrid.export.maps import opened, version_of
 from sitegrid.export.wanted import Wanted, parse_wanted
-from sitegrid.options.values import OutputFile
 from sitegrid.process.lifetime import raise_interrupts, return_large_blocks, say, tell
 from sitegrid.times import iso
 
@@ -60,7 +59,7 @@ def run(arguments: Namespace) -> int:
     """Write the file, and say what it holds."""
     raise_interrupts()  # what is not complete is removed
     return_large_blocks()
-    path = OutputFile(tuple(FORMS))(str(arguments.file))
+    path: Path = arguments.file
     form = FORMS[path.suffix.lower()]
     what = chosen(form, path, arguments)
     write = form.write()
