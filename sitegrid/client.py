@@ -43,10 +43,11 @@ from protocol.queries.roads import Segments, Worklist
 from protocol.queries.route_requests import RouteQuery
 from protocol.queries.routing import LOADER, NamedMachine, RouteAnswer, RouteMachine, machine_of
 from protocol.site.geometry import Bounds
-from protocol.site.site_config import Projection, SiteConfig
+from protocol.site.site_config import Projection
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.asking import Answered, Asker
+from sitegrid.features.feature import projection_of
 from sitegrid.geo_table import to_geopandas
 from sitegrid.listener import Listener
 from sitegrid.map_region import MapRegion
@@ -281,8 +282,7 @@ class Client:
         return None if time is None else self.stamp(time)
 
     def _projection(self) -> Projection:
-        site = self.site_info()
-        return Projection(SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m))
+        return projection_of(self.site_info())
 
     def _command(self, command: Request[T], wait_s: float) -> T:
         key = keys.admin(self.site, command.name)

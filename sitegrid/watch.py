@@ -10,10 +10,11 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from threading import Event
 
-from protocol.errors import LinkError, MessageError, QueryError
+from protocol.errors import LinkError, MessageError, QueryError, Refusal
 from protocol.queries.answers import MapVersion, Region
 from protocol.queries.map_tiles import TILE_CELLS, MapTile, TilesAnswer, TilesQuery
 from protocol.site.geometry import Bounds
+from sitegrid.asking import ELSEWHERE
 
 AGAIN_S = 1.0  # between two looks, by default
 NEAR_TILES = 1  # layers of areas depend on cells so far away
@@ -26,7 +27,7 @@ def watch(ask: Ask, read: Read, bounds: Bounds | None, again_s: float, stop: Eve
     """Regions of the tiles that differ, again and again; first of all that there are. Ends when `stop` is set.
 
     ask: for tiles since a version. read: a region. bounds: of what is watched, None for all. A server that is away is
-    asked again; a QueryError of another kind than its state ends the watch.
+    asked again; a QueryError about the question ends the watch.
     """
     version: MapVersion | None = None
     while not stop.is_set():
@@ -39,7 +40,7 @@ def watch(ask: Ask, read: Read, bounds: Bounds | None, again_s: float, stop: Eve
         except (LinkError, MessageError):
             pass
         except QueryError as error:
-            if not error.retry_after_s and error.reason not in ("store", "internal", "overloaded", "expired"):
+            if error.reason not in (*ELSEWHERE, Refusal.EXPIRED):
                 raise
         stop.wait(max(0.0, again_s - (time.monotonic() - began_s)))
 
@@ -60,13 +61,5 @@ def _areas(answer: TilesAnswer, bounds: Bounds | None) -> Iterator[Bounds]:
         west, east = min(tile.x for tile in tiles), max(tile.x for tile in tiles)
         corners = (west - NEAR_TILES, y - NEAR_TILES, east + 1 + NEAR_TILES, y + 1 + NEAR_TILES)
         area = Bounds(*(edge_m * corner for corner in corners))
-        if bounds is None:
-            yield area
-        elif shared := _shared(area, bounds):
+        if shared := area.shared(bounds) if bounds else area:
             yield shared
-
-
-def _shared(one: Bounds, other: Bounds) -> Bounds | None:
-    west, south = max(one.west_m, other.west_m), max(one.south_m, other.south_m)
-    east, north = min(one.east_m, other.east_m), min(one.north_m, other.north_m)
-    return Bounds(west, south, east, north) if west < east and south < north else None

@@ -1,7 +1,7 @@
 """What all queries and commands are: frozen records whose fields say which parameters of a selector they are.
 
-A field is declared once, by `asked` or `group`: from it follow the selector both ways, the options of the command line,
-the parameters of HTTP and their description. One that every query of a kind has stands in a class that they share.
+A field is declared once, by `asked` or `grouped`. From it follow the selector both ways, options of the command line,
+parameters of HTTP and their description. A field that several queries have stands in a class that they share.
 """
 
 from __future__ import annotations

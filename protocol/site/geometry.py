@@ -32,6 +32,12 @@ class Bounds:
         if self.west_m >= self.east_m or self.south_m >= self.north_m:
             raise ValueError("bounds: west must be below east and south below north")
 
+    def shared(self, other: "Bounds") -> "Bounds | None":
+        """The rectangle that two have in common; None for none."""
+        west_m, south_m = max(self.west_m, other.west_m), max(self.south_m, other.south_m)
+        east_m, north_m = min(self.east_m, other.east_m), min(self.north_m, other.north_m)
+        return Bounds(west_m, south_m, east_m, north_m) if west_m < east_m and south_m < north_m else None
+
 
 @dataclass(frozen=True)
 class CellWindow:

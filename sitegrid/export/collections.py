@@ -8,7 +8,7 @@ from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.requests import ChangesQuery
 from protocol.site.geometry import Bounds
 from sitegrid.export.samples import tracks
-from sitegrid.export.wanted import Wanted, meet
+from sitegrid.export.wanted import Wanted
 from sitegrid.features.feature import Collection
 from sitegrid.features.kinds import CHANGE, REPAIR, SEGMENT, WORK
 from sitegrid.features.zones import zones
@@ -24,7 +24,7 @@ def _changes(wanted: Wanted) -> Collection:
     bounds, as_of_ns = wanted.roads.bounds, wanted.roads.as_of_ns
     known = wanted.map.ask(ChangesQuery()).changes
     then = (one for one in known if as_of_ns is None or one.first_ns <= as_of_ns)
-    return Collection(CHANGE, [one for one in then if bounds is None or meet(bounds, Bounds(*one.bounds))])
+    return Collection(CHANGE, [one for one in then if bounds is None or bounds.shared(Bounds(*one.bounds))])
 
 
 COLLECTIONS: dict[str, Callable[[Wanted], Collection]] = {

@@ -36,7 +36,7 @@ class Wanted:
     @cached_property
     def projection(self) -> Projection:
         """From the site's frame to latitude and longitude."""
-        return projection_of(self.info)
+        return projection_of(self.info.site)
 
     def region(self, query: RegionQuery | None = None) -> Region:
         """The layers of its cells, or of what another query names; refused where none is known."""
@@ -72,19 +72,13 @@ def parse_wanted(arguments: Namespace, opened: OpenMap) -> Wanted:
         cells: Any = given(RegionQuery, of_cells, now_ns)
     except ValueError as error:
         raise ConfigError("--bounds", str(error)) from None
-    if roads.bounds and not meet(roads.bounds, Bounds(*whole)):
+    if roads.bounds and not roads.bounds.shared(Bounds(*whole)):
         nothing_there(info)
     return Wanted(opened, info, cells, roads)
 
 
 def _only(arguments: Namespace, *names: str) -> Namespace:
     return Namespace(**{dest(name): getattr(arguments, dest(name)) for name in names})
-
-
-def meet(one: Bounds, other: Bounds) -> bool:
-    """Whether two rectangles have ground in common."""
-    apart = one.east_m <= other.west_m or one.west_m >= other.east_m
-    return not (apart or one.north_m <= other.south_m or one.south_m >= other.north_m)
 
 
 def nothing_there(info: MapInfo) -> NoReturn:

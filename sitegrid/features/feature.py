@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from protocol.arrays import Floats
-from protocol.queries.answers import MapInfo
+from protocol.queries.answers import SiteInfo
 from protocol.site.site_config import Projection, SiteConfig
 from sitegrid.features.meridian import geometry
 from sitegrid.times import iso
@@ -55,9 +55,8 @@ def _part(item: Any, name: str) -> Any:
     return item[int(name)] if name.isdigit() else getattr(item, name)
 
 
-def projection_of(info: MapInfo) -> Projection:
+def projection_of(site: SiteInfo) -> Projection:
     """From the frame of a site to latitude and longitude."""
-    site = info.site
     return Projection(SiteConfig(site.name, site.origin_lat_deg, site.origin_lon_deg, site.origin_height_m))
 
 

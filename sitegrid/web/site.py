@@ -97,7 +97,7 @@ class SiteFeed:
     async def projection(self) -> Projection:
         """From latitude and longitude to the site's frame."""
         if self._projection is None:
-            self._projection = projection_of(await self.info())
+            self._projection = projection_of((await self.info()).site)
         return self._projection
 
     async def tiles_as_of(self, as_of_ns: int) -> TilesAnswer:
