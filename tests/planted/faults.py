@@ -153,7 +153,9 @@ def changes(function: Function) -> Iterator[tuple[ast.expr, str]]:
             if isinstance(node, ast.If | ast.While) and not _is_changed(node.test):
                 yield node.test, f"not ({ast.unparse(node.test)})"
             elif isinstance(node, ast.Call) and len(node.args) == 2 and not node.keywords:
-                yield node, f"{ast.unparse(node.func)}({ast.unparse(node.args[1])}, {ast.unparse(node.args[0])})"
+                first, second = map(ast.unparse, node.args)
+                if first != second:
+                    yield node, f"{ast.unparse(node.func)}({second}, {first})"
             elif isinstance(node, ast.expr) and (changed := _changed(node)):
                 yield node, changed
 
