@@ -29,6 +29,7 @@ from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection
 from sitegrid.cli import main
+from sitegrid.commands.export import FORMS as OPTIONS
 from sitegrid.export import maps
 from sitegrid.export.command import FEATURES, FORMS
 from tests.integration.hauling_site import haulers
@@ -298,6 +299,10 @@ def test_a_library_that_is_not_installed_is_named_with_its_extra(suffix, store, 
         monkeypatch.setitem(sys.modules, library, None)
     assert export(tmp_path / FILES[suffix], store) == 1
     assert "pip install '.[export" in capsys.readouterr().err
+
+
+def test_the_command_takes_the_forms_that_there_are():
+    assert set(OPTIONS) == set(FORMS)
 
 
 def test_what_was_written_is_named_for_programs(store, tmp_path, capsys):
