@@ -4,8 +4,6 @@ Where wheels are missing or silent, speed over ground by GPS stands in for them 
 
 Several sensors of a kind count as their mean, of those that spoke within the last second. So no result depends on the
 order in which they are described, and one that dies leaves the others.
-
-It is one module because all that shows the motion moves the same pose.
 """
 
 import math

@@ -40,7 +40,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Place:
+class SamplePlace:
     """What a sample is made of: its mark, where the filter saw the machine, and the ground there."""
 
     mark: Mark
@@ -124,7 +124,7 @@ class Sampler:
         self._marked_m = 0.0
         self._marks: deque[Mark] = deque()  # wait for the estimator
         self._estimated: deque[tuple[Mark, GroundEstimate]] = deque()  # wait for a pose
-        self._pending: deque[Place] = deque()  # sampled, wait for the smoother
+        self._pending: deque[SamplePlace] = deque()  # sampled, wait for the smoother
 
     @property
     def waiting(self) -> int:
@@ -156,12 +156,12 @@ class Sampler:
         newest = self.poses.newest
         if not self._estimated or not newest or self._estimated[0][0].stamp_ns > newest.stamp_ns:
             return NOTHING
-        made: list[Place] = []
+        made: list[SamplePlace] = []
         while self._estimated and self._estimated[0][0].stamp_ns <= newest.stamp_ns:
             mark, estimate = self._estimated.popleft()
             pose = self.poses.at(mark.stamp_ns)
             if pose and self._is_usable(pose, estimate):
-                made.append(Place(mark, pose, estimate))
+                made.append(SamplePlace(mark, pose, estimate))
             elif not pose:
                 self.withheld["no_pose"] += 1
         self._pending += made
@@ -187,7 +187,7 @@ class Sampler:
             self.without_resistance[e.reason] += 1
         return True
 
-    def _row(self, place: Place, pose: PoseBelief) -> tuple[float, ...]:
+    def _row(self, place: SamplePlace, pose: PoseBelief) -> tuple[float, ...]:
         """The sample of a place, with the machine in this pose: load centre and gradient turn with its heading."""
         mark, e = place.mark, place.estimate
         (xx, xy), (_, yy) = pose.covariance_m2

@@ -3,7 +3,7 @@
 import sys
 
 from lab import commands
-from sitegrid.door import run
+from sitegrid.command_line import run
 
 if __name__ == "__main__":
     sys.exit(run(sys.argv[1:], commands, "python -m lab"))

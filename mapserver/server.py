@@ -25,7 +25,7 @@ from mapserver.past.past import Past
 from mapserver.query import road_maps, routes
 from mapserver.query.answering import Answers
 from mapserver.query.queryable import AnswerPool, MapQueryable, Replies, question
-from mapserver.query.server_source import Commands, ServerSource
+from mapserver.query.server_source import CommandDesk, ServerSource
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import ConfigError, QueryError, Refusal
 from protocol.queries.answer_codec import encode_change
@@ -93,7 +93,7 @@ class Server:
         self._upkeep = Upkeep(self._writer, self._publish, past)
         source = ServerSource(self._writer, self._upkeep, past)
         self.answers = Answers(source)
-        self._replies, self._commands = Replies(source), Commands(self._writer, self._upkeep, self.answers.info)
+        self._replies, self._commands = Replies(source), CommandDesk(self._writer, self._upkeep, self.answers.info)
         self._pool = AnswerPool("command", COMMAND_THREADS, MOST_COMMANDS)
         self._queries = MapQueryable(readers, keys.map_queries_all(site.name), source, self.answers)
         self.answers.start()

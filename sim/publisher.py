@@ -43,7 +43,7 @@ class SimReport:
     stopped: bool
 
 
-class Stream:
+class BundleStream:
     """The bundles of one machine, counted 1, 2, 3..."""
 
     def __init__(self, session: zenoh.Session, site: str, machine: str) -> None:
@@ -69,7 +69,7 @@ class Stream:
         self._publisher.undeclare()
 
 
-class Pace:
+class SimulationClock:
     """Holds simulated time back to `speed` times the clock's; speed 0 never waits."""
 
     def __init__(self, speed: float, stop: threading.Event, clock: Callable[[], float]) -> None:
@@ -123,14 +123,14 @@ def run(
 
 def _drive(
     simulator: Simulator,
-    streams: list[Stream],
+    streams: list[BundleStream],
     ports: Ports | None,
     stop: threading.Event,
     clock: Callable[[], float],
     progress: Callable[[float], None] | None,
 ) -> SimReport:
     start, bundles, readings = clock(), 0, 0
-    pace = Pace(simulator.config.speed, stop, clock)
+    pace = SimulationClock(simulator.config.speed, stop, clock)
     planned = simulator.bundles
     for _ in itertools.count() if planned is None else range(planned):
         if stop.is_set():
@@ -155,17 +155,17 @@ def _ports(simulator: Simulator, folder: Path) -> Ports:
 
 
 @contextlib.contextmanager
-def _streams(simulator: Simulator, session_config: SessionConfig) -> Iterator[list[Stream]]:
+def _streams(simulator: Simulator, session_config: SessionConfig) -> Iterator[list[BundleStream]]:
     session: Any = open_session(session_config)
     with contextlib.closing(session), contextlib.ExitStack() as closing:
-        streams = [Stream(session, simulator.site.name, machine.name) for machine in simulator.machines]
+        streams = [BundleStream(session, simulator.site.name, machine.name) for machine in simulator.machines]
         for stream in streams:
             closing.callback(stream.close)
         yield streams
 
 
 def _await_subscribers(
-    streams: list[Stream], wait_s: float, stop: threading.Event, clock: Callable[[], float]
+    streams: list[BundleStream], wait_s: float, stop: threading.Event, clock: Callable[[], float]
 ) -> list[str]:
     """Wait until every machine has a subscriber, or the run is stopped; returns the machines that got none in time."""
     deadline = clock() + wait_s

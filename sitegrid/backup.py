@@ -29,7 +29,7 @@ BESIDE = ("site.toml", "server.toml")  # copied where they are in the store
 
 
 @dataclass(frozen=True)
-class Examined:
+class BackupReport:
     """What was looked through, all of it: rows with their samples, events, files of the archive, and spools."""
 
     store: str
@@ -43,7 +43,7 @@ class Examined:
     newest_ns: int
 
 
-def backup(store: Path, out: Path) -> Examined:
+def backup(store: Path, out: Path) -> BackupReport:
     """Copy a store, also while its server writes, and read the copy back; StoreError, ConfigError."""
     with _making(store, out) as (source, part):
         _require_whole(source)
@@ -58,7 +58,7 @@ def backup(store: Path, out: Path) -> Examined:
         return _examined(JournalLocation(part), live=False)
 
 
-def restore(copy: Path, store: Path) -> Examined:
+def restore(copy: Path, store: Path) -> BackupReport:
     """Make a store of a backup; the backup is read through before, and the store after."""
     if is_in_use(copy):
         raise ConfigError(copy, "is the store of a server that runs, and no backup; make one of it: sitegrid backup")
@@ -73,7 +73,7 @@ def restore(copy: Path, store: Path) -> Examined:
         return _examined(JournalLocation(part), live=False)
 
 
-def verify(store: Path) -> Examined:
+def verify(store: Path) -> BackupReport:
     """Read all of a store or a backup; StoreError names the first thing that is not as it was written."""
     location = _journal_of(store)
     _require_whole(location)
@@ -87,7 +87,7 @@ def _require_whole(location: JournalLocation) -> None:
         raise StoreError(location, f"lacks what was acknowledged: {shortfall}; {advice}")
 
 
-def _examined(location: JournalLocation, *, live: bool) -> Examined:
+def _examined(location: JournalLocation, *, live: bool) -> BackupReport:
     """Read all. live: batches come in meanwhile, so that rows and watermarks are not compared."""
     rows, samples, reached = 0, Counter[SpoolKey](), Counter[SpoolKey]()
     with location.file_reader() as journal:
@@ -113,7 +113,7 @@ def _examined(location: JournalLocation, *, live: bool) -> Examined:
     newest_ns = max((mark.newest_ns for mark in watermarks.values()), default=0)
     machines = len({name for name, _ in watermarks})
     counts = (rows, samples.total(), lost, len(events), len(files), len(watermarks), machines)
-    return Examined(identity, *counts, newest_ns)
+    return BackupReport(identity, *counts, newest_ns)
 
 
 def _journal_of(store: Path) -> JournalLocation:
@@ -167,7 +167,7 @@ def _copy(path: Path, folder: Path) -> None:
     sync_folder(folder)
 
 
-def lines(store: Path, examined: Examined) -> list[str]:
+def lines(store: Path, examined: BackupReport) -> list[str]:
     """What was looked through, for people."""
     e = examined
     return [

@@ -20,7 +20,7 @@ def main(words: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     # Linear algebra here is small, or in the background of something that must not wait: it gets no more than one core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is loaded
-    from sitegrid.door import run
+    from sitegrid.command_line import run
 
     return run(sys.argv[1:] if words is None else words)
 

@@ -1,7 +1,4 @@
-"""The Python client of the map. It needs the base install only.
-
-It is one module because it is one class: all that a program may ask.
-"""
+"""The Python client of the map. It needs the base install only."""
 
 from __future__ import annotations
 
@@ -46,8 +43,8 @@ from protocol.site.geometry import Bounds
 from protocol.site.site_config import Projection
 from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
-from sitegrid.asking import Answered, Asker
 from sitegrid.features.feature import projection_of
+from sitegrid.follower_choice import Answered, Asker
 from sitegrid.geo_table import to_geopandas
 from sitegrid.listener import Listener
 from sitegrid.map_region import MapRegion

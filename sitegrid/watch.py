@@ -14,7 +14,7 @@ from protocol.errors import LinkError, MessageError, QueryError, Refusal
 from protocol.queries.answers import MapVersion, Region
 from protocol.queries.map_tiles import TILE_CELLS, MapTile, TilesAnswer, TilesQuery
 from protocol.site.geometry import Bounds
-from sitegrid.asking import ELSEWHERE
+from sitegrid.follower_choice import ELSEWHERE
 
 AGAIN_S = 1.0  # between two looks, by default
 NEAR_TILES = 1  # layers of areas depend on cells so far away

@@ -14,7 +14,7 @@ from protocol.queries.origin import Origin
 from protocol.queries.pieces import Progress, joined
 from protocol.queries.request import MapQuery
 from protocol.queries.requests import ChangesQuery, PieceQuery, RegionQuery
-from sitegrid.asking import Answered
+from sitegrid.follower_choice import Answered
 
 REGION_ATTEMPTS = 3
 Ask = Callable[[MapQuery[Any], Origin | None], Answered]  # one reply, from a certain process where one is named

@@ -9,7 +9,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from typing import Any, NamedTuple
 
 from sitegrid.cli import main
-from sitegrid.door import build_parser
+from sitegrid.command_line import build_parser
 from sitegrid.options.values import OutputFile
 
 Given = dict[str, str]  # value of each option by its destination

@@ -42,7 +42,7 @@ class CorrectionsConfig:
             raise ValueError("base, ports: one is of no use without the other")
 
 
-class Port(Protocol):
+class CorrectionPort(Protocol):
     """Where a receiver takes corrections."""
 
     def write(self, data: bytes) -> object:
@@ -124,7 +124,7 @@ class CorrectionsDelivery:
         session: zenoh.Session,
         site: str,
         base: str,
-        ports: Mapping[str, Port],
+        ports: Mapping[str, CorrectionPort],
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._ports, self._clock_ns = dict(ports), clock_ns
@@ -173,7 +173,7 @@ class CorrectionsDelivery:
 
 
 def open_delivery(
-    session: zenoh.Session, site: str, config: CorrectionsConfig, open_ports: Mapping[str, Port]
+    session: zenoh.Session, site: str, config: CorrectionsConfig, open_ports: Mapping[str, CorrectionPort]
 ) -> CorrectionsDelivery | None:
     """Begin to write corrections, where a machine takes some. open_ports: those that drivers read, by address."""
     ports = {address: open_ports.get(address) or OwnPort(address, config.baud) for address in config.ports}

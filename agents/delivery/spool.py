@@ -9,8 +9,6 @@ they record from then on has another spool_id.
 The newest samples may be **pending**: they have the filter's position, and wait for the smoother's. They are on disk,
 and not sent. Only memory knows that they are pending: whoever opens the file again takes them as they are, since a
 coarse place is better than none.
-
-It is one module because every method is a transaction over the same few tables, and they must agree.
 """
 
 import contextlib

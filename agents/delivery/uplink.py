@@ -6,8 +6,6 @@ Each event returns the next action; whoever carries it out (uplink_thread.py, or
 
 What holds through kills of router, server and agent is a query with payload, a reply after the commit, a watermark, and
 a deletion after the reply. An empty reply means "no server" or "denied", never "done".
-
-It is one module because an action and the event that it leads to are read together.
 """
 
 import math

@@ -23,7 +23,7 @@ NO_FIX_S = 30.0  # of messages without a fix: a warm start takes less
 FOREIGN_FRAMES = 10  # of another format, and none of its own
 
 
-class Receiver:
+class ReceiverSource:
     """Source of one port. baud: 0 to find it. clock_ns, wait: the host's monotonic clock, and how to let time pass."""
 
     def __init__(

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 from agents.drivers import Observed, Source
-from agents.drivers.receiver import Receiver
+from agents.drivers.receiver import ReceiverSource
 from agents.drivers.time_base import TimeBase
 from protocol.errors import MessageError
 from protocol.machine.readings import Reading, parse_reading
@@ -40,9 +40,9 @@ class Sources:
         for thread in self._threads:
             thread.start()
 
-    def receivers(self) -> dict[str, Receiver]:
+    def receivers(self) -> dict[str, ReceiverSource]:
         """Those that read a port of a receiver, by address."""
-        return {name: source for name, source in self._sources.items() if isinstance(source, Receiver)}
+        return {name: source for name, source in self._sources.items() if isinstance(source, ReceiverSource)}
 
     def read(self, timeout_s: float) -> Sequence[Reading] | None:
         """Readings of the next piece, and of all before it that waited for UTC."""

@@ -8,7 +8,7 @@ from agents.drivers import Driver, Source
 from agents.drivers.formats import STREAMS
 from agents.drivers.formats.framing import GPSD
 from agents.drivers.line import DECODERS, Line, split_stream
-from agents.drivers.receiver import Receiver
+from agents.drivers.receiver import ReceiverSource
 from agents.drivers.sources import Sources
 from agents.drivers.time_base import TimeBase
 from agents.drivers.transports import split_address
@@ -126,7 +126,7 @@ def _open(driver: DriverConfig, machine: MachineConfig, bundles: Callable[[], Dr
     if driver.kind == ZENOH:
         return BundleSource(bundles(), feeds)
     if driver.kind in DECODERS:
-        return Receiver(driver.address, driver.baud, driver.kind, Line(driver.kind, feeds))
+        return ReceiverSource(driver.address, driver.baud, driver.kind, Line(driver.kind, feeds))
     plug_in = next(iter(entry_points(group=PLUG_INS, name=driver.kind)))
     try:
         factory: Factory = plug_in.load()

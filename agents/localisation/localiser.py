@@ -3,8 +3,6 @@
 A heading that GPS shows may be wrong: a receiver that has just started is tens of metres off, and says so or not. So it
 is unproven at first, and all events are kept. A receiver that the filter refuses RELOCK times in a row takes such a
 heading back: what came before its refusals counts no longer, and the rest is aligned and filtered again.
-
-It is one module because collecting, proving and taking back share all that is kept.
 """
 
 import math

@@ -4,8 +4,6 @@ x: the state (`filters.state`): position p, attitude (roll, pitch, yaw), velocit
 v, w and a are in `base_link`, R = map_from_base turns them into `map`, r is the lever arm of a sensor in `base_link`,
 and [.]_en are the components east and north. States (m, n) come as rows; where a model takes more than a few operations
 it works on columns, whose values adjoin. Angular rates and forces are turned into `base_link` before they come here.
-
-It is one module because each model is a few lines, and most share their rotations.
 """
 
 import math

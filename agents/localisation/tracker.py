@@ -1,7 +1,4 @@
-"""The tracker: filters all that a machine senses, from one alignment on.
-
-It is one module because every kind of event meets here the one filter that all of them change.
-"""
+"""The tracker: filters all that a machine senses, from one alignment on."""
 
 from collections import Counter
 from collections.abc import Sequence

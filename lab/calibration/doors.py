@@ -31,7 +31,7 @@ from lab.campaign.goals import goals
 from lab.campaign.summary import column, mean, summary
 from protocol.machine.readings import Reading, columns
 from sim.config import SimConfig
-from sim.receivers.receiver import Receiver, carried, wire
+from sim.receivers.receiver import SimulatedReceiver, carried, wire
 from sim.sensors.rigs import Rig
 from sim.simulator import Simulator
 from sim.truth import save_tracks
@@ -109,7 +109,7 @@ def _solve(task: Task[Door], _: Path) -> Compared:
 def through(rig: Rig, format_: str, spans: Sequence[Sequence[Reading]], seed: int) -> list[Reading]:
     """What an agent reads of a machine whose receivers speak, each span at once, with a link's delay."""
     wirings, draw = wire(rig, format_), np.random.default_rng(seed)
-    lines = [(Receiver(wiring), Line(format_, wiring.feeds)) for wiring in wirings]
+    lines = [(SimulatedReceiver(wiring), Line(format_, wiring.feeds)) for wiring in wirings]
     pieces, first_ns = [], spans[0][0].stamp_ns
     for span in filter(None, spans):
         host_ns = BOOT_NS + span[-1].stamp_ns - first_ns + round(draw.exponential(LATE_S) * 1e9)

@@ -26,7 +26,7 @@ from mapserver.evidence.grid import Grid
 from mapserver.query.views import place, read_cells, view_of
 from mapserver.roads.passes import MINUTE_NS
 from mapserver.roads.repairs import ages
-from mapserver.roads.segments import Segments
+from mapserver.roads.segments import SegmentTable
 from protocol.arrays import Bools, Ints
 from protocol.site.geometry import CellWindow
 from sim.scenario.file import load_scenario
@@ -111,7 +111,7 @@ class ChangedGround:
         return cls(window_of(scene.truth), np.maximum(before / after, after / before) > UNTOUCHED)
 
 
-def changes(recorded: Recorded, whole: Segments, seen: SegmentRepairs, ground: ChangedGround) -> list[Changes]:
+def changes(recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs, ground: ChangedGround) -> list[Changes]:
     """Of segments, of cells as they are read usually, and of cells with `repairs`."""
     half_ns, window = recorded.half_ns, ground.window
     shape = (window.rows, window.columns)
@@ -132,7 +132,7 @@ def changes(recorded: Recorded, whole: Segments, seen: SegmentRepairs, ground: C
 
 
 def maps_of_changes(
-    recorded: Recorded, whole: Segments, seen: SegmentRepairs, window: CellWindow, grid: Grid
+    recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs, window: CellWindow, grid: Grid
 ) -> Iterator[tuple[int, dict[str, Bools]]]:
     """Fold a recording into a grid; every STEP_S, a stamp and which cells (rows, columns) are said to have changed."""
     config = ServerConfig()

@@ -16,7 +16,7 @@ from mapserver.roads.ledger import Ledgers
 from mapserver.roads.loss import losses
 from mapserver.roads.passes import MINUTE_NS, PassTally
 from mapserver.roads.repairs import Repair, ages, repairs
-from mapserver.roads.segments import Segments
+from mapserver.roads.segments import SegmentTable
 from mapserver.roads.tally import Tally
 from protocol.arrays import Floats, Ints
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -57,7 +57,7 @@ class SegmentRepairs:
     halves: tuple[TrueTraffic, TrueTraffic]
 
     @classmethod
-    def of_recording(cls, recorded: Recorded, whole: Segments) -> SegmentRepairs:
+    def of_recording(cls, recorded: Recorded, whole: SegmentTable) -> SegmentRepairs:
         """Those of a recording, on the roads of all of it."""
         ledgers, kept = Ledgers(whole), PassTally()
         for name, table in recorded.rows.items():
@@ -92,7 +92,7 @@ def shown_at(later: Mapping[str, Ints], machines: Collection[str], seen: int | N
     return min(ends_ns, default=(seen + 1) * MINUTE_NS)
 
 
-def repair_figures(recorded: Recorded, whole: Segments, seen: SegmentRepairs) -> dict[str, float]:
+def repair_figures(recorded: Recorded, whole: SegmentTable, seen: SegmentRepairs) -> dict[str, float]:
     """Counts of repairs and of false alarms, and the work that they save an hour [J], known and true."""
     before, after = seen.halves
     judged = [each for each in seen.true if len(each.passes_ns) > SEEN[-1]]
@@ -113,7 +113,7 @@ def repair_figures(recorded: Recorded, whole: Segments, seen: SegmentRepairs) ->
 
 
 def _cells_shown(
-    recorded: Recorded, whole: Segments, shown: Sequence[Repair], true: tuple[Floats, Floats], judged: Sequence[int]
+    recorded: Recorded, whole: SegmentTable, shown: Sequence[Repair], true: tuple[Floats, Floats], judged: Sequence[int]
 ) -> dict[str, float]:
     """How many cells judged segments have, and how many are nearer to what is true after the repair than to before.
 

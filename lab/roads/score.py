@@ -18,7 +18,7 @@ from mapserver.fleet.correction import corrected
 from mapserver.roads.ledger import Ledgers, mean
 from mapserver.roads.loss import SIGMA_90, Losses, losses
 from mapserver.roads.network import network
-from mapserver.roads.segments import Segments, segments
+from mapserver.roads.segments import SegmentTable, segments
 from mapserver.roads.skeleton import Skeletons
 from mapserver.roads.tally import PER_M, Tally
 from mapserver.roads.worklist import TIE_SHARE, ranked
@@ -160,7 +160,7 @@ def grid_of(rows: Rows) -> Grid:
     return grid
 
 
-def roads(rows: Rows) -> Segments:
+def roads(rows: Rows) -> SegmentTable:
     """The roads that a server would have."""
     grid = grid_of(rows)
     blocks = grid.blocks_in(EVERYWHERE)
@@ -176,7 +176,7 @@ def tally_of(rows: Rows) -> Tally:
     return out
 
 
-def road_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
+def road_figures(recorded: Recorded, whole: SegmentTable) -> dict[str, float]:
     """Percent of what was driven that is near a road, of roads that nobody drove, of length that keeps its name."""
     driven = np.concatenate([track.place_m[track.step_m > STEP_M] for track in recorded.tracks.values()])
     lines = np.concatenate([_dense(whole.line(i)) for i in range(len(whole.ids))])
@@ -194,7 +194,7 @@ def road_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
     }
 
 
-def kept_after(recorded: Recorded, later: Recorded, whole: Segments) -> float:
+def kept_after(recorded: Recorded, later: Recorded, whole: SegmentTable) -> float:
     """Percent of the length of roads that keeps its names once another day is in the map, with other ground."""
     names = recorded.rows.keys() | later.rows.keys()
     after_ns = DAY_NS + recorded.start_ns - later.start_ns
@@ -216,14 +216,14 @@ def _dense(line: Floats) -> Floats:
     return np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def _kept(part: Segments, whole: Segments) -> float:
+def _kept(part: SegmentTable, whole: SegmentTable) -> float:
     """Percent of the length of a part's roads that has its names in the whole map too."""
     names = set(whole.ids)
     kept = np.array([name in names for name in part.ids])
     return 100.0 * float(part.length_m[kept].sum() / part.length_m.sum())
 
 
-def traffic_figures(recorded: Recorded, whole: Segments) -> dict[str, float]:
+def traffic_figures(recorded: Recorded, whole: SegmentTable) -> dict[str, float]:
     """Passes, resistance and losses of segments against the truth."""
     ledgers, tally = Ledgers(whole), tally_of(recorded.rows)
     ledger = ledgers.ledger(tally.table(), tally.slot_ns)

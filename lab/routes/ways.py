@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from lab.routes.maps import KnownMap, true_squares
-from mapserver.routes.least_cost import Cell, Terrain, least_cost_line
+from mapserver.routes.least_cost import Cell, CostField, least_cost_line
 from mapserver.routes.route import route
 from protocol.arrays import Bools, Floats
 from protocol.machine.samples import empty
@@ -54,13 +54,13 @@ def rows(first_seed: int) -> list[Row]:
     return out
 
 
-def drawn(draw: np.random.Generator, size: int = SIZE) -> Terrain:
+def drawn(draw: np.random.Generator, size: int = SIZE) -> CostField:
     """Hills, and patches of soils."""
     height = gaussian_filter(draw.standard_normal((size, size)), HILL_CELLS)
     north, east = np.gradient(HILLS_M * height / height.std())
     patches = _field(draw, PATCH_CELLS, size)
     resistance = np.select([patches > 1.4, patches > 0.6, patches < -1.0], [SAND, WET, PAVED], GRAVEL)
-    return Terrain(resistance, east, north, np.ones((size, size), bool), 1.0)
+    return CostField(resistance, east, north, np.ones((size, size), bool), 1.0)
 
 
 def _random(draw: np.random.Generator) -> Row:
@@ -72,7 +72,7 @@ def _random(draw: np.random.Generator) -> Row:
 
 def _even(draw: np.random.Generator) -> Row:
     flat = np.zeros((SIZE, SIZE))
-    terrain = Terrain(flat + GRAVEL, flat, flat, np.ones((SIZE, SIZE), bool), 1.0)
+    terrain = CostField(flat + GRAVEL, flat, flat, np.ones((SIZE, SIZE), bool), 1.0)
     start, end = (tuple(draw.integers(0, SIZE, 2).tolist()) for _ in range(2))
     return {"over": _cost(terrain, start, end) / (GRAVEL * math.dist(start, end)) - 1 if start != end else 0.0}
 
@@ -84,7 +84,7 @@ def _sand(draw: np.random.Generator) -> Row:
     left, right = np.sort(draw.integers(2 * MARGIN, SIZE - 2 * MARGIN, 2))
     top = draw.integers(SIZE // 2, SIZE - MARGIN)
     sand = (column >= left) & (column <= right) & (row < top)
-    terrain = Terrain(np.where(sand, SAND, GRAVEL), flat, flat, np.ones((SIZE, SIZE), bool), 1.0)
+    terrain = CostField(np.where(sand, SAND, GRAVEL), flat, flat, np.ones((SIZE, SIZE), bool), 1.0)
     start, end = (int(draw.integers(0, top)), MARGIN), (int(draw.integers(0, top)), SIZE - MARGIN)
     result = least_cost_line(terrain, start, end)
     assert result
@@ -111,7 +111,7 @@ def _unknown(draw: np.random.Generator) -> Row:
     return {"over": costs[0] / costs[1] - 1}
 
 
-def _samples(terrain: Terrain, known: Bools) -> np.ndarray:
+def _samples(terrain: CostField, known: Bools) -> np.ndarray:
     row, column = np.nonzero(known)
     out = empty(len(row))
     out["stamp_ns"] = STAMP_NS + np.arange(len(row)) * 10**6
@@ -122,7 +122,7 @@ def _samples(terrain: Terrain, known: Bools) -> np.ndarray:
     return out
 
 
-def _cost(terrain: Terrain, start: Cell, end: Cell) -> float:
+def _cost(terrain: CostField, start: Cell, end: Cell) -> float:
     result = least_cost_line(terrain, start, end)
     assert result
     return result[1]

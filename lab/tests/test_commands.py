@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from lab import commands
-from sitegrid.door import build_parser, run
+from sitegrid.command_line import build_parser, run
 from sitegrid.options.values import count, positive, seed
 
 # Where the work of each command begins: module and function; these take seeds.

@@ -87,7 +87,7 @@ class Backlog(Generic[T]):
         return batch
 
 
-class Pace:
+class WorkRate:
     """How fast batches are worked off, which tells when there will be room again."""
 
     def __init__(self) -> None:

@@ -1,7 +1,4 @@
-"""The store of one site: journal, grid and snapshots. One thread owns it (see writer.py).
-
-It is one module because whatever changes journal, grid or facts has to leave them in step.
-"""
+"""The store of one site: journal, grid and snapshots. One thread owns it (see writer.py)."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from mapserver.ingest.backlog import Backlog, Pace, size_of
+from mapserver.ingest.backlog import Backlog, WorkRate, size_of
 from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.ingest.snapshot_times import SnapshotTimes
 from mapserver.ingest.store import Incoming, Store
@@ -55,7 +55,7 @@ class Writer:
         self._backlog: Backlog[_Batch] = Backlog()
         self._group: list[_Batch] = []  # of this turn, as far as nobody has an answer
         self._works: deque[_Work] = deque()
-        self._pace = Pace()
+        self._pace = WorkRate()
         self._counts: Counter[str] = Counter()  # of what never comes to the store
         self._is_closing = False
         self._ended = ""  # why nothing is taken any more

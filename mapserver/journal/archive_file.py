@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from mapserver.journal.places import Place
+from mapserver.journal.places import FilePlace
 from mapserver.journal.rows import ALL, LAST, JournalRow, JournalRows, Selection
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.config import from_table
@@ -83,7 +83,7 @@ class ArchiveFile:
     not have.
     """
 
-    def __init__(self, path: Path | Place) -> None:
+    def __init__(self, path: Path | FilePlace) -> None:
         self.path = path
         tail = _tail(path)
         self.identity = tail[len(_SEAL) : _SEAL_BYTES].hex()
@@ -152,7 +152,7 @@ class ArchiveFile:
         return min(stamps, default=None)
 
 
-def row_range(path: Path | Place) -> tuple[int, int]:
+def row_range(path: Path | FilePlace) -> tuple[int, int]:
     """First and last journal row of a file, by its name."""
     first, last = path.stem.partition("_")[2].split("-")
     return int(first), int(last)
@@ -205,7 +205,7 @@ def seal(file: BinaryIO) -> None:
     file.flush()
 
 
-def _tail(path: Path | Place) -> bytes:
+def _tail(path: Path | FilePlace) -> bytes:
     """Seal and footer, checked, without reading the rest."""
     length = int.from_bytes(_read(path, 8)[:4], "little")  # of the footer alone
     tail = _read(path, _SEAL_BYTES + length + 8)
@@ -216,7 +216,7 @@ def _tail(path: Path | Place) -> bytes:
     return tail
 
 
-def _checked(path: Path | Place) -> bytes:
+def _checked(path: Path | FilePlace) -> bytes:
     """All bytes of a file, read once, so that what is decoded is what was checked."""
     tail = _tail(path)
     data = _read(path)
@@ -227,7 +227,7 @@ def _checked(path: Path | Place) -> bytes:
 
 
 @contextmanager
-def _described(path: Path | Place) -> Iterator[None]:
+def _described(path: Path | FilePlace) -> Iterator[None]:
     """Whatever Parquet or a stranger's values can be wrong in, as one StoreError."""
     wrong = (arrow().ArrowException, OSError, ValueError, TypeError, LookupError, MessageError)
     try:
@@ -248,7 +248,7 @@ def _check_schema(metadata: Any) -> None:
         raise ValueError(f"column {min(missing)} is missing")
 
 
-def _read(path: Path | Place, last: int | None = None) -> bytes:
+def _read(path: Path | FilePlace, last: int | None = None) -> bytes:
     """The bytes of a file, or so many of its last ones."""
     if isinstance(path, Path) and path.exists() and not path.is_file():
         raise StoreError(path, "is no regular file")  # a FIFO would be waited for
@@ -261,7 +261,7 @@ def _read(path: Path | Place, last: int | None = None) -> bytes:
         raise StoreError(path, f"cannot be read: {error.strerror or error}") from None
 
 
-def _header(path: Path | Place, metadata: dict[bytes, bytes]) -> ArchiveHeader:
+def _header(path: Path | FilePlace, metadata: dict[bytes, bytes]) -> ArchiveHeader:
     table = json.loads((metadata or {})[KEY])
     if table["schema"] != SCHEMA:
         problem = f"has schema {table['schema']}, this version knows {SCHEMA}"

@@ -13,7 +13,7 @@ from typing import Any
 
 from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.journal.archive import READABLE
-from mapserver.journal.places import Place
+from mapserver.journal.places import FilePlace
 from protocol.errors import StoreError
 from protocol.files import write_whole
 
@@ -30,7 +30,7 @@ def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> 
         raise StoreError(folder / FILE, f"cannot be written: {error.strerror}") from None
 
 
-def load(folder: Path | Place) -> list[CalibrationDecision]:
+def load(folder: Path | FilePlace) -> list[CalibrationDecision]:
     """Read what `save` wrote, nothing where there is no file; StoreError for damage, and for another version."""
     path = folder / FILE
     try:

@@ -14,7 +14,7 @@ from protocol.errors import ConfigError, StoreError
 
 
 @dataclass(frozen=True, order=True)
-class Place:
+class FilePlace:
     """A file or a folder; what it is asked has the names and the meaning that `pathlib.Path` gives them.
 
     StoreError where its store cannot be reached, FileNotFoundError for a file that is not there.
@@ -33,12 +33,12 @@ class Place:
         return self.name.rpartition(".")[0] or self.name
 
     @property
-    def parent(self) -> Place:
+    def parent(self) -> FilePlace:
         """The folder that it lies in."""
-        return Place(self.url.rpartition("/")[0])
+        return FilePlace(self.url.rpartition("/")[0])
 
-    def __truediv__(self, name: str) -> Place:
-        return Place(f"{self.url}/{name}")
+    def __truediv__(self, name: str) -> FilePlace:
+        return FilePlace(f"{self.url}/{name}")
 
     def __str__(self) -> str:
         return self.url
@@ -53,7 +53,7 @@ class Place:
         with self._reached() as store:
             return bool(store.isdir(self.url))
 
-    def glob(self, pattern: str) -> list[Place]:
+    def glob(self, pattern: str) -> list[FilePlace]:
         """Files of a folder whose names match."""
         with self._reached() as store:
             names = (str(path).rstrip("/").rpartition("/")[2] for path in store.ls(self.url, detail=False))
@@ -81,12 +81,12 @@ class Place:
             raise StoreError(self.url, f"cannot be read: {error or type(error).__name__}") from None
 
 
-def place(text: str) -> Path | Place:
+def place(text: str) -> Path | FilePlace:
     """Parse a path of this host, or the address of another place; ConfigError where no library reaches that."""
     if "://" not in text:
         return Path(text)
     filesystem(text)
-    return Place(text.rstrip("/"))
+    return FilePlace(text.rstrip("/"))
 
 
 def filesystem(url: str) -> Any:

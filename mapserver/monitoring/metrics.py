@@ -21,7 +21,7 @@ from prometheus_client.registry import Collector
 from protocol.errors import ConfigError, MessageError
 from protocol.wire import keys
 from protocol.wire.codec import MAX_SMALL_BYTES, decode_health
-from protocol.wire.heard import Heard
+from protocol.wire.latest_values import LatestValues
 
 _REFUSED, _REFUSED_QUERY = "refused_", "refused_query_"
 Family = GaugeMetricFamily | CounterMetricFamily
@@ -40,7 +40,7 @@ class HealthListener:
     """Keeps the newest health of every agent of a site as bytes until somebody asks: callbacks only move bytes."""
 
     def __init__(self, session: zenoh.Session, site: str, clock: Callable[[], float] = time.time) -> None:
-        self._newest: Heard[bytes] = Heard(clock)
+        self._newest: LatestValues[bytes] = LatestValues(clock)
         self._subscriber = session.declare_subscriber(keys.health_all(site), self._on_health)
 
     def received(self) -> dict[str, ReceivedHealth]:

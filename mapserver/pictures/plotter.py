@@ -31,7 +31,7 @@ TRACK_COLOURS: tuple[Colour, ...] = (
 
 
 @dataclass(frozen=True)
-class Track:
+class DrawnTrack:
     """Where a machine has been, oldest first, in `map` [m]; NaN breaks the line."""
 
     name: str
@@ -63,7 +63,7 @@ class _Scale:
 
 
 def draw_resistance(
-    region: Region, tracks: Sequence[Track] = (), title: str = "Rolling resistance", notes: Sequence[str] = ()
+    region: Region, tracks: Sequence[DrawnTrack] = (), title: str = "Rolling resistance", notes: Sequence[str] = ()
 ) -> Image:
     """Draw the layer `resistance` in the paper's classes and colours. notes: lines below the legend.
 
@@ -81,7 +81,7 @@ def draw_resistance(
     return _finish(ground, scale, entries, tracks, title, notes)
 
 
-def draw_grade(region: Region, tracks: Sequence[Track] = (), title: str = "Grade") -> Image:
+def draw_grade(region: Region, tracks: Sequence[DrawnTrack] = (), title: str = "Grade") -> Image:
     """Draw the layers `grade_east`, `grade_north` as flat and slope, with arrows that point uphill."""
     entries = [LegendEntry(FLAT_COLOUR, "flat"), LegendEntry(SLOPE_COLOUR, "slope > 7.5 deg")]
     scale, classes = _scale(region), slope_class(region["grade_east"], region["grade_north"])
@@ -182,7 +182,7 @@ def _finish(
     ground: Image,
     scale: _Scale,
     entries: Sequence[LegendEntry],
-    tracks: Sequence[Track],
+    tracks: Sequence[DrawnTrack],
     title: str,
     notes: Sequence[str] = (),
 ) -> Image:
@@ -200,9 +200,9 @@ def _fixed(pixels: Floats) -> NDArray[np.int32]:
     return np.rint(np.clip(pixels, -1e6, 1e6) * 16).astype(np.int32)
 
 
-def _draw_tracks(ground: Image, tracks: Sequence[Track], scale: _Scale) -> None:
+def _draw_tracks(ground: Image, tracks: Sequence[DrawnTrack], scale: _Scale) -> None:
     height, width = ground.shape[:2]
-    ends: list[tuple[Track, Colour, Floats]] = []
+    ends: list[tuple[DrawnTrack, Colour, Floats]] = []
     for track, colour in zip(tracks, _colours(tracks), strict=True):
         pixels = scale.pixels(track.x_m, track.y_m, height)
         finite = np.isfinite(pixels).all(axis=1)
@@ -220,7 +220,7 @@ def _draw_tracks(ground: Image, tracks: Sequence[Track], scale: _Scale) -> None:
         _label(ground, track.name, colour, (round(end[0]), round(end[1])), taken)
 
 
-def _colours(tracks: Sequence[Track]) -> list[Colour]:
+def _colours(tracks: Sequence[DrawnTrack]) -> list[Colour]:
     return [TRACK_COLOURS[i % len(TRACK_COLOURS)] for i in range(len(tracks))]
 
 

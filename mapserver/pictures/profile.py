@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from mapserver.pictures.frame import INK, LEFT, PAD, Colour, Image, text, text_size
-from mapserver.pictures.plotter import Track, draw_resistance
+from mapserver.pictures.plotter import DrawnTrack, draw_resistance
 from protocol.arrays import Floats
 from protocol.queries.answers import Region
 from protocol.queries.routing import RouteAnswer, RouteTotals
@@ -35,7 +35,7 @@ def draw_drive(region: Region, answer: RouteAnswer) -> Image:
     region: around the line, with `resistance`, and with `resistance_filled` as a drive counts filled ground as known.
     """
     totals, machine = answer.totals, answer.machine
-    tracks = [Track("end", *answer.line_m.T), Track("start", *answer.line_m[:1].T)]
+    tracks = [DrawnTrack("end", *answer.line_m.T), DrawnTrack("start", *answer.line_m[:1].T)]
     notes = [
         f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up",
         _unknown(totals),

@@ -1,7 +1,4 @@
-"""Map queries answered: pages come from whoever has the map, layers are derived here, on the asking thread.
-
-It is one module because all queries about cells read them in the same few steps.
-"""
+"""Map queries answered: pages come from whoever has the map, layers are derived here, on the asking thread."""
 
 from __future__ import annotations
 
@@ -20,15 +17,15 @@ from mapserver.past.cell_history import CellHistory
 from mapserver.query import roads
 from mapserver.query.areas import cells_to_a_side, finer, inside, means
 from mapserver.query.block_layers import BlockLayers, Look, around_squares
+from mapserver.query.cell_reasons import reasons
 from mapserver.query.coverage import coverage
 from mapserver.query.map_tiles import Tiles, cut, tiles_of
 from mapserver.query.on_site import check_on_site
-from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
+from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, RegionReading
 from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource, MapState
 from mapserver.query.views import PastMaps, StillMap, View, check_past, view_now, widened
-from mapserver.query.why import reasons
 from protocol.arrays import Floats32, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
@@ -267,9 +264,9 @@ class Answers:
         count = cells_to_a_side(query.resolution_m, self._site.cell_m)
         return GridGeometry(count * self._site.cell_m).window(query.bounds), count
 
-    def _reading(self, window: CellWindow, names: tuple[str, ...], query: Compared[Any]) -> Reading:
+    def _reading(self, window: CellWindow, names: tuple[str, ...], query: Compared[Any]) -> RegionReading:
         looks = (self._look(window, names, as_of_ns, repairs=query.repairs) for as_of_ns in query.times)
-        return Reading(window, names, tuple(looks))
+        return RegionReading(window, names, tuple(looks))
 
     def _look_at_cells(
         self, cells: Ints, names: tuple[str, ...], as_of_ns: int | None, *, repairs: bool
@@ -303,10 +300,10 @@ class Answers:
         """Look at the map as it is; repairs: with the ages of roads, at the version that the newest of these are of."""
         return look(self._roads.read().still) if repairs else self._source.run(look)
 
-    def _piece(self, reading: Reading, pieces: PieceGrid, number: int, cursor: int) -> Region:
+    def _piece(self, reading: RegionReading, pieces: PieceGrid, number: int, cursor: int) -> Region:
         return replace(self._read(reading, pieces.piece(number)), piece=pieces.place(number, cursor))
 
-    def _read(self, reading: Reading, window: CellWindow) -> Region:
+    def _read(self, reading: RegionReading, window: CellWindow) -> Region:
         """Layers of a window in that of the reading."""
         fine = finer(window, reading.count)
         newer, *others = (self._map(look, reading.layers, fine) for look in reading.looks)

@@ -7,8 +7,6 @@ which pages count now, which are seldom others: a block is derived again only wh
 ones of them count, and a square only where a block was. Layers of areas are derived square by square, of some blocks
 each: the same bits for whoever asks, for whatever window. Where the ground of a road changed, they depend on its age
 besides: what is read with ages and without has all other blocks in common.
-
-It is one module because what is looked up on the map's thread and what is derived beside it have to agree.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.grid import chunks
 from mapserver.evidence.timeline import Block, evidence
 from mapserver.layers import cell_layers
+from mapserver.query.cell_reasons import machine_bit
 from mapserver.query.views import View
-from mapserver.query.why import machine_bit
 from protocol.arrays import Bools
 from protocol.queries.coverage import Coverage
 from protocol.site.geometry import BLOCK_CELLS, CellWindow

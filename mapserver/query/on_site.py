@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from protocol.errors import QueryError, Refusal
-from protocol.queries.parameters import Form
+from protocol.queries.parameters import ValueForm
 from protocol.queries.places import Place, around, where_it_lies
 from protocol.queries.request import MapQuery, groups
 from protocol.queries.requests import HistoryQuery, PointQuery, WhyQuery
@@ -34,11 +34,11 @@ def _places(query: MapQuery[Any]) -> Mapping[str, Sequence[Place]]:
         value, one = getattr(query, field.name), group.parameters[0]
         if isinstance(value, Bounds):
             places[one.name] = (_nearest(value),)
-        elif one.kind.form is Form.RECTANGLE and value:
+        elif one.kind.form is ValueForm.RECTANGLE and value:
             places["polygon"] = (_nearest(around(value)),)
-        elif one.kind.form is Form.PLACES:
+        elif one.kind.form is ValueForm.PLACES:
             places[one.name] = value
-        elif one.kind.form is Form.PLACE:
+        elif one.kind.form is ValueForm.PLACE:
             places[one.name] = (value,)
     if isinstance(query, PointQuery | HistoryQuery | WhyQuery):
         places["x`, `y"] = ((query.x_m, query.y_m),)

@@ -19,7 +19,7 @@ from mapserver.query.source import MapSource
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import encode_error
 from protocol.queries.origin import encode_origin
-from protocol.queries.parameters import Form, split_selector
+from protocol.queries.parameters import ValueForm, split_selector
 from protocol.queries.places import PLACES_BYTES
 from protocol.queries.request import parameters_of
 from protocol.queries.requests import QUERIES, parse_query
@@ -107,7 +107,9 @@ ANSWER_BYTES = 2**25  # of all answers that wait or are in work: 40 pieces, or 2
 MOST_PAST = 16  # that wait or are in work
 MAX_QUESTION = 4096  # bytes of a query's parameters
 WITH_PLACES = {
-    name for name, query in QUERIES.items() if any(p.kind.form is Form.PLACES for p in parameters_of(query).values())
+    name
+    for name, query in QUERIES.items()
+    if any(p.kind.form is ValueForm.PLACES for p in parameters_of(query).values())
 }
 ANSWERED = "queries_answered"  # a counter of `info`
 log = logging.getLogger("mapserver.query.queryable")

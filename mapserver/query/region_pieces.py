@@ -31,7 +31,7 @@ RETRY_AFTER_S = 2.0
 
 
 @dataclass(frozen=True)
-class Reading:
+class RegionReading:
     """What a region is read from: layers, and the map that they are read from, less another one if there are two.
 
     window: in cells of the answer, each of `count` cells of the map to a side. outline: outside of it nothing is known.
@@ -121,7 +121,7 @@ def _cut(first: int, count: int, length: int, step: int) -> list[tuple[int, int]
 
 @dataclass
 class _Open:
-    reading: Reading
+    reading: RegionReading
     opened_s: float
     used_s: float
     is_read: bool = False  # to its last piece
@@ -149,7 +149,7 @@ class OpenRegions:
         kept = sum(one.reading.past_blocks for one in self._open.values())
         return len(self._open) >= MOST_OPEN or bool(past_blocks and kept and kept + past_blocks > MOST_BLOCKS)
 
-    def open(self, reading: Reading) -> int:
+    def open(self, reading: RegionReading) -> int:
         """Keep what a region is read from; returns its cursor. QueryError as `make_room`."""
         self.make_room(reading.past_blocks)
         cursor, now_s = 1 + secrets.randbelow(2**48), time.monotonic()
@@ -157,7 +157,7 @@ class OpenRegions:
             self._open[cursor] = _Open(reading, now_s, now_s)
         return cursor
 
-    def reading(self, cursor: int, number: int) -> tuple[Reading, PieceGrid]:
+    def reading(self, cursor: int, number: int) -> tuple[RegionReading, PieceGrid]:
         """What a piece is read from; QueryError if that is not kept any more, or there is no such piece."""
         with self._lock:
             self._forget()

@@ -2,8 +2,6 @@
 
 The tally follows the journal; roads and changes are made from the same version of the map, beside the questions: who
 asks is answered from the newest that are made, while these are of the last seconds.
-
-It is one module because what makes roads and what says which may be read have to agree on their version and age.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from mapserver.roads.ledger import Ledger, Ledgers
 from mapserver.roads.network import network
 from mapserver.roads.passes import PassTally
 from mapserver.roads.repairs import Repair, ages, repairs
-from mapserver.roads.segments import Segments, segments
+from mapserver.roads.segments import SegmentTable, segments
 from mapserver.roads.skeleton import Pages, Skeletons
 from mapserver.roads.tally import HOUR_NS, Tally, between
 from protocol.arrays import Ints, Table
@@ -64,7 +62,7 @@ class RoadMap:
     the newest first.
     """
 
-    segments: Segments
+    segments: SegmentTable
     ledgers: Ledgers
     tally: Table
     changes: tuple[Repair, ...]

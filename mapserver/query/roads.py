@@ -12,7 +12,7 @@ from mapserver.query.road_maps import RoadMap
 from mapserver.roads.ledger import Ledger
 from mapserver.roads.loss import Losses, losses
 from mapserver.roads.repairs import Repair
-from mapserver.roads.segments import Segments
+from mapserver.roads.segments import SegmentTable
 from mapserver.roads.tally import HOUR_NS
 from mapserver.roads.worklist import DAY_NS, Daily, daily, litres, ranked, seconds, trends
 from protocol.arrays import Floats, Ints
@@ -89,7 +89,7 @@ def _saved_j(roads: RoadMap, traffic: Ledger, target: float) -> dict[Repair, flo
     return out
 
 
-def _levels(roads: Segments, changes: Iterable[Repair]) -> tuple[Floats, Floats]:
+def _levels(roads: SegmentTable, changes: Iterable[Repair]) -> tuple[Floats, Floats]:
     """c_rr of segments (k,) before and after these changes, NaN where there is none."""
     before, after = np.full((2, len(roads.ids)), np.nan)
     for change in changes:
@@ -97,7 +97,7 @@ def _levels(roads: Segments, changes: Iterable[Repair]) -> tuple[Floats, Floats]
     return before, after
 
 
-def _inside(roads: Segments, bounds: Bounds | None) -> set[int]:
+def _inside(roads: SegmentTable, bounds: Bounds | None) -> set[int]:
     """Segments whose middle lies in a rectangle."""
     if bounds is None:
         return set(range(len(roads.ids)))

@@ -15,7 +15,7 @@ from mapserver.query.block_layers import SQUARE_CELLS, BlockLayers, Look, place_
 from mapserver.query.named_machines import NamedMachines
 from mapserver.query.source import MapSource
 from mapserver.routes.ground import Squares, squares_at, steps
-from mapserver.routes.least_cost import Cell, Terrain, cost_of, least_cost_line, reaches
+from mapserver.routes.least_cost import Cell, CostField, cost_of, least_cost_line, reaches
 from mapserver.routes.prices import PRICED, Prices, around, bare
 from mapserver.routes.route import LAYERS, STEP_M, route
 from protocol.arrays import Bools, Floats, Floats32, Ints
@@ -93,7 +93,7 @@ class Routes:
             raise problems[0]
         return min(answers, key=lambda answer: answer.totals.time_s if query.cost == TIME else answer.totals.energy_j)
 
-    def _line(self, query: WayQuery, terrain: Terrain, known: Bools, start: Cell, end: Cell) -> Ints:
+    def _line(self, query: WayQuery, terrain: CostField, known: Bools, start: Cell, end: Cell) -> Ints:
         for name, cell in (("from", start), ("to", end)):
             if not terrain.is_open[cell]:
                 raise _refusal(f"parameter `{name}`: {self._closed(query, terrain, known, cell)}")
@@ -103,7 +103,7 @@ class Routes:
         line, _ = found_line
         return line if len(line) > 1 else np.array([start, end])
 
-    def _closed(self, query: WayQuery, terrain: Terrain, known: Bools, cell: Cell) -> str:
+    def _closed(self, query: WayQuery, terrain: CostField, known: Bools, cell: Cell) -> str:
         """Why no way leads over a cell."""
         if query.unknown == REFUSE and not known[cell]:
             return "unknown ground; give `unknown` a resistance, or a place that somebody drove over"
@@ -111,7 +111,7 @@ class Routes:
             return f"{_steepness(terrain)[cell]:.0%} steep, over `max_grade`"
         return "nearer than `margin` to what no way leads over"
 
-    def _limit(self, query: WayQuery, terrain: Terrain, known: Bools, start: Cell, end: Cell) -> str:
+    def _limit(self, query: WayQuery, terrain: CostField, known: Bools, start: Cell, end: Cell) -> str:
         """Which limit has to give so that there is a way."""
         window = CellWindow(0, 0, *terrain.is_open.shape[::-1])
         for name, eased in (
@@ -170,7 +170,7 @@ class Routes:
 
     def _terrain(
         self, query: WayQuery, machine: RouteMachine, window: CellWindow, read: Squares, prices: Prices
-    ) -> tuple[Terrain, Bools]:
+    ) -> tuple[CostField, Bools]:
         """Ground of a window, open everywhere, and which cells of it are known."""
         resistance, east, north, visits = (_in_window(read, name, window) for name in GROUND)
         known = np.isfinite(resistance) | np.isfinite(visits)
@@ -185,7 +185,7 @@ class Routes:
         crawl = machine.power_w / (machine.mass_kg * GRAVITY_MPS2 * machine.speed_mps)
         crawl = crawl if query.cost == TIME else math.inf
         is_open = np.ones(known.shape, bool)
-        return Terrain(resistance.astype(np.float64), east_m, north_m, is_open, self._site.cell_m, crawl), known
+        return CostField(resistance.astype(np.float64), east_m, north_m, is_open, self._site.cell_m, crawl), known
 
     def _window(self, query: WayQuery) -> CellWindow:
         """Where a way is looked for."""
@@ -221,7 +221,7 @@ def _in_window(squares: Squares, name: str, window: CellWindow) -> Floats32:
     return out
 
 
-def _open(terrain: Terrain, known: Bools, query: WayQuery, window: CellWindow, cell_m: float) -> Bools:
+def _open(terrain: CostField, known: Bools, query: WayQuery, window: CellWindow, cell_m: float) -> Bools:
     """Over which cells a way may lead."""
     is_open = _steepness(terrain) <= query.max_grade
     if query.unknown == REFUSE:
@@ -236,7 +236,7 @@ def _open(terrain: Terrain, known: Bools, query: WayQuery, window: CellWindow, c
     return np.ascontiguousarray(is_open)
 
 
-def _steepness(terrain: Terrain) -> Floats:
+def _steepness(terrain: CostField) -> Floats:
     return np.asarray(np.hypot(terrain.grade_east, terrain.grade_north))
 
 
@@ -247,7 +247,7 @@ def _refusal(problem: str) -> QueryError:
 def warm_up() -> None:
     """Compile the kernels of routes, or read them from their cache, before somebody who asks waits for them."""
     resistance, level = np.full((8, 8), 0.02), np.zeros((8, 8))
-    terrain = Terrain(resistance, level, level, resistance > 0, 1.0)
+    terrain = CostField(resistance, level, level, resistance > 0, 1.0)
     least_cost_line(terrain, (0, 0), (7, 5))
     cost_of(terrain, np.array([(0, 0), (7, 5)]))
     ground = {name: resistance.astype(np.float32) for name in LAYERS}

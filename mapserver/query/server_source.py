@@ -59,7 +59,7 @@ class ServerSource:
         self._writer.count(what)
 
 
-class Commands:
+class CommandDesk:
     """Carries out commands. info: all that an answer of `info` has."""
 
     def __init__(self, writer: Writer, upkeep: Upkeep, info: Callable[[], Mapping[str, Any]]) -> None:

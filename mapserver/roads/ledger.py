@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mapserver.evidence.fold_config import HASH
-from mapserver.roads.segments import Segments
+from mapserver.roads.segments import SegmentTable
 from mapserver.roads.tally import CELL_M, PER_C, PER_M, SUMS, between, corner_m, heading_rad, place, slot
 from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 
@@ -66,7 +66,7 @@ class Ledgers:
     slices, place: as of `Placing`.
     """
 
-    def __init__(self, segments: Segments) -> None:
+    def __init__(self, segments: SegmentTable) -> None:
         self.segments = segments
         placing = Placing(segments)
         self.slices, self.place = placing.slices, placing.place
@@ -241,7 +241,7 @@ class Placed(NamedTuple):
 class Placing:
     """Finds segments. slices: (k + 1,) number of the first slice of each segment, one behind the other."""
 
-    def __init__(self, segments: Segments) -> None:
+    def __init__(self, segments: SegmentTable) -> None:
         counts = np.maximum(1, np.rint(segments.length_m / SLICE_M)).astype(np.int64)
         self.slices: Ints = np.concatenate([[0], np.cumsum(counts)])
         owner = np.repeat(np.arange(len(segments.ids)), np.diff(segments.ends))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapserver.roads.ledger import Ledger, filled, mean, resistance
-from mapserver.roads.segments import Segments
+from mapserver.roads.segments import SegmentTable
 from mapserver.roads.tally import PER_C, PER_M, squares_of
 from protocol.arrays import Bools, Floats, Ints
 from protocol.units import GRAVITY_MPS2
@@ -45,7 +45,7 @@ class Losses:
     passes: Floats
 
 
-def losses(ledger: Ledger, segments: Segments, target: float, level: Floats | None = None) -> Losses:
+def losses(ledger: Ledger, segments: SegmentTable, target: float, level: Floats | None = None) -> Losses:
     """What was lost on each segment against ground of a target c_rr.
 
     level (k,): c_rr of segments in place of what was measured, which was before or after a repair; NaN for the others.
@@ -93,7 +93,7 @@ def _by_segment(values: Floats, ends: Ints) -> Floats:
     return np.asarray(np.add.reduceat(values, ends[:-1], axis=0), np.float64)
 
 
-def _slope(ledger: Ledger, segments: Segments, owner: Ints) -> Floats:
+def _slope(ledger: Ledger, segments: SegmentTable, owner: Ints) -> Floats:
     """Rise over run of slices (s,) from beginning to end, 0 where it is not known."""
     graded = ledger.of_slices("graded").sum(axis=1)
     east, north = (ledger.of_slices(name).sum(axis=1) / np.maximum(graded, 1) / PER_C for name in ("east", "north"))

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from mapserver.evidence.timeline import Block
 from mapserver.roads.passes import MINUTE_NS, Passes
-from mapserver.roads.segments import Segments
+from mapserver.roads.segments import SegmentTable
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
@@ -155,7 +155,7 @@ def _agree(before: Any, after: Any) -> bool:
     return bool((after != after[0]).any() or (before == before[0]).all())
 
 
-def ages(segments: Segments, changes: Iterable[Repair], cell_m: float) -> dict[Block, Ints]:
+def ages(segments: SegmentTable, changes: Iterable[Repair], cell_m: float) -> dict[Block, Ints]:
     """Since when (256,) [ns] the ground of cells is as it is, 0 for ever, in the blocks of segments that changed.
 
     Of those cells whose centres are nearest to a changed segment, and within HALF_WIDTH_M of its line.

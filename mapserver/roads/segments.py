@@ -20,7 +20,7 @@ FIFTHS = 5
 
 
 @dataclass(frozen=True)
-class Segments:
+class SegmentTable:
     """All segments of a map, in the order of their names' places.
 
     ids: (k,) names. points: (n, 2) x, y [m] of all lines, each from its beginning to its end; ends: (k + 1,) where
@@ -40,7 +40,7 @@ class Segments:
         return self.points[self.ends[index] : self.ends[index + 1]]
 
 
-def segments(graph: Network) -> Segments:
+def segments(graph: Network) -> SegmentTable:
     """Cut a graph of roads, turn all pieces into the directions of their axes, and name them."""
     points, pieces = cut(graph.points, graph.ends, graph.nodes)
     first, last, nodes = pieces[:, 0], pieces[:, 1], pieces[:, 2:]
@@ -58,7 +58,7 @@ def segments(graph: Network) -> Segments:
     beside = place[:, 1] * np.cos(turn) - place[:, 0] * np.sin(turn)  # to the left of the cell's middle
     order = np.lexsort((*run.T, *middle.T[::-1], beside, axis, cell[:, 1], cell[:, 0]))
     lines, ends, length_m = gathered(points, first[order], last[order], back[order])
-    return Segments(
+    return SegmentTable(
         _ids(cell[order], axis[order], beside[order]),
         lines,
         ends,

@@ -28,7 +28,7 @@ BAND = 16  # cells: in one of 8 one drawn map in a hundred has its cheapest line
 
 
 @dataclass(frozen=True)
-class Terrain:
+class CostField:
     """What lines cost over a window of cells.
 
     resistance, grade_east, grade_north (rows, columns): known wherever is_open, and positive. cell_m: edge of a cell.
@@ -44,7 +44,7 @@ class Terrain:
     crawl: float = math.inf
 
 
-def least_cost_line(terrain: Terrain, start: Cell, end: Cell) -> tuple[Ints, float] | None:
+def least_cost_line(terrain: CostField, start: Cell, end: Cell) -> tuple[Ints, float] | None:
     """Corners (n, 2), as rows and columns, of the cheapest line, and its cost; None where there is none.
 
     Cost: metres of lift, or metres at the highest speed.
@@ -57,7 +57,7 @@ def least_cost_line(terrain: Terrain, start: Cell, end: Cell) -> tuple[Ints, flo
     return straightened(terrain, line if finer is None else finer)
 
 
-def _search(terrain: Terrain, start: Cell, end: Cell, steps: Ints) -> Ints | None:
+def _search(terrain: CostField, start: Cell, end: Cell, steps: Ints) -> Ints | None:
     """Cells (n, 2) of the cheapest line in steps (k, 2)."""
     border = int(np.abs(steps).max())
     columns = terrain.is_open.shape[1] + 2 * border
@@ -74,7 +74,7 @@ def _search(terrain: Terrain, start: Cell, end: Cell, steps: Ints) -> Ints | Non
     return np.stack(np.divmod(np.array(places[::-1]), columns), axis=1) - border
 
 
-def _bordered(terrain: Terrain, border: int) -> Floats:
+def _bordered(terrain: CostField, border: int) -> Floats:
     """Resistance and slopes (n, 3) of cells, row by row, with so many closed ones around; inf where closed."""
     rows, columns = terrain.is_open.shape
     out = np.zeros((rows + 2 * border, columns + 2 * border, 3))
@@ -93,7 +93,7 @@ def _band(shape: tuple[int, int], line: Ints) -> Bools:
     return band
 
 
-def reaches(terrain: Terrain, start: Cell, end: Cell) -> bool:
+def reaches(terrain: CostField, start: Cell, end: Cell) -> bool:
     """Whether any line leads from one cell to the other."""
     # a line goes through a corner only where both cells beside it are open
     _, part = cv2.connectedComponents(terrain.is_open.astype(np.uint8), connectivity=4)
@@ -118,12 +118,12 @@ def moves(order: int) -> Ints:
     return np.array(whole)
 
 
-def cost_of(terrain: Terrain, line: Ints) -> float:
+def cost_of(terrain: CostField, line: Ints) -> float:
     """Cost of a line (n, 2) of cells; inf where it leaves the open ones."""
     return float(sum(_piece(*_arrays(terrain), *a, *b) for a, b in pairwise(line)))
 
 
-def straightened(terrain: Terrain, line: Ints) -> tuple[Ints, float]:
+def straightened(terrain: CostField, line: Ints) -> tuple[Ints, float]:
     """A line (n, 2) over some of the places of another one, where straight pieces cost less; and what it costs."""
     while True:
         kept = np.zeros(len(line), np.bool_)
@@ -133,7 +133,7 @@ def straightened(terrain: Terrain, line: Ints) -> tuple[Ints, float]:
         line = line[kept]
 
 
-def _arrays(terrain: Terrain) -> tuple[Floats, Floats, Floats, Bools, float, float]:
+def _arrays(terrain: CostField) -> tuple[Floats, Floats, Floats, Bools, float, float]:
     fields = (
         np.ascontiguousarray(a, np.float64) for a in (terrain.resistance, terrain.grade_east, terrain.grade_north)
     )

@@ -1,7 +1,6 @@
 """Answers to map queries, to MessagePack and back (docs/protocol.md, "Map queries").
 
 Reading ignores fields that it does not know, and refuses an answer without one that it does: a MessageError names it.
-It is one module because all answers are read by the same few rules.
 """
 
 import functools

@@ -1,7 +1,7 @@
 """Answers to map queries as values (docs/protocol.md, "Map queries"); their bytes: `answer_codec.py`.
 
 Stamps are UTC in nanoseconds. `version` is the version of the map that an answer is true for, `merged` its journal row;
-`stamp_ns` is the site's now, or the time that the map is as of. It is one module because they are read side by side.
+`stamp_ns` is the site's now, or the time that the map is as of.
 """
 
 from collections.abc import Mapping

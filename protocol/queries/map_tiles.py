@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from protocol.arrays import Floats
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.queries.answers import MapVersion
-from protocol.queries.parameters import METRES, Form, Kind, count, name_of
+from protocol.queries.parameters import METRES, ValueForm, ValueKind, count, name_of
 from protocol.queries.request import AsOf, Codec, Group, Parameter, Size, asked, grouped
 from protocol.wire.codec import MAX_SEQ, pack, take, unpack
 
@@ -176,7 +176,7 @@ def _read_tile(name: str, text: str) -> tuple[int, int]:
     return int(numbers[0]), int(numbers[1])
 
 
-TILE = Kind(Form.TEXT, _read_tile, lambda value: f"{value[0]},{value[1]}")
+TILE = ValueKind(ValueForm.TEXT, _read_tile, lambda value: f"{value[0]},{value[1]}")
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ def check_order(from_ns: int | None, to_ns: int | None) -> None:
         raise QueryError(Refusal.OUT_OF_RANGE, f"`from` ({from_ns}) is after `to` ({to_ns})")
 
 
-class Form(Enum):
+class ValueForm(Enum):
     """How a value is given: on the command line, in a request over HTTP."""
 
     NUMBER = auto()
@@ -82,19 +82,19 @@ class Form(Enum):
 
 
 @dataclass(frozen=True)
-class Kind:
+class ValueKind:
     """A kind of value. read: of a parameter's name and text. write: its text, empty for what a selector leaves out.
 
     check: refuses a value of the kind that is too large or too small, by the parameter's name.
     """
 
-    form: Form
+    form: ValueForm
     read: Callable[[str, str], Any]
     write: Callable[[Any], str] = str
     check: Callable[[str, Any], None] = lambda _, __: None
 
 
-def number(low: float = -MAX_NUMBER, high: float = MAX_NUMBER, unit: str = "", *, above: bool = False) -> Kind:
+def number(low: float = -MAX_NUMBER, high: float = MAX_NUMBER, unit: str = "", *, above: bool = False) -> ValueKind:
     """A number from low to high; above: not low itself."""
 
     def check(name: str, value: float) -> None:
@@ -103,7 +103,7 @@ def number(low: float = -MAX_NUMBER, high: float = MAX_NUMBER, unit: str = "", *
             span = f"above {low:g} and at most" if above else f"between {_with(low, unit)} and"
             raise refusal(name, f"{_with(value, unit)} is not {span} {_with(high, unit)}")
 
-    return Kind(Form.NUMBER, read_number, text_of, check)
+    return ValueKind(ValueForm.NUMBER, read_number, text_of, check)
 
 
 def _with(value: float, unit: str) -> str:
@@ -113,7 +113,7 @@ def _with(value: float, unit: str) -> str:
 METRES = number()
 
 
-def count(low: int = 0, high: int = int(MAX_NUMBER), *, is_stated: bool = False) -> Kind:
+def count(low: int = 0, high: int = int(MAX_NUMBER), *, is_stated: bool = False) -> ValueKind:
     """A whole number from low to high; is_stated: written also if it is 0."""
 
     def read(name: str, text: str) -> int:
@@ -126,7 +126,7 @@ def count(low: int = 0, high: int = int(MAX_NUMBER), *, is_stated: bool = False)
         if not low <= value <= high:
             raise refusal(name, f"{value} is not between {low} and {high}")
 
-    return Kind(Form.NUMBER, read, lambda value: str(value) if value or is_stated else "", check)
+    return ValueKind(ValueForm.NUMBER, read, lambda value: str(value) if value or is_stated else "", check)
 
 
 def _read_stamp(name: str, text: str) -> int:
@@ -142,10 +142,10 @@ def _check_stamp(name: str, value: int) -> None:
         raise refusal(name, f"{value} is not between 1 and {MAX_STAMP_NS}")
 
 
-STAMP = Kind(Form.STAMP, _read_stamp, str, _check_stamp)  # nanoseconds since 1970, UTC, to the last digit
+STAMP = ValueKind(ValueForm.STAMP, _read_stamp, str, _check_stamp)  # nanoseconds since 1970, UTC, to the last digit
 
 
-def flag(*, usual: bool) -> Kind:
+def flag(*, usual: bool) -> ValueKind:
     """Yes or no, as 1 or 0; left out where it is as usual."""
 
     def read(name: str, text: str) -> bool:
@@ -153,10 +153,10 @@ def flag(*, usual: bool) -> Kind:
             raise refusal(name, f"{text[:40]!r} is neither 0 nor 1")
         return text == "1"
 
-    return Kind(Form.FLAG, read, lambda value: "" if value == usual else str(int(value)))
+    return ValueKind(ValueForm.FLAG, read, lambda value: "" if value == usual else str(int(value)))
 
 
-def choice(values: Mapping[str, Any], usual: str = "") -> Kind:
+def choice(values: Mapping[str, Any], usual: str = "") -> ValueKind:
     """One of some words, each with what it means; usual: the word that is not written."""
 
     def read(name: str, text: str) -> Any:
@@ -172,11 +172,11 @@ def choice(values: Mapping[str, Any], usual: str = "") -> Kind:
         if value not in values.values():
             read(name, str(value))
 
-    return Kind(Form.TEXT, read, write, check)
+    return ValueKind(ValueForm.TEXT, read, write, check)
 
 
 # Names, comma-separated; left out where there are none.
-WORDS = Kind(Form.TEXT, lambda _, text: tuple(part for part in text.split(",") if part), ",".join)
+WORDS = ValueKind(ValueForm.TEXT, lambda _, text: tuple(part for part in text.split(",") if part), ",".join)
 
 
 def _check_line(name: str, value: str) -> None:
@@ -185,10 +185,12 @@ def _check_line(name: str, value: str) -> None:
 
 
 # One line that a person wrote, percent-encoded; left out where it is empty.
-LINE = Kind(Form.LINE, lambda _, text: unquote(text).strip(), lambda value: quote(value, safe=""), _check_line)
+LINE = ValueKind(
+    ValueForm.LINE, lambda _, text: unquote(text).strip(), lambda value: quote(value, safe=""), _check_line
+)
 
 
-def name_of(pattern: re.Pattern[str] = NAME, rule: str = "a name") -> Kind:
+def name_of(pattern: re.Pattern[str] = NAME, rule: str = "a name") -> ValueKind:
     """A name by a rule, which `rule` says in words."""
 
     def read(name: str, text: str) -> str:
@@ -196,7 +198,7 @@ def name_of(pattern: re.Pattern[str] = NAME, rule: str = "a name") -> Kind:
             raise refusal(name, f"{text[:70]!r} is not {rule}")
         return text
 
-    return Kind(Form.TEXT, read)
+    return ValueKind(ValueForm.TEXT, read)
 
 
 def _read_rectangle(name: str, text: str) -> Bounds:
@@ -214,4 +216,4 @@ def _write_rectangle(value: Bounds) -> str:
     return ",".join(text_of(edge) for edge in (value.west_m, value.south_m, value.east_m, value.north_m))
 
 
-RECTANGLE = Kind(Form.RECTANGLE, _read_rectangle, _write_rectangle)  # west,south,east,north [m]
+RECTANGLE = ValueKind(ValueForm.RECTANGLE, _read_rectangle, _write_rectangle)  # west,south,east,north [m]

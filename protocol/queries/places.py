@@ -8,7 +8,7 @@ import numpy as np
 
 from protocol.arrays import Bools, Floats, Ints
 from protocol.errors import QueryError, Refusal
-from protocol.queries.parameters import RECTANGLE, Form, Kind, Parameters, read_number, refusal, text_of
+from protocol.queries.parameters import RECTANGLE, Parameters, ValueForm, ValueKind, read_number, refusal, text_of
 from protocol.queries.request import Group, Parameter
 from protocol.site.geometry import Bounds
 
@@ -19,7 +19,7 @@ MAX_CORNERS = 500  # of one outline: each of its sides is compared with each oth
 PLACES_BYTES = 2**19  # of the parameters of a query with places: MAX_PLACES of them with all their digits
 
 
-def places(most: int = MAX_PLACES) -> Kind:
+def places(most: int = MAX_PLACES) -> ValueKind:
     """So many places at most, x,y,x,y,... in metres; left out where there are none."""
 
     def read(name: str, text: str) -> tuple[Place, ...]:
@@ -30,7 +30,7 @@ def places(most: int = MAX_PLACES) -> Kind:
         numbers = [read_number(name, part) for part in parts]
         return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
-    return Kind(Form.PLACES, read, _write_places, lambda name, value: check_count(name, len(value), most))
+    return ValueKind(ValueForm.PLACES, read, _write_places, lambda name, value: check_count(name, len(value), most))
 
 
 def _write_places(value: Sequence[Place]) -> str:
@@ -45,7 +45,7 @@ def _read_place(name: str, text: str) -> Place:
     return x_m, y_m
 
 
-PLACE = Kind(Form.PLACE, _read_place, lambda value: _write_places((value,)))
+PLACE = ValueKind(ValueForm.PLACE, _read_place, lambda value: _write_places((value,)))
 
 
 def check_count(name: str, count: int, most: int = MAX_PLACES) -> None:

@@ -12,7 +12,7 @@ from enum import Enum, auto
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from protocol.errors import QueryError, Refusal
-from protocol.queries.parameters import MAX_WAIT_S, STAMP, Kind, Parameters, count, flag, number
+from protocol.queries.parameters import MAX_WAIT_S, STAMP, Parameters, ValueKind, count, flag, number
 
 T = TypeVar("T")
 REPAIRS = "1: roads whose ground changed are read from the samples since; 0: from all samples"
@@ -25,7 +25,7 @@ class Parameter:
 
     name: str
     help: str
-    kind: Kind
+    kind: ValueKind
 
     def read(self, parameters: Parameters) -> Any:
         """Its value; QueryError where it is missing, or wrong."""
@@ -53,7 +53,7 @@ class Group:
     check: Callable[[Any], None] = lambda _: None
 
 
-def asked(kind: Kind, name: str, help: str, default: Any = MISSING) -> Any:  # noqa: A002 - as argparse has it
+def asked(kind: ValueKind, name: str, help: str, default: Any = MISSING) -> Any:  # noqa: A002 - as argparse has it
     """A field of a request that is one parameter."""
     one = Parameter(name, help, kind)
     if default is not None:

@@ -11,9 +11,9 @@ from itertools import pairwise
 
 from protocol.errors import Refusal
 from protocol.queries.parameters import (
-    Form,
-    Kind,
     Parameters,
+    ValueForm,
+    ValueKind,
     choice,
     flag,
     name_of,
@@ -112,9 +112,9 @@ def _check_unknown(name: str, value: str | float) -> None:
         raise refusal(name, f"a resistance of {value:g} is not above 0 and at most 1")
 
 
-STOPS = Kind(Form.TEXT, _read_stops, _write_stops)
-UNKNOWN = Kind(
-    Form.TEXT, _read_unknown, lambda value: value if isinstance(value, str) else text_of(value), _check_unknown
+STOPS = ValueKind(ValueForm.TEXT, _read_stops, _write_stops)
+UNKNOWN = ValueKind(
+    ValueForm.TEXT, _read_unknown, lambda value: value if isinstance(value, str) else text_of(value), _check_unknown
 )
 
 

@@ -1,7 +1,4 @@
-"""Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong.
-
-It is one module because both directions of a message have to agree.
-"""
+"""Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong."""
 
 import math
 import re

@@ -52,7 +52,7 @@ class Drivers:
 
 
 @dataclass(frozen=True)
-class Commands:
+class DriverCommands:
     """Commands of n drivers: articulation, drive force, most force of the brakes; and the payload they carry."""
 
     steer_rad: Floats
@@ -79,15 +79,15 @@ def at_start(starts: Sequence[Start], habits: Habits) -> Drivers:
     )
 
 
-def no_commands(machines: int) -> Commands:
+def no_commands(machines: int) -> DriverCommands:
     """Commands before drivers act: nothing is asked for."""
     zero = np.zeros(machines)
-    return Commands(zero, zero, zero, zero)
+    return DriverCommands(zero, zero, zero, zero)
 
 
 def drive(
     course: Course, crew: Crew, habits: Habits, old: Drivers, state: FleetState, dt: float
-) -> tuple[Drivers, Commands]:
+) -> tuple[Drivers, DriverCommands]:
     """Drive one step; returns the drivers' next memory and their commands."""
     # Where on the leg the machine is; at its end it stops, waits, loads, and takes up the next leg.
     position = crew.joint_m(state)
@@ -132,7 +132,7 @@ def drive(
     # At a stop of their own they go on as they came, so the torque against a slope is kept for the start.
     afresh = (halt & ~at_stop) | done
     force, integral = hold_speed(crew, aim, speed, np.where(afresh, 0.0, old.integral_n), dt)
-    commands = Commands(
+    commands = DriverCommands(
         steer_rad=steer,
         drive_n=np.where(halt, 0.0, travel * force),
         brake_n=np.where(halt, crew.max_brake_n, 0.0),

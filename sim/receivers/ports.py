@@ -13,10 +13,10 @@ from pathlib import Path
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
-from sim.receivers.receiver import Receiver, Wiring, carried
+from sim.receivers.receiver import SimulatedReceiver, Wiring, carried
 
 
-class Port:
+class PseudoTerminal:
     """A pseudo terminal. Bytes that nobody listens to are lost, as on a wire."""
 
     def __init__(self, path: Path) -> None:
@@ -54,14 +54,14 @@ class Ports:
     """The ports of all machines of a simulation. folder: is made if need be."""
 
     def __init__(self, folder: Path, machines: Mapping[str, Sequence[Wiring]]) -> None:
-        self._receivers: dict[str, list[tuple[Receiver, Port]]] = {}
+        self._receivers: dict[str, list[tuple[SimulatedReceiver, PseudoTerminal]]] = {}
         self._carried = {name: carried(wirings) for name, wirings in machines.items()}
         folder.mkdir(parents=True, exist_ok=True)
         try:
             for name, wirings in machines.items():
                 opened = self._receivers.setdefault(name, [])
                 for wiring in wirings:
-                    opened.append((Receiver(wiring), Port(folder / wiring.name)))
+                    opened.append((SimulatedReceiver(wiring), PseudoTerminal(folder / wiring.name)))
         except ConfigError:
             self.close()
             raise

@@ -76,7 +76,7 @@ def _compass(base: SensorConfig, rover: SensorConfig) -> SensorConfig:
     return SensorConfig("antennas", STREAMS[HEADING], mount, measures=("heading",))
 
 
-class Receiver:
+class SimulatedReceiver:
     """One receiver; without a fix it says so at each epoch."""
 
     def __init__(self, wiring: Wiring) -> None:

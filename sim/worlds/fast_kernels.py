@@ -1,7 +1,7 @@
 """One step of the fast world's machines, compiled by numba.
 
-It is one module because numba's cache notices changes in the file of the function that is called, and in no other; for
-the same reason constants of other files are passed in. After a change in `terrain/terrain.py`, touch this file.
+numba's cache notices changes in the file of the function that is called, and in no other: constants of other files are
+passed in, and after a change in `terrain/terrain.py` this file is to be touched.
 """
 
 from __future__ import annotations

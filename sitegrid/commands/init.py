@@ -17,7 +17,7 @@ from sitegrid.options.values import positive
 from sitegrid.process.lifetime import note, say, tell
 
 if TYPE_CHECKING:
-    from sitegrid.setup.hearing import Heard
+    from sitegrid.setup.hearing import HeardLine
 
 T = TypeVar("T")
 HELP = "make a folder with the files of a site and a machine, for the receivers that are plugged in"
@@ -113,7 +113,7 @@ def _answer(given: str | None, option: str, question: str, default: str, parse: 
             note(str(error))
 
 
-def _receivers(arguments: Namespace) -> list[Heard]:
+def _receivers(arguments: Namespace) -> list[HeardLine]:
     """What a driver reads, of all that is there; ConfigError where that is nothing, or not what was named."""
     from agents.drivers.transports import serial_ports
     from sitegrid.setup.listening import address_of, listen_to

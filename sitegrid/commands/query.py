@@ -1,7 +1,4 @@
-"""`sitegrid query`: ask the map from the command line.
-
-It is one module because all queries share their options and their tables.
-"""
+"""`sitegrid query`: ask the map from the command line."""
 
 from __future__ import annotations
 
@@ -51,7 +48,7 @@ from protocol.queries.roads import RoadSegment, Segments, SegmentsQuery, Worklis
 from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
 from protocol.queries.routing import RouteAnswer
 from sitegrid.client import Client, connect
-from sitegrid.explanations import calibrated, why
+from sitegrid.machine_sentences import calibrated, why
 from sitegrid.options.groups import Subparsers, add_action, add_network, add_site, sentence
 from sitegrid.options.parameters import add_parameters, dest, given, spread
 from sitegrid.options.values import OutputFile

@@ -23,9 +23,9 @@ from protocol.site.site_file import load_site
 from protocol.version import package_version
 from protocol.wire import keys
 from protocol.wire.credentials import Identity, load_credentials
-from sitegrid.asking import Asker, is_answered
 from sitegrid.doctor import Finding, Level, disk, network, skipped
 from sitegrid.doctor.keys import check_certificate, read_certificate
+from sitegrid.follower_choice import Asker, is_answered
 from sitegrid.security.join import join
 
 ANYBODY = "doctor"  # where there are no keys, every name is as good

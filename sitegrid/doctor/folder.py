@@ -15,7 +15,7 @@ from protocol.site.site_config import Projection, SiteConfig
 from protocol.wire.session import is_free
 from sitegrid.doctor import Finding, Level, disk, skipped
 from sitegrid.setup.files import PORTS, Folder
-from sitegrid.setup.hearing import Heard
+from sitegrid.setup.hearing import HeardLine
 from sitegrid.setup.listening import listen_to
 
 LISTEN_S = 2.5  # receivers send each second
@@ -89,7 +89,7 @@ def check_sensors(machine: MachineConfig, config: AgentConfig) -> list[Finding]:
     return findings or [Finding(Level.PASS, "sensors", "each is fed")]
 
 
-def check_receiver(driver: DriverConfig, heard: Heard) -> Finding:
+def check_receiver(driver: DriverConfig, heard: HeardLine) -> Finding:
     """Whether what was heard at the port of a driver is what its table says."""
     where = f"{driver.address}: "
     if heard.kind and heard.kind != driver.kind:
@@ -127,7 +127,7 @@ def check_ports(taken: list[str]) -> Finding:
     return Finding(Level.PASS, "ports", "those of router and page are free")
 
 
-def _fix_of(heard: Heard) -> str:
+def _fix_of(heard: HeardLine) -> str:
     """What comes there, in a few words."""
     fix = f"; {heard.quality}, {heard.satellites} satellites" if heard.place else ""
     return f"{heard.kind} feeds {', '.join(heard.streams)}{fix}"

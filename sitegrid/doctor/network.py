@@ -28,9 +28,9 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_health, decode_reply, encode_batch
 from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, open_session
-from sitegrid.asking import KNOWN_S
 from sitegrid.doctor import Finding, Level, skipped
-from sitegrid.explanations import rolls
+from sitegrid.follower_choice import KNOWN_S
+from sitegrid.machine_sentences import rolls
 from sitegrid.security.join import signer
 
 ANSWER_S = 5.0

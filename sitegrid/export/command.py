@@ -22,7 +22,7 @@ Write = Callable[[BinaryIO, Wanted, Sequence[str]], Mapping[str, int]]
 
 
 @dataclass(frozen=True)
-class Form:
+class FileForm:
     """A form of files.
 
     writer: module of this package and function. holds: what it can hold, at most `most` of it at once. usual: unless
@@ -43,15 +43,15 @@ class Form:
 
 TABLES = ("cells", "samples", *FEATURES)
 FORMS = {
-    ".tif": Form(("raster", "write_tif"), ("cells",), ("cells",)),
-    ".gpkg": Form(("vectors", "write_gpkg"), FEATURES, FEATURES, len(FEATURES)),
-    ".geojson": Form(("vectors", "write_geojson"), FEATURES),
-    ".fgb": Form(("vectors", "write_fgb"), FEATURES),
-    ".dxf": Form(("vectors", "write_dxf"), FEATURES, ("zones", "segments"), len(FEATURES)),
-    ".parquet": Form(("tables", "write_parquet"), TABLES),
-    ".csv": Form(("tables", "write_csv"), ("cells", "samples"), ("cells",)),
-    ".tum": Form(("samples", "write_tum"), ("tracks",), ("tracks",)),
-    ".html": Form(("report", "write_html"), ("report",), ("report",)),
+    ".tif": FileForm(("raster", "write_tif"), ("cells",), ("cells",)),
+    ".gpkg": FileForm(("vectors", "write_gpkg"), FEATURES, FEATURES, len(FEATURES)),
+    ".geojson": FileForm(("vectors", "write_geojson"), FEATURES),
+    ".fgb": FileForm(("vectors", "write_fgb"), FEATURES),
+    ".dxf": FileForm(("vectors", "write_dxf"), FEATURES, ("zones", "segments"), len(FEATURES)),
+    ".parquet": FileForm(("tables", "write_parquet"), TABLES),
+    ".csv": FileForm(("tables", "write_csv"), ("cells", "samples"), ("cells",)),
+    ".tum": FileForm(("samples", "write_tum"), ("tracks",), ("tracks",)),
+    ".html": FileForm(("report", "write_html"), ("report",), ("report",)),
 }
 
 
@@ -77,7 +77,7 @@ def run(arguments: Namespace) -> int:
     return 0
 
 
-def chosen(form: Form, path: Path, arguments: Namespace) -> Sequence[str]:
+def chosen(form: FileForm, path: Path, arguments: Namespace) -> Sequence[str]:
     """What the file will hold; ConfigError where it cannot, or where an option would do nothing."""
     named = (path.stem,) if path.stem in form.holds else form.usual
     if not arguments.store and not arguments.what:  # of a running site only the map is known

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from protocol.errors import ConfigError
 from protocol.queries.origin import SERVER, Origin
 from protocol.queries.request import MapQuery
-from sitegrid.asking import Answered
 from sitegrid.client import connect
+from sitegrid.follower_choice import Answered
 from sitegrid.whole_answers import whole_answer
 
 if TYPE_CHECKING:

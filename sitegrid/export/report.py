@@ -17,8 +17,8 @@ from protocol.queries.answers import MachineState
 from protocol.queries.coverage import Coverage, CoverageQuery
 from protocol.queries.requests import MachinesQuery
 from protocol.queries.roads import Corners, RoadChange, Worklist, WorklistRow
-from sitegrid.explanations import rolls, why
 from sitegrid.export.wanted import Wanted, coarser
+from sitegrid.machine_sentences import rolls, why
 from sitegrid.times import utc_text
 
 WORST = 10  # sections in the list

@@ -15,10 +15,10 @@ from protocol.errors import StoreError
 from sitegrid.export.collections import COLLECTIONS
 from sitegrid.export.styles import style_of
 from sitegrid.export.wanted import Wanted
-from sitegrid.features.feature import Collection, Kind
+from sitegrid.features.feature import Collection, FeatureKind
 from sitegrid.features.gdal import LAT_LON, columns, in_memory, write
 
-ENTITY = Kind("LineString", lambda entity: [entity[1]], {"Layer": (str, "0")})  # of DXF
+ENTITY = FeatureKind("LineString", lambda entity: [entity[1]], {"Layer": (str, "0")})  # of DXF
 # QGIS 3.22 warns of the version that GDAL writes by default.
 GPKG_VERSION = "1.3"
 # As QGIS makes it (its documentation: "Saving styles in a database").

@@ -20,7 +20,7 @@ Time = datetime  # the type of a field of times: ISO 8601 in UTC, from a stamp
 
 
 @dataclass(frozen=True)
-class Kind:
+class FeatureKind:
     """What all features of a collection are, also of an empty one: so programs know its columns.
 
     geometry: Point, LineString or Polygon. lines: corners (n, 2) in `map` [m] of an item: of a place one, of a line
@@ -37,7 +37,7 @@ class Kind:
 class Collection:
     """Items of one kind; they may be made as they are iterated over, once."""
 
-    kind: Kind
+    kind: FeatureKind
     items: Iterable[Any]
 
     def properties(self, item: Any) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def _geojson(collection: Collection, projection: Projection) -> Iterator[dict[st
         yield {"type": "Feature", "geometry": shape, "properties": collection.properties(item)}
 
 
-def shape_of(kind: Kind, item: Any, projection: Projection | None) -> dict[str, Any]:
+def shape_of(kind: FeatureKind, item: Any, projection: Projection | None) -> dict[str, Any]:
     """Its geometry as GeoJSON has it: longitude, latitude [deg], cut at the 180th meridian; without projection in m."""
     lines = [_degrees(line, projection) if projection else line.tolist() for line in kind.lines(item)]
     nested: Any = lines if kind.geometry == "Polygon" else lines[0]

@@ -9,7 +9,7 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.wire.messages import Pose
-from sitegrid.features.feature import Collection, Kind, Time
+from sitegrid.features.feature import Collection, FeatureKind, Time
 
 
 def _line(item: Any) -> list[Floats]:
@@ -26,7 +26,7 @@ def _floats(*names: str) -> dict[str, tuple[type, str]]:
 
 
 # Of `GroundChange`: rectangles around changes of the ground.
-CHANGE = Kind(
+CHANGE = FeatureKind(
     "Polygon",
     _rectangle,
     {
@@ -38,7 +38,7 @@ CHANGE = Kind(
     },
 )
 # Of poses as tables.
-MACHINE = Kind(
+MACHINE = FeatureKind(
     "Point",
     lambda pose: [np.array([(pose["x_m"], pose["y_m"])])],
     {
@@ -49,13 +49,13 @@ MACHINE = Kind(
     },
 )
 # Of tables: machine, line (n, 2), first_ns, last_ns.
-TRACK = Kind(
+TRACK = FeatureKind(
     "LineString",
     lambda track: [track["line"]],
     {"machine": (str, "machine"), "first_time": (Time, "first_ns"), "last_time": (Time, "last_ns")},
 )
 # Of `RoadSegment`, in the direction that is the first of each pair, which becomes two: few programs read lists.
-SEGMENT = Kind(
+SEGMENT = FeatureKind(
     "LineString",
     _line,
     {
@@ -71,7 +71,7 @@ SEGMENT = Kind(
     },
 )
 # Of `WorklistRow`; of what is lost its value, `_low` and `_high` (90 %).
-WORK = Kind(
+WORK = FeatureKind(
     "LineString",
     lambda row: _line(row.segment),
     {
@@ -88,7 +88,7 @@ WORK = Kind(
     },
 )
 # Of `RoadChange`: repaired, or become worse.
-REPAIR = Kind(
+REPAIR = FeatureKind(
     "LineString",
     _line,
     {

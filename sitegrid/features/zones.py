@@ -14,9 +14,9 @@ from protocol.arrays import AnyArray, Floats, Ints
 from protocol.queries.map_tiles import PLANES, TILE_CELLS, MapTile, TilesAnswer
 from protocol.site.geometry import Bounds, GridGeometry
 from protocol.site.ground_classes import ZONES
-from sitegrid.features.feature import Collection, Kind
+from sitegrid.features.feature import Collection, FeatureKind
 
-ZONE = Kind("Polygon", lambda zone: zone["lines"], {"class": (int, "class"), "name": (str, "name")})
+ZONE = FeatureKind("Polygon", lambda zone: zone["lines"], {"class": (int, "class"), "name": (str, "name")})
 LEAST_CELLS = 4  # smaller areas of one kind are noise to the eye
 # A picture's side: 17 MB while its areas are followed. An area that is wider than 2 km is cut there.
 MOST_TILES = 32

@@ -63,7 +63,7 @@ class SensorData:
 
 
 @dataclass(frozen=True)
-class Examined:
+class LogCheck:
     """begins: time of the first reading, empty without one. rows: a table of the sensors. findings: what to know."""
 
     begins: str
@@ -76,7 +76,7 @@ class Examined:
         return not any(one.level == Level.FAIL and one.check == "positions" for one in self.findings)
 
 
-def examine(manifest: Path, data: Path | None = None) -> Examined:
+def examine(manifest: Path, data: Path | None = None) -> LogCheck:
     """Look at a log, and at what is known of it beside its manifest; raises ConfigError on the manifest."""
     log, folder = open_log(manifest, data), manifest if manifest.is_dir() else manifest.parent
     read = [_read(log, source.sensor) for source in log.sources if source.sensor.use]
@@ -94,7 +94,7 @@ def examine(manifest: Path, data: Path | None = None) -> Examined:
         check_positions(read, is_barred=is_barred),
         *_compared(log, folder, start_ns, last_ns),
     ]
-    return Examined(time_of(start_ns) if start_ns else "", rows, findings)
+    return LogCheck(time_of(start_ns) if start_ns else "", rows, findings)
 
 
 def check_sensor(data: SensorData) -> Iterator[Finding]:

@@ -7,13 +7,13 @@ from argparse import ArgumentParser, BooleanOptionalAction, Namespace
 from collections.abc import Callable, Container, Mapping
 from typing import Any
 
-from protocol.queries.parameters import Form, text_of
+from protocol.queries.parameters import ValueForm, text_of
 from protocol.queries.request import MapQuery, Parameter, parameters_of
 from protocol.queries.requests import parse_query
 from sitegrid.options.values import site_time
 from sitegrid.times import HELP
 
-NUMBERS = {Form.PLACE: 2, Form.PLACES: "+", Form.RECTANGLE: 4}  # of a value, each a word of its own
+NUMBERS = {ValueForm.PLACE: 2, ValueForm.PLACES: "+", ValueForm.RECTANGLE: 4}  # of a value, each a word of its own
 SIDES = ("W", "S", "E", "N")
 
 
@@ -22,7 +22,7 @@ def add_parameters(parser: ArgumentParser, query: type[MapQuery[Any]], without: 
     for one in parameters_of(query).values():
         if one.name not in without:
             _add(parser, one)
-    if any(one.kind.form is Form.STAMP for one in parameters_of(query).values()):
+    if any(one.kind.form is ValueForm.STAMP for one in parameters_of(query).values()):
         parser.epilog = f"TIME: {HELP}."
     # argparse knows no public way to say that -2h is a value as -2 is one, not an option
     parser._negative_number_matcher = re.compile(r"-\.?\d.*")  # noqa: SLF001
@@ -31,12 +31,12 @@ def add_parameters(parser: ArgumentParser, query: type[MapQuery[Any]], without: 
 def _add(parser: ArgumentParser, one: Parameter) -> None:
     option: dict[str, Any] = {"dest": dest(one.name), "help": one.help.replace("%", "%%")}
     form = one.kind.form
-    if form is Form.FLAG:
+    if form is ValueForm.FLAG:
         option |= {"action": BooleanOptionalAction}
-    elif form is Form.STAMP:
+    elif form is ValueForm.STAMP:
         option |= {"type": site_time, "metavar": "TIME"}
     elif form in NUMBERS:
-        option |= {"type": float, "nargs": NUMBERS[form], "metavar": SIDES if form is Form.RECTANGLE else "M"}
+        option |= {"type": float, "nargs": NUMBERS[form], "metavar": SIDES if form is ValueForm.RECTANGLE else "M"}
     else:
         option |= {"metavar": "VALUE"}
     parser.add_argument(f"--{one.name.replace('_', '-')}", **option)
@@ -62,11 +62,11 @@ def given(query: type[MapQuery[Any]], arguments: Namespace, now_ns: Callable[[],
 
 def _text(one: Parameter, value: Any, now_ns: Callable[[], int]) -> str:
     match one.kind.form:
-        case Form.STAMP:
+        case ValueForm.STAMP:
             return str(value.stamp(f"--{one.name.replace('_', '-')}", now_ns))
-        case Form.FLAG:
+        case ValueForm.FLAG:
             return str(int(value))
-        case Form.LINE:
+        case ValueForm.LINE:
             return one.kind.write(value)
     return numbers(value) if isinstance(value, list) else str(value)
 

@@ -14,7 +14,14 @@ import numpy as np
 import zenoh
 
 from mapserver.pictures.frame import Image
-from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side, write_image
+from mapserver.pictures.plotter import (
+    DrawnTrack,
+    draw_difference,
+    draw_grade,
+    draw_resistance,
+    side_by_side,
+    write_image,
+)
 from mapserver.pictures.profile import draw_drive
 from mapserver.pictures.worklist import draw_worklist
 from protocol.arrays import Floats32
@@ -27,12 +34,12 @@ from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import receive_pose
-from protocol.wire.heard import Heard
+from protocol.wire.latest_values import LatestValues
 from protocol.wire.messages import Pose
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.explanations import calibrations
 from sitegrid.listener import Listener
+from sitegrid.machine_sentences import calibrations
 from sitegrid.options.parameters import dest, given, spread
 from sitegrid.process.lifetime import note, say
 
@@ -103,7 +110,7 @@ def draw(
     client: Client,
     out: Path,
     bounds: list[float] | None,
-    tracks: list[Track],
+    tracks: list[DrawnTrack],
     truth: Path | None = None,
     empty: str = SAMPLES_FOLLOW,
 ) -> Region:
@@ -126,14 +133,14 @@ def beside(out: Path) -> Path:
 
 
 def draw_both(
-    region: Region, tracks: list[Track], empty: str = SAMPLES_FOLLOW, machines: Sequence[MachineState] = ()
+    region: Region, tracks: list[DrawnTrack], empty: str = SAMPLES_FOLLOW, machines: Sequence[MachineState] = ()
 ) -> list[Image]:
     """Resistance and grade; the title of a map without any resistance says why. machines: calibrated ones are noted."""
     resistance = draw_resistance(region, tracks, _title(region, tracks, empty), calibrations(machines))
     return [resistance, draw_grade(region, tracks)]
 
 
-def _title(region: Region, tracks: list[Track], empty: str) -> str:
+def _title(region: Region, tracks: list[DrawnTrack], empty: str) -> str:
     if np.isfinite(region["resistance"]).any():
         return "Rolling resistance"
     if np.isfinite(region["grade_east"]).any():
@@ -186,7 +193,7 @@ class TrackRecorder:
 
     def __init__(self, session: zenoh.Session, site: str) -> None:
         self._lock = threading.Lock()
-        self._poses: Heard[list[Pose]] = Heard(time.monotonic)
+        self._poses: LatestValues[list[Pose]] = LatestValues(time.monotonic)
         self._listener = Listener(session, keys.poses_all(site), receive_pose, self._on_pose)
 
     def poses(self) -> dict[str, list[Pose]]:
@@ -194,10 +201,10 @@ class TrackRecorder:
         with self._lock:
             return {name: list(poses) for name, poses, _ in sorted(self._poses.items())}
 
-    def tracks(self) -> list[Track]:
+    def tracks(self) -> list[DrawnTrack]:
         """All poses so far, as lines to draw."""
         return [
-            Track(name, np.array([p.x_m for p in poses]), np.array([p.y_m for p in poses]))
+            DrawnTrack(name, np.array([p.x_m for p in poses]), np.array([p.y_m for p in poses]))
             for name, poses in self.poses().items()
         ]
 

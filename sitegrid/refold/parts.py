@@ -19,7 +19,7 @@ from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.history import History, read_history
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.location import JournalLocation
-from mapserver.journal.places import Place
+from mapserver.journal.places import FilePlace
 from mapserver.journal.rows import JournalRows, Selection, SpoolKey
 from protocol.arrays import Bools, Ints
 from protocol.errors import ConfigError, MessageError, StoreError
@@ -49,7 +49,7 @@ class Origin:
 class FilePart:
     """One file of an archive."""
 
-    path: Path | Place
+    path: Path | FilePlace
 
     def origin(self) -> Origin:
         """What its header says."""

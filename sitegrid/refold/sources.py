@@ -18,7 +18,7 @@ from mapserver.ingest.store import ACCEPTED
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
-from mapserver.journal.places import Place
+from mapserver.journal.places import FilePlace
 from mapserver.journal.rows import SpoolKey, Watermark
 from protocol.config import from_table
 from protocol.errors import ConfigError, StoreError
@@ -34,7 +34,7 @@ SITE_FILE, CONFIG_FILE = "site.toml", "server.toml"  # in the new store
 class Source:
     """One archive that was named. stores: ids of those whose samples these are, or whose place that store took."""
 
-    path: Path | Place | JournalLocation
+    path: Path | FilePlace | JournalLocation
     parts: tuple[Part, ...]
     decisions: Sequence[CalibrationDecision]
     stores: tuple[str, ...] = ()
@@ -42,7 +42,7 @@ class Source:
     watermarks: Mapping[SpoolKey, Watermark] = field(default_factory=dict)
 
 
-def source(path: Path | Place | JournalLocation) -> Source:
+def source(path: Path | FilePlace | JournalLocation) -> Source:
     """What a Parquet file, a folder of them, a store or a journal in PostgreSQL holds; no samples are read yet."""
     if isinstance(path, JournalLocation):
         return _store(path)
@@ -51,7 +51,7 @@ def source(path: Path | Place | JournalLocation) -> Source:
         return _store(JournalLocation(path))
     if not path.exists():
         raise ConfigError(path, "no such file or folder")
-    files: list[Path | Place] = [path]
+    files: list[Path | FilePlace] = [path]
     if path.is_dir():
         files = sorted(path.glob("*.parquet"), key=str)
     if not files:

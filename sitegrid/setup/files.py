@@ -22,7 +22,7 @@ from protocol.machine.machine_config import MachineConfig
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from protocol.wire.session import DEFAULT_ENDPOINT
-from sitegrid.setup.hearing import Heard
+from sitegrid.setup.hearing import HeardLine
 
 PORTS = ROUTER, PAGE = int(DEFAULT_ENDPOINT.rpartition(":")[2]), 8080  # where router and page usually listen
 MODELS = Path(__file__).with_name("models.toml")
@@ -71,7 +71,7 @@ def models() -> dict[str, dict[str, Any]]:
     return tomllib.loads(MODELS.read_text(encoding="utf-8"))
 
 
-def origin_of(every: Sequence[Heard]) -> tuple[float, ...]:
+def origin_of(every: Sequence[HeardLine]) -> tuple[float, ...]:
     """The first place that a receiver states: latitude, longitude, height; empty where none does."""
     place = next((heard.place for heard in every if heard.place), ())
     return tuple(round(value, n) for value, n in zip(place, PLACES, strict=False))
@@ -85,7 +85,7 @@ def site_text(name: str, origin: Sequence[float]) -> str:
     return "\n".join([about, *toml_lines({"name": name}), origin_is, *where]) + "\n"
 
 
-def agent_text(name: str, model: str, every: Sequence[Heard]) -> str:
+def agent_text(name: str, model: str, every: Sequence[HeardLine]) -> str:
     """An `agent.toml` for a machine of this model with these receivers."""
     template = models()[model]
     lines = [f"# A machine, made by `sitegrid init` as a {model}: measure, and correct, what has a comment."]

@@ -31,7 +31,7 @@ MANY, MOST_BETWEEN = 3, 2000  # such beginnings, and bytes from one to the next,
 
 
 @dataclass(frozen=True)
-class Heard:
+class HeardLine:
     """What came over a line.
 
     kind: of the [[driver]] that reads it; empty where none does. messages: how often each comes [Hz]. streams: what it
@@ -83,13 +83,13 @@ class Ear:
                 self._streams[frame.format].update(PROMISED.get(name[-3:] if frame.format == NMEA else name, ()))
                 self._decode(frame, host_ns or self._utc_ns)
 
-    def heard(self, address: str, baud: int = 0) -> Heard:
+    def heard(self, address: str, baud: int = 0) -> HeardLine:
         """What has been heard so far."""
         rates = {name: rate.hz for name, rate in sorted(self._rates.items())}
         kind = max(self._streams, key=lambda name: (len(self._streams[name]), name == UBX))
         streams = tuple(stream for stream in STREAMS if stream in self._streams[kind])
         if not streams:
-            return Heard(address, baud=baud, messages=rates, problem=self._why_useless())
+            return HeardLine(address, baud=baud, messages=rates, problem=self._why_useless())
         problem = why_unplaced(self._seen) if FIX in streams else ""
         if len(self._senders) > 1:
             one, *_ = senders = sorted(self._senders)
@@ -99,7 +99,7 @@ class Ear:
         std_m = math.sqrt(sum(fix.values[3:5]) / 2)
         stated_m = std_m if std_m > 0 else None  # NaN is not stated
         shown = (fix.values[:3], stated_m, fix.quality, fix.satellites)
-        return Heard(address, kind, baud, rates, streams, *shown, self._utc_ns, problem)
+        return HeardLine(address, kind, baud, rates, streams, *shown, self._utc_ns, problem)
 
     def _decode(self, frame: Frame, host_ns: int) -> None:
         try:

@@ -14,7 +14,7 @@ from agents.drivers.formats.gpsd import GPSD_PORT, GREETING
 from agents.drivers.receiver import BAUDS, TRY_S
 from agents.drivers.transports import Transport, open_transport, split_address, why_closed
 from protocol.errors import ConfigError
-from sitegrid.setup.hearing import Ear, Heard
+from sitegrid.setup.hearing import Ear, HeardLine
 
 POLL_S = 0.1
 MOST_FILE_BYTES = 1 << 22  # of a recording: an hour of a receiver
@@ -32,7 +32,7 @@ def address_of(text: str) -> str:
     return str(Path(address).absolute())
 
 
-def listen_to(addresses: Sequence[str], seconds: float, bauds: Sequence[int] = BAUDS) -> list[Heard]:
+def listen_to(addresses: Sequence[str], seconds: float, bauds: Sequence[int] = BAUDS) -> list[HeardLine]:
     """What talks at these addresses, all at once. seconds: from the first frame, or of silence."""
     if not addresses:
         return []
@@ -40,7 +40,7 @@ def listen_to(addresses: Sequence[str], seconds: float, bauds: Sequence[int] = B
         return list(pool.map(lambda address: listen(address, seconds, bauds), addresses))
 
 
-def listen(address: str, seconds: float, bauds: Sequence[int] = BAUDS) -> Heard:
+def listen(address: str, seconds: float, bauds: Sequence[int] = BAUDS) -> HeardLine:
     """What talks at one address; on a serial port at the first baud with frames."""
     ear, is_serial = Ear(), "://" not in address
     for baud in bauds if is_serial else bauds[:1]:
@@ -50,7 +50,7 @@ def listen(address: str, seconds: float, bauds: Sequence[int] = BAUDS) -> Heard:
                 is_serial = is_serial and transport.is_live
                 broke = _hear(transport, ear, seconds)
         except OSError as error:
-            return Heard(address, problem=why_closed(error))
+            return HeardLine(address, problem=why_closed(error))
         if ear.frames or not ear.n_bytes or not is_serial:
             break
     heard = ear.heard(address, baud if is_serial and ear.frames else 0)

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from agents.drivers.formats import FIX, IMU
-from sitegrid.setup.hearing import Heard
+from sitegrid.setup.hearing import HeardLine
 
 NO_PORT = "no serial port is there: plug a receiver in, or name an address (tcp://HOST:PORT, udp://:PORT, gpsd, a file)"
 
 
-def block(heard: Heard) -> list[str]:
+def block(heard: HeardLine) -> list[str]:
     """The address, then what comes there and what hinders it."""
     baud = f" at {heard.baud} baud" if heard.baud else ""
     rates = ", ".join(f"{name} {f'{hz:g} Hz' if hz else 'once'}" for name, hz in heard.messages.items())
@@ -28,7 +28,7 @@ def block(heard: Heard) -> list[str]:
     return [heard.address, *(f"  {line}" for line in (*said, heard.problem) if line)]
 
 
-def missing(every: Sequence[Heard]) -> dict[str, str]:
+def missing(every: Sequence[HeardLine]) -> dict[str, str]:
     """What an agent lacks that is fed by these, a sentence for each thing that it cannot know."""
     streams = {stream for heard in every for stream in heard.streams}
     lacks = {} if FIX in streams else {"position": "no receiver: no position, so no sample"}

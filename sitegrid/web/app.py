@@ -34,7 +34,7 @@ from sitegrid.web.openapi import PREFIX, description
 from sitegrid.web.resource import has_copy, tag_of
 from sitegrid.web.resources import RESOURCES, follows_now
 from sitegrid.web.site import SiteFeed
-from sitegrid.web.values import Problem, bad, problem_response
+from sitegrid.web.values import RequestProblem, bad, problem_response
 from sitegrid.web.xyz import mercator, overview
 
 PAGE = Path(__file__).parent / "page"
@@ -84,7 +84,9 @@ class WebApp:
         name = request.path_params["site"]
         if name not in self._feeds:
             known = ", ".join(self._feeds)
-            raise Problem(HTTPStatus.NOT_FOUND, "unknown_site", f"site `{name[:40]}` is not here; known: {known}")
+            raise RequestProblem(
+                HTTPStatus.NOT_FOUND, "unknown_site", f"site `{name[:40]}` is not here; known: {known}"
+            )
         return self._feeds[name]
 
     async def _sites(self, _: Request) -> Response:
@@ -226,7 +228,7 @@ def _check_layer(kind: str, layer: str, info: MapInfo) -> None:
         raise bad(Refusal.OUT_OF_RANGE, f"`{kind[:40]}` is neither colour nor value")
     if layer not in info.layers:
         problem = f"layer `{layer[:40]}` is not known; known: {', '.join(info.layers)}"
-        raise Problem(HTTPStatus.NOT_FOUND, Refusal.UNKNOWN_LAYER, problem)
+        raise RequestProblem(HTTPStatus.NOT_FOUND, Refusal.UNKNOWN_LAYER, problem)
 
 
 def _parameters(request: Request) -> dict[str, str]:
@@ -247,7 +249,7 @@ def _not_there(_: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     status = HTTPStatus(error.status_code)
     reason = "wrong_method" if status == HTTPStatus.METHOD_NOT_ALLOWED else "not_found"
-    return problem_response(Problem(status, reason, f"{status.phrase}; see {PREFIX}/openapi.json"))
+    return problem_response(RequestProblem(status, reason, f"{status.phrase}; see {PREFIX}/openapi.json"))
 
 
 def _failed(request: Request, error: Exception) -> Response:

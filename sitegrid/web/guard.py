@@ -16,7 +16,7 @@ from starlette.datastructures import Headers
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sitegrid.web.values import Problem, problem_response
+from sitegrid.web.values import RequestProblem, problem_response
 
 COOKIE = "sitegrid"
 RATE_HZ, BURST = 100.0, 500.0  # requests of one address: a GIS asks for some hundred tiles when its view moves
@@ -56,7 +56,7 @@ class Guard:
         self.counts["requests"] += 1
         try:
             self._check(scope)
-        except Problem as problem:
+        except RequestProblem as problem:
             self.counts[f"refused_{problem.reason}"] += 1
             await self._refuse(problem, scope, receive, send)
             return
@@ -77,7 +77,7 @@ class Guard:
         headers = Headers(scope=scope)
         if len(scope["raw_path"]) > MAX_PATH or len(scope["query_string"]) > MAX_QUERY:
             detail = f"more than {MAX_PATH} bytes of path, or {MAX_QUERY} of parameters; ask for less"
-            raise Problem(HTTPStatus.REQUEST_URI_TOO_LONG, "too_large", detail)
+            raise RequestProblem(HTTPStatus.REQUEST_URI_TOO_LONG, "too_large", detail)
         _check_body(headers)
         if scope["path"] not in OPEN_PATHS:
             self._check_host(headers)
@@ -87,7 +87,7 @@ class Guard:
             scope["may_stay"] = lambda: person(token) is not None
         if not scope.get("may_stay", _always)():
             detail = "a visitor's token is needed: ask the office for one, and open the link with it"
-            raise Problem(HTTPStatus.UNAUTHORIZED, "no_permission", detail, {"WWW-Authenticate": "Bearer"})
+            raise RequestProblem(HTTPStatus.UNAUTHORIZED, "no_permission", detail, {"WWW-Authenticate": "Bearer"})
 
     def _check_host(self, headers: Headers) -> None:
         """Refuse pages of others, and a page whose own name was made to lead here (DNS rebinding)."""
@@ -96,9 +96,9 @@ class Guard:
         name = parts[1].lower().rstrip(".") if parts else host
         if host and name not in self._names and not (parts and _is_address(name.strip("[]"))):
             detail = f"`{name[:80]}` is no name of this server: open it by its address, or start it with --host NAME"
-            raise Problem(HTTPStatus.MISDIRECTED_REQUEST, "wrong_host", detail)
+            raise RequestProblem(HTTPStatus.MISDIRECTED_REQUEST, "wrong_host", detail)
         if (origin := headers.get("origin")) and _place_of(origin) != host:
-            raise Problem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
+            raise RequestProblem(HTTPStatus.FORBIDDEN, "wrong_origin", "a page of another address may not ask here")
 
     def _count_rate(self, scope: Scope) -> None:
         """A bucket of BURST that fills with RATE_HZ."""
@@ -110,7 +110,9 @@ class Guard:
         if len(self._rates) > ADDRESSES:
             self._rates.popitem(last=False)
         if level < 0:
-            raise Problem(HTTPStatus.TOO_MANY_REQUESTS, "too_many", "too many requests; wait", {"Retry-After": "1"})
+            raise RequestProblem(
+                HTTPStatus.TOO_MANY_REQUESTS, "too_many", "too many requests; wait", {"Retry-After": "1"}
+            )
 
     def _without_token(self, scope: Scope) -> RedirectResponse | None:
         """A page that was opened with its token goes on with a cookie, so that the token stays in no history."""
@@ -123,7 +125,7 @@ class Guard:
         response.set_cookie(COOKIE, token, httponly=True, samesite="strict", secure=scope["scheme"] == "https")
         return response
 
-    async def _refuse(self, problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _refuse(self, problem: RequestProblem, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
             await problem_response(problem)(scope, receive, send)
             return
@@ -137,10 +139,10 @@ def _check_body(headers: Headers) -> None:
     """Refuse a body, and end its connection: another reader may see its end elsewhere, and a second request in it."""
     if "content-length" in headers and "transfer-encoding" in headers:
         detail = "the request states its length twice (Content-Length, Transfer-Encoding); send neither"
-        raise Problem(HTTPStatus.BAD_REQUEST, "two_lengths", detail, {"Connection": "close"})
+        raise RequestProblem(HTTPStatus.BAD_REQUEST, "two_lengths", detail, {"Connection": "close"})
     if headers.get("content-length", "0") not in ("", "0") or "transfer-encoding" in headers:
         detail = "no body is taken"
-        raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too_large", detail, {"Connection": "close"})
+        raise RequestProblem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too_large", detail, {"Connection": "close"})
 
 
 def _is_address(text: str) -> bool:

@@ -11,7 +11,7 @@ from operator import itemgetter
 from typing import Any
 
 from protocol.errors import MessageError, Refusal
-from protocol.wire.heard import Heard
+from protocol.wire.latest_values import LatestValues
 from protocol.wire.messages import Health, Pose
 from sitegrid.health import problems_of, report_of
 from sitegrid.web.values import plain
@@ -34,7 +34,7 @@ class Machines:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()
-        self._heard: Heard[_Machine] = Heard(clock)
+        self._heard: LatestValues[_Machine] = LatestValues(clock)
         self._findings: Mapping[str, str] = {}
         self.heard = 0
 

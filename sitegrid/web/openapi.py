@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from protocol.queries.parameters import Form
+from protocol.queries.parameters import ValueForm
 from protocol.version import package_version
 from sitegrid.web.resource import Resource
 from sitegrid.web.resources import RESOURCES
 
 PREFIX = "/api/v1"
-JSON = {Form.NUMBER: "number"}  # types of parameters, where they are not text
+JSON = {ValueForm.NUMBER: "number"}  # types of parameters, where they are not text
 PROBLEM = {
     "description": "Refused, or not possible now",
     "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},

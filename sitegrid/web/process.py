@@ -27,7 +27,7 @@ from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
 from sitegrid.web.site import SiteFeed
 from sitegrid.web.sockets import AT_ONCE, OF_ADDRESS, Listening, listen
-from sitegrid.web.values import Problem, problem_response
+from sitegrid.web.values import RequestProblem, problem_response
 
 MESSAGE_BYTES = 4096  # of what a page says
 ADDRESS_BYTES = 2**18  # that are read, to be refused by name: a line of 10,000 places; beyond, the connection ends
@@ -148,7 +148,7 @@ class PatientProtocol(H11Protocol):
         self._listening.refuse(self._connection.origin)
         detail = f"too many connections; an address may have {OF_ADDRESS}: close some"
         close = {"Connection": "close"}
-        self.app = problem_response(Problem(HTTPStatus.TOO_MANY_REQUESTS, "too_many", detail, close))
+        self.app = problem_response(RequestProblem(HTTPStatus.TOO_MANY_REQUESTS, "too_many", detail, close))
 
     def data_received(self, data: bytes) -> None:
         """Go on with a request, or begin one, and the time that it has."""

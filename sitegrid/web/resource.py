@@ -12,7 +12,7 @@ from starlette.responses import Response
 
 from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion
-from protocol.queries.parameters import Form, name_of, number, text_of
+from protocol.queries.parameters import ValueForm, name_of, number, text_of
 from protocol.queries.request import Fresh, MapQuery, Parameter, parameters_of
 from protocol.queries.requests import parse_query
 from sitegrid.features.feature import Collection, geojson
@@ -87,9 +87,9 @@ def _parsed(query: type[MapQuery[Any]], parameters: Parameters) -> MapQuery[Any]
     """A query, checked as the map server does; times may be ISO 8601, places x,y;x,y;... too."""
     texts = dict(parameters)
     for name, one in parameters_of(query).items():
-        if name in texts and one.kind.form is Form.STAMP:
+        if name in texts and one.kind.form is ValueForm.STAMP:
             texts[name] = str(values.stamp(parameters, name))
-        elif name in texts and one.kind.form in (Form.PLACE, Form.PLACES):
+        elif name in texts and one.kind.form in (ValueForm.PLACE, ValueForm.PLACES):
             texts[name] = texts[name].replace(";", ",")
     return parse_query(query.name, texts)
 

@@ -24,11 +24,11 @@ from protocol.site.site_config import MAX_EXTENT_M, Projection
 from protocol.wire import keys
 from protocol.wire.codec import decode_health, receive_pose
 from protocol.wire.messages import Health, Pose
-from sitegrid.asking import is_answered
 from sitegrid.client import Client
-from sitegrid.explanations import rolls
 from sitegrid.features.feature import projection_of
+from sitegrid.follower_choice import is_answered
 from sitegrid.listener import Listener
+from sitegrid.machine_sentences import rolls
 from sitegrid.web.encoding import Cache
 from sitegrid.web.machines import Machines
 from sitegrid.web.values import plain

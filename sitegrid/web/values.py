@@ -86,7 +86,7 @@ def _is_stamp(key: object, value: object) -> bool:
     return isinstance(key, str) and key.endswith("_ns") and type(value) is int
 
 
-class Problem(SitegridError):  # noqa: N818 - the word of RFC 9457
+class RequestProblem(SitegridError):  # noqa: N818 - the word of RFC 9457
     """A request that is refused, or that cannot be answered. reason: a word for programs, as in the protocol."""
 
     def __init__(self, status: HTTPStatus, reason: str, detail: str, headers: dict[str, str] | None = None) -> None:
@@ -94,25 +94,25 @@ class Problem(SitegridError):  # noqa: N818 - the word of RFC 9457
         self.status, self.reason, self.headers = status, reason, headers or {}
 
 
-def bad(reason: Refusal, detail: str) -> Problem:
+def bad(reason: Refusal, detail: str) -> RequestProblem:
     """A request that says something wrong."""
-    return Problem(STATUS.get(reason, HTTPStatus.BAD_REQUEST), reason, detail)
+    return RequestProblem(STATUS.get(reason, HTTPStatus.BAD_REQUEST), reason, detail)
 
 
-def problem_of(error: Exception) -> Problem:
+def problem_of(error: Exception) -> RequestProblem:
     """An error as a problem; one that nobody expected says no more than that it was one."""
-    if isinstance(error, Problem):
+    if isinstance(error, RequestProblem):
         return error
     if isinstance(error, QueryError):
         status = STATUS.get(error.reason, HTTPStatus.BAD_REQUEST)
         headers = {"Retry-After": "1"} if status == HTTPStatus.SERVICE_UNAVAILABLE else {}
-        return Problem(status, error.reason, str(error), headers)
+        return RequestProblem(status, error.reason, str(error), headers)
     if isinstance(error, LinkError):
         detail = "no map server answers for this site; start one with `sitegrid server`"
-        return Problem(HTTPStatus.SERVICE_UNAVAILABLE, "no_server", detail, {"Retry-After": "2"})
+        return RequestProblem(HTTPStatus.SERVICE_UNAVAILABLE, "no_server", detail, {"Retry-After": "2"})
     if isinstance(error, SitegridError):
-        return Problem(HTTPStatus.BAD_GATEWAY, "bad_answer", "the map server's answer cannot be read")
-    return Problem(HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "the web server failed; its log has more")
+        return RequestProblem(HTTPStatus.BAD_GATEWAY, "bad_answer", "the map server's answer cannot be read")
+    return RequestProblem(HTTPStatus.INTERNAL_SERVER_ERROR, "internal", "the web server failed; its log has more")
 
 
 def problem_response(error: Exception) -> Response:

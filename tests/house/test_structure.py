@@ -15,7 +15,6 @@ from tests.structure import CONFIGS, PACKAGES, crowds, is_description, modules, 
 
 MOST_MODULES = 16  # of a folder, beside __init__
 LIST = Path("sitegrid/commands")  # one module a command: `sitegrid --help` is its table of contents
-MOST_LINES = 300  # of a module whose docstring does not say why it is longer
 MOST_OPTIONS = 60
 
 # Contracts of pyproject.toml by their first words, each with an import that breaks it: where it is planted, and what.
@@ -80,11 +79,6 @@ def test_no_contract_has_an_exception() -> None:
 def test_a_folder_is_taken_in_at_a_glance() -> None:
     crowded = {folder: n for folder, n in crowds(modules(ROOT, *PACKAGES)).items() if n > MOST_MODULES}
     assert not crowded.keys() - {LIST}
-
-
-def test_a_long_module_says_why() -> None:
-    long = [module for module in modules(ROOT, *PACKAGES) if module.lines > MOST_LINES]
-    assert not [str(module.path) for module in long if "one module because" not in " ".join(module.docstring.split())]
 
 
 def test_options_stay_few() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from protocol.machine.log_folder import open_log
 from protocol.wire.session import free_endpoint
-from sitegrid.door import INTERRUPTED
+from sitegrid.command_line import INTERRUPTED
 from tests.command_lines import COMMANDS
 from tests.integration.site_run import SiteRun  # beside this file
 from tests.patience import PATIENCE_S, until

@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from mapserver.routes.grid_search import LEAST_COST
-from mapserver.routes.least_cost import Cell, Terrain
+from mapserver.routes.least_cost import Cell, CostField
 from protocol.arrays import Floats, Ints
 
 POINTS = 480  # that the length of a step is divided into
@@ -31,7 +31,7 @@ def neighbours(order: int) -> Ints:
     return np.array(sorted(near))
 
 
-def graph(terrain: Terrain, steps: Ints) -> csr_matrix:
+def graph(terrain: CostField, steps: Ints) -> csr_matrix:
     """Costs of all steps (k, 2) from all cells; of open ground."""
     rows, columns = terrain.resistance.shape
     index = np.arange(rows * columns).reshape(rows, columns)
@@ -52,7 +52,7 @@ def graph(terrain: Terrain, steps: Ints) -> csr_matrix:
     return csr_matrix(edges, shape=(rows * columns, rows * columns))
 
 
-def least_cost(terrain: Terrain, start: Cell, end: Cell, order: int = 4) -> float:
+def least_cost(terrain: CostField, start: Cell, end: Cell, order: int = 4) -> float:
     """Cost of the cheapest line from cell to cell."""
     columns = terrain.resistance.shape[1]
     distance: Floats = dijkstra(graph(terrain, neighbours(order)), indices=start[0] * columns + start[1])

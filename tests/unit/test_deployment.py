@@ -54,9 +54,9 @@ def test_dockerfile_is_clean():
 
 
 def test_every_command_is_one_that_the_parser_takes():
-    import sitegrid.door
+    import sitegrid.command_line
 
-    parser = sitegrid.door.build_parser()
+    parser = sitegrid.command_line.build_parser()
     words = commands()
     assert len(words) == len(services()) - 2 + 3, "less the databases, and with three health checks"
     for line in words:
@@ -132,12 +132,12 @@ def test_only_this_host_gets_in_while_there_are_no_keys():
 
 
 def test_the_image_has_the_extra_of_every_command_in_compose():
-    import sitegrid.door
+    import sitegrid.command_line
 
     of_project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     extras = set(re.search(r'"\.\[(.*)\]"', DOCKERFILE.read_text())[1].split(","))
     extras |= set(re.findall(r"\w+", str([of_project[name] for name in extras])))
-    parser = sitegrid.door.build_parser()
+    parser = sitegrid.command_line.build_parser()
     assert {parser.parse_args(line).extra for line in commands()} - {""} <= extras
 
 

@@ -11,8 +11,6 @@ Over a step dt, with R = map_from_base and E the matrix from body rates to the r
 `velocity` is that of base_link's origin in its own axes and `acceleration` its rate of change; what an accelerometer
 measures besides (rate x velocity, gravity) belongs to the measurement. On a plane (two_d_mode of robot_localization)
 the states off it are zero before and after each step, with a small variance so that the covariance stays definite.
-
-It is one module because f, its Jacobian and its noise are one model.
 """
 
 import math

@@ -12,7 +12,7 @@ from lab.paper import experiment
 from lab.paper.drives import ALONE, FLEETS, QUICK, Plan
 from lab.paper.experiment import Outcomes, contradictions, map_row
 from lab.paper.maps import OURS, PAPERS, SERVED
-from sitegrid.door import run
+from sitegrid.command_line import run
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report
 

@@ -3,8 +3,7 @@
 A commit is one message: what it writes is gathered in memory until then. It names the epoch and the last row that this
 writer knows, and fails where the journal has others: a writer that has lost its lock without a word acknowledges
 nothing. Where its answer is lost it is not known whether it happened; then the lock and a new epoch are taken, which
-waits for a commit that is still under way, and the journal says. It is one module because a transaction, and what
-to do when its answer is lost, are about the same few values.
+waits for a commit that is still under way, and the journal says.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sitegrid import cli, commands, door
+from sitegrid import cli, command_line, commands
 
 COMMANDS = sorted(path.stem for path in Path(commands.__path__[0]).rglob("[a-z]*.py"))
 
@@ -46,7 +46,7 @@ def test_every_command_in_the_readme_is_one_that_the_parser_takes(root: Path, mo
         words[0] for words in commands
     }
     for words in commands:
-        door.build_parser().parse_args(words)  # a usage error exits, and fails the test
+        command_line.build_parser().parse_args(words)  # a usage error exits, and fails the test
 
 
 BEYOND_BASE = {"cryptography", "cv2", "filterpy", "matplotlib", "numba", "pyarrow", "pybullet", "pyproj", "rich"}
@@ -56,7 +56,7 @@ BEYOND_BASE |= {"scipy", "agents", "mapserver", "sim", "lab"}
 @pytest.mark.parametrize(
     ("imports", "needed", "not_needed"),
     [
-        ("sitegrid.door; sitegrid.door.build_parser()", {"sitegrid", "zenoh"}, BEYOND_BASE),
+        ("sitegrid.command_line; sitegrid.command_line.build_parser()", {"sitegrid", "zenoh"}, BEYOND_BASE),
         ("sitegrid.client, sitegrid.security.join, sitegrid.commands.router", {"sitegrid"}, {"cryptography"}),
         (
             "sitegrid.commands.agent, agents.agent, agents.config, agents.drivers.sources, agents.drivers.replay",

@@ -13,13 +13,12 @@ import pytest
 
 from agents.drivers import Observed
 from agents.drivers.line import Line
-from agents.drivers.receiver import Receiver
+from agents.drivers.receiver import ReceiverSource
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import Gps, GpsVelocity
-from sim.receivers.ports import Port, Ports
-from sim.receivers.receiver import Receiver as SimulatedReceiver
-from sim.receivers.receiver import Wiring
+from sim.receivers.ports import Ports, PseudoTerminal
+from sim.receivers.receiver import SimulatedReceiver, Wiring
 from tests.patience import until
 from tests.unit.agents.drivers.frames import TEN
 
@@ -40,7 +39,7 @@ def test_a_simulated_port_is_read_from_when_it_is_opened_and_is_gone_with_the_si
     now_ns, values = 10**12, list[Observed]()
     with closing(Ports(tmp_path, {"loader-1": [WIRING]})) as ports:
         line = Line("nmea", WIRING.feeds)
-        source = Receiver(str(tmp_path / WIRING.name), 0, "nmea", line, lambda: now_ns, lambda _: None)
+        source = ReceiverSource(str(tmp_path / WIRING.name), 0, "nmea", line, lambda: now_ns, lambda _: None)
         assert ports.send("loader-1", measured(0)) == ()
         assert source.read(0.0) == (), "what was sent before it was opened is lost"
         for i in (1, 2):
@@ -55,11 +54,11 @@ def test_a_simulated_port_is_read_from_when_it_is_opened_and_is_gone_with_the_si
 
 def test_a_port_takes_the_place_of_one_that_a_killed_simulator_left_but_of_no_file(tmp_path: Path) -> None:
     (tmp_path / "gps-1").symlink_to("/dev/pts/no-more")
-    with closing(Port(tmp_path / "gps-1")):
+    with closing(PseudoTerminal(tmp_path / "gps-1")):
         assert os.path.realpath(tmp_path / "gps-1").startswith("/dev/pts/")
     (tmp_path / "gps-1").write_text("a file")
     with pytest.raises(ConfigError, match="no port can be there"):
-        Port(tmp_path / "gps-1")
+        PseudoTerminal(tmp_path / "gps-1")
 
 
 def free_port() -> int:
@@ -72,10 +71,10 @@ def free_port() -> int:
 @pytest.mark.skipif(not shutil.which("gpsd"), reason="gpsd is not installed (Debian's package gpsd)")
 def test_gpsd_reports_what_a_simulated_receiver_sends(tmp_path: Path) -> None:
     sent, values, number = 0, dict[int, tuple[float, ...]](), free_port()
-    with closing(Port(tmp_path / "gps-1")) as port:
+    with closing(PseudoTerminal(tmp_path / "gps-1")) as port:
         device = os.path.realpath(tmp_path / "gps-1")
         daemon = subprocess.Popen(["gpsd", "-N", "-n", "-S", str(number), device])
-        source = Receiver(f"tcp://127.0.0.1:{number}", 0, "gpsd", Line("gpsd", WIRING.feeds))
+        source = ReceiverSource(f"tcp://127.0.0.1:{number}", 0, "gpsd", Line("gpsd", WIRING.feeds))
         spoken = SimulatedReceiver(WIRING)
 
         def heard() -> bool:

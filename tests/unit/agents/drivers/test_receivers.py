@@ -18,7 +18,7 @@ import pytest
 
 from agents.drivers import Observed
 from agents.drivers.line import Line
-from agents.drivers.receiver import NO_FIX_S, RETRY_S, SILENT_S, TRY_S, Receiver
+from agents.drivers.receiver import NO_FIX_S, RETRY_S, SILENT_S, TRY_S, ReceiverSource
 from agents.drivers.sources import Sources
 from agents.drivers.tables import DriverConfig, open_sources
 from agents.drivers.time_base import TimeBase
@@ -28,8 +28,7 @@ from agents.sampling import joined
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Reading
 from sim.receivers.nmea import sentence as nmea
-from sim.receivers.receiver import Receiver as SimulatedReceiver
-from sim.receivers.receiver import Wiring
+from sim.receivers.receiver import SimulatedReceiver, Wiring
 from tests.patience import until
 from tests.unit.agents.drivers.frames import GGA, RMC, TEN, TPV, Script, esf, no_bundles, pvt, report, spoiled
 from tests.unit.agents.drivers.test_formats import SENSORS
@@ -86,13 +85,13 @@ def device(tmp_path: Path) -> Iterator[Device]:
 
 
 @contextmanager
-def receiver(address: object, clock: Clock, format_: str = "nmea", baud: int = 0) -> Iterator[Receiver]:
-    made = Receiver(str(address), baud, format_, Line(format_, SENSORS), lambda: clock.now_ns, clock.wait)
+def receiver(address: object, clock: Clock, format_: str = "nmea", baud: int = 0) -> Iterator[ReceiverSource]:
+    made = ReceiverSource(str(address), baud, format_, Line(format_, SENSORS), lambda: clock.now_ns, clock.wait)
     with closing(made):
         yield made
 
 
-def listened(source: Receiver, send: Callable[[], object], n: int = 1) -> list[Observed]:
+def listened(source: ReceiverSource, send: Callable[[], object], n: int = 1) -> list[Observed]:
     """Values of sensors, once so many have come in; sent again and again until they have."""
     values: list[Observed] = []
 
@@ -252,7 +251,7 @@ def test_a_baud_is_found_and_a_wrong_one_is_named(device: Device) -> None:
 # --- wrong set-ups, a sentence each ----------------------------------------------------------------------------------
 
 
-def problem(source: Receiver, clock: Clock, device: Device, data: bytes, step_s: float, n: int) -> str:
+def problem(source: ReceiverSource, clock: Clock, device: Device, data: bytes, step_s: float, n: int) -> str:
     for _ in range(n):
         source.read(0.0)
         device.send(data)

@@ -15,7 +15,7 @@ from mapserver.config import ServerConfig, StoreConfig
 from mapserver.evidence import snapshot
 from mapserver.ingest import backlog, merge_waits, snapshot_times
 from mapserver.ingest import writer as writer_module
-from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, GROUP_BYTES, MOST_RETRY_S, Backlog, Pace
+from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, GROUP_BYTES, MOST_RETRY_S, Backlog, WorkRate
 from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
@@ -413,7 +413,7 @@ def test_a_batch_larger_than_all_room_is_not_taken_and_takes_nobodys_place():
 
 
 def test_the_time_until_there_is_room_follows_the_pace():
-    pace = Pace()
+    pace = WorkRate()
     for _ in range(100):
         pace.worked(2_000_000, 0.5)
     assert 0.9 < pace.retry_after_s(4_000_000) < 1.1

@@ -23,7 +23,7 @@ from mapserver.monitoring.metrics import HealthListener, ReceivedHealth, ServerC
 from protocol.errors import LinkError
 from protocol.wire import keys
 from protocol.wire.codec import MAX_SMALL_BYTES, encode_health
-from protocol.wire.heard import MOST_NAMES
+from protocol.wire.latest_values import MOST_NAMES
 from protocol.wire.messages import Health
 from tests.paths import ROOT
 from tests.unit.mapserver.data import NOW_NS, routed

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapserver.pictures import frame, plotter
-from mapserver.pictures.plotter import Track, draw_difference, draw_grade, draw_resistance, side_by_side
+from mapserver.pictures.plotter import DrawnTrack, draw_difference, draw_grade, draw_resistance, side_by_side
 from protocol.queries.answers import Region
 from protocol.site.ground_classes import ZONES
 from tests.unit.records import version
@@ -52,7 +52,7 @@ def test_wrong_cells_are_loud():
     ("columns", "rows", "cell"), [(1, 1, 1.0), (30, 400, 1.0), (400, 30, 1.0), (1241, 3, 1.0), (9, 5, 0.05)]
 )
 def test_every_size_fits_a_screen(columns, rows, cell):
-    track = Track("m" * 63, np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    track = DrawnTrack("m" * 63, np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     here = region(columns, rows, west=-90_000.55, south=-90_000.55, cell=cell, resistance=0.04)
     image = draw_resistance(here, [track] * 40, "A long title " * 20)
     assert image.dtype == np.uint8
@@ -62,7 +62,7 @@ def test_every_size_fits_a_screen(columns, rows, cell):
 
 
 def test_track_has_its_colour_and_a_marker_at_its_end():
-    track = Track("loader-1", np.array([10.5, 50.5, np.nan, 90.5]), np.array([10.5, 10.5, np.nan, 40.5]))
+    track = DrawnTrack("loader-1", np.array([10.5, 50.5, np.nan, 90.5]), np.array([10.5, 10.5, np.nan, 40.5]))
     image = draw_resistance(region(100, 50, resistance=0.04), [track])
     assert cell_colour(image, 90, 40, 50, 12) == plotter.TRACK_COLOURS[0]
     assert min(cell_colour(image, 30, 10, 50, 12)) > 150  # a thin white line, smoothed

@@ -11,7 +11,7 @@ from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.location import JournalLocation
 from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.answering import Answers
-from mapserver.query.server_source import Commands
+from mapserver.query.server_source import CommandDesk
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
 from protocol.queries.commands import TrustCommand
@@ -222,7 +222,7 @@ def test_questions_about_the_past_are_recognised():
 def test_the_upkeep_is_asked(served):
     upkeep = FakeUpkeep()
     answers = served(upkeep=upkeep)
-    commands = Commands(answers.writer, upkeep, answers.info)  # type: ignore[arg-type]
+    commands = CommandDesk(answers.writer, upkeep, answers.info)  # type: ignore[arg-type]
     machines = codec.decode_machines(answered(answers, "machines", {"after": "1"})).machines
     assert [(machine.name, machine.trusted) for machine in machines] == [("a", True), ("b", False)]
     changes = codec.decode_changes(answered(answers, "changes", {"after": "41"})).changes
@@ -249,5 +249,5 @@ def test_an_accepted_store_that_is_not_written_is_refused_as_a_decision_is(tmp_p
     with closing(open_writer(tmp_path)) as writer:
         writer._store.journal.append_event = Mock(side_effect=error)
         with refused(reason, problem):
-            Commands(writer, None, dict).obey("accept", {"store": "0123456789abcdef", "reason": "its disk died"})
+            CommandDesk(writer, None, dict).obey("accept", {"store": "0123456789abcdef", "reason": "its disk died"})
         assert not writer._store.accepted

@@ -10,7 +10,7 @@ from mapserver.layers.cell_layers import LAYERS
 from mapserver.query import region_pieces
 from mapserver.query.answering import WITHOUT_MEAN
 from mapserver.query.areas import cells_to_a_side
-from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, Reading
+from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, RegionReading
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_points, decode_region
 from protocol.queries.pieces import joined
@@ -158,7 +158,7 @@ def test_pieces_cover_every_cell_once_and_stay_small(layers):
             assert all(end == begin and end % BLOCK_CELLS == 0 for (_, end), (begin, _) in pairwise(spans))
 
 
-LARGE = Reading(CellWindow(0, 0, 4000, 4000), ("visits",), ())
+LARGE = RegionReading(CellWindow(0, 0, 4000, 4000), ("visits",), ())
 
 
 @pytest.fixture

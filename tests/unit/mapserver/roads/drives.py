@@ -9,7 +9,7 @@ import numpy as np
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.roads.network import network
-from mapserver.roads.segments import Segments, segments
+from mapserver.roads.segments import SegmentTable, segments
 from mapserver.roads.skeleton import Skeletons
 from protocol.arrays import Floats, Table
 from protocol.machine.samples import empty
@@ -65,13 +65,13 @@ def grid_of(*machines: Table) -> Grid:
     return grid
 
 
-def roads_of(grid: Grid, skeletons: Skeletons | None = None) -> Segments:
+def roads_of(grid: Grid, skeletons: Skeletons | None = None) -> SegmentTable:
     """The roads that a map shows."""
     blocks = grid.blocks_in(EVERYWHERE)
     pages = dict(zip(blocks, grid.pages(blocks), strict=True))
     return segments(network((skeletons or Skeletons(1.0)).skeleton(pages)))
 
 
-def roads(*machines: Table) -> Segments:
+def roads(*machines: Table) -> SegmentTable:
     """The roads that samples show."""
     return roads_of(grid_of(*machines))

@@ -9,7 +9,7 @@ import pytest
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.roads.cutting import LATTICE_M, LEAST_M, SLIVER_M, cut
-from mapserver.roads.segments import Segments
+from mapserver.roads.segments import SegmentTable
 from mapserver.roads.skeleton import Skeletons
 from protocol.arrays import Floats
 from tests.unit.mapserver.roads.drives import along, grid_of, passes, ring, roads, roads_of
@@ -17,22 +17,22 @@ from tests.unit.mapserver.roads.drives import along, grid_of, passes, ring, road
 END_M = 3.5  # a road ends within so much of where machines turned round
 
 
-def off_m(line: Floats, shown: Segments) -> float:
+def off_m(line: Floats, shown: SegmentTable) -> float:
     """How far points of a line are from the roads at most."""
     return float(max(np.hypot(*(shown.points - place).T).min() for place in line))
 
 
-def beyond_m(line: Floats, shown: Segments) -> float:
+def beyond_m(line: Floats, shown: SegmentTable) -> float:
     """How far the roads are from a line at most."""
     return float(max(np.hypot(*(line - place).T).min() for place in shown.points))
 
 
-def degrees(shown: Segments) -> Counter[int]:
+def degrees(shown: SegmentTable) -> Counter[int]:
     """How many nodes there are of each degree."""
     return Counter(Counter(shown.nodes[shown.nodes >= 0].tolist()).values())
 
 
-def same(one: Segments, other: Segments) -> bool:
+def same(one: SegmentTable, other: SegmentTable) -> bool:
     arrays = ("points", "ends", "ahead", "length_m", "nodes")
     return one.ids == other.ids and all(
         getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in arrays

@@ -8,16 +8,16 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from mapserver.routes.grid_search import LEAST_COST
-from mapserver.routes.least_cost import Terrain, cost_of, least_cost_line, reaches
+from mapserver.routes.least_cost import CostField, cost_of, least_cost_line, reaches
 from tests.reference.least_cost import least_cost
 
 
-def even(size: int = 100, resistance: float = 0.02, crawl: float = math.inf) -> Terrain:
+def even(size: int = 100, resistance: float = 0.02, crawl: float = math.inf) -> CostField:
     flat = np.zeros((size, size))
-    return Terrain(flat + resistance, flat, flat, np.ones((size, size), bool), 1.0, crawl)
+    return CostField(flat + resistance, flat, flat, np.ones((size, size), bool), 1.0, crawl)
 
 
-def rough(seed: int, size: int = 120) -> Terrain:
+def rough(seed: int, size: int = 120) -> CostField:
     """Hills, and patches of sand and of paved ground."""
     rng = np.random.default_rng(seed)
     height = gaussian_filter(rng.standard_normal((size, size)), 20)
@@ -25,10 +25,10 @@ def rough(seed: int, size: int = 120) -> Terrain:
     patches = gaussian_filter(rng.standard_normal((size, size)), 8)
     patches /= patches.std()
     resistance = np.select([patches > 1.4, patches > 0.6, patches < -1.0], [0.25, 0.06, 0.012], 0.03)
-    return Terrain(resistance, east, north, np.ones((size, size), bool), 1.0)
+    return CostField(resistance, east, north, np.ones((size, size), bool), 1.0)
 
 
-def line_of(terrain: Terrain, start: tuple[int, int], end: tuple[int, int]) -> tuple[np.ndarray, float]:
+def line_of(terrain: CostField, start: tuple[int, int], end: tuple[int, int]) -> tuple[np.ndarray, float]:
     result = least_cost_line(terrain, start, end)
     assert result
     return result

@@ -16,7 +16,7 @@ from agents.drivers.line import Line
 from protocol.machine.readings import Encoder, Gps, GpsVelocity, Reading
 from sim.config import SimConfig
 from sim.receivers.epoch import GEOID_M
-from sim.receivers.receiver import Receiver, Wiring, wire
+from sim.receivers.receiver import SimulatedReceiver, Wiring, wire
 from sim.simulator import Simulator
 
 pytestmark = pytest.mark.slow
@@ -30,7 +30,7 @@ class Driven:
         config = SimConfig("loading", world="fast", machines=1, seed=seed, seconds=SECONDS, receivers=format_)
         with closing(Simulator(replace(config, preset=preset))) as simulator:
             self.wirings = wire(simulator.scenario.rigs()[0], format_)
-            receivers = [Receiver(wiring) for wiring in self.wirings]
+            receivers = [SimulatedReceiver(wiring) for wiring in self.wirings]
             self.readings, self.sent = list[Reading](), [b""] * len(receivers)
             for _ in range(simulator.bundles or 0):
                 (span,) = simulator.advance().values()

@@ -18,8 +18,8 @@ from sim.config import resolve
 from sim.scenario.file import load_scenario
 from sim.truth import TruthMap
 from sitegrid.cli import main
+from sitegrid.command_line import build_parser
 from sitegrid.commands import agent, sim
-from sitegrid.door import build_parser
 from tests.paths import ROOT
 
 MACHINE = load_scenario("paper_site").rigs()[0].machine

@@ -32,11 +32,11 @@ from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import MACHINES, NamedMachine
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
-from sitegrid.asking import PAST_S
 from sitegrid.cli import main
 from sitegrid.client import Client
+from sitegrid.command_line import build_parser
 from sitegrid.commands import query
-from sitegrid.door import build_parser
+from sitegrid.follower_choice import PAST_S
 from tests.paths import GOLDEN
 from tests.unit.records import STORE, map_info, version
 

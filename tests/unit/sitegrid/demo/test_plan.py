@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from protocol.errors import ConfigError
+from sitegrid.command_line import build_parser
 from sitegrid.demo.plan import DemoPlan, make_plan, start_sim
 from sitegrid.demo.run import stays
-from sitegrid.door import build_parser
 from tests.paths import ROOT
 
 

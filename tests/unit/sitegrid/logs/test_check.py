@@ -12,7 +12,7 @@ import pytest
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Odometry
 from sitegrid.doctor import Level
-from sitegrid.logs.check import Examined, examine
+from sitegrid.logs.check import LogCheck, examine
 from sitegrid.logs.speeds import wheel_distance, wheel_share
 from tests.unit.sitegrid.logs.data import MANIFEST, START_S, edit, write_circle
 
@@ -24,7 +24,7 @@ def circle(tmp_path: Path) -> Path:
     return write_circle(tmp_path)
 
 
-def said(examined: Examined, check: str) -> str:
+def said(examined: LogCheck, check: str) -> str:
     """All lines about a subject, which are one line each."""
     lines = [str(finding) for finding in examined.findings if finding.check == check]
     assert all("\n" not in line for line in lines)

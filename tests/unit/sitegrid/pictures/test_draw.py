@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.pictures.plotter import Track
+from mapserver.pictures.plotter import DrawnTrack
 from protocol.errors import ConfigError, QueryError
 from protocol.queries.answers import Region
 from protocol.queries.route_requests import RouteQuery, WayQuery
@@ -49,7 +49,7 @@ def test_cells_of_another_size_are_refused(truth: TruthMap):
         truth_layers(truth, region(10, 20, 2, 2, cell_m=2.0))
 
 
-TRACKS = [Track("loader-1", np.zeros(2), np.zeros(2))]
+TRACKS = [DrawnTrack("loader-1", np.zeros(2), np.zeros(2))]
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ TRACKS = [Track("loader-1", np.zeros(2), np.zeros(2))]
         (np.nan, np.nan, [], "Rolling resistance"),
     ],
 )
-def test_a_map_without_resistance_says_why(resistance: float, grade: float, tracks: list[Track], title: str):
+def test_a_map_without_resistance_says_why(resistance: float, grade: float, tracks: list[DrawnTrack], title: str):
     known = region(0, 0, 2, 2)
     layers = {"resistance": resistance, "grade_east": grade, "grade_north": grade}
     known = Region(

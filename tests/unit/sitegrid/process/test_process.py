@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sitegrid.door import build_parser
+from sitegrid.command_line import build_parser
 from sitegrid.process import progress
 from sitegrid.process.children import Children, ProcessError
 from sitegrid.process.progress import COMPILING, Display

@@ -19,7 +19,7 @@ from sitegrid.doctor import Level, folder
 from sitegrid.doctor.folder import examine_folder
 from sitegrid.setup import files
 from sitegrid.setup.files import Folder, models
-from sitegrid.setup.hearing import Heard
+from sitegrid.setup.hearing import HeardLine
 from tests.unit.agents.drivers.frames import TPV, pvt, report, ubx
 from tests.unit.sitegrid.setup.test_listening import IMU, INDOORS
 
@@ -68,14 +68,17 @@ def test_a_second_machine_keeps_the_site_that_is_there(tmp_path: Path, recording
 @pytest.mark.parametrize(
     "every",
     [
-        [Heard("/dev/ttyACM0", "ubx", 115_200, streams=(*GNSS, "heading", "imu", "wheels"))],
-        [Heard("/dev/ttyUSB0", "nmea", 9600, streams=GNSS), Heard('C:\\"x"', "nmea", streams=(*GNSS, "heading"))],
-        [Heard("tcp://127.0.0.1:2947", "gpsd", streams=GNSS)],
+        [HeardLine("/dev/ttyACM0", "ubx", 115_200, streams=(*GNSS, "heading", "imu", "wheels"))],
+        [
+            HeardLine("/dev/ttyUSB0", "nmea", 9600, streams=GNSS),
+            HeardLine('C:\\"x"', "nmea", streams=(*GNSS, "heading")),
+        ],
+        [HeardLine("tcp://127.0.0.1:2947", "gpsd", streams=GNSS)],
     ],
     ids=["all streams", "two receivers", "gpsd"],
 )
 def test_what_is_written_for_any_model_and_receivers_is_read_back(
-    tmp_path: Path, model: str, every: list[Heard]
+    tmp_path: Path, model: str, every: list[HeardLine]
 ) -> None:
     made = Folder(tmp_path / "made")
     files.write(made, files.site_text("pit", (-33.9, 18.4, 0.0)), files.agent_text("m-1", model, every))

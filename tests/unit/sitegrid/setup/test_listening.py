@@ -21,7 +21,7 @@ import pytest
 from agents.drivers.transports import serial_ports, why_closed
 from protocol.errors import ConfigError
 from sim.receivers.nmea import sentence as nmea
-from sitegrid.setup.hearing import Ear, Heard
+from sitegrid.setup.hearing import Ear, HeardLine
 from sitegrid.setup.listening import address_of, listen, listen_to
 from sitegrid.setup.summary import block, missing
 from tests.unit.agents.drivers.frames import GGA, RMC, TPV, esf, pvt, report, ubx
@@ -217,5 +217,5 @@ def test_ports_go_by_the_names_that_survive_replugging(tmp_path: Path) -> None:
 def test_what_is_missing_is_said_for_position_slope_and_resistance(
     streams: tuple[str, ...], sentences: tuple[str, ...]
 ) -> None:
-    said = missing([Heard("a", "ubx", streams=streams)]).values()
+    said = missing([HeardLine("a", "ubx", streams=streams)]).values()
     assert all(want in one for want, one in itertools.zip_longest(sentences, said, fillvalue="-"))

@@ -3,7 +3,7 @@
 import pytest
 
 from protocol.errors import MessageError, Refusal
-from protocol.wire.heard import MOST_NAMES
+from protocol.wire.latest_values import MOST_NAMES
 from protocol.wire.messages import Health, Pose
 from sitegrid.web import machines
 from sitegrid.web.machines import MOST_IN_ALL, MOST_POSES, SILENT_S, Machines

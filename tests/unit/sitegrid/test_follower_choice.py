@@ -17,9 +17,9 @@ from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import pack
 from protocol.wire.messages import VERSION
-from sitegrid import asking
-from sitegrid.asking import Asker, preferred
+from sitegrid import follower_choice
 from sitegrid.client import Client
+from sitegrid.follower_choice import Asker, preferred
 from sitegrid.whole_answers import REGION_ATTEMPTS
 from tests.unit.records import STORE, map_info, version
 
@@ -72,7 +72,7 @@ class Site:
 
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch):
-    monkeypatch.setattr(asking, "AGAIN_S", 0.001)
+    monkeypatch.setattr(follower_choice, "AGAIN_S", 0.001)
 
 
 def asker(site: Site, timeout_s: float = 10.0) -> Asker:
@@ -118,7 +118,7 @@ def test_one_that_dies_or_hangs_is_replaced_and_not_asked_again_for_a_while(sile
 def test_where_all_followers_are_silent_the_server_is_asked():
     site = Site(a=SILENT, b=SILENT, c=SILENT)
     assert asker(site).ask(PointQuery(0, 0)).origin == Origin()
-    assert len(site.asked) == asking.FOLLOWERS_TRIED + 1
+    assert len(site.asked) == follower_choice.FOLLOWERS_TRIED + 1
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_a_follower_is_given_a_second_for_a_row_and_the_server_all_of_the_wait()
     site = Site(a=QueryError(Refusal.AFTER_TIMEOUT, "not yet"))
     asker(site).ask(PointQuery(0, 0, after=7, wait_s=30.0))
     waits = [split_selector(parameters)["wait"] for _, parameters in site.asked]
-    assert [float(wait) for wait in waits] == [asking.FOLLOWER_WAIT_S, 30.0]
+    assert [float(wait) for wait in waits] == [follower_choice.FOLLOWER_WAIT_S, 30.0]
 
 
 def test_what_only_the_server_knows_is_asked_of_it_alone():

@@ -1,11 +1,11 @@
 """Names are made up where there are no keys: they are few, nobody who speaks is forgotten, and the silent make room."""
 
-from protocol.wire.heard import MOST_NAMES, SILENT_S, Heard
+from protocol.wire.latest_values import MOST_NAMES, SILENT_S, LatestValues
 
 
 def test_who_speaks_keeps_its_place_and_the_silent_make_room():
     now_s = 0.0
-    heard: Heard[int] = Heard(lambda: now_s)
+    heard: LatestValues[int] = LatestValues(lambda: now_s)
     assert heard.hear("loader-1", 0)
     for i in range(2 * MOST_NAMES):
         assert heard.hear(f"made-up-{i}", i) == (i < MOST_NAMES - 1)

@@ -39,7 +39,7 @@ ADVICE = {
     errno.EMFILE: "raise the limit of open files (`ulimit -n`)",
     errno.EADDRINUSE: "end the process that listens there, or choose another port",
 }
-log = logging.getLogger("sitegrid.door")
+log = logging.getLogger("sitegrid.command_line")
 
 
 def run(words: Sequence[str], commands: ModuleType = commands, program: str = "sitegrid") -> int:

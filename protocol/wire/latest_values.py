@@ -11,7 +11,7 @@ MOST_NAMES = 1000
 SILENT_S = 60.0  # a name that was silent for so long makes room for another one; agents speak every second
 
 
-class Heard(Generic[T]):
+class LatestValues(Generic[T]):
     """Values by name, and when each was heard last [s of the clock]; not for several threads at once."""
 
     def __init__(self, clock: Callable[[], float], most: int = MOST_NAMES) -> None:
