@@ -25,7 +25,7 @@ import zenoh
 
 from protocol.errors import LinkError, MessageError, StoreError
 from protocol.wire import keys
-from protocol.wire.codec import take
+from protocol.wire.fields import take
 from protocol.wire.owners import ANSWER_S, EVERY_OTHER, Owner, decode_owner, encode_owner, this_process
 
 ROUNDS = 2  # without an answer: the first question after a reconnection may find nobody (Zenoh issue 2767)

@@ -52,7 +52,7 @@ from protocol.site.site_config import KnownGround
 from protocol.version import package_version
 from sitegrid.client import Client, connect
 from sitegrid.listener import Listener
-from sitegrid.map_region import MapRegion
+from sitegrid.notebook import MapRegion
 
 __all__ = ["Client", "Listener", "connect"]
 __all__ += ["ConfigError", "LinkError", "MessageError", "QueryError", "SitegridError"]

@@ -25,7 +25,6 @@ from protocol.queries.answers import (
 from protocol.queries.calibration import CalibrationAnswer
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand
 from protocol.queries.origin import SERVER, Origin
-from protocol.queries.pieces import Progress
 from protocol.queries.places import Place, around, where_it_lies
 from protocol.queries.request import MapQuery, Request
 from protocol.queries.requests import (
@@ -45,13 +44,12 @@ from protocol.wire import keys
 from protocol.wire.session import DEFAULT_ENDPOINT, open_session
 from sitegrid.features.feature import projection_of
 from sitegrid.follower_choice import Answered, Asker
-from sitegrid.geo_table import to_geopandas
 from sitegrid.listener import Listener
-from sitegrid.map_region import MapRegion
+from sitegrid.notebook import MapRegion, to_geopandas
 from sitegrid.security.join import join
 from sitegrid.times import Time, parse_time
 from sitegrid.watch import AGAIN_S, watch, watch_async
-from sitegrid.whole_answers import whole_answer
+from sitegrid.whole_answers import Progress, whole_answer
 
 SOLVE_S = 30.0  # that the server has to calibrate a fleet for: a large one on a busy host
 Layers = str | Sequence[str]

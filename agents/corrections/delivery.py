@@ -14,7 +14,7 @@ from agents.drivers.transports import Transport, open_transport, why_closed
 from protocol.errors import MessageError
 from protocol.site.site_config import NAME
 from protocol.wire import keys
-from protocol.wire.correction_codec import decode_corrections
+from protocol.wire.codec import decode_corrections
 from protocol.wire.messages import Corrections
 
 WAITING = 50  # messages while a port holds the thread up: some seconds; then the oldest gives way

@@ -17,7 +17,7 @@ from agents.corrections.rtcm import rtcm_framer
 from agents.drivers.transports import Transport, open_transport, split_address, why_closed
 from protocol.errors import ConfigError, LinkError
 from protocol.site.site_config import SiteConfig
-from protocol.wire.correction_codec import encode_corrections
+from protocol.wire.codec import encode_corrections
 from protocol.wire.keys import check_name
 from protocol.wire.messages import Corrections
 

@@ -15,8 +15,8 @@ from mapserver.journal.rows import Event
 from mapserver.trust import decisions as trust
 from mapserver.trust.decisions import TrustDecision, TrustDecisions
 from protocol.errors import StoreError
+from protocol.wire.codec import encode_offer
 from protocol.wire.messages import CalibrationOffer
-from protocol.wire.offer_codec import encode_offer
 
 Decision = TrustDecision | CalibrationDecision
 KINDS = (trust.KIND, calibration.KIND)

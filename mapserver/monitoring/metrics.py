@@ -20,7 +20,8 @@ from prometheus_client.registry import Collector
 
 from protocol.errors import ConfigError, MessageError
 from protocol.wire import keys
-from protocol.wire.codec import MAX_SMALL_BYTES, decode_health
+from protocol.wire.codec import decode_health
+from protocol.wire.fields import MAX_SMALL_BYTES
 from protocol.wire.latest_values import LatestValues
 
 _REFUSED, _REFUSED_QUERY = "refused_", "refused_query_"

@@ -16,7 +16,7 @@ from protocol.arrays import Floats, Floats32
 from protocol.errors import MessageError, QueryError, Refusal
 from protocol.queries import answers
 from protocol.site.geometry import MAX_CELLS
-from protocol.wire.codec import MAX_SMALL_BYTES, check_plain, pack, take, take_store, unpack
+from protocol.wire.fields import MAX_SMALL_BYTES, check_plain, pack, take, take_store, unpack
 
 MAX_REPLY_BYTES = 2**23  # a piece has 0.8 MB, a history of 2000 spans 1 MB
 MAX_CHANGES = 1000  # of one answer

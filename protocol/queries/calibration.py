@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_record
-from protocol.wire.codec import pack, unpack
+from protocol.wire.fields import pack, unpack
 
 
 @dataclass(frozen=True)

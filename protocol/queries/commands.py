@@ -12,7 +12,7 @@ from protocol.queries.answers import MapInfo, TrustAnswer
 from protocol.queries.calibration import CalibrationAnswer, decode_calibration, encode_calibration
 from protocol.queries.parameters import LINE, MAX_WAIT_S, choice, name_of, number, refusal
 from protocol.queries.request import Codec, Request, asked, parse
-from protocol.wire.codec import STORE_ID
+from protocol.wire.fields import STORE_ID
 
 # By which a person may correct: an accelerometer that lies on its side, a torque that reads twice or half as much.
 MOST_OFF = {"zero": 0.5, "scale": 0.9, "across": 0.5}

@@ -9,7 +9,7 @@ from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_recor
 from protocol.queries.parameters import RECTANGLE
 from protocol.queries.request import AsOf, Codec, Fresh, Size, asked
 from protocol.site.geometry import Bounds
-from protocol.wire.codec import pack, unpack
+from protocol.wire.fields import pack, unpack
 
 
 @dataclass(frozen=True)

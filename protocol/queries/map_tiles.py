@@ -14,7 +14,8 @@ from protocol.errors import MessageError, QueryError, Refusal
 from protocol.queries.answers import MapVersion
 from protocol.queries.parameters import METRES, ValueForm, ValueKind, count, name_of
 from protocol.queries.request import AsOf, Codec, Group, Parameter, Size, asked, grouped
-from protocol.wire.codec import MAX_SEQ, pack, take, unpack
+from protocol.wire.codec import MAX_SEQ
+from protocol.wire.fields import pack, take, unpack
 
 TILE_CELLS = 64
 AREA = TILE_CELLS * TILE_CELLS

@@ -9,7 +9,7 @@ import math
 from dataclasses import asdict, dataclass
 
 from protocol.errors import MessageError, Refusal
-from protocol.wire.codec import MAX_SMALL_BYTES, pack, take, take_name, unpack
+from protocol.wire.fields import MAX_SMALL_BYTES, pack, take, take_name, unpack
 
 SHOWN_S = 10.0  # behind: a follower that is more is not offered to clients, until it has caught up
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_record
-from protocol.wire.codec import pack, unpack
+from protocol.wire.fields import pack, unpack
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from protocol.queries.answer_codec import MAX_ITEMS, MAX_REPLY_BYTES, take_recor
 from protocol.queries.parameters import LINE, RECTANGLE, STAMP, check_order, count, number
 from protocol.queries.request import AsOf, Codec, Fresh, asked
 from protocol.site.geometry import Bounds
-from protocol.wire.codec import pack, unpack
+from protocol.wire.fields import pack, unpack
 
 Corners = tuple[tuple[float, ...], ...]
 MAX_LIMIT = 1000  # stretches of one worklist

@@ -19,7 +19,7 @@ from protocol.queries.answer_codec import (
 )
 from protocol.queries.answers import MapVersion
 from protocol.units import DIESEL_J_PER_L
-from protocol.wire.codec import pack, take, unpack
+from protocol.wire.fields import pack, take, unpack
 
 MAX_MASS_KG = 1e6
 MAX_ROTATING = 2.0

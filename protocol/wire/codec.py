@@ -1,126 +1,48 @@
 """Messages to bytes and back, with full validation: a MessageError names the field (and row) that is wrong."""
 
-import math
-import re
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
-import msgpack
 import numpy as np
 
-from protocol.errors import MessageError, Refusal
+from protocol.errors import MessageError, Refusal, one_line
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
 from protocol.machine.samples import COLUMNS, LIMITS, OPTIONAL, SAMPLE_DTYPE, check_samples, empty
-from protocol.site.site_config import MAX_EXTENT_M, NAME
-from protocol.wire.messages import VERSION, Ack, Health, PackedBatch, Pose, Refused, SampleBatch, SensorBundle
+from protocol.site.site_config import MAX_EXTENT_M
+from protocol.wire.fields import (
+    MAX_INT,
+    MAX_SMALL_BYTES,
+    pack,
+    take,
+    take_int,
+    take_name,
+    take_plain,
+    take_stamp,
+    take_store,
+    unpack,
+)
+from protocol.wire.messages import (
+    Ack,
+    CalibrationOffer,
+    Corrections,
+    Health,
+    PackedBatch,
+    Pose,
+    Refused,
+    SampleBatch,
+    SensorBundle,
+)
 
 MAX_BATCH_BYTES = 4 * 2**20
 MAX_BATCH_SAMPLES = 20_000
 MAX_BUNDLE_BYTES = 2**20
-MAX_SMALL_BYTES = 64 * 2**10
-MAX_ITEMS = 1000  # of one list, except in answers: the decoder reserves memory for what a header claims
-MAX_DEPTH = 16  # of plain values
-MAX_U64 = 2**64 - 1
 MAX_SEQ = 2**62
-MAX_INT = 2**64 - 1  # of MessagePack
 MAX_RETRY_S = 3600.0
+MAX_CORRECTIONS_BYTES = 16 * 2**10  # a second of a base with all satellites and signals has some 2 kB
+MOST_VAR = 1.0  # of zero and scale of an offer: more is no knowledge
 _WIDTHS = tuple(SAMPLE_DTYPE[name].itemsize for name in COLUMNS)
 _STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value in OPTIONAL.items()}
-STORE_ID = re.compile(r"[0-9a-f]{16}")
-
-
-def pack(table: dict[str, Any]) -> bytes:
-    """MessagePack with the protocol's version in front; an integer beyond its 64 bits is the greatest that it has."""
-    packed: bytes = msgpack.packb({"v": VERSION, **table}, default=_fitting)
-    return packed
-
-
-def _fitting(value: Any) -> int:
-    """A sum of what machines say that they lost may be any number: it must not keep all others from being read."""
-    if type(value) is int and value > MAX_INT:
-        return MAX_INT
-    raise TypeError(f"{type(value).__name__} is no value of MessagePack")
-
-
-def unpack(data: bytes, limit: int, items: int = MAX_ITEMS) -> dict[str, Any]:
-    """Undo `pack`; refuses what is too long, no MessagePack map, or of another version. items: most in one list."""
-    if len(data) > limit:
-        raise MessageError(Refusal.TOO_LARGE, f"{len(data)} bytes, at most {limit} are allowed")
-    try:
-        table = msgpack.unpackb(data, max_array_len=min(items, len(data)))
-    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
-        raise MessageError(Refusal.NOT_MSGPACK, f"not MessagePack, or cut off: {error}") from None
-    if not isinstance(table, dict):
-        raise MessageError(Refusal.NOT_MSGPACK, "not a MessagePack map")
-    if (version := take(table, "v", int)) != VERSION:
-        raise MessageError(Refusal.VERSION, f"{version}: this side speaks version {VERSION}", field="v")
-    return table
-
-
-def take(table: dict[str, Any], name: str, kind: type[Any], default: Any = None) -> Any:
-    """Take one field of the given type; a default makes it optional."""
-    value: Any = table.get(name, default)
-    if value is None:
-        raise MessageError(Refusal.MISSING_FIELD, "missing", field=name)
-    if kind is float and type(value) is int:
-        value = float(value)
-    if type(value) is not kind:
-        raise MessageError(Refusal.WRONG_TYPE, f"{kind.__name__} expected, not {type(value).__name__}", field=name)
-    if kind is float and not math.isfinite(value):
-        raise MessageError(Refusal.NOT_FINITE, f"{value} is not finite", field=name)
-    return value
-
-
-def check_plain(value: Any, field: str, depth: int = MAX_DEPTH) -> None:
-    """Refuse what is no plain value: bytes, MessagePack's own types, and tables deeper than `depth`."""
-    if depth < 0:
-        raise MessageError(Refusal.WRONG_TYPE, f"nested more than {MAX_DEPTH} deep", field=field)
-    if isinstance(value, dict):
-        for name, part in value.items():
-            if type(name) is not str:
-                raise MessageError(Refusal.WRONG_TYPE, f"the name {name!r:.40} is no text", field=field)
-            check_plain(part, field, depth - 1)
-    elif isinstance(value, list):
-        for part in value:
-            check_plain(part, field, depth - 1)
-    elif not isinstance(value, str | int | float | None):
-        raise MessageError(Refusal.WRONG_TYPE, f"{type(value).__name__} is no plain value", field=field)
-
-
-def take_plain(table: dict[str, Any], name: str) -> dict[str, Any]:
-    """Take a map of plain values, which can be shown as they are."""
-    values: dict[str, Any] = take(table, name, dict)
-    check_plain(values, name)
-    return values
-
-
-def _take_int(table: dict[str, Any], name: str, low: int, high: int, reason: Refusal = Refusal.OUT_OF_RANGE) -> int:
-    value: int = take(table, name, int)
-    if not low <= value <= high:
-        raise MessageError(reason, f"{value} is not between {low} and {high}", field=name)
-    return value
-
-
-def take_name(table: dict[str, Any], field: str = "machine") -> str:
-    """Take a name."""
-    name: str = take(table, field, str)
-    if not NAME.fullmatch(name):
-        raise MessageError(Refusal.OUT_OF_RANGE, f"{name[:70]!r} is not a name", field=field)
-    return name
-
-
-def take_store(table: dict[str, Any], name: str = "store", *, optional: bool = False) -> str:
-    """Take the id of a store; empty where it is optional and missing."""
-    text: str = take(table, name, str, "" if optional else None)
-    if not STORE_ID.fullmatch(text) and (text or not optional):
-        raise MessageError(Refusal.OUT_OF_RANGE, f"{text[:40]!r} is no id of a store", field=name)
-    return text
-
-
-def take_stamp(table: dict[str, Any]) -> int:
-    """Take `stamp_ns`."""
-    return _take_int(table, "stamp_ns", 1, MAX_STAMP_NS)
 
 
 # --- samples ---------------------------------------------------------------------------------------------------------
@@ -159,12 +81,12 @@ def decode_batch(data: bytes, extent_m: float) -> SampleBatch:
 def unpack_batch(data: bytes) -> PackedBatch:
     """Check all of a batch but its samples."""
     table = unpack(data, MAX_BATCH_BYTES)
-    n = _take_int(table, "n", 0, MAX_BATCH_SAMPLES, Refusal.TOO_LARGE)
-    first_seq = _take_int(table, "first_seq", 1, MAX_SEQ - max(0, n - 1), Refusal.FIRST_SEQ)
-    lost_before = _take_int({"lost_before": 0, **table}, "lost_before", 0, first_seq - 1)
+    n = take_int(table, "n", 0, MAX_BATCH_SAMPLES, Refusal.TOO_LARGE)
+    first_seq = take_int(table, "first_seq", 1, MAX_SEQ - max(0, n - 1), Refusal.FIRST_SEQ)
+    lost_before = take_int({"lost_before": 0, **table}, "lost_before", 0, first_seq - 1)
     batch = SampleBatch(
         machine=take_name(table),
-        spool_id=_take_int(table, "spool_id", 1, MAX_U64),
+        spool_id=take_int(table, "spool_id", 1, MAX_INT),
         first_seq=first_seq,
         rows=empty(),
         frame=take(table, "frame", str),
@@ -202,11 +124,11 @@ def decode_reply(data: bytes) -> Ack | Refused:
     """Undo `encode_reply`."""
     table = unpack(data, MAX_SMALL_BYTES)
     if take(table, "ack", bool):
-        watermark, row, trimmed = (_take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
+        watermark, row, trimmed = (take_int(table, name, 0, MAX_SEQ) for name in ("watermark", "row", "trimmed"))
         replaces = take_store(table, "replaces", optional=True)
-        epoch = _take_int(table, "epoch", 0, MAX_SEQ) if "epoch" in table else 0
+        epoch = take_int(table, "epoch", 0, MAX_SEQ) if "epoch" in table else 0
         return Ack(watermark, row, trimmed, take_store(table), replaces, table.get("offer"), epoch)
-    expected, retry_after_s = _take_int(table, "expected", 0, MAX_SEQ), take(table, "retry_after_s", float, 0.0)
+    expected, retry_after_s = take_int(table, "expected", 0, MAX_SEQ), take(table, "retry_after_s", float, 0.0)
     if not 0 <= retry_after_s <= MAX_RETRY_S:
         problem = f"{retry_after_s} is not between 0 and {MAX_RETRY_S}"
         raise MessageError(Refusal.OUT_OF_RANGE, problem, field="retry_after_s")
@@ -246,7 +168,7 @@ def decode_bundle(data: bytes) -> SensorBundle:
     readings.sort(key=lambda r: r.stamp_ns)
     return SensorBundle(
         machine=take_name(table),
-        counter=_take_int(table, "counter", 1, MAX_SEQ),
+        counter=take_int(table, "counter", 1, MAX_SEQ),
         readings=tuple(readings),
         last=take(table, "last", bool, default=False),
         refused=dict(refused),
@@ -257,7 +179,7 @@ def _decode_group(group: dict[str, Any], refused: Counter[str]) -> list[Reading]
     sensor, kind = take_name(group, "sensor"), take(group, "kind", str)
     if kind not in KINDS:
         raise MessageError(Refusal.OUT_OF_RANGE, f"{kind[:40]!r} is none of {', '.join(KINDS)}", field="kind")
-    n, cols = _take_int(group, "n", 0, MAX_BATCH_SAMPLES), take(group, "cols", dict)
+    n, cols = take_int(group, "n", 0, MAX_BATCH_SAMPLES), take(group, "cols", dict)
     arrays = []
     for name in ("stamp_ns", *columns(kind)):
         data: bytes = take(cols, name, bytes)
@@ -314,5 +236,51 @@ def encode_health(health: Health) -> bytes:
 def decode_health(data: bytes) -> Health:
     """Undo `encode_health`."""
     table = unpack(data, MAX_SMALL_BYTES)
-    stamp_ns = _take_int(table, "stamp_ns", 0, MAX_STAMP_NS)  # 0: nothing was read yet
+    stamp_ns = take_int(table, "stamp_ns", 0, MAX_STAMP_NS)  # 0: nothing was read yet
     return Health(take_name(table), stamp_ns, take_plain(table, "values"))
+
+
+# --- corrections ------------------------------------------------------------------------------------------------------
+
+
+def encode_corrections(message: Corrections) -> bytes:
+    """What a relay says of its base."""
+    return pack(vars(message))
+
+
+def decode_corrections(data: bytes, base: str) -> Corrections:
+    """Undo `encode_corrections`; refused where it is of another base than this one."""
+    table = unpack(data, MAX_CORRECTIONS_BYTES)
+    if (sender := take_name(table, "base")) != base:
+        raise MessageError(Refusal.OUT_OF_RANGE, f"of {sender}, on the key of {base}", field="base")
+    problem = one_line(take(table, "problem", str, ""))
+    return Corrections(sender, take_stamp(table), take(table, "frames", bytes), problem)
+
+
+# --- offers of a calibration ------------------------------------------------------------------------------------------
+
+
+def encode_offer(offer: CalibrationOffer) -> dict[str, Any]:
+    """The table."""
+    return asdict(offer)
+
+
+def decode_offer(table: Any) -> CalibrationOffer:
+    """Undo `encode_offer`; refused where a value is not plausible."""
+    if not isinstance(table, dict):
+        raise MessageError(Refusal.WRONG_TYPE, f"map expected, not {type(table).__name__}", field="offer")
+    names = ("zero", "scale", "zero_var", "scale_var", "covariance")
+    values = {name: take(table, name, float) for name in names}
+    for name in ("zero", "scale"):
+        low, high = LIMITS[f"applied_{name}"]
+        _check(low <= values[name] <= high, name, f"{values[name]} is not between {low} and {high}")
+        variance = values[f"{name}_var"]
+        _check(0 < variance <= MOST_VAR, f"{name}_var", f"{variance} is not above 0, up to {MOST_VAR}")
+    product = values["zero_var"] * values["scale_var"]
+    _check(values["covariance"] ** 2 < product, "covariance", "not positive definite")
+    return CalibrationOffer(take_name(table), take_stamp(table), **values)
+
+
+def _check(holds: bool, field: str, problem: str) -> None:  # noqa: FBT001
+    if not holds:
+        raise MessageError(Refusal.OUT_OF_RANGE, problem, field=field)

@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from protocol.errors import MessageError
-from protocol.wire.codec import MAX_SMALL_BYTES, pack, take, unpack
+from protocol.wire.fields import MAX_SMALL_BYTES, pack, take, unpack
 
 ANSWER_S = 1.0  # how long to wait for answers
 # Every process but this one, each with its own answer.

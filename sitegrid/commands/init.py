@@ -41,7 +41,7 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Listen, ask, write."""
     from sitegrid.setup import files
-    from sitegrid.setup.summary import block, missing
+    from sitegrid.setup.hearing import block, missing
 
     folder = files.Folder(arguments.folder)
     if folder.agent_file.exists():
@@ -116,8 +116,8 @@ def _answer(given: str | None, option: str, question: str, default: str, parse: 
 def _receivers(arguments: Namespace) -> list[HeardLine]:
     """What a driver reads, of all that is there; ConfigError where that is nothing, or not what was named."""
     from agents.drivers.transports import serial_ports
+    from sitegrid.setup.hearing import NO_PORT
     from sitegrid.setup.listening import address_of, listen_to
-    from sitegrid.setup.summary import NO_PORT
 
     addresses = [address_of(port) for port in arguments.ports] or serial_ports()
     if not addresses:

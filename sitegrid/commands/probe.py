@@ -21,8 +21,8 @@ def add_options(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> int:
     """Listen and tell; 1 where nothing talks that a driver reads."""
     from agents.drivers.transports import serial_ports
+    from sitegrid.setup.hearing import NO_PORT, block, missing
     from sitegrid.setup.listening import address_of, listen_to
-    from sitegrid.setup.summary import NO_PORT, block, missing
 
     addresses = [address_of(port) for port in arguments.ports] or serial_ports()
     if addresses and not arguments.json:

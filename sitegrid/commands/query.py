@@ -29,7 +29,6 @@ from protocol.queries.answers import (
     ServerAlive,
 )
 from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
-from protocol.queries.pieces import Progress
 from protocol.queries.places import where_it_lies
 from protocol.queries.request import Compared, MapQuery
 from protocol.queries.requests import (
@@ -56,6 +55,7 @@ from sitegrid.process import streams
 from sitegrid.process.lifetime import note, plain, say, stop_flag, tell, wait
 from sitegrid.process.progress import EVERY_S
 from sitegrid.times import utc_text
+from sitegrid.whole_answers import Progress
 
 HELP = "ask the map"
 Answer = tuple[Any, Iterable[str]]  # a table for programs; lines for people

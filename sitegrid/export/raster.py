@@ -10,7 +10,7 @@ from rasterio.io import MemoryFile
 from rasterio.shutil import copy
 
 from sitegrid.export.wanted import Wanted
-from sitegrid.map_region import unit_of
+from sitegrid.notebook import unit_of
 from sitegrid.times import iso
 
 CACHE_MB = 8  # of GDAL's blocks; its default is a twentieth of the host's memory

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from protocol.wire import keys
-from protocol.wire.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_SMALL_BYTES
-from protocol.wire.correction_codec import MAX_CORRECTIONS_BYTES
+from protocol.wire.codec import MAX_BATCH_BYTES, MAX_BUNDLE_BYTES, MAX_CORRECTIONS_BYTES
+from protocol.wire.fields import MAX_SMALL_BYTES
 from sitegrid.security.register import Register, common_name
 
 POSE_HZ, HEALTH_HZ = 50.0, 10.0  # of one link; poses come with 5 Hz, at ten times real time with 50

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 from agents.corrections.rtcm import RTCM, RTCM_FRAMING, message_number
-from agents.drivers.formats import FIX, HEADING, STREAMS, VELOCITY, Message
+from agents.drivers.formats import FIX, HEADING, IMU, STREAMS, VELOCITY, Message
 from agents.drivers.formats.framing import FRAMINGS, GPSD, NMEA, UBX, Frame, Framer
 from agents.drivers.line import DECODERS
 from agents.drivers.receiver import why_unplaced
@@ -28,6 +29,7 @@ PROMISED = {
 # Formats that no driver reads, by how their messages begin.
 FOREIGN = {b"$@": "SBF (Septentrio)", b"\xaaD\x12": "NovAtel's binary", b"\xa0\xa2": "SiRF's binary"}
 MANY, MOST_BETWEEN = 3, 2000  # such beginnings, and bytes from one to the next, are no chance
+NO_PORT = "no serial port is there: plug a receiver in, or name an address (tcp://HOST:PORT, udp://:PORT, gpsd, a file)"
 
 
 @dataclass(frozen=True)
@@ -162,3 +164,30 @@ def _sender(frame: Frame) -> str:
     if frame.format == NMEA:
         return frame.data[1:3].decode("ascii", "replace").lower()
     return str(json.loads(frame.data).get("device", "")) if frame.format == GPSD else ""
+
+
+def block(heard: HeardLine) -> list[str]:
+    """The address, then what comes there and what hinders it."""
+    baud = f" at {heard.baud} baud" if heard.baud else ""
+    rates = ", ".join(f"{name} {f'{hz:g} Hz' if hz else 'once'}" for name, hz in heard.messages.items())
+    said = [f"{heard.kind or 'no driver reads this'}{baud}: {rates}"] if heard.messages else []
+    if heard.streams:
+        said.append(f"feeds: {', '.join(heard.streams)}")
+    if heard.place:
+        lat_deg, lon_deg, height_m = heard.place
+        accuracy = "accuracy not stated" if heard.accuracy_m is None else f"within {heard.accuracy_m:.2g} m"
+        fix = f"{heard.quality}, {heard.satellites} satellites, {accuracy}"
+        said.append(f"fix: {fix}, at {lat_deg:.6f} {lon_deg:.6f}, {height_m:.1f} m")
+    if heard.utc_ns:
+        said.append(f"time: {datetime.fromtimestamp(heard.utc_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC")
+    return [heard.address, *(f"  {line}" for line in (*said, heard.problem) if line)]
+
+
+def missing(every: Sequence[HeardLine]) -> dict[str, str]:
+    """What an agent lacks that is fed by these, a sentence for each thing that it cannot know."""
+    streams = {stream for heard in every for stream in heard.streams}
+    lacks = {} if FIX in streams else {"position": "no receiver: no position, so no sample"}
+    if IMU not in streams:
+        lacks["slope"] = "no IMU: no slope (of a u-blox with one: switch on ESF-MEAS or ESF-RAW)"
+    rest = "slope only" if IMU in streams else "no rolling resistance"
+    return lacks | {"resistance": f"no torque: {rest} (no receiver carries it: a driver of your own, or a log)"}

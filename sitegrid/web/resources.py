@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,11 @@ from protocol.queries.requests import (
     RegionQuery,
     WhyQuery,
 )
+from protocol.queries.roads import Segments, SegmentsQuery, Worklist, WorklistQuery
+from protocol.queries.route_requests import LineQuery, RouteQuery, WayQuery
 from sitegrid.features.feature import Collection
-from sitegrid.features.kinds import CHANGE, MACHINE, tracks
+from sitegrid.features.kinds import CHANGE, MACHINE, REPAIR, SEGMENT, WORK, tracks
 from sitegrid.features.zones import zones
-from sitegrid.web import roads
 from sitegrid.web.encoding import PIECE, ROOM, answered, as_json, beside, frame, pieces
 from sitegrid.web.resource import Resource, as_features, of_features, of_version, version_of
 from sitegrid.web.site import SiteFeed
@@ -157,8 +159,40 @@ async def track_features(feed: SiteFeed, _: None, more: Parameters) -> Response:
         return await as_features(feed, more, "tracks", tracks(feed.tracks()))
 
 
+async def segment_features(feed: SiteFeed, query: SegmentsQuery, more: Parameters) -> Response:
+    """Roads as lines."""
+    answer = await feed.answer_to(query)
+    return _of_map(await as_features(feed, more, "segments", Collection(SEGMENT, answer.segments)), answer)
+
+
+async def worklist_features(feed: SiteFeed, query: WorklistQuery, more: Parameters) -> Response:
+    """Stretches where work pays, as lines."""
+    answer = await feed.answer_to(query)
+    return _of_map(await as_features(feed, more, "worklist", Collection(WORK, answer.rows)), answer)
+
+
+async def repair_features(feed: SiteFeed, query: WorklistQuery, more: Parameters) -> Response:
+    """Stretches whose ground changed, as lines."""
+    answer = await feed.answer_to(query)
+    return _of_map(await as_features(feed, more, "repairs", Collection(REPAIR, answer.changes)), answer)
+
+
+async def drive(feed: SiteFeed, query: LineQuery, _: Parameters) -> Response:
+    """What a drive costs a machine, along a line that is given or that costs least."""
+    answer = await feed.answer_to(query)
+    totals = {**asdict(answer.totals), "litres": answer.totals.litres}
+    ground = {"line": answer.line_m, "totals": totals, "steps": vars(answer.steps), "machine": asdict(answer.machine)}
+    table = {**ground, **version_of(answer.version), "stamp_ns": answer.stamp_ns}
+    return of_version(await as_json(table), answer.version)
+
+
+def _of_map(response: Response, answer: Segments | Worklist) -> Response:
+    return of_version(response, MapVersion(answer.store, answer.merged, answer.fact))
+
+
 FORMAT = Parameter("format", "json or npz", name_of())
 BINARY = ("application/octet-stream",)
+REPAIRS = "Stretches that were repaired or became worse, as lines"
 ZONES = "Areas of one kind of ground"
 EVERY_TILE = tuple(parameters_of(TilesQuery))
 RESOURCES: dict[str, Resource] = {
@@ -172,7 +206,11 @@ RESOURCES: dict[str, Resource] = {
     "agents": Resource(agents, "What each machine says of itself: what it lacks, what waits", follows_now=True),
     "changes": Resource(changes, ChangesQuery.help, ChangesQuery, follows_now=True),
     "tiles": Resource(tiles, TilesQuery.help, TilesQuery, without=("place",), media=BINARY, follows_now=True),
-    **roads.RESOURCES,
+    "features/segments": of_features(segment_features, "Roads as lines", SegmentsQuery),
+    "features/worklist": of_features(worklist_features, "The worklist as lines", WorklistQuery),
+    "features/repairs": of_features(repair_features, REPAIRS, WorklistQuery, ("limit", "efficiency")),
+    "route": Resource(drive, RouteQuery.help, RouteQuery),
+    "way": Resource(drive, WayQuery.help, WayQuery),
     "features/zones": of_features(zone_features, ZONES, TilesQuery, EVERY_TILE, follows_now=False),
     "features/changes": of_features(change_features, "Changes of the ground as areas", ChangesQuery, ("after",)),
     "features/machines": of_features(machine_features, "Positions of machines"),

@@ -44,11 +44,10 @@ from protocol.queries.parameters import selector_of, split_selector
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import MAX_EXTENT_M, SiteConfig
 from protocol.site.site_file import load_site
-from protocol.wire.codec import receive_pose
+from protocol.wire.codec import decode_offer, encode_offer, receive_pose
 from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.keys import check_name, pose
 from protocol.wire.messages import SampleBatch
-from protocol.wire.offer_codec import decode_offer, encode_offer
 from sim.config import load_sim
 from sitegrid.logs.log_truth import read_known_ground, read_log_truth
 from sitegrid.security.register import Register, RegisterEntry, load_register, register_toml

@@ -52,7 +52,8 @@ from protocol.queries.roads import (
 )
 from protocol.queries.routing import RouteAnswer, RouteMachine, RouteSteps, RouteTotals, decode_answer, encode_answer
 from protocol.wire import codec
-from protocol.wire.correction_codec import decode_corrections, encode_corrections
+from protocol.wire.codec import decode_corrections, encode_corrections, encode_offer
+from protocol.wire.fields import MAX_SMALL_BYTES, take_plain, unpack
 from protocol.wire.messages import (
     Ack,
     CalibrationOffer,
@@ -63,7 +64,6 @@ from protocol.wire.messages import (
     SampleBatch,
     SensorBundle,
 )
-from protocol.wire.offer_codec import encode_offer
 
 FOLDER = Path(__file__).parent
 STORE = "0123456789abcdef"
@@ -145,7 +145,7 @@ def decode_batch(data: bytes) -> SampleBatch:
 
 def decode_info_table(data: bytes) -> dict[str, Any]:
     """Decode any table of plain values; `decode_info` asks for every field of `MapInfo`."""
-    return codec.take_plain(codec.unpack(data, codec.MAX_SMALL_BYTES), "info")
+    return take_plain(unpack(data, MAX_SMALL_BYTES), "info")
 
 
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")

@@ -25,8 +25,9 @@ from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.requests import PointQuery
 from protocol.site.site_file import load_site
 from protocol.wire import keys
-from protocol.wire.codec import MAX_BATCH_BYTES, MAX_SMALL_BYTES, decode_reply, encode_batch
+from protocol.wire.codec import MAX_BATCH_BYTES, decode_reply, encode_batch
 from protocol.wire.credentials import SIGNING_FILE, Credentials, Identity, load_credentials
+from protocol.wire.fields import MAX_SMALL_BYTES
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig, write_configs

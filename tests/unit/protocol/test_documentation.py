@@ -20,6 +20,7 @@ from protocol.queries.request import parameters_of
 from protocol.site.geometry import MAX_CELLS
 from protocol.units import _NS, _UNITS
 from protocol.wire import codec
+from protocol.wire.fields import MAX_SMALL_BYTES
 from protocol.wire.messages import Pose
 from sitegrid.logs.ground import FIGURES as GROUND
 from sitegrid.logs.log_truth import read_known_ground, read_log_truth
@@ -58,7 +59,7 @@ def test_the_table_of_calibration_has_the_fields_of_the_answer_and_of_a_machine(
 
 
 def test_limits_are_the_documented_ones():
-    assert (codec.MAX_BATCH_BYTES, codec.MAX_BUNDLE_BYTES, codec.MAX_SMALL_BYTES) == (4 * 2**20, 2**20, 64 * 2**10)
+    assert (codec.MAX_BATCH_BYTES, codec.MAX_BUNDLE_BYTES, MAX_SMALL_BYTES) == (4 * 2**20, 2**20, 64 * 2**10)
     assert "at most 4 MiB" in WIRE
     assert "At most 1 MiB" in WIRE
     for number in (codec.MAX_BATCH_SAMPLES, MAX_STAMP_NS, f"{MAX_CELLS:,}", "2^62", "2^64 - 1"):

@@ -15,7 +15,7 @@ from protocol.queries.parameters import split_selector
 from protocol.queries.requests import AliveQuery, InfoQuery, PointQuery, RegionQuery
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
-from protocol.wire.codec import pack
+from protocol.wire.fields import pack
 from protocol.wire.messages import VERSION
 from sitegrid import follower_choice
 from sitegrid.client import Client

@@ -10,10 +10,10 @@ import pytest
 from mapserver.ingest.writer import Writer
 from protocol.errors import LinkError, QueryError, Refusal
 from protocol.queries.map_tiles import TilesAnswer, TilesQuery
-from protocol.queries.pieces import joined
 from protocol.queries.requests import PieceQuery, RegionQuery
 from protocol.site.geometry import Bounds
 from sitegrid.watch import watch
+from sitegrid.whole_answers import joined
 from tests.unit.mapserver.data import incoming, open_writer, random_samples, send
 from tests.unit.mapserver.query.fake_upkeep import AnswersOf, answers_of
 

@@ -28,7 +28,7 @@ from agents.corrections.relay import Relay, RelayConfig
 from agents.drivers.line import Line
 from agents.drivers.receiver import ReceiverSource as DriverReceiver
 from protocol.wire import keys
-from protocol.wire.correction_codec import encode_corrections
+from protocol.wire.codec import encode_corrections
 from protocol.wire.messages import Corrections
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from tests.patience import until

@@ -15,7 +15,7 @@ from agents.corrections.ntrip import CONNECT_S, Chunks, NtripStream, gga, parse_
 from agents.corrections.relay import Relay, RelayConfig
 from agents.corrections.rtcm import whole_frames
 from protocol.errors import ConfigError, LinkError
-from protocol.wire.correction_codec import decode_corrections
+from protocol.wire.codec import decode_corrections
 from protocol.wire.messages import Corrections
 from tests.patience import PATIENCE_S
 from tests.unit.agents.corrections.caster import Caster, Serve, floods, sends

@@ -20,8 +20,8 @@ from agents.estimation.ground import EstimationConfig
 from agents.estimation.offers import AHEAD_NS, TOO_OLD_NS, Offers, intersected
 from protocol.errors import StoreError
 from protocol.machine.samples import LIMITS
+from protocol.wire.codec import encode_offer
 from protocol.wire.messages import CalibrationOffer
-from protocol.wire.offer_codec import encode_offer
 from tests.unit.agents.drives import START_NS, VEHICLE, Leg, drive
 from tests.unit.agents.ground import STEADY, STEP_S, EstimatorRun
 

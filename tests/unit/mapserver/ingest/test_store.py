@@ -24,8 +24,8 @@ from mapserver.journal.postgres import reader as postgres_reader
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import Refusal, StoreError
 from protocol.wire import keys
+from protocol.wire.codec import decode_offer
 from protocol.wire.messages import Ack, CalibrationOffer, Refused
-from protocol.wire.offer_codec import decode_offer
 from sitegrid.security.signing import Signer, Verifier, make_signing_key
 from tests.postgres_server import Database
 from tests.unit.mapserver.data import (

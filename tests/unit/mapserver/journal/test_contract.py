@@ -20,7 +20,7 @@ from mapserver.journal.rows import ALL, Admission, Selection, Watermark
 from mapserver.journal.sqlite.journal import SqliteJournal
 from protocol.errors import StoreError
 from protocol.site.geometry import Bounds
-from protocol.wire.codec import pack, unpack
+from protocol.wire.fields import pack, unpack
 from protocol.wire.messages import Ack, Refused
 from tests.postgres_server import Database
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, fold_of, incoming, random_samples, same, samples, store_at

@@ -22,7 +22,8 @@ from mapserver.monitoring.exporter import Exporter
 from mapserver.monitoring.metrics import HealthListener, ReceivedHealth, ServerCollector
 from protocol.errors import LinkError
 from protocol.wire import keys
-from protocol.wire.codec import MAX_SMALL_BYTES, encode_health
+from protocol.wire.codec import encode_health
+from protocol.wire.fields import MAX_SMALL_BYTES
 from protocol.wire.latest_values import MOST_NAMES
 from protocol.wire.messages import Health
 from tests.paths import ROOT

@@ -13,9 +13,9 @@ from mapserver.query.areas import cells_to_a_side
 from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, RegionReading
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answer_codec import decode_points, decode_region
-from protocol.queries.pieces import joined
 from protocol.queries.requests import PieceQuery, PointQuery, PointsQuery, RegionQuery, parse_query
 from protocol.site.geometry import BLOCK_CELLS, Bounds, CellWindow
+from sitegrid.whole_answers import joined
 from tests.unit.mapserver.data import NOW_NS, incoming, open_writer, random_samples, refused, send
 from tests.unit.mapserver.query.fake_upkeep import answers_of
 

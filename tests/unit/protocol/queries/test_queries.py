@@ -24,7 +24,7 @@ from protocol.queries.requests import (
 )
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround, SiteConfig
-from protocol.wire.codec import pack
+from protocol.wire.fields import pack
 from tests.golden import questions
 from tests.unit.records import STORE, site_info, version
 

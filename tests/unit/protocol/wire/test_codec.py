@@ -11,10 +11,16 @@ from protocol.errors import MessageError, Refusal
 from protocol.machine.readings import KINDS, Encoder, Imu, columns
 from protocol.machine.samples import COLUMNS, LIMITS, SAMPLE_DTYPE, empty
 from protocol.wire import codec, keys
-from protocol.wire.codec import decode_batch, encode_batch
-from protocol.wire.correction_codec import decode_corrections, encode_corrections
-from protocol.wire.messages import Ack, CalibrationOffer, Health, Pose, Refused, SampleBatch, SensorBundle
-from protocol.wire.offer_codec import decode_offer, encode_offer
+from protocol.wire.codec import (
+    decode_batch,
+    decode_corrections,
+    decode_offer,
+    encode_batch,
+    encode_corrections,
+    encode_offer,
+)
+from protocol.wire.fields import STORE_ID, pack, unpack
+from protocol.wire.messages import VERSION, Ack, CalibrationOffer, Health, Pose, Refused, SampleBatch, SensorBundle
 from tests.golden import make as golden
 
 EXTENT_M = 20_000.0
@@ -175,7 +181,7 @@ def test_batch_round_trip(table, machine, spool_id, first_seq, data):
 counts = st.integers(0, codec.MAX_SEQ)
 
 
-stores = st.from_regex(codec.STORE_ID, fullmatch=True)
+stores = st.from_regex(STORE_ID, fullmatch=True)
 acks = st.builds(Ack, counts, counts, counts, stores, stores | st.just(""))
 
 
@@ -186,7 +192,7 @@ def test_reply_round_trip(reply):
 
 @pytest.mark.parametrize("after_s", [-0.1, 3600.1, float("nan"), float("inf"), "1", True])
 def test_a_server_cannot_keep_a_machine_waiting_for_ever(after_s):
-    data = codec.pack({"ack": False, "reason": "overloaded", "problem": "", "expected": 0, "retry_after_s": after_s})
+    data = pack({"ack": False, "reason": "overloaded", "problem": "", "expected": 0, "retry_after_s": after_s})
     assert refusal(data, codec.decode_reply).field == "retry_after_s"
 
 
@@ -219,7 +225,7 @@ def bundle_with(**fields) -> bytes:
         "n": 2,
         "cols": {"stamp_ns": np.array([5, 6], "<i8").tobytes(), **cols},
     }
-    return codec.pack({"machine": "m-1", "counter": 1, "sensors": [{**group, **fields}]})
+    return pack({"machine": "m-1", "counter": 1, "sensors": [{**group, **fields}]})
 
 
 def test_implausible_reading_is_left_out_and_counted():
@@ -248,7 +254,7 @@ def test_bundle_has_a_counter_from_one_on_and_groups_that_are_maps():
     data = codec.encode_bundle(SensorBundle("m-1", 0, ()))
     assert refusal(data, codec.decode_bundle).field == "counter"
     for group in (1, [], None):
-        data = codec.pack({"machine": "m-1", "counter": 1, "sensors": [group]})
+        data = pack({"machine": "m-1", "counter": 1, "sensors": [group]})
         assert refusal(data, codec.decode_bundle).field == "sensors"
 
 
@@ -302,13 +308,13 @@ def test_a_pose_is_of_the_machine_of_its_key_and_where_a_sample_could_be(changed
 
 
 def test_a_number_beyond_64_bits_is_the_greatest_and_anything_else_is_refused():
-    assert codec.unpack(codec.pack({"n": [2**64 - 1, 2**64, 2**80], "m": -(2**63)}), 99) == {
-        "v": codec.VERSION,
+    assert unpack(pack({"n": [2**64 - 1, 2**64, 2**80], "m": -(2**63)}), 99) == {
+        "v": VERSION,
         "n": [2**64 - 1] * 3,
         "m": -(2**63),
     }
     with pytest.raises(TypeError, match="object is no value"):
-        codec.pack({"n": object()})
+        pack({"n": object()})
 
 
 # --- an offer in an acknowledgement ----------------------------------------------------------------------------------

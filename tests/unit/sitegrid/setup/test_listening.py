@@ -21,9 +21,8 @@ import pytest
 from agents.drivers.transports import serial_ports, why_closed
 from protocol.errors import ConfigError
 from sim.receivers.nmea import sentence as nmea
-from sitegrid.setup.hearing import Ear, HeardLine
+from sitegrid.setup.hearing import Ear, HeardLine, block, missing
 from sitegrid.setup.listening import address_of, listen, listen_to
-from sitegrid.setup.summary import block, missing
 from tests.unit.agents.drivers.frames import GGA, RMC, TPV, esf, pvt, report, ubx
 
 IMU = esf(5, *((kind, 4) for kind in (14, 13, 5, 16, 17, 18)))

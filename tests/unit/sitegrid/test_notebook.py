@@ -10,8 +10,7 @@ from protocol.queries.answers import ChangesAnswer, GroundChange, Region
 from protocol.queries.roads import decode_segments, decode_worklist
 from protocol.site.site_config import Projection, SiteConfig
 from sitegrid.client import Client
-from sitegrid.geo_table import to_geopandas
-from sitegrid.map_region import MapRegion, unit_of
+from sitegrid.notebook import MapRegion, to_geopandas, unit_of
 from tests.paths import GOLDEN
 from tests.unit.records import map_info, site_info, version
 

@@ -1,6 +1,6 @@
-"""A region for notebooks: as a dataset, a table, a plot, with the coordinates and units of the site.
+"""Answers in notebooks: a region as a dataset, table and plot, roads and changes as tables with geometries.
 
-xarray, pandas, matplotlib and pyproj come with the extra `notebook`.
+xarray, pandas, geopandas, matplotlib and pyproj come with the extra `notebook`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,15 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyproj
     import xarray
+from typing import TYPE_CHECKING
+
+from protocol.queries.answers import ChangesAnswer
+from protocol.queries.roads import Segments, Worklist
+from sitegrid.features.feature import Collection, shape_of
+from sitegrid.features.kinds import CHANGE, SEGMENT, WORK
+
+if TYPE_CHECKING:
+    import geopandas
 
 UNITS = {"grade": "m/m", "heading": "rad", "weight": "m", "age": "s", "changed": "s"}  # by the first word; others: 1
 
@@ -110,3 +119,21 @@ def _summary(values: Any) -> tuple[str, str, str, str]:
         return "0 %", "", "", ""
     least, mean, most = (f"{end(known):.4g}" for end in (np.min, np.mean, np.max))
     return f"{known.size / values.size:.0%}", least, mean, most
+
+
+def to_geopandas(answer: Segments | Worklist | ChangesAnswer, crs: str) -> geopandas.GeoDataFrame:
+    """A row for each segment, stretch or change, with the columns that exported files have too."""
+    import geopandas
+    from shapely.geometry import shape
+
+    match answer:
+        case Segments():
+            features = Collection(SEGMENT, answer.segments)
+        case Worklist():
+            features = Collection(WORK, answer.rows)
+        case ChangesAnswer():
+            features = Collection(CHANGE, answer.changes)
+    rows = [
+        {**features.properties(one), "geometry": shape(shape_of(features.kind, one, None))} for one in features.items
+    ]
+    return geopandas.GeoDataFrame(rows, columns=[*features.kind.fields, "geometry"], geometry="geometry", crs=crs)

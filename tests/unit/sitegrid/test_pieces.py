@@ -6,7 +6,7 @@ import pytest
 from protocol.errors import MessageError
 from protocol.queries.answer_codec import decode_region, encode_region
 from protocol.queries.answers import MapVersion, Piece, Region
-from protocol.queries.pieces import joined
+from sitegrid.whole_answers import joined
 
 VERSION = MapVersion("0123456789abcdef", 7, 0)
 
