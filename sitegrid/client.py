@@ -27,14 +27,7 @@ from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustComm
 from protocol.queries.origin import SERVER, Origin
 from protocol.queries.places import Place, around, where_it_lies
 from protocol.queries.request import MapQuery, Request
-from protocol.queries.requests import (
-    AliveQuery,
-    ChangesQuery,
-    InfoQuery,
-    MachinesQuery,
-    PointQuery,
-    RegionQuery,
-)
+from protocol.queries.requests import AliveQuery, ChangesQuery, InfoQuery, MachinesQuery, PointQuery, RegionQuery
 from protocol.queries.roads import Segments, Worklist
 from protocol.queries.route_requests import RouteQuery
 from protocol.queries.routing import LOADER, NamedMachine, RouteAnswer, RouteMachine, machine_of

@@ -17,14 +17,7 @@ from agents.dead_reckoning import DeadReckonedPose
 from agents.ground_speed import MIN_FIX_STD_M
 from agents.localisation import measurements
 from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor
-from agents.localisation.filters.belief import (
-    Belief,
-    Change,
-    Conditioned,
-    Measurement,
-    anchor_states,
-    restate_states,
-)
+from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, anchor_states, restate_states
 from agents.localisation.filters.late_measurements import RELOCK
 from agents.localisation.filters.motion import GpsError, gps_covariance
 from agents.localisation.filters.state import YAW, Layout

@@ -38,9 +38,7 @@ from lab.speed.site import (
     settle,
     used,
 )
-from lab.speed.site import (
-    OPTIONS as STORE_OPTIONS,
-)
+from lab.speed.site import OPTIONS as STORE_OPTIONS
 from protocol.queries.answer_codec import decode_region
 from protocol.queries.origin import decode_origin
 from protocol.wire import keys

@@ -14,29 +14,10 @@ from protocol.queries import answers
 from protocol.queries.calibration import CalibrationAnswer, decode_calibration, encode_calibration
 from protocol.queries.coverage import CoverageQuery
 from protocol.queries.map_tiles import TilesQuery
-from protocol.queries.parameters import (
-    METRES,
-    STAMP,
-    WORDS,
-    check_order,
-    count,
-    number,
-    refusal,
-)
+from protocol.queries.parameters import METRES, STAMP, WORDS, check_order, count, number, refusal
 from protocol.queries.places import AREA, Place, around, places
 from protocol.queries.reasons import CellReasons, decode_why, encode_why
-from protocol.queries.request import (
-    AskFirst,
-    Codec,
-    Compared,
-    Fresh,
-    MapQuery,
-    Repaired,
-    Size,
-    asked,
-    grouped,
-    parse,
-)
+from protocol.queries.request import AskFirst, Codec, Compared, Fresh, MapQuery, Repaired, Size, asked, grouped, parse
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds

@@ -19,16 +19,7 @@ from protocol.site.site_file import load_site
 from sim.recorder import TRACKS_FOLDER
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
-from sitegrid.demo.plan import (
-    READY_S,
-    DemoPlan,
-    LogReplay,
-    make_plan,
-    start_agent,
-    start_server,
-    start_sim,
-    start_web,
-)
+from sitegrid.demo.plan import READY_S, DemoPlan, LogReplay, make_plan, start_agent, start_server, start_sim, start_web
 from sitegrid.pictures.draw import TrackRecorder, draw, draw_both, draw_differences, truth_layers
 from sitegrid.process.children import Child, Children
 from sitegrid.process.lifetime import note, plain, say, tell, wait

@@ -17,16 +17,7 @@ from typing import Any, Self, TypeVar
 from uuid import uuid4
 
 from protocol.errors import ConfigError
-from sitegrid.refold.engine import (
-    PATIENCE_S,
-    TASK_SAMPLES,
-    TRIES,
-    EngineError,
-    StalledError,
-    attempt,
-    in_turns,
-    opened,
-)
+from sitegrid.refold.engine import PATIENCE_S, TASK_SAMPLES, TRIES, EngineError, StalledError, attempt, in_turns, opened
 
 T = TypeVar("T")
 R = TypeVar("R")

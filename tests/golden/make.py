@@ -16,16 +16,7 @@ import msgpack
 import numpy as np
 
 from protocol.errors import QueryError, Refusal
-from protocol.machine.readings import (
-    Articulation,
-    Attitude,
-    Encoder,
-    Gps,
-    GpsVelocity,
-    Imu,
-    Odometry,
-    Torque,
-)
+from protocol.machine.readings import Articulation, Attitude, Encoder, Gps, GpsVelocity, Imu, Odometry, Torque
 from protocol.machine.samples import OPTIONAL, SAMPLE_DTYPE
 from protocol.queries import answer_codec as answers
 from protocol.queries import answers as records
@@ -54,16 +45,7 @@ from protocol.queries.routing import RouteAnswer, RouteMachine, RouteSteps, Rout
 from protocol.wire import codec
 from protocol.wire.codec import decode_corrections, encode_corrections, encode_offer
 from protocol.wire.fields import MAX_SMALL_BYTES, take_plain, unpack
-from protocol.wire.messages import (
-    Ack,
-    CalibrationOffer,
-    Corrections,
-    Health,
-    Pose,
-    Refused,
-    SampleBatch,
-    SensorBundle,
-)
+from protocol.wire.messages import Ack, CalibrationOffer, Corrections, Health, Pose, Refused, SampleBatch, SensorBundle
 
 FOLDER = Path(__file__).parent
 STORE = "0123456789abcdef"

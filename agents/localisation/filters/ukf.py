@@ -26,14 +26,7 @@ import numpy as np
 from scipy.linalg.blas import dtrsm
 
 from agents.localisation.filters.belief import Belief, Conditioned, Measurement, Motion
-from agents.localisation.filters.square_root import (
-    conclude,
-    conclude_motion,
-    noise_root,
-    refused,
-    root,
-    wrapped,
-)
+from agents.localisation.filters.square_root import conclude, conclude_motion, noise_root, refused, root, wrapped
 from protocol.arrays import Floats
 
 

@@ -4,17 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.cooperation.drives import (
-    EIGHT,
-    FOUR,
-    MIXED,
-    ONE,
-    REPAVED,
-    TOURS,
-    TWO,
-    length_m,
-    planned,
-)
+from lab.cooperation.drives import EIGHT, FOUR, MIXED, ONE, REPAVED, TOURS, TWO, length_m, planned
 from sim.config import SimConfig, resolve
 
 

@@ -6,11 +6,7 @@ import pytest
 from lab.calibration.drives import Scene
 from lab.cooperation.drives import FOUR, REPAVED, TOURS, length_m, planned
 from lab.cooperation.live import LiveRun
-from lab.cooperation.scores import (
-    false_alarms,
-    minutes_until,
-    rounds_ns,
-)
+from lab.cooperation.scores import false_alarms, minutes_until, rounds_ns
 from lab.ground.truth import true_ground
 from lab.tests.cooperation.samples import driving, track
 from sim.simulator import START_NS

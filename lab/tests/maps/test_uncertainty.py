@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from lab.maps.methods import Hits
-from lab.maps.uncertainty import (
-    Believed,
-    by_frequency,
-    by_mean,
-    coverage_pct,
-    pooled,
-)
+from lab.maps.uncertainty import Believed, by_frequency, by_mean, coverage_pct, pooled
 from protocol.site.ground_classes import UNKNOWN
 
 

@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from lab.campaign.recordings import PAPER, PlannedDrive, RecordedDrive, load, make
-from lab.positions.substitution import (
-    TrueMotion,
-    gps_errors,
-    true_motion,
-    with_gps_errors,
-)
+from lab.positions.substitution import TrueMotion, gps_errors, true_motion, with_gps_errors
 from protocol.machine.readings import Gps
 from sim.sensors.presets import load_preset
 from sim.simulator import START_NS

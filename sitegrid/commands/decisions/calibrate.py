@@ -6,9 +6,9 @@ from argparse import ArgumentParser, Namespace
 
 from protocol.errors import ConfigError
 from protocol.queries.calibration import CalibrationAnswer
+from sitegrid.answer_text import calibration_table
 from sitegrid.client import Client, connect
 from sitegrid.commands.decisions.trust import add_wait
-from sitegrid.commands.query import calibration_table
 from sitegrid.options.groups import add_network, add_site
 from sitegrid.process.lifetime import plain, say, tell
 

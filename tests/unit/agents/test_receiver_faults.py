@@ -18,17 +18,7 @@ from agents.positioning import PipelineConfig
 from agents.sampling import joined
 from protocol.arrays import Floats
 from protocol.machine.readings import Gps, Reading
-from tests.unit.agents.drives import (
-    PROJECTION,
-    SITE,
-    VEHICLE,
-    Leg,
-    changed_sensor,
-    drive,
-    noisy,
-    seconds,
-    thinned,
-)
+from tests.unit.agents.drives import PROJECTION, SITE, VEHICLE, Leg, changed_sensor, drive, noisy, seconds, thinned
 
 STD_M, SLOW_SHARE, SLOW_S = 1.2, 0.75, 45.0  # of the receiver, as it states and as a machine's description has it
 RECEIVER = changed_sensor(VEHICLE, "gps-1", drift_share=SLOW_SHARE, drift_time_s=SLOW_S)

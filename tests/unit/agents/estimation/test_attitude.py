@@ -4,9 +4,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from agents.estimation.attitude import (
-    SlopeFilter,
-)
+from agents.estimation.attitude import SlopeFilter
 from protocol.units import GRAVITY_MPS2
 
 STEP_S = 0.05

@@ -7,15 +7,7 @@ from agents.localisation import measurements
 from agents.localisation.filters.belief import Belief, Filter, Measurement
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.motion import map_from_base
-from agents.localisation.filters.state import (
-    ACCELERATION,
-    ATTITUDE,
-    POSITION,
-    RATE,
-    VELOCITY,
-    YAW,
-    Layout,
-)
+from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2

@@ -19,13 +19,7 @@ from mapserver.journal.postgres.session import WriterSession
 from protocol.errors import Refusal, StoreError
 from protocol.wire.messages import Ack, Refused
 from tests.postgres_server import Cluster, Database
-from tests.unit.mapserver.data import (
-    CONFIG,
-    NOW_NS,
-    SITE,
-    now_ns,
-    wait_for,
-)
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, now_ns, wait_for
 from tests.unit.mapserver.journal.test_postgres import LostAnswer, place, send, synchronous_pair
 
 YEAR_NS = 365 * 86400 * 10**9

@@ -20,15 +20,7 @@ from agents.localisation.filters.motion import (
     map_from_base,
     motion,
 )
-from agents.localisation.filters.state import (
-    ACCELERATION,
-    ATTITUDE,
-    OFF_PLANE,
-    POSITION,
-    RATE,
-    VELOCITY,
-    Layout,
-)
+from agents.localisation.filters.state import ACCELERATION, ATTITUDE, OFF_PLANE, POSITION, RATE, VELOCITY, Layout
 from protocol.arrays import Floats
 
 PAPER, FULL = Layout(), Layout(imus=2, wheel_scale=True, receivers=2)

@@ -1,0 +1,326 @@
+"""Answers as text: a table for programs, and lines for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from protocol.arrays import Floats32
+from protocol.queries.answers import (
+    ChangesAnswer,
+    CheckpointCounts,
+    GroundChange,
+    HistoryAnswer,
+    MachinesAnswer,
+    MachineState,
+    MapInfo,
+    PointAnswer,
+    PointsAnswer,
+    Region,
+    ServerAlive,
+)
+from protocol.queries.calibration import CalibrationAnswer, MachineCalibration
+from protocol.queries.places import where_it_lies
+from protocol.queries.request import Compared
+from protocol.queries.requests import (
+    AliveQuery,
+    CalibrationQuery,
+    ChangesQuery,
+    HistoryQuery,
+    InfoQuery,
+    MachinesQuery,
+    PointQuery,
+    PointsQuery,
+    RegionQuery,
+)
+from protocol.queries.roads import RoadSegment, Segments, SegmentsQuery, Worklist, WorklistQuery
+from protocol.queries.route_requests import LineQuery, RouteQuery
+from protocol.queries.routing import RouteAnswer
+from sitegrid.client import Client
+from sitegrid.machine_sentences import calibrated, why
+from sitegrid.process.lifetime import plain
+from sitegrid.times import utc_text
+
+Answer = tuple[Any, Iterable[str]]  # a table for programs; lines for people
+
+
+def record_text(_: Client, __: Any, answer: Any) -> Answer:
+    """An answer that has no table of its own: its fields."""
+    table = plain(answer)
+    lines = []
+    for name, value in table.items():
+        parts = value.items() if isinstance(value, dict) else ()
+        lines += [f"{name}{'' if parts else f'  {value}'}", *(f"  {key}  {part}" for key, part in parts)]
+    return table, lines
+
+
+def _point(client: Client, query: PointQuery, point: PointAnswer) -> Answer:
+    table = {"x_m": point.x_m, "y_m": point.y_m, **point.values, **_version(point)}
+    head = f"cell at {point.x_m:g}, {point.y_m:g} m{_as_of(query, point.stamp_ns)}"
+    lines = [head, *(f"  {name:18} {_value(value)}" for name, value in point.values.items())]
+    return table, lines + (
+        [] if np.isfinite([*point.values.values()]).any() else _off_map(client, point.x_m, point.y_m)
+    )
+
+
+def _off_map(client: Client, x_m: float, y_m: float) -> list[str]:
+    """Where the map lies, for who asks for another place."""
+    info = client.info()
+    west, south, east, north = (edge * info.site.cell_m for edge in info.bounds or (0, 0, 0, 0))
+    is_inside = west <= x_m < east and south <= y_m < north
+    if is_inside or not info.bounds:
+        return []
+    return [f"nobody was there: {where_it_lies(info.bounds, info.site.cell_m)}"]
+
+
+def _points(_: Client, __: PointsQuery, answer: PointsAnswer) -> Answer:
+    places = {"x_m": answer.x_m.tolist(), "y_m": answer.y_m.tolist()}
+    table = {**places, **{name: values.tolist() for name, values in answer.layers.items()}, **_version(answer)}
+    rows = (
+        [f"{x:g}", f"{y:g}", *(_value(float(values[i])) for values in answer.layers.values())]
+        for i, (x, y) in enumerate(zip(answer.x_m, answer.y_m, strict=True))
+    )
+    return table, _table(["x", "y", *answer.layers], rows)
+
+
+def _region(_: Client, query: RegionQuery, region: Region) -> Answer:
+    summary = {name: _statistics(values) for name, values in region.layers.items()}
+    size = {"columns": len(region.x_m), "rows": len(region.y_m)}
+    b = region.bounds
+    place = f"{b.west_m:g}..{b.east_m:g} x {b.south_m:g}..{b.north_m:g} m, {region.cell_m:g} m cells"
+    lines = [f"{place}{_as_of(query, region.stamp_ns)}, journal row {region.merged}"]
+    for name, row in summary.items():
+        span = f"min {row['min']:.4g}   mean {row['mean']:.4g}   max {row['max']:.4g}"
+        lines.append(f"  {name:18} {row['known']:7d} known   {span}")
+    return {**size, **_version(region), "layers": summary}, lines
+
+
+def _version(answer: PointAnswer | PointsAnswer | Region | RouteAnswer) -> dict[str, Any]:
+    version = answer.version
+    return {"store": version.store, "merged": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
+
+
+def _history(_: Client, __: HistoryQuery, answer: HistoryAnswer) -> Answer:
+    table = {"spans": [{"first_ns": s.first_ns, "last_ns": s.last_ns, **s.values} for s in answer.spans]}
+    if not answer.spans:
+        return table, ["nobody was there"]
+    rows = ([utc_text(s.first_ns), *map(_value, s.values.values())] for s in answer.spans)
+    return table, _table(["from (UTC)", *answer.spans[0].values], rows)
+
+
+def _segments(_: Client, __: SegmentsQuery, answer: Segments) -> Answer:
+    if not answer.segments:
+        return answer, ["no roads are known"]
+    head = ["stretch", "around", "m", "resistance", "+-", "grade", "passes/h there", "back", "t/h there", "back"]
+    rows = (
+        [
+            *_place(one),
+            f"{one.length_m:.0f}",
+            *map(_value, (one.resistance, one.resistance_std, one.grade, *one.passes_ph, *one.tonnes_ph)),
+        ]
+        for one in answer.segments
+    )
+    km = sum(one.length_m for one in answer.segments) / 1000
+    return answer, [f"{km:.2f} km of roads, traffic of {answer.hours:.2f} h", *_table(head, rows)]
+
+
+def _worklist(_: Client, __: WorklistQuery, answer: Worklist) -> Answer:
+    total = f"{answer.total_kwh_ph:.2f} kWh/h lost on all roads against a resistance of {answer.target:g}"
+    if not answer.rows and not answer.changes:
+        return answer, [f"{total}: no stretch is worse for sure"]
+    head = ["", "stretch", "around", "kWh/h", "low..high", "l/h", "s/h", "resistance", "+-", "a day", "machines"]
+    head += ["since", "before"]
+    rows = (
+        [
+            str(row.rank),
+            *_place(row.segment),
+            f"{row.kwh_ph[0]:.2f}",
+            f"{row.kwh_ph[1]:.2f}..{row.kwh_ph[2]:.2f}",
+            f"{row.litres_ph[0]:.2f}",
+            f"{row.seconds_ph[0]:.0f}",
+            *map(_value, (row.segment.resistance, row.segment.resistance_std)),
+            "-" if row.segment.trend is None else f"{row.segment.trend:+.4f}",
+            str(row.segment.machines),
+            utc_text(row.since_ns),
+            "-" if row.before is None else _value(row.before),
+        ]
+        for row in answer.rows
+    )
+    lines = [f"{total}, traffic of {answer.hours:.2f} h", *_table(head, rows)]
+    if any(row.segment.guessed for row in answer.rows):
+        lines.append("no machine stated its mass on some of them: what is lost there is a guess")
+    lines += [
+        f"{utc_text(one.first_ns)} {one.id}: resistance {_value(one.before)} -> {_value(one.after)}, "
+        f"saves {one.saved_kwh_ph:.2f} kWh/h"
+        for one in answer.changes
+    ]
+    return answer, lines
+
+
+def _place(segment: RoadSegment) -> list[str]:
+    x_m, y_m = segment.line[len(segment.line) // 2]
+    return [segment.id, f"{x_m:.0f}, {y_m:.0f}"]
+
+
+def _machines(_: Client, __: MachinesQuery, answer: MachinesAnswer) -> Answer:
+    head = ["machine", "trusted", "since", "samples", "lost", "newest", "accelerometer zero", "torque gain", "why"]
+    return {"machines": answer.machines}, _table(head, map(_machine_row, answer.machines))
+
+
+def _machine_row(machine: MachineState) -> list[str]:
+    trusted = ("yes" if machine.trusted else "NO") + (f", by {machine.by}" if machine.by else "")
+    since = utc_text(machine.since_ns) if machine.since_ns else "-"
+    counts = [str(machine.samples), str(machine.lost)]
+    calibration = [calibrated(machine, name) or "-" for name in ("zero", "torque_gain")]
+    return [machine.name, trusted, since, *counts, utc_text(machine.newest_ns), *calibration, why(machine) or "-"]
+
+
+def _calibration(_: Client, __: CalibrationQuery, answer: CalibrationAnswer) -> Answer:
+    return answer, calibration_table(answer)
+
+
+def calibration_table(answer: CalibrationAnswer) -> list[str]:
+    """A line for each machine, and what is known of their common scale."""
+    head = ["machine", "zero", "+-", "scale", "+-", "across", "+-", "known by", "taken off since", "by"]
+    lines = _table(head, map(_calibration_row, answer.machines))
+    if answer.common_scale_unknown:
+        lines.append(f"nothing shows the mean scale of all machines: {answer.common_scale_unknown}")
+    return lines
+
+
+def _calibration_row(machine: MachineCalibration) -> list[str]:
+    """Zeros and slopes in m/m; of what counts, the newest span."""
+    values = (machine.zero, machine.zero_std, machine.scale, machine.scale_std, machine.across, machine.across_std)
+    shown = [f"{name} {'+'.join(by)}" for name, by in (("zero", machine.zero_by), ("scale", machine.scale_by)) if by]
+    newest, decided = "nothing", "-"
+    if machine.spans:
+        span = machine.spans[-1]
+        since = utc_text(span.from_ns) if span.from_ns else "ever"
+        newest = f"{span.zero:g}, {span.scale:g}, {span.across:g} {since}"
+        decided = machine.by + (f": {machine.reason}" if machine.reason else "")
+    return [machine.name, *map(_value, values), "; ".join(shown) or "-", newest, decided]
+
+
+def _changes(_: Client, __: ChangesQuery, answer: ChangesAnswer) -> Answer:
+    lines = [*map(change_line, answer.changes)]
+    return {"changes": answer.changes}, lines or ["no change of the ground was found"]
+
+
+def change_line(change: GroundChange) -> str:
+    """When, where, and from which ground to which."""
+    west, south, east, north = change.bounds
+    parts = [f"{change.id}: {utc_text(change.first_ns)} to {utc_text(change.last_ns)}"]
+    parts += [f"{west:g}..{east:g} x {south:g}..{north:g} m", f"{change.cells} cells"]
+    resistance = ("resistance", change.resistance_before, change.resistance_after)
+    for name, before, after in (resistance, ("grade", change.grade_before, change.grade_after)):
+        if before is not None or after is not None:
+            parts.append(f"{name} {_value(before)} -> {_value(after)}")
+    return "  ".join(parts)
+
+
+def _info(_: Client, __: InfoQuery, info: MapInfo) -> Answer:
+    return info, [
+        f"site {info.site.name}: {info.cells} cells driven, bounds {info.bounds and list(info.bounds)}",
+        f"  journal row {info.journalled}, merged {info.merged}, snapshot {info.snapshot}",
+        f"  {_checkpoints(info.checkpoints)}",
+        f"  samples merged {info.samples_merged}, too unsure of their place {info.samples_too_unsure}",
+        *(
+            f"  {name}: {m.samples} samples, {m.lost} lost, {m.spools} spools"
+            for name, m in sorted(info.machines.items())
+        ),
+        *(f"  {name}: {count}" for name, count in sorted(info.counters.items())),
+    ]
+
+
+def _drive(_: Client, query: LineQuery, answer: RouteAnswer) -> Answer:
+    """What a drive costs, in a line of totals and a table of steps."""
+    totals, steps, machine = answer.totals, answer.steps, answer.machine
+    corners = (
+        []
+        if isinstance(query, RouteQuery)
+        else [f"{len(answer.line_m)} places: " + " ".join(f"{x:.0f},{y:.0f}" for x, y in answer.line_m)]
+    )
+    kwh = f"{totals.energy_j / 3.6e6:.2f} kWh ({totals.energy_low_j / 3.6e6:.2f}..{totals.energy_high_j / 3.6e6:.2f})"
+    taken = f"{totals.time_s:.0f} s ({totals.time_low_s:.0f}..{totals.time_high_s:.0f})"
+    ground = f"{totals.unknown:.0%} unknown, {totals.unmeasured:.0%} driven and not measured"
+    lines = [
+        f"{totals.length_m:.0f} m, {totals.lift_m:+.1f} m up, {ground}",
+        f"{machine.mass_kg / 1000:.1f} t, at most {machine.speed_mps:g} m/s, {machine.power_w / 1000:.0f} kW",
+        f"{kwh}, {totals.litres:.2f} l of diesel, {totals.braked_j / 3.6e6:.2f} kWh braked, {taken}",
+        *corners,
+    ]
+    head = ["m", "from", "resistance", "+-", "slope %", "unknown", "kWh", "braked", "s", "km/h"]
+    rows = [
+        [
+            f"{steps.distance_m[i]:.0f}",
+            f"{steps.x_m[i]:.0f},{steps.y_m[i]:.0f}",
+            f"{steps.resistance[i]:.4f}",
+            f"{steps.resistance_std[i]:.4f}",
+            f"{100 * steps.slope[i]:+.1f}",
+            f"{steps.unknown[i]:.0%}",
+            f"{steps.energy_j[i] / 3.6e6:.3f}",
+            f"{steps.braked_j[i] / 3.6e6:.3f}",
+            f"{steps.time_s[i]:.1f}",
+            f"{3.6 * steps.speed_mps[i]:.1f}",
+        ]
+        for i in range(len(steps.distance_m))
+    ]
+    columns = {name: column.tolist() for name, column in vars(steps).items()}
+    shown = {"line": answer.line_m.tolist(), "totals": asdict(totals), "steps": columns, "machine": asdict(machine)}
+    table = {**shown, **_version(answer)}
+    return table, [*lines, *_table(head, rows)]
+
+
+def _alive(_: Client, __: AliveQuery, alive: ServerAlive) -> Answer:
+    return alive, [f"batches are taken: journal row {alive.journalled}, merged {alive.merged}"]
+
+
+def _checkpoints(counts: CheckpointCounts) -> str:
+    """What makes maps of the past quick."""
+    newest = f", samples until {utc_text(counts.newest_ns)}" if counts.newest_ns else ""
+    damaged = f", {counts.passed_over} damaged" if counts.passed_over else ""
+    return f"checkpoints {counts.count} ({counts.bytes / 1e6:.0f} MB){newest}{damaged}"
+
+
+def _as_of(query: Compared[Any], stamp_ns: int) -> str:
+    """What to say of the time of an answer, nothing where it is the map as it is."""
+    as_of = f", as of {utc_text(stamp_ns)}" if query.as_of_ns else ""
+    return as_of + (f", minus that of {utc_text(query.minus_ns)}" if query.minus_ns else "")
+
+
+def _value(value: float | None) -> str:
+    return "unknown" if value is None or math.isnan(value) else f"{value:.4g}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    lines = [head, *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
+
+
+def _statistics(values: Floats32) -> dict[str, float]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return {"known": 0, "min": math.nan, "mean": math.nan, "max": math.nan}
+    return {"known": known.size, "min": float(known.min()), "mean": float(known.mean()), "max": float(known.max())}
+
+
+AS_TEXT: dict[str, Callable[..., Answer]] = {
+    "point": _point,
+    "points": _points,
+    "region": _region,
+    "history": _history,
+    "segments": _segments,
+    "worklist": _worklist,
+    "route": _drive,
+    "way": _drive,
+    "machines": _machines,
+    "calibration": _calibration,
+    "changes": _changes,
+    "info": _info,
+    "alive": _alive,
+}
