@@ -41,9 +41,9 @@ from protocol.queries.roads import RoadSegment, Segments, SegmentsQuery, Worklis
 from protocol.queries.route_requests import LineQuery, RouteQuery
 from protocol.queries.routing import RouteAnswer
 from sitegrid.client import Client
-from sitegrid.machine_sentences import calibrated, why
 from sitegrid.process.lifetime import plain
 from sitegrid.times import utc_text
+from sitegrid.trust_sentences import calibrated, why
 
 Answer = tuple[Any, Iterable[str]]  # a table for programs; lines for people
 

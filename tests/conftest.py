@@ -131,7 +131,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     for report in terminalreporter.stats.get("", []):
         taken_s = dict(report.user_properties).get(CPU_S, 0.0)
         if taken_s > MOST_CPU_S and not {"slow", "processes", "nightly"} & report.keywords.keys():
-            terminalreporter.line(f"{report.nodeid} took {taken_s:.1f} s of processor time: mark it slow")
+            terminalreporter.line(
+                f"{report.nodeid} took {taken_s:.1f} s of processor time: mark it slow, unless kernels compiled"
+            )
     times = os.times()
     of_children_s = max(times.children_user + times.children_system, config.stash.get(OF_WORKERS, 0.0))
     minutes, seconds = divmod(round(times.user + times.system + of_children_s), 60)

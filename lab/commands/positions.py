@@ -25,10 +25,10 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> int:
     """Record, replay and score all rows."""
-    from lab.positions import table
+    from lab.positions import experiment
     from lab.positions.configurations import HEADLINE, SENSORS, configurations
 
     rows = configurations(HEADLINE if arguments.rows == "headline" else SENSORS, arguments.shares)
     setup = SETUPS[arguments.scenario]
-    work = partial(table.run, seeds=seeds_of(arguments), seconds=arguments.seconds, rows=rows, setup=setup)
+    work = partial(experiment.run, seeds=seeds_of(arguments), seconds=arguments.seconds, rows=rows, setup=setup)
     return perform(arguments, "machines drive, filters follow", work)

@@ -23,10 +23,10 @@ from lab.paper import maps
 from lab.paper.drives import QUICK, RECOMMENDED, MapSource, Plan
 from lab.paper.maps import AS_TRUE, FORECASTS, KINDS, PAPERS, SERVED, MadeMaps, MapKind
 from lab.paper.tensor import write_tensor
-from lab.positions import table
+from lab.positions import experiment as positions
 from lab.positions.configurations import Configuration
+from lab.positions.experiment import Scores
 from lab.positions.published import PLOTTING, POSITIONS, Published
-from lab.positions.table import Scores
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from protocol.errors import SitegridError
 from protocol.site.ground_classes import resistance_class
@@ -83,7 +83,7 @@ def run(runner: Runner, plan: Plan) -> tuple[Report, Outcomes]:
     report: Report = {
         "seeds": list(plan.seeds),
         "seconds": plan.seconds,
-        "gps_error": table.gps_error(PlannedDrive(plan.seeds[0], plan.seconds, PAPER.preset, plan.setup)),
+        "gps_error": positions.gps_error(PlannedDrive(plan.seeds[0], plan.seconds, PAPER.preset, plan.setup)),
         "rows": rows,
         "forecasts": forecasts,
         "coverage": coverage,
@@ -103,8 +103,8 @@ def write_map(outcomes: Outcomes, runner: Runner, path: Path) -> None:
 def _positions(runner: Runner, plan: Plan) -> Scores:
     """Tables 1 and 2, by the replays of `lab positions`."""
     planned = [PlannedDrive(seed, plan.seconds, PAPER.preset, plan.setup) for seed in plan.seeds]
-    rows = [table.as_recorded(row, planned[0]) for row in plan.positions]
-    return table.scored(runner, planned, rows)
+    rows = [positions.as_recorded(row, planned[0]) for row in plan.positions]
+    return positions.scored(runner, planned, rows)
 
 
 def _maps(runner: Runner, plan: Plan) -> list[MapOutcome]:

@@ -14,7 +14,7 @@ from lab.ground import experiment as ground
 from lab.ground.experiment import GroundConfiguration
 from lab.maps import experiment as maps
 from lab.maps.cases import CASES
-from lab.positions import table
+from lab.positions import experiment
 from lab.positions.configurations import Configuration
 from sitegrid.process.lifetime import plain
 from sitegrid.proof.figures import Report, Row
@@ -31,7 +31,7 @@ LOADERS = Setup("paper_site", ("west", "east"), gps=(1, 2), imu=(3,), world="fas
 GROUND = (GroundConfiguration("kalman", "calibrated"), GroundConfiguration("rls", "harsh"))
 SMALL = tuple(replace(case, columns=45, rows=30) for case in CASES)
 RUNS: dict[str, Callable[[Runner], Report]] = {
-    "positions": lambda runner: table.run(runner, (3,), 14.0, POSITIONS, FAST)[0],
+    "positions": lambda runner: experiment.run(runner, (3,), 14.0, POSITIONS, FAST)[0],
     "ground": lambda runner: ground.run(runner, (4,), 40.0, GROUND, LOADERS)[0],
     "maps": lambda runner: maps.run(runner, (3,), SMALL)[0],
 }

@@ -21,7 +21,7 @@ WORK = {
     "ground": "lab.ground.experiment",
     "maps": "lab.maps.experiment",
     "paper": "lab.paper.experiment",
-    "positions": "lab.positions.table",
+    "positions": "lab.positions.experiment",
     "roads": "lab.roads.experiment",
     "routes": "lab.routes.experiment",
 }

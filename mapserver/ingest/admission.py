@@ -44,7 +44,7 @@ def nothing_seen(_: str) -> SeenTime:
     return SeenTime()
 
 
-def judge(
+def judge_batch(
     batch: SampleBatch,
     machine: str,
     site: SiteConfig,

@@ -16,7 +16,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_store, judge, signature_problem
+from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_store, judge_batch, signature_problem
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.block_credit import BlockCredit
 from mapserver.ingest.decisions import Decision, Decisions, plain
@@ -233,7 +233,7 @@ class Store:
         try:
             if isinstance(batch, MessageError):
                 raise batch
-            judge(batch, incoming.machine, self.site, self.now_ns, self._seen)
+            judge_batch(batch, incoming.machine, self.site, self.now_ns, self._seen)
             replaces = check_store(batch, self.identity, self.accepted)
             admission = admit(batch, self.journal.watermark(batch.machine, batch.spool_id).seq)
             if new := len(admission.batch.rows) > 0:

@@ -30,8 +30,8 @@ from protocol.wire.messages import Ack, Health, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, open_session
 from sitegrid.doctor import Finding, Level, skipped
 from sitegrid.follower_choice import KNOWN_S
-from sitegrid.machine_sentences import rolls
 from sitegrid.security.join import signer
+from sitegrid.trust_sentences import rolls
 
 ANSWER_S = 5.0
 LINK_S = 3.0

@@ -18,8 +18,8 @@ from protocol.queries.coverage import Coverage, CoverageQuery
 from protocol.queries.requests import MachinesQuery
 from protocol.queries.roads import Corners, RoadChange, Worklist, WorklistRow
 from sitegrid.export.wanted import Wanted, coarser
-from sitegrid.machine_sentences import rolls, why
 from sitegrid.times import utc_text
+from sitegrid.trust_sentences import rolls, why
 
 WORST = 10  # sections in the list
 STYLE = """body{font:15px/1.4 system-ui,sans-serif;max-width:60em;margin:1em auto;padding:0 1em}h1{margin-bottom:0}

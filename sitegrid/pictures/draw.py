@@ -39,9 +39,9 @@ from protocol.wire.messages import Pose
 from sim.truth import TruthMap
 from sitegrid.client import Client, connect
 from sitegrid.listener import Listener
-from sitegrid.machine_sentences import calibrations
 from sitegrid.options.parameters import dest, given, spread
 from sitegrid.process.lifetime import note, say
+from sitegrid.trust_sentences import calibrations
 
 AROUND_M = 30.0  # of the map around a drive
 STEP_M, MOST_STEPS = 5.0, 1000  # of a drive's profile

@@ -28,7 +28,7 @@ from sitegrid.client import Client
 from sitegrid.features.feature import projection_of
 from sitegrid.follower_choice import is_answered
 from sitegrid.listener import Listener
-from sitegrid.machine_sentences import rolls
+from sitegrid.trust_sentences import rolls
 from sitegrid.web.encoding import Cache
 from sitegrid.web.machines import Machines
 from sitegrid.web.values import plain

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapserver.evidence.fold_config import FoldConfig
-from mapserver.ingest.admission import GapError, SeenTime, admit, judge
+from mapserver.ingest.admission import GapError, SeenTime, admit, judge_batch
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.block_credit import BlockCredit
 from protocol.arrays import Table
@@ -49,7 +49,7 @@ def test_what_is_there_already_is_trimmed(first, n, watermark, new, trimmed):
 
 
 def judged(sent, machine="a", site=SITE):
-    judge(sent, machine, site, now_ns)
+    judge_batch(sent, machine, site, now_ns)
 
 
 def test_a_stamp_ahead_of_the_wall_clock_is_refused_where_the_site_says_so():
@@ -81,7 +81,7 @@ DAY = 86_400 * 10**9
 def test_a_stamp_a_day_ahead_of_all_that_is_known_is_refused_with_its_row(clock, ahead_ns, seen, reason):
     sent = batch(samples(3, stamp_ns=[NOW_NS, NOW_NS + ahead_ns, NOW_NS]))
     with pytest.raises(MessageError) as caught:
-        judge(sent, "a", replace(SITE, clock=clock), now_ns, lambda machine: {"a": seen}[machine])
+        judge_batch(sent, "a", replace(SITE, clock=clock), now_ns, lambda machine: {"a": seen}[machine])
     assert (caught.value.reason, caught.value.field, caught.value.row) == (reason, "stamp_ns", 1)
 
 
@@ -95,9 +95,9 @@ def test_a_stamp_a_day_ahead_of_all_that_is_known_is_refused_with_its_row(clock,
 )
 def test_a_stamp_that_others_bear_out_passes_a_site_that_goes_by_its_data(ahead_ns, seen):
     sent = batch(samples(1, stamp_ns=NOW_NS + ahead_ns))
-    judge(sent, "a", SITE, now_ns, lambda _: seen)
+    judge_batch(sent, "a", SITE, now_ns, lambda _: seen)
     with refused(Refusal.SERVER_CLOCK, "set the server's clock"):
-        judge(sent, "a", SITE, lambda: 1)
+        judge_batch(sent, "a", SITE, lambda: 1)
 
 
 @pytest.mark.parametrize("lost_before", [0, 1, 2, 5])

@@ -66,7 +66,7 @@ def test_query_round_trip(query):
 
 def test_selectors_do_not_change_by_accident():
     lines = questions.SELECTORS.read_text().splitlines()
-    assert questions.selectors() == lines
+    assert questions.selectors() == lines, "if it is meant: PYTHONPATH=. python tests/golden/questions.py"
     for line, asked in zip(lines, (*questions.QUESTIONS, *questions.COMMANDS), strict=True):
         name, _, text = line.partition("?")
         parse = parse_query if asked in questions.QUESTIONS else parse_command

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from sitegrid.doctor.network import check_machines
-from sitegrid.machine_sentences import MOST_LISTED, calibrated, calibrations, rolls, why
+from sitegrid.trust_sentences import MOST_LISTED, calibrated, calibrations, rolls, why
 from tests.unit.records import machine_state
 
 CALIBRATED = {"zero": -0.0034, "zero_std": 0.0005, "torque_gain": 1.49, "torque_gain_std": 0.012}

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from lab.campaign.recordings import PAPER, PlannedDrive, load, make
-from lab.positions import table
+from lab.positions import experiment
 from lab.positions.configurations import Configuration
-from lab.positions.table import ratios, summarise
+from lab.positions.experiment import ratios, summarise
 from sitegrid.logs.replay import Score
 
 FAST = replace(PAPER, world="fast")
@@ -69,8 +69,8 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_share_that_was_recorded_is_the_recording_itself(cache: Path):
     """And another one changes what all receivers read, but not when: the drive and the seed are the same."""
     recording = load(DRIVE.folder(cache))
-    assert table._with_share(table.replay_task(TWO, DRIVE), cache) == recording
-    shared = table._with_share(table.replay_task(SHARED, DRIVE), cache)
+    assert experiment._with_share(experiment.replay_task(TWO, DRIVE), cache) == recording
+    shared = experiment._with_share(experiment.replay_task(SHARED, DRIVE), cache)
     pairs = list(zip(recording.readings, shared.readings, strict=True))
     assert all(a.stamp_ns == b.stamp_ns and a.sensor == b.sensor for a, b in pairs)
     assert {a.sensor for a, b in pairs if a != b} == {"gps-1", "gps-2", "gps-3"}
