@@ -1,6 +1,10 @@
-"""The notebooks of examples/ run on a site from their first cell to their last."""
+"""The notebooks of examples/ run on a site from their first cell to their last, and so does the Python of README."""
 
 from __future__ import annotations
+
+import re
+import subprocess
+import sys
 
 import pytest
 
@@ -25,3 +29,13 @@ def test_a_notebook_runs_and_was_saved_with_its_answers(hauling: WebSite, name: 
     said = [output for cell in code for output in cell.outputs]
     assert not [output for output in said if output.output_type == "error"]
     assert any("image/png" in output.get("data", {}) for output in said)
+
+
+@pytest.mark.processes
+def test_the_python_of_the_readme_runs(hauling: WebSite):
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
+    assert code.count('connect("tcp/127.0.0.1:7447", "paper")') == 1
+    here = code.replace("tcp/127.0.0.1:7447", hauling.endpoint).replace('"paper"', repr(NAME))
+    ended = subprocess.run([sys.executable, "-c", here], capture_output=True, text=True, timeout=120, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    float(ended.stdout)  # a value, or NaN where nobody was
