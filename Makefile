@@ -8,7 +8,7 @@ SIZE_dev := 670 MB to load, 2.4 GB on disk
 
 # make quick: unit tests that are not slow, in about a minute. make test: the proof. make nightly, make weekly: what
 # takes longer (CONTRIBUTING.md).
-.PHONY: venv demo quick test nightly weekly check chaos fuzz soak bench
+.PHONY: venv demo quick test nightly weekly check lint-page chaos fuzz soak bench
 
 venv: $(VENV)/.dev
 
@@ -48,6 +48,16 @@ check: venv
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest --quiet tests/house
+	@if command -v npm >/dev/null; then $(MAKE) --no-print-directory lint-page; \
+	else echo "no npm: the live page's JavaScript is not checked; install it, for example with apt-get install npm"; fi
+
+# The live page's JavaScript; npm installs what checks it, as the lock file says.
+lint-page: tests/page/node_modules/.package-lock.json
+	tests/page/node_modules/.bin/eslint --config tests/page/eslint.config.mjs sitegrid/web/page
+
+tests/page/node_modules/.package-lock.json: tests/page/package.json tests/page/package-lock.json
+	npm ci --loglevel error --no-audit --no-fund --prefix tests/page
+	@touch $@
 
 chaos: venv
 	$(BIN)/python -m tests.chaos

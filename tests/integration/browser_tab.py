@@ -65,9 +65,8 @@ class Tab:
         raise AssertionError(f"did not come true: {expression}; {self.complaints}")
 
     def loaded(self) -> Tab:
-        self.until(
-            "window.sitegrid && sitegrid.map.tiles.size > 0 && sitegrid.state === 'live' && sitegrid.time.step_ns > 0"
-        )
+        ready = "sitegrid.site.state === 'live' && sitegrid.times.step_ns"
+        self.until(f"window.sitegrid && !sitegrid.site.isEmpty && {ready}")
         return self
 
     def pixel_of(self, x_m: float, y_m: float) -> tuple[float, float]:

@@ -51,14 +51,14 @@ def test_the_value_under_the_pointer_is_the_querys(tab: Tab, web: WebSite):
 
 def test_the_colours_on_the_map_are_those_of_its_cells(tab: Tab, web: WebSite):
     x_m, y_m = known_place(web)
-    tab.js("(sitegrid.shows.unsure = false, sitegrid.shows.machines = false, sitegrid.redraw())")
+    tab.js("(sitegrid.choices.setShow('unsure', false), sitegrid.choices.setShow('machines', false))")
     left, top = tab.pixel_of(x_m, y_m)
     tab.page.wait_for_timeout(300)
     red, green, blue, _ = tab.js(
         f"[...document.getElementById('map').getContext('2d').getImageData({left:.0f}, {top:.0f}, 1, 1).data]"
     )
     resistance = web.client.point(x_m, y_m, ["resistance"]).values["resistance"]
-    expected = tab.js(f"sitegrid.layer.colour({resistance})")
+    expected = tab.js(f"sitegrid.choices.layer.colour({resistance})")
     shown = (red << 16) | (green << 8) | blue
     assert all(abs((shown >> s & 255) - (expected >> s & 255)) <= 6 for s in (0, 8, 16))
 
@@ -90,7 +90,7 @@ def test_a_click_on_a_machine_says_how_it_does(tab: Tab, web: WebSite):
     x_m, y_m = known_place(web)
     web.session.put(keys.pose(NAME, "here-1"), encode_pose(Pose("here-1", web.now_ns, x_m, y_m, *[0.01] * 5)))
     web.session.put(keys.health(NAME, "here-1"), encode_health(Health("here-1", web.now_ns, {"status": "calibrating"})))
-    tab.until("sitegrid.machines.has('here-1')")
+    tab.until("sitegrid.site.machines.has('here-1')")
     tab.page.mouse.click(*tab.pixel_of(x_m, y_m))
     panel = tab.page.locator("#panel .agent")
     panel.first.wait_for(timeout=WAIT_MS)
@@ -102,7 +102,7 @@ def test_a_click_on_a_machine_says_how_it_does(tab: Tab, web: WebSite):
 
 
 def test_ground_where_nobody_was_says_so(tab: Tab):
-    tab.page.mouse.click(*tab.pixel_of(*tab.js("[sitegrid.map.bounds()[0] - 3.5, sitegrid.map.bounds()[1] - 3.5]")))
+    tab.page.mouse.click(*tab.pixel_of(*tab.js("sitegrid.site.map.bounds().map((edge) => edge - 3.5).slice(0, 2)")))
     tab.page.locator("#panel .say").wait_for(timeout=WAIT_MS)
     assert "Nobody has driven" in tab.page.locator("#panel").inner_text()
 
@@ -111,42 +111,42 @@ def test_the_slider_shows_the_map_of_its_time(tab: Tab, web: WebSite):
     tab.page.locator("#slider").focus()
     for _ in range(3):
         tab.page.keyboard.press("ArrowLeft")
-    tab.until("sitegrid.time.map !== null && sitegrid.time.at !== null")
-    at_ns = int(tab.js("String(BigInt(sitegrid.time.at))"))
-    tab.until(f"sitegrid.time.map.stamp_ns === {at_ns}")
+    tab.until("sitegrid.times.map !== null && sitegrid.times.at !== null")
+    at_ns = int(tab.js("String(BigInt(sitegrid.times.at))"))
+    tab.until(f"sitegrid.times.map.stamp_ns === {at_ns}")
     tiles = {(tile.x, tile.y) for tile in web.client.ask(TilesQuery(as_of_ns=at_ns)).tiles}
-    assert {tuple(map(int, key.split(","))) for key in tab.js("[...sitegrid.time.map.tiles.keys()]")} == tiles
+    assert {tuple(map(int, key.split(","))) for key in tab.js("[...sitegrid.times.map.tiles.keys()]")} == tiles
     assert START_NS < at_ns < web.now_ns
     assert "The map as of" in tab.page.locator("#status").inner_text()
     tab.page.keyboard.press("l")
-    tab.until("sitegrid.time.at === null && sitegrid.time.map === null")
+    tab.until("sitegrid.times.at === null && sitegrid.times.map === null")
 
 
 @pytest.mark.nightly
 def test_two_times_stand_beside_each_other_and_are_subtracted(tab: Tab, web: WebSite):
     tab.page.keyboard.press("c")
-    tab.until("sitegrid.time.mode === 'beside' && sitegrid.time.otherMap !== null")
+    tab.until("sitegrid.times.mode === 'beside' && sitegrid.times.otherMap !== null")
     assert tab.page.locator("#sides").inner_text().endswith("now")
     tab.page.mouse.move(640, 300)  # the line is in the middle
     tab.page.mouse.down()
     tab.page.mouse.move(900, 300, steps=4)
     tab.page.mouse.up()
-    assert tab.js("sitegrid.time.split") == pytest.approx(900 / 1280, abs=0.01)
+    assert tab.js("sitegrid.times.split") == pytest.approx(900 / 1280, abs=0.01)
     assert tab.page.locator("#panel").is_hidden(), "who drags asks no why"
     tab.page.keyboard.press("c")
-    tab.until("sitegrid.time.mode === 'difference' && sitegrid.difference !== undefined")
+    tab.until("sitegrid.times.mode === 'difference' && sitegrid.shown.map().layer.id === 'difference'")
     legend = tab.page.locator("#legend").inner_text()
     assert all(word in legend for word in ("Difference", "a quarter", "four times", "to now", "at one of the times"))
     x_m, y_m = known_place(web)
     column, row = math.floor(x_m), math.floor(y_m)
-    other_ns = int(tab.js("String(BigInt(sitegrid.time.other))"))
+    other_ns = int(tab.js("String(BigInt(sitegrid.times.other))"))
     then, now = (web.client.point(x_m, y_m, ["resistance"], as_of=ns).values["resistance"] for ns in (other_ns, None))
-    shown = tab.js(f"sitegrid.difference.at({column}, {row}, 'difference')")
+    shown = tab.js(f"sitegrid.shown.map().map.at({column}, {row}, 'difference')")
     assert shown == pytest.approx(math.log(now / then) / math.log(4), abs=0.03)
     tab.page.mouse.move(*tab.pixel_of(x_m, y_m))
     tab.until(f"document.getElementById('readout').textContent.startsWith('{100 * then:.1f} % → {100 * now:.1f} %')")
     tab.page.keyboard.press("c")
-    tab.until("sitegrid.time.mode === 'one'")
+    tab.until("sitegrid.times.mode === 'one'")
 
 
 @pytest.mark.nightly
@@ -182,11 +182,11 @@ def test_a_link_holds_view_layer_and_time(tab: Tab, browser):
     tab.page.mouse.wheel(0, -400)
     tab.page.keyboard.press("[")
     tab.until(
-        "sitegrid.time.map !== null && location.search.includes('layer=grade') && location.search.includes('time=')"
+        "sitegrid.times.map !== null && location.search.includes('layer=grade') && location.search.includes('time=')"
     )
     other = Tab(browser, tab.page.url)
-    other.until("window.sitegrid && sitegrid.time.map !== null")
-    for value in ("sitegrid.layer.id", "sitegrid.view.scale.toFixed(2)", "String(sitegrid.time.at)"):
+    other.until("window.sitegrid && sitegrid.times.map !== null")
+    for value in ("sitegrid.choices.layer.id", "sitegrid.view.scale.toFixed(2)", "String(sitegrid.times.at)"):
         assert other.js(value) == tab.js(value)
     other.close()
 
@@ -199,7 +199,7 @@ def test_a_phone_shows_map_legend_and_panel(browser, web: WebSite):
     assert tab.page.get_by_role("radio", name="Slope").is_hidden()
     tab.page.locator("#drawer").tap()
     tab.page.get_by_text("Slope", exact=True).tap()
-    tab.until("sitegrid.layer.id === 'grade'")
+    tab.until("sitegrid.choices.layer.id === 'grade'")
     tab.page.locator("#drawer").tap()
     x_m, y_m = known_place(web)
     tab.page.touchscreen.tap(*tab.pixel_of(x_m, y_m))
@@ -218,12 +218,12 @@ def test_a_server_that_is_gone_is_named_and_comes_back(browser, web: WebSite):
     tab = Tab(browser, web.url).loaded()
     kill(web.server)
     tab.until("document.getElementById('notice').textContent.includes('No map server answers')")
-    assert tab.js("sitegrid.map.tiles.size") > 0, "what it said last stays"
+    assert tab.js("sitegrid.site.map.tiles.size") > 0, "what it said last stays"
     tab.page.keyboard.press("[")
     tab.until("document.getElementById('notice').textContent.includes('map of that time could not be read')")
-    assert tab.js("[sitegrid.time.at, sitegrid.time.map, sitegrid.time.playing]") == [None, None, 0]
+    assert tab.js("[sitegrid.times.at, sitegrid.times.map, sitegrid.times.playing]") == [None, None, 0]
     web.server = web.start_server()
-    tab.until("sitegrid.state === 'live' && document.getElementById('notice').hidden")
+    tab.until("sitegrid.site.state === 'live' && document.getElementById('notice').hidden")
     tab.close()
 
 
@@ -247,15 +247,15 @@ def test_an_empty_map_says_what_to_do_and_what_comes_is_in_sight_until_the_view_
         def machine_at(*place: float) -> None:
             pose = Pose("machine-9", START_NS, *place, 0.0, 2.0, 1.0, 0.0, 1.0)
             web.session.put(keys.pose(NAME, pose.machine), encode_pose(pose))
-            tab.until(f"sitegrid.machines.get('machine-9')?.x_m === {place[0]}")
+            tab.until(f"sitegrid.site.machines.get('machine-9')?.x_m === {place[0]}")
 
         machine_at(400.0, 300.0)
         tab.until("document.getElementById('notice').textContent.includes('Machines are driving')")
         assert "small" in tab.js("document.getElementById('notice').className")
         assert seen(tab, (400, 300))
         web.drive(8)
-        tab.until("document.getElementById('notice').hidden && sitegrid.map.tiles.size > 0 && !sitegrid.view.flight")
-        west, south, east, north = tab.js("sitegrid.map.bounds()")
+        tab.until("document.getElementById('notice').hidden && !sitegrid.site.isEmpty && !sitegrid.view.flight")
+        west, south, east, north = tab.js("sitegrid.site.map.bounds()")
         assert seen(tab, (400, 300), (west, south), (east, north)), "ground and machines"
         machine_at(-700.0, 900.0)
         tab.until("!sitegrid.view.flight")
@@ -300,7 +300,7 @@ def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
         )
         children.start("revoke", "keys", "token", "anna", "--revoke", "--dir", keys).wait(PATIENCE_S)
         until(lambda: web.get("info", {"token": token}).status == 401, "the token is revoked")
-        tab.until("sitegrid.state === 'refused'")
+        tab.until("sitegrid.site.state === 'refused'")
         assert "Ask the office" in tab.page.locator("#notice").inner_text()
         tab.close()
 
@@ -317,12 +317,15 @@ def test_axe_finds_no_serious_fault(browser, web: WebSite, tmp_path: Path):
 
 
 class Sweeper:
-    """A machine that drives lanes over an area, once an hour; one half of it is paved between."""
+    """A machine that drives lanes over an area, once an hour; one half of it is paved between.
+
+    blind_hours: it measures no resistance before them.
+    """
 
     name = "sweeper"
 
-    def __init__(self) -> None:
-        self._seq = 0
+    def __init__(self, blind_hours: float = 0) -> None:
+        self._seq, self._blind_hours = 0, blind_hours
 
     def drive(self, from_s: float, frame: str) -> bytes:
         """The batch of an hour, which begins 900 times as late as the others' seconds."""
@@ -335,9 +338,35 @@ class Sweeper:
         rows["speed_mps"], rows["distance_m"] = 2.5, 1.0
         rows["c_rr"] = np.where((rows["x_m"] > 50) & (hour >= 3), 0.009, 0.04)
         rows["c_rr_var"], rows["grade_var"] = 1e-6, 1e-4
+        if hour < self._blind_hours:
+            rows["c_rr"] = rows["c_rr_var"] = np.nan
         batch = SampleBatch(self.name, 7, self._seq + 1, rows, frame)
         self._seq += len(rows)
         return encode_batch(batch)
+
+
+@pytest.mark.nightly
+def test_the_page_opens_with_the_layer_that_the_map_knows(browser, tmp_path: Path):
+    with Children(tmp_path) as children:
+        web = WebSite(tmp_path, children)
+        web.machines = [Sweeper(blind_hours=2)]
+        web.drive(2 * BATCH_S)
+        tab, asked = Tab(browser, web.url).loaded(), Tab(browser, f"{web.url}?layer=resistance").loaded()
+        slope = tab.page.get_by_role("radio", name="Slope")
+        tab.until("sitegrid.choices.layer.id === 'grade'")
+        assert slope.is_checked()
+        assert "level" in tab.page.locator("#legend").inner_text()
+        assert asked.js("sitegrid.choices.layer.id") == "resistance", "a link is a choice"
+        chosen = Tab(browser, web.url).loaded()
+        chosen.page.keyboard.press("3")
+        web.drive(BATCH_S)
+        tab.until("sitegrid.choices.layer.id === 'resistance'")
+        assert not slope.is_checked()
+        chosen.until("sitegrid.site.map.knows('resistance')")
+        assert chosen.js("sitegrid.choices.layer.id") == "visits"
+        for one in (tab, asked, chosen):
+            assert one.complaints == []
+            one.close()
 
 
 @pytest.mark.nightly
@@ -347,18 +376,18 @@ def test_changed_ground_is_outlined_and_says_what_it_was(browser, tmp_path: Path
         web.machines = [Sweeper()]
         web.drive(5 * BATCH_S)
         tab = Tab(browser, web.url).loaded()
-        tab.until("sitegrid.changes.length === 1")
-        west, south, east, north = tab.js("sitegrid.changes[0].bounds")
+        tab.until("sitegrid.site.changes.length === 1")
+        west, south, east, north = tab.js("sitegrid.site.changes[0].bounds")
         assert (round(west / 5), round(east / 5)) == (10, 16), "the half that was paved"
         tab.page.mouse.click(*tab.pixel_of((west + east) / 2, (south + north) / 2))
         tab.page.locator("#panel .change").wait_for(timeout=WAIT_MS)
         text = tab.page.locator("#panel .change").inner_text()
         assert "Was 4.0 % (dry dirt)" in text
         tab.page.get_by_role("button", name="Compare with before").click()
-        tab.until("sitegrid.time.mode === 'beside' && sitegrid.time.otherMap !== null")
-        shown = tab.js(f"sitegrid.time.otherMap.at({(west + east) // 2}, {(south + north) // 2}, 'resistance')")
+        tab.until("sitegrid.times.mode === 'beside' && sitegrid.times.otherMap !== null")
+        shown = tab.js(f"sitegrid.times.otherMap.at({(west + east) // 2}, {(south + north) // 2}, 'resistance')")
         assert shown == pytest.approx(0.04, rel=0.1), "the map of before the change"
-        tab.js(f"sitegrid.time.go({START_NS + 2 * 3600 * 10**9})")
+        tab.js(f"sitegrid.times.go({START_NS + 2 * 3600 * 10**9})")
         tab.until("document.querySelector('#panel .big b').textContent === '4.0 %'")  # the panel is of the time shown
         assert tab.complaints == []
         tab.close()

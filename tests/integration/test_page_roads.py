@@ -32,7 +32,7 @@ def tab(browser, web: WebSite) -> Iterator[Tab]:
 def opened(tab: Tab, key: str = "w") -> Any:
     """The panel of a key, once it has its answer."""
     tab.page.keyboard.press(key)
-    tab.until(f"sitegrid.panel !== null && {QUIET}")
+    tab.until(f"sitegrid.panel.name !== null && {QUIET}")
     return tab.page.locator("#panel")
 
 
@@ -107,7 +107,7 @@ def test_the_target_is_chosen_and_a_link_keeps_it(tab: Tab, browser, web: WebSit
     tab.until("location.search.includes('panel=work') && location.search.includes('target=0.05')")
     shown = panel.inner_text()
     other = Tab(browser, tab.page.url).loaded()
-    other.until(f"sitegrid.panel === 'work' && {QUIET}")
+    other.until(f"sitegrid.panel.name === 'work' && {QUIET}")
     assert other.page.locator("#panel").inner_text() == shown
     assert other.js("sitegrid.view.x.toFixed(1)") == tab.js("sitegrid.view.x.toFixed(1)")
     other.close()
@@ -125,9 +125,9 @@ def test_the_list_is_of_the_time_that_is_shown(tab: Tab, web: WebSite):
     panel = opened(tab)
     assert panel.locator(".stretch.short").count() > 0
     at_ns = FIRST_NS + DAY_NS
-    tab.js(f"sitegrid.time.go({at_ns})")
+    tab.js(f"sitegrid.times.go({at_ns})")
     rows = web.client.ask(WorklistQuery(limit=10, as_of_ns=at_ns)).rows
-    tab.until(f"sitegrid.time.map !== null && sitegrid.panelAt === {at_ns} && {QUIET}")
+    tab.until(f"sitegrid.times.map !== null && sitegrid.panel.at === {at_ns} && {QUIET}")
     assert panel.locator("ol .stretch").count() == len(rows)
     assert figure(rows[0].kwh_ph[0]) in panel.locator("ol .stretch").first.inner_text()
     assert panel.locator(".stretch.short").count() == 0, "the repair came later"
@@ -240,7 +240,7 @@ def test_a_link_opens_the_same_drive(tab: Tab, browser, cheapest: bool):
     tab.until("location.search.includes('line=')")
     tab.page.wait_for_timeout(300)
     other = Tab(browser, tab.page.url).loaded()
-    other.until(f"sitegrid.panel === 'route' && {QUIET} && sitegrid.route.answer !== null")
+    other.until(f"sitegrid.panel.name === 'route' && {QUIET} && sitegrid.route.answer !== null")
     assert other.page.locator("#panel .totals").inner_text() == panel.locator(".totals").inner_text()
     for name in ("cheapest", "machine", "places"):
         assert other.js(f"sitegrid.route.{name}") == tab.js(f"sitegrid.route.{name}")
@@ -311,10 +311,10 @@ def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
         tab.page.mouse.click(*tab.pixel_of(*place))
     tab.until("sitegrid.route.places.length === 2")
     tab.page.wait_for_timeout(1000)
-    frames, x = tab.js("[sitegrid.frames, sitegrid.view.x]")
+    frames, x = tab.js("[sitegrid.drawn.frames, sitegrid.view.x]")
     tab.page.locator("#map").focus()
     tab.page.keyboard.press("ArrowRight")
-    tab.until(f"sitegrid.frames > {frames} && sitegrid.view.x > {x}")
+    tab.until(f"sitegrid.drawn.frames > {frames} && sitegrid.view.x > {x}")
     assert tab.js("document.querySelector('#panel .asking') !== null"), "it says that it works"
     tab.page.mouse.click(*tab.pixel_of(140, 10))
     tab.until(f"{QUIET} && sitegrid.route.answer !== null && sitegrid.route.places.length === 3")

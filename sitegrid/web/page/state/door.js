@@ -3,10 +3,16 @@ import { readFrame } from "./tiles.js";
 
 const AGAIN_S = 2;
 
-export class Refused extends Error { constructor(status, problem) { super(problem.detail ?? problem.title ?? `refused with ${status}`); this.status = status; } }
+export class Refused extends Error {
+  constructor(status, problem) {
+    super(problem.detail ?? problem.title ?? `refused with ${status}`);
+    this.status = status;
+  }
+}
 
-export async function get(path, parameters = {}, signal = undefined) {
-  const query = new URLSearchParams(Object.entries(parameters).filter(([, value]) => value !== undefined && value !== null));
+async function get(path, parameters = {}, signal = undefined) {
+  const given = Object.entries(parameters).filter(([, value]) => value !== undefined && value !== null);
+  const query = new URLSearchParams(given);
   const answer = await fetch(`${path}${query.size ? `?${query}` : ""}`, { credentials: "same-origin", signal });
   if (!answer.ok) throw new Refused(answer.status, await answer.json().catch(() => ({})));
   return answer;
@@ -14,18 +20,17 @@ export async function get(path, parameters = {}, signal = undefined) {
 export const getJson = async (path, parameters, signal) => (await get(path, parameters, signal)).json();
 export const getFrame = async (path, parameters) => readFrame(await (await get(path, parameters)).arrayBuffer());
 
-// Keeps a live connection. on.state("live" | "away" | "refused" | "offline"), on.frame(frame), on.poses(list), on.site(table).
+// Keeps a live connection: on.state("live" | "away" | "refused" | "offline"), on.frame(frame), on.poses(list),
+// on.site(table).
 export function connect(site, map, on) {
-  let socket = null, closed = false, order = Promise.resolve();
+  let socket = null, order = Promise.resolve();
   const open = () => {
-    if (closed) return;
-    const known = map.store ? { store: map.store, row: map.row, fact: map.fact } : {};
-    const query = new URLSearchParams(known).toString();
-    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/sites/${site}/live${query ? `?${query}` : ""}`);
+    const known = map.store ? `?${new URLSearchParams({ store: map.store, row: map.row, fact: map.fact })}` : "";
+    const address = `${location.host}/api/v1/sites/${site}/live${known}`;
+    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${address}`);
     socket.binaryType = "arraybuffer";
     socket.onmessage = ({ data }) => { order = order.then(() => receive(data)).catch((error) => console.warn(error)); };
     socket.onclose = (event) => {
-      if (closed) return;
       on.state(event.code === 4401 ? "refused" : "offline");
       setTimeout(open, AGAIN_S * 1000);
     };
@@ -43,5 +48,4 @@ export function connect(site, map, on) {
     if (message.site) on.site(message.site);
   };
   open();
-  return () => { closed = true; socket?.close(); };
 }
