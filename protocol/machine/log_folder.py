@@ -6,7 +6,7 @@ The manifest may lie apart from the data, so that logs of others are described w
 import csv
 import heapq
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from pathlib import Path
@@ -21,7 +21,7 @@ from protocol.machine.csv_file import (
     CsvFile,
     Row,
     check_place,
-    no_number,
+    no_value,
     opened_rows,
     parse_column,
     require,
@@ -128,7 +128,8 @@ class LogFolder:
             reason, where = ("stamp_ahead", "ahead of") if ahead_s > 0 else ("stamp_goes_back", "behind")
             self.refused[reason] += 1
             problem = f"it is {abs(ahead_s):.1f} s {where} the rows around it"
-            self.first_refused.setdefault(reason, f"{source.file.file} line {line}: {problem}")
+            columns_ = ", ".join(source.stamp.columns)
+            self.first_refused.setdefault(reason, f"{source.file.file} line {line}: {columns_}: {problem}")
 
     def _rows(self, source: SensorFile) -> Iterator[_Numbered]:
         """The rows of a file that are readings, each with its line."""
@@ -152,21 +153,28 @@ class LogFolder:
 
     def _parser(self, source: SensorFile) -> Callable[[Row], Reading]:
         """What makes a reading of a row; raises RowError."""
-        sensor, stamp, values = source.sensor, stamp_reader(source.stamp), source.columns.reader(self.site)
-        described = (source.stamp, *source.columns.described.values())
-        numbers = [*source.file.at_least, *(name for column in described for name in column.columns)]
-        start_ns = self.start_ns - round(source.ahead_s * 1e9)
+        sensor, values = source.sensor, source.columns.reader(self.site)
+        stamp, ahead_ns = stamp_reader(source.stamp, self.start_ns), round(source.ahead_s * 1e9)
+        described = {"stamp": source.stamp, **source.columns.described}
 
         def parse(row: Row) -> Reading:
             try:
                 source.file.check(row)
-                return parse_reading(sensor.kind, sensor.name, start_ns + stamp(row), values(row))
+                return parse_reading(sensor.kind, sensor.name, stamp(row) - ahead_ns, values(row))
             except MessageError as error:
-                raise RowError(error.reason, str(error)) from None
+                raise RowError(error.reason, f"{error}{_cells(row, described, error.field or '')}") from None
             except (ValueError, TypeError, OverflowError):
-                raise RowError(Refusal.WRONG_TYPE, no_number(row, numbers)) from None
+                raise RowError(Refusal.WRONG_TYPE, no_value(row, described, source.file)) from None
 
         return parse
+
+
+def _cells(row: Row, described: Mapping[str, Column], field_: str) -> str:
+    """Which texts of a row a field comes from, behind a sentence on its value."""
+    name = field_.rpartition(".")[2]
+    column = described.get("stamp" if name == "stamp_ns" else name, Column())
+    cells = ", ".join(f"`{one}` has {row[one]!r:.40}" for one in column.columns)
+    return f" ({cells})" if cells else ""
 
 
 def open_log(manifest: Path, data: Path | None = None) -> LogFolder:

@@ -31,7 +31,7 @@ from protocol.files import load_toml
 from protocol.machine.csv_file import (
     Column,
     CsvFile,
-    no_number,
+    no_value,
     number_reader,
     opened_rows,
     parse_column,
@@ -48,6 +48,7 @@ from sitegrid.proof.tracks import Truth
 SIDE_FILE = "evaluation.toml"
 PLANAR, GEODETIC = ("x_m", "y_m"), ("lat_deg", "lon_deg")
 LIMITS = {"x_m": MAX_FAR_M, "y_m": MAX_FAR_M, "lat_deg": 90.0, "lon_deg": 180.0}
+ALL_DIGITS = "export the time column with all its digits"
 GAP_NS = 2_000_000_000  # between two rows that are further apart nobody knows where the machine was
 
 
@@ -135,6 +136,8 @@ def _read(log: LogFolder, described: dict[str, Any], where: str) -> LogTruth:
         raise ConfigError(where, f"its columns are {known}; not {', '.join(columns) or 'none'}")
     rows = list(_rows(log, file, columns["stamp"], {name: columns[name] for name in pair}))
     stamps, places = np.array([row[0] for row in rows], np.int64), np.array([row[1:] for row in rows])
+    if stands(stamps):
+        raise LogFolderError(log.data / file.file, f"the stamps of its {len(stamps)} rows do not advance; {ALL_DIGITS}")
     if pair == GEODETIC:
         places = np.stack(Projection(log.site).to_map_many(*places.T), axis=1)
     return LogTruth(_cut_at_gaps(stamps, places), np.array(mount.xyz_m))
@@ -145,19 +148,21 @@ def _rows(
 ) -> Iterator[tuple[int, float, float]]:
     """Stamp and place of each row that counts, NaN where a row says so; raises LogFolderError with the line."""
     path, newest = log.data / file.file, 0
-    stamp, readers = stamp_reader(time), [number_reader(column, name) for name, column in pair.items()]
-    numbers = [*file.at_least, *(name for column in (time, *pair.values()) for name in column.columns)]
+    stamp = stamp_reader(time, log.start_ns)
+    readers = [number_reader(column, name) for name, column in pair.items()]
     with opened_rows(file, log.data) as rows:
         for column in (time, *pair.values()):
             require(column.columns, rows, path)
         for row in rows:
             try:
                 file.check(row)
-                stamp_ns, (a, b) = log.start_ns + stamp(row), (read(row) for read in readers)
+                stamp_ns, (a, b) = stamp(row), (read(row) for read in readers)
             except RowError:
                 continue
             except (ValueError, TypeError, OverflowError):
-                raise LogFolderError(path, f"line {rows.line_num}: {no_number(row, numbers)}") from None
+                raise LogFolderError(
+                    path, f"line {rows.line_num}: {no_value(row, {'stamp': time, **pair}, file)}"
+                ) from None
             if stamp_ns < newest:
                 raise LogFolderError(path, f"line {rows.line_num}: it is older than the row before it")
             for name, value in zip(pair, (a, b), strict=True):
@@ -167,6 +172,11 @@ def _rows(
             yield stamp_ns, a, b
     if not newest:
         raise LogFolderError(path, "has no row that counts")
+
+
+def stands(stamps: Ints) -> bool:
+    """Whether most of these stamps (n,) equal the one before, as a spreadsheet leaves them."""
+    return len(stamps) > 1 and bool((np.diff(stamps) == 0).mean() > 1 / 2)
 
 
 def _cut_at_gaps(stamps: Ints, places: Floats) -> Truth:
