@@ -7,13 +7,14 @@ import csv
 import heapq
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from protocol.config import from_table, section, toml_lines
-from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal, RowError
+from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal, RowError, one_line
 from protocol.files import load_toml
 from protocol.machine.clock_watch import LATE_LIMIT, LONG_NS, ClockWatch
 from protocol.machine.csv_file import (
@@ -246,24 +247,36 @@ def _take_ahead_s(table: dict[str, Any]) -> float:
 def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig, readings: Iterable[Reading]) -> None:
     """Write readings as a log folder that `open_log` reads back exactly."""
     folder.mkdir(parents=True, exist_ok=True)
-    files: dict[str, list[Reading]] = {s.name: [] for s in machine.sensors}
-    for reading in readings:
-        if reading.sensor not in files:
-            raise LogFolderError(folder, f"machine {machine.name} has no sensor `{reading.sensor}`")
-        files[reading.sensor].append(reading)
-    for sensor in machine.sensors:
-        with (folder / f"{sensor.name}.csv").open("w", encoding="utf-8", newline="") as text:
-            writer = csv.writer(text)
-            names = columns(sensor.kind)
-            writer.writerow(["stamp_ns", *names])
-            writer.writerows([r.stamp_ns, *(repr(float(getattr(r, n))) for n in names)] for r in files[sensor.name])
-    (folder / MANIFEST).write_text(_manifest(name, site, machine), encoding="utf-8")
+    names = {sensor.name: columns(sensor.kind) for sensor in machine.sensors}
+    with log_files(folder, {sensor.name: sensor.kind for sensor in machine.sensors}) as write:
+        for reading in readings:
+            if reading.sensor not in names:
+                raise LogFolderError(folder, f"machine {machine.name} has no sensor `{reading.sensor}`")
+            write(reading.sensor, reading.stamp_ns, [getattr(reading, name) for name in names[reading.sensor]])
+    (folder / MANIFEST).write_text(manifest_toml(name, site, machine), encoding="utf-8")
 
 
-def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
-    head = "\n".join(["[log]", *toml_lines({"name": name}), "", "[site]"])
-    lines = [head, site_toml(site), "[machine]", *plain_lines(machine)]
+@contextmanager
+def log_files(folder: Path, kinds: Mapping[str, str]) -> Iterator[Callable[[str, int, Sequence[float]], None]]:
+    """Write the CSV files of a log folder, by what is yielded: sensor, stamp [ns] and values. kinds: by sensor."""
+    with ExitStack() as stack:
+        writers = {}
+        for sensor, kind in kinds.items():
+            text = stack.enter_context((folder / f"{sensor}.csv").open("w", encoding="utf-8", newline=""))
+            writers[sensor] = csv.writer(text)
+            writers[sensor].writerow(["stamp_ns", *columns(kind)])
+        yield lambda sensor, ns, values: writers[sensor].writerow([ns, *(repr(float(value)) for value in values)])
+
+
+def manifest_toml(
+    name: str, site: SiteConfig, machine: MachineConfig, notes: Mapping[str, Sequence[str]] | None = None
+) -> str:
+    """The manifest of what `log_files` has written. notes: comments, by sensor; those by "" stand at the top."""
+    comments = {sensor: [f"# {one_line(line)}" for line in some] for sensor, some in (notes or {}).items()}
+    lines = [*comments.get("", ()), "[log]", *toml_lines({"name": name}), "", "[site]", site_toml(site)]
+    lines += ["[machine]", *plain_lines(machine)]
     for sensor in machine.sensors:
-        lines += ["", "[[sensor]]", *sensor_lines(sensor), f'file = "{sensor.name}.csv"', "[sensor.columns]"]
+        lines += ["", *comments.get(sensor.name, ()), "[[sensor]]", *sensor_lines(sensor)]
+        lines += [f'file = "{sensor.name}.csv"', "[sensor.columns]"]
         lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(sensor.kind))]
     return "\n".join(lines) + "\n"

@@ -23,17 +23,8 @@ from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.machine_config import ABSOLUTE, QUANTITIES, MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu, Reading, Torque
 from sitegrid.doctor import Finding, Level
-from sitegrid.logs.clocks import check_clocks, time_of
-from sitegrid.logs.log_truth import (
-    ALL_DIGITS,
-    SIDE_FILE,
-    KnownArea,
-    LogTruth,
-    read_known_ground,
-    read_log_truth,
-    require_overlap,
-    stands,
-)
+from sitegrid.logs.clocks import ALL_DIGITS, check_clocks, stands, time_of
+from sitegrid.logs.log_truth import SIDE_FILE, KnownArea, LogTruth, read_known_ground, read_log_truth, require_overlap
 from sitegrid.logs.speeds import places, wheel_distance, wheel_share
 from sitegrid.logs.wheels import check_wheels
 from sitegrid.proof.figures import Row, rounded

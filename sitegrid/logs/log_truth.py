@@ -43,12 +43,12 @@ from protocol.machine.log_columns import MAX_FAR_M
 from protocol.machine.log_folder import LogFolder
 from protocol.machine.machine_config import Mount
 from protocol.site.site_config import KnownGround, Projection
+from sitegrid.logs.clocks import ALL_DIGITS, stands
 from sitegrid.proof.tracks import Truth
 
 SIDE_FILE = "evaluation.toml"
 PLANAR, GEODETIC = ("x_m", "y_m"), ("lat_deg", "lon_deg")
 LIMITS = {"x_m": MAX_FAR_M, "y_m": MAX_FAR_M, "lat_deg": 90.0, "lon_deg": 180.0}
-ALL_DIGITS = "export the time column with all its digits"
 GAP_NS = 2_000_000_000  # between two rows that are further apart nobody knows where the machine was
 
 
@@ -172,11 +172,6 @@ def _rows(
             yield stamp_ns, a, b
     if not newest:
         raise LogFolderError(path, "has no row that counts")
-
-
-def stands(stamps: Ints) -> bool:
-    """Whether most of these stamps (n,) equal the one before, as a spreadsheet leaves them."""
-    return len(stamps) > 1 and bool((np.diff(stamps) == 0).mean() > 1 / 2)
 
 
 def _cut_at_gaps(stamps: Ints, places: Floats) -> Truth:
