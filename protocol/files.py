@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
 
 from protocol.errors import ConfigError
@@ -84,6 +85,19 @@ def write_whole(path: Path, data: bytes, permissions: int = 0o666) -> None:
     """Write a file whole or not at all; raises OSError."""
     with whole_file(path, permissions) as file:
         file.write(data)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Make a folder that gets its name when the block ends without an error; else nothing is there. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{path.name}.", suffix=".part", dir=path.parent) as beside:
+        part = Path(beside) / path.name
+        part.mkdir()
+        yield part
+        sync_folder(part)
+        part.rename(path)
+    sync_folder(path.parent)
 
 
 def make_private(path: Path) -> None:

@@ -1,6 +1,8 @@
 """Units that logs come in, their factor to the unit that a field's suffix names, and standard gravity."""
 
 import math
+import re
+from datetime import UTC, datetime
 
 GRAVITY_MPS2 = 9.80665  # standard gravity (ISO 80000-3)
 DIESEL_J_PER_L = 35.8e6  # lower heating value
@@ -31,6 +33,9 @@ _UNITS: dict[str, dict[str, float]] = {
     "s": {"_s": 1.0},
 }
 _NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+ISO, DDMM = "iso", "ddmm"  # texts in place of numbers: a time with its zone; degrees and minutes as NMEA has them
+_FRACTION = re.compile(r"[.,](\d+)")
+_DDMM = re.compile(r"([-+]?)(\d{0,3})([0-5]\d(?:\.\d*)?) ?([NSEW]?)")
 
 
 def factor(unit: str, field: str) -> float:
@@ -46,7 +51,7 @@ def factor(unit: str, field: str) -> float:
 def stamp_scale(unit: str) -> int:
     """Nanoseconds in one `unit`; ValueError if that is no unit of time."""
     if unit not in _NS:
-        raise ValueError(f"unit `{unit}` is no unit of time; known: {', '.join(_NS)}")
+        raise ValueError(f"unit `{unit}` is no unit of time; known: {', '.join((*_NS, ISO))}")
     return _NS[unit]
 
 
@@ -56,3 +61,26 @@ def stamp_ns(text: str, scale: int) -> int:
         return int(text) * scale
     except ValueError:
         return round(float(text) * scale)
+
+
+def iso_ns(text: str) -> int:
+    """UTC nanoseconds of an ISO 8601 time with its zone, exact to 9 decimals; ValueError."""
+    fraction = _FRACTION.search(text)
+    try:
+        time = datetime.fromisoformat(_FRACTION.sub("", text.strip(), 1))
+    except ValueError:
+        raise ValueError("is no time in ISO 8601") from None
+    if time.tzinfo is None:
+        raise ValueError("names no zone, as Z or +02:00")
+    seconds = round(time.astimezone(UTC).timestamp())
+    return seconds * 10**9 + int(fraction[1][:9].ljust(9, "0") if fraction else 0)
+
+
+def ddmm_deg(text: str, side: str = "", sides: str = "NSEW") -> float:
+    """Degrees of ddmm.mmmm. side: one of `sides`, where it is neither the text's last letter nor a sign; ValueError."""
+    if not (match := _DDMM.fullmatch(text.strip())) or (match[4] and (side or match[1])):
+        raise ValueError("is not ddmm.mmmm, with minutes below 60")
+    if (letter := side.strip() or match[4]) not in ("", *sides):
+        raise ValueError(f"is on side {letter!r}, not {' or '.join(sides)}")
+    degrees = int(match[2] or 0) + float(match[3]) / 60
+    return -degrees if letter in ("S", "W") or match[1] == "-" else degrees

@@ -13,10 +13,11 @@ from typing import IO, Any
 
 from protocol.config import from_table
 from protocol.errors import ConfigError, LogFolderError, RowError
-from protocol.units import factor, stamp_ns, stamp_scale
+from protocol.units import DDMM, ISO, ddmm_deg, factor, iso_ns, stamp_ns, stamp_scale
 
 MAX_LINE = 2**20  # characters of a CSV file
 MAX_COLUMNS = 1000  # of a CSV file
+SIDES = {"lat_deg": "NS", "lon_deg": "EW"}  # of the world, of positions in degrees and minutes
 SPACES = " "  # as a delimiter: any number of spaces and tabs
 DELIMITERS = (",", ";", "\t", SPACES)
 Row = Mapping[str, str]  # texts by column
@@ -53,17 +54,43 @@ class Column:
     """A value of a row: the sum of CSV columns times their weights, plus an offset, in a unit; it may be constant.
 
     over: a column that the sum is divided by, as power is by speed; "" for none. Where it is 0, so is the quotient.
+    side: of a position as ddmm.mmmm, the column with N, S, E or W; "" where that stands behind the number.
     """
 
     weights: Mapping[str, float] = field(default_factory=dict, hash=False)
     unit: str = ""
     offset: float = 0.0
     over: str = ""
+    side: str = ""
 
     @property
     def columns(self) -> tuple[str, ...]:
         """The CSV columns that it needs."""
-        return (*self.weights, self.over) if self.over else tuple(self.weights)
+        return tuple(filter(None, (*self.weights, self.over, self.side)))
+
+    def text(self, unit: str) -> str:
+        """The CSV column of a text in place of a number; ValueError where more than that is described."""
+        only, *_ = *self.weights, ""
+        if not only or self != Column({only: 1.0}, unit, side=self.side if unit == DDMM else ""):
+            raise ValueError(f"unit `{unit}` is of a column alone, without weight, offset or quotient")
+        return only
+
+    def problem(self, field_: str, row: Row) -> str:
+        """Why a row has no value of that field, with column and text; empty where each text can be read."""
+        for name in filter(lambda name: name != self.side, self.columns):
+            if not (text := row[name]):
+                return f"{name}: a value is missing"
+            try:
+                if self.unit == ISO:
+                    iso_ns(text)
+                elif self.unit == DDMM:
+                    _ddmm_reader(self, field_)(row)
+                else:
+                    float(text)
+            except ValueError as error:
+                why = str(error) if self.unit in (ISO, DDMM) else "is not a number"
+                return f"{name}: {text!r:.40} {why}"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -76,6 +103,7 @@ class _Written:
     unit: str = ""
     offset: float = 0.0
     over: str = ""
+    side: str = ""
 
 
 def take_file(table: dict[str, Any], where: str) -> CsvFile:
@@ -99,7 +127,7 @@ def _parse_table(value: Any, where: str) -> Column:
     if (
         sum(one is not None for one in given) != 1
         or written.column == ""
-        or (written.value is not None and (written.offset or written.over))
+        or (written.value is not None and (written.offset or written.over or written.side))
     ):
         forms = '{ column = "name", unit = "deg", offset = 1.5 }, { columns = { left = 0.5, right = 0.5 } }'
         raise ConfigError(where, f'write "name", {forms} or {{ value = 0.01 }}')
@@ -108,7 +136,7 @@ def _parse_table(value: Any, where: str) -> Column:
     weights = {written.column: 1.0} if written.column else dict(written.columns or {})
     if not weights or not all(weights.values()):
         raise ConfigError(where, "columns: names with weights other than 0 are expected")
-    return Column(weights, written.unit, written.offset, written.over)
+    return Column(weights, written.unit, written.offset, written.over, written.side)
 
 
 def number_reader(column: Column, name: str) -> Callable[[Row], float]:
@@ -116,6 +144,8 @@ def number_reader(column: Column, name: str) -> Callable[[Row], float]:
 
     Raises ValueError if the unit is not known or does not fit; so does what it returns on a text that is no number.
     """
+    if column.unit == DDMM or column.side:
+        return _ddmm_reader(column, name)
     scale = factor(column.unit, name) if column.unit else 1.0
     offset, weights = column.offset * scale, [(c, w * scale) for c, w in column.weights.items()]
     if over := column.over:
@@ -131,13 +161,25 @@ def number_reader(column: Column, name: str) -> Callable[[Row], float]:
     return lambda row: sum((float(row[c]) * w for c, w in weights), offset)
 
 
-def stamp_reader(column: Column) -> Callable[[Row], int]:
-    """What makes nanoseconds of a row's time, exactly where all its numbers are whole; raises ValueError.
+def _ddmm_reader(column: Column, name: str) -> Callable[[Row], float]:
+    """As `number_reader`, of a position in degrees and minutes."""
+    only, sides, side = column.text(DDMM), SIDES.get(name, ""), column.side
+    if not sides:
+        raise ValueError(f"unit `{DDMM}` does not fit `{name}`, but {', '.join(SIDES)}")
+    return lambda row: ddmm_deg(row[only], row[side] if side else "", sides)
 
-    Seconds and nanoseconds may stand in two columns, of weights 1.0 and 1e-9.
+
+def stamp_reader(column: Column, start_ns: int = 0) -> Callable[[Row], int]:
+    """What makes UTC nanoseconds of a row's time, exactly where all its numbers are whole; raises ValueError.
+
+    start_ns: what numbers count from; ISO times do not. Seconds and nanoseconds may stand in two columns, of weights
+    1.0 and 1e-9.
     """
+    if column.unit == ISO:
+        only = column.text(ISO)
+        return lambda row: iso_ns(row[only])
     unit_ns = stamp_scale(column.unit or "s")
-    if not column.weights or column.offset or column.over:
+    if not column.weights or column.offset or column.over or column.side:
         raise ValueError(
             "a column is expected, neither a constant, an offset nor a quotient: times count from `start_ns`"
         )
@@ -145,7 +187,7 @@ def stamp_reader(column: Column) -> Callable[[Row], int]:
     for name, weight in column.weights.items():
         if not scales[name] or not math.isclose(scales[name], weight * unit_ns, rel_tol=1e-9):
             raise ValueError(f"{weight:g} of `{name}` is no whole number of nanoseconds")
-    return lambda row: sum(stamp_ns(row[name], scale) for name, scale in scales.items())
+    return lambda row: sum((stamp_ns(row[name], scale) for name, scale in scales.items()), start_ns)
 
 
 @contextmanager
@@ -161,6 +203,7 @@ def opened_rows(csv_file: CsvFile, folder: Path) -> Iterator["csv.DictReader[str
                 delimiter="," if csv_file.delimiter == SPACES else csv_file.delimiter,
                 skipinitialspace=True,
             )
+            rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
             require(csv_file.at_least, rows, path)
             yield rows
     except FileNotFoundError:
@@ -192,14 +235,12 @@ def require(names: Iterable[str], rows: "csv.DictReader[str]", path: Path) -> No
             raise LogFolderError(path, f"has {header.count(name)} columns `{name}`; name its columns by `names`")
 
 
-def no_number(row: Row, names: Iterable[str]) -> str:
-    """Which of these columns of a row has no number, as a sentence."""
-    for name in names:
-        try:
-            float(row[name])
-        except (ValueError, TypeError):
-            return f"{name}: {row[name]!r:.40} is not a number" if row[name] else f"{name}: a value is missing"
-    return "its stamp is not a number"  # as NaN, which is a number elsewhere
+def no_value(row: Row, described: Mapping[str, Column], csv_file: CsvFile) -> str:
+    """Which column of a row has no value of its field, as a sentence. described: columns by field, with the stamp."""
+    counted = ((name, Column({name: 1.0})) for name in csv_file.at_least)
+    problems = (column.problem(name, row) for name, column in (*counted, *described.items()))
+    stamps = described["stamp"].columns  # as NaN, which is a number elsewhere
+    return next(filter(None, problems), f"{', '.join(stamps)}: {', '.join(row[name] for name in stamps)!r} is no time")
 
 
 def open_text(path: Path) -> IO[str]:

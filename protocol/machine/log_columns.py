@@ -20,7 +20,7 @@ INSTEAD = {
     "gps_velocity": (("speed_mps", "course_deg"), ("velocity_e_mps", "velocity_n_mps")),
 }
 # What the variances of a kind are of, as `std` and `measures` call it.
-_VARIANCES = {
+VARIANCES = {
     "gps": {"var_e_m2": "position", "var_n_m2": "position"},
     "gps_velocity": {"var_e_m2ps2": "velocity", "var_n_m2ps2": "velocity"},
     "attitude": {"var_roll_rad2": "tilt", "var_pitch_rad2": "tilt", "var_yaw_rad2": "heading"},
@@ -69,9 +69,15 @@ class ReadingColumns:
         return values
 
     def _variances(self) -> Values:
-        """What the sensor's `std` states, for rows with 0 or less: many receivers write that where they know none."""
-        variances = _VARIANCES.get(self.sensor.kind, {}).items()
-        return {name: self.sensor.std[quantity] ** 2 for name, quantity in variances if quantity in self.sensor.std}
+        """What the sensor's `std` states, for rows with 0 or less: many receivers write that where they know none.
+
+        A variance that nobody uses refuses no row either.
+        """
+        unused = {name: value for name, value in _UNUSED.get(self.sensor.kind, {}).items() if name.startswith("var_")}
+        variances = VARIANCES.get(self.sensor.kind, {}).items()
+        return unused | {
+            name: self.sensor.std[quantity] ** 2 for name, quantity in variances if quantity in self.sensor.std
+        }
 
     def _steps(self, site: SiteConfig) -> list[Callable[[Values], None]]:
         """What turns described columns into those of the kind."""
@@ -113,7 +119,7 @@ def _value_of_absent(sensor: SensorConfig, name: str, forms: tuple[str, ...], si
         return site.origin_height_m
     if name in (unused := _UNUSED.get(sensor.kind, {})):
         return unused[name]
-    if quantity := _VARIANCES.get(sensor.kind, {}).get(name):
+    if quantity := VARIANCES.get(sensor.kind, {}).get(name):
         if quantity in sensor.std:
             return sensor.std[quantity] ** 2
         if not sensor.provides(quantity):

@@ -6,14 +6,15 @@ The manifest may lie apart from the data, so that logs of others are described w
 import csv
 import heapq
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from protocol.config import from_table, section, toml_lines
-from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal, RowError
+from protocol.errors import ConfigError, LogFolderError, MessageError, Refusal, RowError, one_line
 from protocol.files import load_toml
 from protocol.machine.clock_watch import LATE_LIMIT, LONG_NS, ClockWatch
 from protocol.machine.csv_file import (
@@ -21,7 +22,7 @@ from protocol.machine.csv_file import (
     CsvFile,
     Row,
     check_place,
-    no_number,
+    no_value,
     opened_rows,
     parse_column,
     require,
@@ -128,7 +129,8 @@ class LogFolder:
             reason, where = ("stamp_ahead", "ahead of") if ahead_s > 0 else ("stamp_goes_back", "behind")
             self.refused[reason] += 1
             problem = f"it is {abs(ahead_s):.1f} s {where} the rows around it"
-            self.first_refused.setdefault(reason, f"{source.file.file} line {line}: {problem}")
+            columns_ = ", ".join(source.stamp.columns)
+            self.first_refused.setdefault(reason, f"{source.file.file} line {line}: {columns_}: {problem}")
 
     def _rows(self, source: SensorFile) -> Iterator[_Numbered]:
         """The rows of a file that are readings, each with its line."""
@@ -152,21 +154,28 @@ class LogFolder:
 
     def _parser(self, source: SensorFile) -> Callable[[Row], Reading]:
         """What makes a reading of a row; raises RowError."""
-        sensor, stamp, values = source.sensor, stamp_reader(source.stamp), source.columns.reader(self.site)
-        described = (source.stamp, *source.columns.described.values())
-        numbers = [*source.file.at_least, *(name for column in described for name in column.columns)]
-        start_ns = self.start_ns - round(source.ahead_s * 1e9)
+        sensor, values = source.sensor, source.columns.reader(self.site)
+        stamp, ahead_ns = stamp_reader(source.stamp, self.start_ns), round(source.ahead_s * 1e9)
+        described = {"stamp": source.stamp, **source.columns.described}
 
         def parse(row: Row) -> Reading:
             try:
                 source.file.check(row)
-                return parse_reading(sensor.kind, sensor.name, start_ns + stamp(row), values(row))
+                return parse_reading(sensor.kind, sensor.name, stamp(row) - ahead_ns, values(row))
             except MessageError as error:
-                raise RowError(error.reason, str(error)) from None
+                raise RowError(error.reason, f"{error}{_cells(row, described, error.field or '')}") from None
             except (ValueError, TypeError, OverflowError):
-                raise RowError(Refusal.WRONG_TYPE, no_number(row, numbers)) from None
+                raise RowError(Refusal.WRONG_TYPE, no_value(row, described, source.file)) from None
 
         return parse
+
+
+def _cells(row: Row, described: Mapping[str, Column], field_: str) -> str:
+    """Which texts of a row a field comes from, behind a sentence on its value."""
+    name = field_.rpartition(".")[2]
+    column = described.get("stamp" if name == "stamp_ns" else name, Column())
+    cells = ", ".join(f"`{one}` has {row[one]!r:.40}" for one in column.columns)
+    return f" ({cells})" if cells else ""
 
 
 def open_log(manifest: Path, data: Path | None = None) -> LogFolder:
@@ -238,24 +247,36 @@ def _take_ahead_s(table: dict[str, Any]) -> float:
 def write_log(folder: Path, name: str, site: SiteConfig, machine: MachineConfig, readings: Iterable[Reading]) -> None:
     """Write readings as a log folder that `open_log` reads back exactly."""
     folder.mkdir(parents=True, exist_ok=True)
-    files: dict[str, list[Reading]] = {s.name: [] for s in machine.sensors}
-    for reading in readings:
-        if reading.sensor not in files:
-            raise LogFolderError(folder, f"machine {machine.name} has no sensor `{reading.sensor}`")
-        files[reading.sensor].append(reading)
-    for sensor in machine.sensors:
-        with (folder / f"{sensor.name}.csv").open("w", encoding="utf-8", newline="") as text:
-            writer = csv.writer(text)
-            names = columns(sensor.kind)
-            writer.writerow(["stamp_ns", *names])
-            writer.writerows([r.stamp_ns, *(repr(float(getattr(r, n))) for n in names)] for r in files[sensor.name])
-    (folder / MANIFEST).write_text(_manifest(name, site, machine), encoding="utf-8")
+    names = {sensor.name: columns(sensor.kind) for sensor in machine.sensors}
+    with log_files(folder, {sensor.name: sensor.kind for sensor in machine.sensors}) as write:
+        for reading in readings:
+            if reading.sensor not in names:
+                raise LogFolderError(folder, f"machine {machine.name} has no sensor `{reading.sensor}`")
+            write(reading.sensor, reading.stamp_ns, [getattr(reading, name) for name in names[reading.sensor]])
+    (folder / MANIFEST).write_text(manifest_toml(name, site, machine), encoding="utf-8")
 
 
-def _manifest(name: str, site: SiteConfig, machine: MachineConfig) -> str:
-    head = "\n".join(["[log]", *toml_lines({"name": name}), "", "[site]"])
-    lines = [head, site_toml(site), "[machine]", *plain_lines(machine)]
+@contextmanager
+def log_files(folder: Path, kinds: Mapping[str, str]) -> Iterator[Callable[[str, int, Sequence[float]], None]]:
+    """Write the CSV files of a log folder, by what is yielded: sensor, stamp [ns] and values. kinds: by sensor."""
+    with ExitStack() as stack:
+        writers = {}
+        for sensor, kind in kinds.items():
+            text = stack.enter_context((folder / f"{sensor}.csv").open("w", encoding="utf-8", newline=""))
+            writers[sensor] = csv.writer(text)
+            writers[sensor].writerow(["stamp_ns", *columns(kind)])
+        yield lambda sensor, ns, values: writers[sensor].writerow([ns, *(repr(float(value)) for value in values)])
+
+
+def manifest_toml(
+    name: str, site: SiteConfig, machine: MachineConfig, notes: Mapping[str, Sequence[str]] | None = None
+) -> str:
+    """The manifest of what `log_files` has written. notes: comments, by sensor; those by "" stand at the top."""
+    comments = {sensor: [f"# {one_line(line)}" for line in some] for sensor, some in (notes or {}).items()}
+    lines = [*comments.get("", ()), "[log]", *toml_lines({"name": name}), "", "[site]", site_toml(site)]
+    lines += ["[machine]", *plain_lines(machine)]
     for sensor in machine.sensors:
-        lines += ["", "[[sensor]]", *sensor_lines(sensor), f'file = "{sensor.name}.csv"', "[sensor.columns]"]
+        lines += ["", *comments.get(sensor.name, ()), "[[sensor]]", *sensor_lines(sensor)]
+        lines += [f'file = "{sensor.name}.csv"', "[sensor.columns]"]
         lines += ['stamp = { column = "stamp_ns", unit = "ns" }', *(f'{c} = "{c}"' for c in columns(sensor.kind))]
     return "\n".join(lines) + "\n"

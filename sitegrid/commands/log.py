@@ -7,13 +7,13 @@ from functools import partial
 from pathlib import Path
 
 from sitegrid.options.groups import add_action
-from sitegrid.options.values import PICTURE, count_or_names, names, setting, withhold
+from sitegrid.options.values import PICTURE, count_or_names, names, setting, taken, withhold
 from sitegrid.process.lifetime import note, plain, say, tell
 from sitegrid.process.streams import lines, table
 
-HELP = "check a recording of a machine, and replay it"
+HELP = "check a recording of a machine, replay it, or convert one of ROS or a receiver"
 EXTRA = "agent"
-BESIDE = {"cv2": "server"}  # for --picture alone
+BESIDE = {"cv2": "server", "rosbags": "recordings"}  # for --picture, and for bags
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -25,6 +25,19 @@ def add_options(parser: ArgumentParser) -> None:
         action.add_argument("manifest", type=Path, metavar="FOLDER", help="folder with log.toml, or that file")
         action.add_argument("--data", type=Path, help="folder with the CSV files, if not beside the manifest")
     _add_options_of_run(run)
+    _add_options_of_convert(add_action(what, "convert", "make a log folder of a bag of ROS, MCAP, NMEA, UBX or GPX"))
+
+
+def _add_options_of_convert(convert: ArgumentParser) -> None:
+    file = "bag of ROS 1 or 2, MCAP file of ROS 2, bytes of a receiver, or GPX"
+    convert.add_argument("file", type=Path, metavar="FILE", help=file)
+    folder = "is made; one that exists is refused (default: the name of FILE without its ending, here)"
+    convert.add_argument("folder", type=Path, nargs="?", metavar="FOLDER", help=folder)
+    take = (
+        "kinds of sensors that a topic feeds, as /odom=odometry, /imu=imu,attitude, /odom=none or "
+        "'/joint_states[left,right]=encoder'; may be repeated (default: what can be but one thing)"
+    )
+    convert.add_argument("--take", action="append", type=taken, default=[], metavar="TOPIC=KIND", help=take)
 
 
 def _add_options_of_run(run: ArgumentParser) -> None:
@@ -46,7 +59,11 @@ def _add_options_of_run(run: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Check a log, or replay it."""
+    """Check a log, replay it, or convert a recording."""
+    if arguments.what == "convert":
+        from sitegrid.convert.command import run as convert
+
+        return convert(arguments)
     return _check(arguments) if arguments.what == "check" else _run(arguments)
 
 

@@ -23,7 +23,7 @@ from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.machine_config import ABSOLUTE, QUANTITIES, MachineConfig, SensorConfig
 from protocol.machine.readings import Gps, Imu, Reading, Torque
 from sitegrid.doctor import Finding, Level
-from sitegrid.logs.clocks import check_clocks, time_of
+from sitegrid.logs.clocks import ALL_DIGITS, check_clocks, stands, time_of
 from sitegrid.logs.log_truth import SIDE_FILE, KnownArea, LogTruth, read_known_ground, read_log_truth, require_overlap
 from sitegrid.logs.speeds import places, wheel_distance, wheel_share
 from sitegrid.logs.wheels import check_wheels
@@ -39,7 +39,7 @@ ADVICE = {
     "out_of_range": "look at the unit of that column; variances of 0 mean unknown: give `std`, and no such columns",
     "stamp_ahead": "no harm if they are few: the clock was not set yet, or a message was damaged",
     "stamp_goes_back": "no harm if they are few; else sort the file by time",
-    "wrong_type": "numbers are expected; of dates and times, seconds",
+    "wrong_type": 'numbers are expected; of times as 2025-06-15T15:06:40Z say unit = "iso", of 4901.2345 N "ddmm"',
 }
 
 
@@ -107,9 +107,9 @@ def check_sensor(data: SensorData) -> Iterator[Finding]:
     for reason, count in data.refused.items():
         what = f"{count} of {count + len(stamps)} rows refused ({reason}), first {data.first[reason]}"
         yield Finding(Level.FAIL if count > len(stamps) else Level.WARN, name, what, ADVICE.get(reason, ""))
-    if _stands(data):
+    if stands(stamps):
         what = f"its stamps do not advance: {len(np.unique(stamps))} different in {len(stamps)} rows"
-        yield Finding(Level.FAIL, name, what, "export the time column with all its digits")
+        yield Finding(Level.FAIL, name, what, ALL_DIGITS)
         return
     steps_s = np.diff(stamps) * 1e-9
     if (longest := float(steps_s.max(initial=0.0))) * 1e9 > GAP_NS:
@@ -153,7 +153,7 @@ def check_positions(data: Sequence[SensorData], *, is_barred: bool) -> Finding:
         problem, advice = "no usable GPS fixes", "add a receiver, or `sitegrid log run --set start=[x,y,heading]`"
     elif unread := [one.sensor.name for one in data if one.problem]:
         problem, advice = f"{unread[0]} cannot be read", "mend its file, or leave it out by `use = false`"
-    elif is_barred or any(_stands(one) for one in data):
+    elif is_barred or any(stands(one.stamps_ns) for one in data):
         problem, advice = "readings do not fit together", "mend the stamps and places that are named above"
     if problem:
         return Finding(Level.FAIL, "positions", problem, advice)
@@ -232,12 +232,6 @@ def _row(data: SensorData, start_ns: int) -> Row:
 def _gaps(steps_s: Floats) -> Floats:
     """Intervals that are far longer than the usual one."""
     return steps_s[steps_s > max(PAUSE * float(np.median(steps_s)), LEAST_GAP_S)]
-
-
-def _stands(data: SensorData) -> bool:
-    """Whether most of its stamps equal the one before."""
-    stamps = data.stamps_ns
-    return len(stamps) > 1 and bool((np.diff(stamps) == 0).mean() > 1 / 2)
 
 
 def _repeated(readings: Sequence[Reading]) -> tuple[float, float]:

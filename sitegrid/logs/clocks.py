@@ -6,10 +6,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 
+import numpy as np
+
 from agents.clock_offsets import ClockOffsets, Offset
+from protocol.arrays import Ints
 from protocol.machine.log_folder import LogFolder
 from protocol.machine.readings import Reading
 from sitegrid.doctor import Finding, Level
+
+ALL_DIGITS = "export the time column with all its digits"
+
+
+def stands(stamps: Ints) -> bool:
+    """Whether most of these stamps (n,) equal the one before, as a spreadsheet leaves them."""
+    return len(stamps) > 1 and bool((np.diff(stamps) == 0).mean() > 1 / 2)
 
 
 def check_clocks(log: LogFolder, readings: Mapping[str, Sequence[Reading]]) -> Iterator[Finding]:

@@ -31,7 +31,7 @@ from protocol.files import load_toml
 from protocol.machine.csv_file import (
     Column,
     CsvFile,
-    no_number,
+    no_value,
     number_reader,
     opened_rows,
     parse_column,
@@ -43,6 +43,7 @@ from protocol.machine.log_columns import MAX_FAR_M
 from protocol.machine.log_folder import LogFolder
 from protocol.machine.machine_config import Mount
 from protocol.site.site_config import KnownGround, Projection
+from sitegrid.logs.clocks import ALL_DIGITS, stands
 from sitegrid.proof.tracks import Truth
 
 SIDE_FILE = "evaluation.toml"
@@ -135,6 +136,8 @@ def _read(log: LogFolder, described: dict[str, Any], where: str) -> LogTruth:
         raise ConfigError(where, f"its columns are {known}; not {', '.join(columns) or 'none'}")
     rows = list(_rows(log, file, columns["stamp"], {name: columns[name] for name in pair}))
     stamps, places = np.array([row[0] for row in rows], np.int64), np.array([row[1:] for row in rows])
+    if stands(stamps):
+        raise LogFolderError(log.data / file.file, f"the stamps of its {len(stamps)} rows do not advance; {ALL_DIGITS}")
     if pair == GEODETIC:
         places = np.stack(Projection(log.site).to_map_many(*places.T), axis=1)
     return LogTruth(_cut_at_gaps(stamps, places), np.array(mount.xyz_m))
@@ -145,19 +148,21 @@ def _rows(
 ) -> Iterator[tuple[int, float, float]]:
     """Stamp and place of each row that counts, NaN where a row says so; raises LogFolderError with the line."""
     path, newest = log.data / file.file, 0
-    stamp, readers = stamp_reader(time), [number_reader(column, name) for name, column in pair.items()]
-    numbers = [*file.at_least, *(name for column in (time, *pair.values()) for name in column.columns)]
+    stamp = stamp_reader(time, log.start_ns)
+    readers = [number_reader(column, name) for name, column in pair.items()]
     with opened_rows(file, log.data) as rows:
         for column in (time, *pair.values()):
             require(column.columns, rows, path)
         for row in rows:
             try:
                 file.check(row)
-                stamp_ns, (a, b) = log.start_ns + stamp(row), (read(row) for read in readers)
+                stamp_ns, (a, b) = stamp(row), (read(row) for read in readers)
             except RowError:
                 continue
             except (ValueError, TypeError, OverflowError):
-                raise LogFolderError(path, f"line {rows.line_num}: {no_number(row, numbers)}") from None
+                raise LogFolderError(
+                    path, f"line {rows.line_num}: {no_value(row, {'stamp': time, **pair}, file)}"
+                ) from None
             if stamp_ns < newest:
                 raise LogFolderError(path, f"line {rows.line_num}: it is older than the row before it")
             for name, value in zip(pair, (a, b), strict=True):

@@ -104,6 +104,13 @@ def setting(text: str) -> tuple[str, Any]:
         return name, value
 
 
+def taken(text: str) -> tuple[str, tuple[str, ...]]:
+    """A topic of a recording, and the kinds of sensors that it feeds: `/imu=imu,attitude`."""
+    topic, _, kinds = text.rpartition("=")
+    _require(bool(topic and all(kinds.split(","))), f"{text!r} is not TOPIC=KIND, as /imu=imu,attitude")
+    return topic, tuple(kinds.split(","))
+
+
 def _require(is_so: bool, problem: str) -> None:  # noqa: FBT001 - a condition
     if not is_so:
         raise ArgumentTypeError(problem)

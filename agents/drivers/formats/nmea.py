@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 
 from agents.drivers import formats
 from agents.drivers.formats import Message
-from protocol.units import factor
+from protocol.units import ddmm_deg, factor
 
 SENTENCES = frozenset(("RMC", "ZDA", "GGA", "GST", "VTG", "HDT", "THS"))  # a method of the receiver each
 DAY_NS = 86_400 * 10**9
@@ -81,7 +81,7 @@ class _Receiver:
         horizontal_m = range_m * float(hdop or math.nan)
         std_m = self._std_m or (horizontal_m, horizontal_m, 2 * horizontal_m)
         height_m = float(height or 0) + float(separation or 0)
-        values = (_degrees(lat, north), _degrees(lon, east), height_m, *map(formats.variance, std_m))
+        values = (ddmm_deg(lat, north or "-"), ddmm_deg(lon, east or "-"), height_m, *map(formats.variance, std_m))
         return *begun, Message(formats.FIX, self._source, self._utc_ns, values, quality=name, satellites=count)
 
     def gst(self, words: list[str], _: int) -> Sequence[Message]:
@@ -143,15 +143,6 @@ def _first(words: list[str], n: int) -> list[str]:
     if len(words) < n:
         raise ValueError(f"{len(words)} fields, {n} are expected")
     return words[:n]
-
-
-def _degrees(text: str, side: str) -> float:
-    """Degrees of ddmm.mmmm and N, S, E or W."""
-    whole = text.index(".") - 2 if "." in text else len(text) - 2
-    degrees = int(text[:whole] or 0) + float(text[whole:]) / 60
-    if side not in ("N", "S", "E", "W"):
-        raise ValueError(f"{side!r} is no side of the world")
-    return -degrees if side in ("S", "W") else degrees
 
 
 def _time_of_day_ns(text: str) -> int:

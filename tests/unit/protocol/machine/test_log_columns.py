@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.readings import columns
 from protocol.site.site_config import Projection
@@ -218,6 +218,74 @@ def test_a_time_that_cannot_be_is_refused_by_name(tmp_path: Path, column: str, p
     assert "[[sensor]] 1 columns.stamp" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "after_ns"),
+    [
+        ("2025-06-15T15:06:40Z", 0),
+        ("2025-06-15 17:06:40,25+02:00 ", 250_000_000),
+        ("20250615T150640.000000001Z", 1),
+    ],
+)
+def test_times_with_their_zone_are_exact_and_count_from_no_start(tmp_path: Path, text: str, after_ns: int) -> None:
+    columns = WHEELS.replace('"t"', '{ column = "t", unit = "iso" }')
+    log = wheels(tmp_path, f't,v,w\n"{text}",1,0\n', columns=columns)
+    assert [r.stamp_ns for r in log.readings()] == [T0 + after_ns]
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon", "row", "place"),
+    [
+        ("", "", "4901.5N,00824.75 E", (49.025, 8.4125)),
+        ("", "", "-4901.5,824.75W", (-49.025, -8.4125)),
+        (', side = "ns"', ', side = "ew"', "4901.5,824.75,S,W", (-49.025, -8.4125)),
+    ],
+)
+def test_positions_may_be_degrees_and_minutes(
+    tmp_path: Path, lat: str, lon: str, row: str, place: tuple[float, float]
+) -> None:
+    fix = only(opened(tmp_path, f"t,lat,lon,ns,ew\n1,{row}\n", "gps", DDMM % (lat, lon), "std = { position = 1.0 }"))
+    assert (fix.lat_deg, fix.lon_deg) == pytest.approx(place, abs=1e-12)
+
+
+DDMM = 'lat_deg = { column = "lat", unit = "ddmm"%s }, lon_deg = { column = "lon", unit = "ddmm"%s }'
+
+
+@pytest.mark.parametrize(
+    ("row", "problem"),
+    [
+        ("2025-06-15T15:06:40,4901.5,824.75", "line 2: t: '2025-06-15T15:06:40' names no zone, as Z or +02:00"),
+        ("yesterday,4901.5,824.75", "line 2: t: 'yesterday' is no time in ISO 8601"),
+        ("2025-06-15T15:06:40Z,4961.5,824.75", "line 2: lat: '4961.5' is not ddmm.mmmm, with minutes below 60"),
+        ("2025-06-15T15:06:40Z,4901.5E,824.75", "line 2: lat: '4901.5E' is on side 'E', not N or S"),
+        ("2025-06-15T15:06:40Z,4901.5,", "line 2: lon: a value is missing"),
+        ("2025-06-15T15:06:40Z,9901.5,824.75", "is not between -90 and 90 (`lat` has '9901.5')"),
+    ],
+)
+def test_a_text_that_is_no_time_or_position_is_refused_with_column_row_and_value(
+    tmp_path: Path, row: str, problem: str
+) -> None:
+    described = '{ stamp = { column = "t", unit = "iso" }, ' + DDMM % ("", "") + " }"
+    log = opened(tmp_path, f"t,lat,lon\n{row}\n", "gps", described, "std = { position = 1.0 }")
+    with pytest.raises(LogFolderError) as caught:
+        list(log.readings())
+    assert problem in str(caught.value)
+    assert "it.csv: none of its rows can be used; line 2: " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "described",
+    [
+        f'{{ stamp = {{ column = "t", unit = "iso", offset = 1.0 }}, {METRES} }}',
+        '{ stamp = "t", x_m = { column = "x", unit = "ddmm" }, y_m = "y" }',
+        '{ stamp = "t", lat_deg = { columns = { x = 2.0 }, unit = "ddmm" }, lon_deg = "y" }',
+        '{ stamp = "t", lat_deg = { column = "x", side = "ns" }, lon_deg = "y" }',
+    ],
+)
+def test_a_unit_of_texts_that_does_not_fit_is_refused(tmp_path: Path, described: str) -> None:
+    with pytest.raises(ConfigError, match=r"unit `(iso|ddmm)`"):
+        opened(tmp_path, "", "gps", described, "std = { position = 1.0 }")
+
+
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
@@ -253,8 +321,8 @@ def test_a_file_that_cannot_be_is_refused_by_name(tmp_path: Path, keys: str, pro
     assert problem in str(caught.value)
 
 
-def test_blanks_behind_a_delimiter_belong_neither_to_a_name_nor_to_a_value(tmp_path: Path) -> None:
-    log = wheels(tmp_path, 't, v, w\n0, 1, 0\n1, "2", 0\n')
+def test_blanks_around_a_delimiter_belong_neither_to_a_name_nor_to_a_value(tmp_path: Path) -> None:
+    log = wheels(tmp_path, 't , v," w "\n0 , 1 , 0\n1, "2", 0 \n')
     assert speeds(log) == [(1.0, 0.0), (2.0, 0.0)]
     assert not log.refused
 
@@ -266,6 +334,6 @@ def test_the_first_bad_row_of_each_reason_is_named_with_its_line(tmp_path: Path)
     assert log.refused == {"wrong_type": 2, "out_of_range": 1, "stamp_goes_back": 1}
     assert log.first_refused == {
         "wrong_type": "it.csv line 3: v: 'x' is not a number",
-        "out_of_range": "it.csv line 6: it.speed_x_mps: 500.0 is not between -100 and 100",
-        "stamp_goes_back": "it.csv line 8: it is 1.0 s behind the rows around it",
+        "out_of_range": "it.csv line 6: it.speed_x_mps: 500.0 is not between -100 and 100 (`v` has '500')",
+        "stamp_goes_back": "it.csv line 8: t: it is 1.0 s behind the rows around it",
     }

@@ -61,7 +61,7 @@ WRONG = {  # a file, what is changed in it, the sensor, and what is said of it
     ),
     "a stamp of the future": (
         *("gps.csv", lambda rows: joined([["9e8", *rows[0][1:]], *rows[1:]]), "gps-1"),
-        "WARN.*1 of 160 rows refused .stamp_ahead., first gps.csv line 2: it is 899999999.0 s ahead.*; no harm",
+        "WARN.*1 of 160 rows refused .stamp_ahead., first gps.csv line 2: t: it is 899999999.0 s ahead.*; no harm",
     ),
     "rounded stamps": ("gps.csv", replaced(0, lambda _: 9), "gps-1", "FAIL.*do not advance: 1 different in 160 rows"),
     "clocks from other days": (

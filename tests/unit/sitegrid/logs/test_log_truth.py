@@ -84,8 +84,9 @@ def test_the_track_of_an_antenna_is_compared_with_where_the_machine_believes_it(
     [
         ("t,x,y\n0,0,0\n1,1,0\n0.5,2,0\n", "truth.csv: line 4: it is older than the row before it"),
         ("t,x,y\n0,0,0\n1,east,0\n", "truth.csv: line 3: x: 'east' is not a number"),
-        ("t,x,y\nnan,0,0\n", "truth.csv: line 2: its stamp is not a number"),
+        ("t,x,y\nnan,0,0\n", "truth.csv: line 2: t: 'nan' is no time"),
         ("t,x,y\n0,4e5,0\n", "truth.csv: line 2: x_m: 400000.0 is beyond 100000"),
+        ("t,x,y\n5,0,0\n5,1,0\n5,2,0\n", "truth.csv: the stamps of its 3 rows do not advance"),
     ],
 )
 def test_a_truth_that_cannot_be_is_refused_with_its_line(tmp_path: Path, rows: str, problem: str) -> None:

@@ -1,0 +1,1 @@
+"""Recordings of others become log folders: bags of ROS, bytes of receivers, GPX (docs/log-folders.md)."""

@@ -1,0 +1,71 @@
+"""Bytes of receivers, NMEA and UBX, by the decoders of an agent's drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from agents.drivers.formats import FIX, STREAMS
+from agents.drivers.line import Line, split_stream
+from protocol.errors import LogFolderError
+from protocol.machine.machine_config import QUANTITIES, SensorConfig
+from protocol.machine.readings import columns
+from sitegrid.convert.recording import Topic, Value
+from sitegrid.setup.hearing import Ear
+
+PIECE = 65_536  # bytes read at once
+UNSTATED_STD = 1e3  # stands for a variance that is not stated, without which the decoders drop a value
+
+
+class ReceiverRecording:
+    """A file of a receiver's bytes. Where several of NMEA's talkers state positions, each has topics of its own."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        ear = Ear()
+        for piece in _pieces(path):
+            ear.feed(piece, None)
+        heard = ear.heard(path.name)
+        if not heard.streams:
+            raise LogFolderError(path, "is no bag of ROS, no MCAP, no GPX, and no receiver's positions are in it")
+        self._format = heard.kind
+        senders = sorted({name[-5:-3].lower() for name in heard.messages if name.endswith("GGA")})
+        senders = senders if heard.kind == "nmea" and len(senders) > 1 else []
+        self.topics = [self._topic(stream, senders) for stream in heard.streams]
+        self.topics += [self._topic(f"{sender}:{stream}", senders) for sender in senders for stream in heard.streams]
+        self.unread = [f"{name}: only {heard.kind} is" for name in heard.messages if not name.startswith(heard.kind)]
+
+    def values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
+        """Values of streams. What lacks the time or is broken is counted in `unread`."""
+        topics = {f"s{i}": topic for i, (topic, _) in enumerate(wanted)}
+        line = Line(self._format, {topic: _sensor(f"s{i}", kind) for i, (topic, kind) in enumerate(wanted)})
+        for piece in _pieces(self._path):
+            for seen in line.feed(piece, None):
+                if seen.sensor:
+                    named = zip(columns(seen.kind), seen.values, strict=True)
+                    values = tuple(0.0 if n.startswith("var_") and v == UNSTATED_STD**2 else v for n, v in named)
+                    yield Value(topics[seen.sensor], seen.kind, seen.utc_ns or seen.host_ns, values)
+        counted = {name.replace("_", " "): n for name, n in line.counters.items() if n and "frames" not in name}
+        self.unread += [f"{self._format}: {n} {name}" for name, n in counted.items()]
+
+    def _topic(self, name: str, senders: Collection[str]) -> Topic:
+        stream = split_stream(name)[1]
+        kind = STREAMS[stream]
+        each = " ".join(f"--take {sender}:{FIX}={kind}" for sender in senders)
+        several = f"{', '.join(senders)} send positions; of several receivers say {each}, of one receiver"
+        note = "`ticks_per_rev` is not stated: count it" if kind == "encoder" else ""
+        question = several if senders and name == FIX else ""
+        return Topic(
+            name, self._format, {kind: f"{stream} of {self._format}"}, () if senders else (kind,), question, note=note
+        )
+
+
+def _sensor(name: str, kind: str) -> SensorConfig:
+    is_stating = any(column.startswith("var_") for column in columns(kind))
+    return SensorConfig(name, kind, std=dict.fromkeys(QUANTITIES[kind][-1:] if is_stating else (), UNSTATED_STD))
+
+
+def _pieces(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while piece := file.read(PIECE):
+            yield piece
