@@ -31,6 +31,7 @@ from protocol.machine.readings import (
 )
 
 Sensed = tuple[Reading, SensorConfig]
+PLACES = (Gps, GpsVelocity)
 NOTHING = (0.0,) * 7  # count and sums
 MIN_NORM = 0.5  # a reference that has not settled yet sends a quaternion of zeros
 
@@ -103,21 +104,23 @@ class StepGatherer:
         Those of GPS end one only where no other sensor has been heard for long.
         """
         stamp_ns = readings[0][0].stamp_ns
-        fast = [(r, sensor) for r, sensor in readings if not isinstance(r, Gps | GpsVelocity)]
-        if fast or not self._sensed_ns:
+        is_sensed = False
+        for reading, sensor in readings:
+            if not isinstance(reading, PLACES):
+                self._add(reading, sensor)
+                is_sensed = True
+        if is_sensed or not self._sensed_ns:
             self._sensed_ns = stamp_ns
-        if not fast and stamp_ns - self._sensed_ns <= SILENT_NS:
+        if not is_sensed and stamp_ns - self._sensed_ns <= SILENT_NS:
             return None
-        for reading, sensor in fast:
-            self._add(reading, sensor)
         self._begin_ns = self._begin_ns or stamp_ns
         return self._finish(stamp_ns, dead_reckoning) if stamp_ns - self._begin_ns >= self._step_ns else None
 
     def _add(self, reading: Reading, sensor: SensorConfig) -> None:
-        if isinstance(reading, Articulation):
-            self._joint.update(reading.stamp_ns, reading.angle_rad)
-        elif isinstance(reading, Imu):
+        if isinstance(reading, Imu):
             self._add_imu(reading, sensor)
+        elif isinstance(reading, Articulation):
+            self._joint.update(reading.stamp_ns, reading.angle_rad)
         elif isinstance(reading, Attitude):
             self._add_attitude(reading, sensor)
         elif isinstance(reading, Steering) and sensor.name == self._turn_sensor:

@@ -202,6 +202,8 @@ class Localiser:
             if isinstance(event, FilterStep) and event.silent and self._sign:
                 self._judge_sign(self._sign, event, dead_reckoning)
             beliefs += self._filter(event, distance_m) if self.is_aligned else self._collect(event, distance_m)
+        if was_proven and not beliefs:  # as mostly
+            return []
         wheels_mps = None if dead_reckoning.is_silent(readings[0][0].stamp_ns) else dead_reckoning.wheels.speed_mps
         poses = [pose_of(belief, wheels_mps) for belief in beliefs]
         if was_proven:

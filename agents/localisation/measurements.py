@@ -134,7 +134,14 @@ def inertial(
 
 
 def wheels(
-    stamp_ns: int, sensor: str, velocity_mps: Floats, R: Floats, scale: int | None, gate: float, offset_m: float = 0.0
+    stamp_ns: int,
+    sensor: str,
+    velocity_mps: Floats,
+    R: Floats,
+    scale: int | None,
+    gate: float,
+    offset_m: float = 0.0,
+    considers: tuple[int, ...] = (),
 ) -> Measurement:
     """Velocity (3,) by wheels at y to the left of the axle's middle: z = ((1 + s) (v_x - w_z y), v_y, v_z).
 
@@ -158,12 +165,12 @@ def wheels(
             H[0, scale] = x[VELOCITY.start] - offset_m * x[YAW_RATE]
         return H
 
-    return Measurement(sensor, stamp_ns, velocity_mps, R, h, jacobian, gate_sigma=gate)
+    return Measurement(sensor, stamp_ns, velocity_mps, R, h, jacobian, gate_sigma=gate, considers=considers)
 
 
-def sides(stamp_ns: int) -> Measurement:
+def sides(stamp_ns: int, considers: tuple[int, ...]) -> Measurement:
     """A machine whose wheels say nothing still moves along its own axis: 0 = (v_y, v_z) at `base_link`."""
-    return _nothing("sides", stamp_ns, slice(VELOCITY.start + 1, VELOCITY.stop), SIDES_R, GATE_SIGMA)
+    return _nothing("sides", stamp_ns, slice(VELOCITY.start + 1, VELOCITY.stop), SIDES_R, GATE_SIGMA, considers)
 
 
 def rest(stamp_ns: int) -> Measurement:
@@ -258,9 +265,13 @@ def standstill(stamp_ns: int) -> Measurement:
     return _nothing(STANDSTILL, stamp_ns, slice(VELOCITY.start, RATE.stop), STILL_R, GATE_SIGMA)
 
 
-def _nothing(sensor: str, stamp_ns: int, states: slice, R: Floats, gate: float) -> Measurement:
+def _nothing(
+    sensor: str, stamp_ns: int, states: slice, R: Floats, gate: float, considers: tuple[int, ...] = ()
+) -> Measurement:
     """No motion in some states: an assumption, which no sensor measures, so it never relocks."""
-    return Measurement(sensor, stamp_ns, np.zeros(len(R)), R, *_picked(states), gate_sigma=gate, relocks=False)
+    h, jacobian = _picked(states)
+    z = np.zeros(len(R))
+    return Measurement(sensor, stamp_ns, z, R, h, jacobian, gate_sigma=gate, relocks=False, considers=considers)
 
 
 def _picked(states: slice) -> tuple[Model, Model]:

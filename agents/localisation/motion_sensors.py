@@ -113,11 +113,14 @@ class MotionSensors:
         std = source.std.get("angle", measurements.STEERING_RAD) * speed / self._wheelbase_m * (1 + tangent**2)
         return math.hypot(measurements.RATE_RADPS, std * math.sqrt(max(2 * STEERED_S / dt_s, 1.0)))
 
-    def wheels(self, step: FilterStep) -> list[Measurement]:
-        """Speed of the wheels less their slip, and a standstill. Silent ones leave what holds without them."""
+    def wheels(self, step: FilterStep, considers: tuple[int, ...] = ()) -> list[Measurement]:
+        """Speed of the wheels less their slip, and a standstill. Silent ones leave what holds without them.
+
+        considers: states that the speed leaves as they are; a standstill does not jitter, and teaches them.
+        """
         if step.silent:
             still = [measurements.rest(step.stamp_ns)] if step.still_s >= REST_S else []
-            return [measurements.sides(step.stamp_ns), *still]
+            return [measurements.sides(step.stamp_ns, considers), *still]
         if not step.rolled or not self._wheels:
             return []
         if forces := self.forces(step):
@@ -130,7 +133,7 @@ class MotionSensors:
         z = np.array([machine_speed(step.wheels.speed_mps, step.traction, slip), 0.0, 0.0])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
         R, gate, offset_m = self._wheels_R, self._wheels_gate, step.wheels.offset_m
-        rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate, offset_m)
+        rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate, offset_m, considers)
         return [rolled, measurements.standstill(step.stamp_ns)] if step.still_s >= STANDSTILL_S else [rolled]
 
     def _doubt_load(self, still_s: float) -> None:

@@ -1,7 +1,6 @@
 """The tracker: filters all that a machine senses, from one alignment on."""
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,7 @@ from agents.localisation.fix import GPS_GATE_SIGMA, Fix
 from agents.localisation.gps import Receivers, drifting
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep
-from agents.localisation.measurements import PLACE, STANDSTILL
+from agents.localisation.measurements import PLACE
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
 from protocol.arrays import Floats
@@ -155,7 +154,15 @@ class Tracker:
         layout = fusion.model.layout
         unplaced = layout.wheel_scale and event.stamp_ns - self._placed_ns > UNPLACED_S * 1e9
         reckons = unplaced and bool(self._placed_ns or self._config.is_started)  # else the fix that aligned it comes
-        inertial, turn, wheels = self._body.inertial(event), self._body.turn(event), self._body.wheels(event)
+        # Wheels show nothing of their own scale s; but h = (1 + s) v is linearised at a speed that jitters.
+        considers = tuple(range(layout.wheel_scales.start, layout.wheel_scales.stop))
+        if unplaced:
+            headed = (YAW, *range(layout.gyro_biases.start, layout.gyro_biases.stop)) if reckons else ()
+            considers = (X, Y, Z, *considers, *headed)
+        inertial, turn = self._body.inertial(event), self._body.turn(event)
+        wheels = self._body.wheels(event, considers)
+        if unplaced:
+            inertial = [replace(m, considers=considers) for m in inertial]
         slip_std = self._body.slip_std
         fusion.model = replace(
             fusion.model, traction=event.traction, slip_std=slip_std, heading_errors=errors, reckons=reckons
@@ -163,14 +170,6 @@ class Tracker:
         beliefs: list[Belief] = []
         for orientation in self._references.own_stamped(event):
             beliefs += self._filter_modal(fusion, self._references, orientation)
-        # Wheels show nothing of their own scale s; but h = (1 + s) v is linearised at a speed that jitters.
-        scale = tuple(range(layout.wheel_scales.start, layout.wheel_scales.stop))
-        if unplaced:
-            headed = (YAW, *range(layout.gyro_biases.start, layout.gyro_biases.stop)) if reckons else ()
-            considers = (X, Y, Z, *scale, *headed)
-            inertial, wheels = ([_considering(m, considers) for m in several] for several in (inertial, wheels))
-        elif scale:
-            wheels = [_considering(m, scale) for m in wheels]
         shown = [*inertial, *absolute, *turn, *wheels]
         if self._doubt and shown:
             shown[0], self._doubt = replace(shown[0], change=self._doubt), None
@@ -201,11 +200,6 @@ class Tracker:
         if beliefs:
             sensors.confirm(value, fusion.last[measurement.sensor])
         return beliefs
-
-
-def _considering(measurement: Measurement, states: Sequence[int]) -> Measurement:
-    """The measurement, which leaves these states as they are; a standstill is no jitter, and teaches."""
-    return measurement if measurement.sensor == STANDSTILL else replace(measurement, considers=tuple(states))
 
 
 def layout_of(machine: MachineConfig) -> Layout:

@@ -154,19 +154,19 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     return Motion(f, jacobian, Q, ANGLES, model.reckons)
 
 
-@lru_cache
 def gps_covariance(errors: tuple[GpsError, ...]) -> Floats:
     """Covariance (k, k) of the slow errors of k receivers, per axis [m2].
 
     What they have in common answers to one noise: with correlation times t and u, 2 sqrt(t u) / (t + u) of it is left.
     """
-    times = np.array([error.time_s for error in errors])
-    parts = np.array([error.common_m2 for error in errors])
-    common = np.minimum.outer(parts, parts)
-    covariance: Floats = common * 2 * np.sqrt(np.outer(times, times)) / np.add.outer(times, times)
-    np.fill_diagonal(covariance, [error.variance_m2 for error in errors])
-    covariance.setflags(write=False)
-    return covariance
+    rows = [[_common_m2(a, b) for b in errors] for a in errors]
+    for i, error in enumerate(errors):
+        rows[i][i] = error.variance_m2
+    return np.array(rows)
+
+
+def _common_m2(a: GpsError, b: GpsError) -> float:
+    return min(a.common_m2, b.common_m2) * 2 * math.sqrt(a.time_s * b.time_s) / (a.time_s + b.time_s)
 
 
 def map_from_base(attitude: Floats) -> Floats:
@@ -279,9 +279,17 @@ def _gps_motion(errors: tuple[GpsError, ...], dt_s: float) -> tuple[Floats, Floa
 
     Exact for steps of any length: what fades is renewed, so that the covariance stays.
     """
-    fading = np.array([-dt_s / error.time_s for error in errors])  # logarithms
-    renewal = gps_covariance(errors) * -np.expm1(np.add.outer(fading, fading))
-    return np.exp(fading).repeat(2), np.kron(renewal, EYE[:2, :2])
+    scale, renewed = _fading(tuple([error.time_s for error in errors]), dt_s)
+    noise = np.zeros((len(scale), len(scale)))
+    noise[::2, ::2] = noise[1::2, 1::2] = gps_covariance(errors) * renewed  # east and north
+    return scale, noise
+
+
+@lru_cache
+def _fading(times_s: tuple[float, ...], dt_s: float) -> tuple[Floats, Floats]:
+    """The factors, and the shares (k, k) of the covariance that are renewed: variances change, these times do not."""
+    fading = -dt_s / np.array(times_s)  # logarithms
+    return np.exp(fading).repeat(2), -np.expm1(np.add.outer(fading, fading))
 
 
 @lru_cache

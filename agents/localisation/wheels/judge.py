@@ -5,6 +5,7 @@ that wanders beside a parked machine is not felt, nor are clocks that are apart.
 those of the accelerometer the other way round needs no fixes to be judged. One that is right again counts again.
 """
 
+import cmath
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from protocol.site.site_config import Projection
 
 NEEDED = 3  # stretches in a row that condemn or acquit; twice as many to condemn without an accelerometer
 UNFELT_MPS, KEPT = 0.4, 0.7  # speed that wheels or force miss of late; how much of it is left after a second
+WEIGHED_S = 0.09  # of force, at least, from one look at the sign to the next: a tenth of what it is compared over
 BEFORE_NS = 3 * 10**9  # how long before a stretch its cause may lie: wheels stop, and the machine drives on
 STOP_NS = 3 * 10**9  # wheels that stop, and are not felt to until then, have died
 STILL_RADPS = 0.04  # above the bias of any gyro: a machine that turns faster does not stand
@@ -177,7 +179,7 @@ class WheelJudge:
             wheel.changed_ns = stamp_ns
         middle_rad = (wheel.angle_rad + angle_rad) / 2
         travel_m = rolled_m + sensor.mount.xyz_m[1] * (angle_rad - wheel.angle_rad)
-        wheel.place_m += travel_m * complex(math.cos(middle_rad), math.sin(middle_rad))
+        wheel.place_m += cmath.rect(travel_m, middle_rad)
         wheel.distance_m, wheel.rolled_m = wheel.distance_m + abs(rolled_m), wheel.rolled_m + rolled_m
         wheel.back_m -= min(rolled_m, 0.0)
         if rolled_m:
@@ -189,15 +191,17 @@ class WheelJudge:
     def _weigh_sign(self, wheel: _Wheel) -> None:
         """Compare changes of a wheel sensor's speed with the force ahead."""
         sign, name, now_ns = wheel.sign, wheel.reading.sensor, wheel.reading.stamp_ns
-        force_mps, pitch_rad, seconds = (now - before for now, before in zip(self._sums, wheel.sums, strict=True))
-        wheel.sums = self._sums
-        if seconds:
-            sign.add_force(force_mps / seconds, pitch_rad / seconds, seconds)
-        if wheel.tracker.is_settled:
-            sign.add_speed(now_ns, wheel.tracker.speed_mps)
         fault = self.faults.get(name)
         if fault == Fault.UNSIGNED and wheel.back_m > BACK_M:
             self._acquit(name)
+        seconds = self._sums[2] - wheel.sums[2]
+        if seconds < WEIGHED_S:
+            return
+        force_mps, pitch_rad = self._sums[0] - wheel.sums[0], self._sums[1] - wheel.sums[1]
+        wheel.sums = self._sums
+        sign.add_force(force_mps / seconds, pitch_rad / seconds, seconds)
+        if wheel.tracker.is_settled:
+            sign.add_speed(now_ns, wheel.tracker.speed_mps)
         if not sign.is_new:
             return
         sign.is_new = False
