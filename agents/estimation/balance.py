@@ -163,7 +163,7 @@ class Balancer:
         ahead, left, up = rotation.dot((imu.force_x_mps2, imu.force_y_mps2, imu.force_z_mps2)).tolist()
         self._wheels_ns = dead_reckoning.wheels_ns
         rolls = wheels.is_known and self._wheels_s() < MAX_PAUSE_S
-        ground = self._fresh(dead_reckoning.ground) if dead_reckoning.is_silent(imu.stamp_ns) else None
+        ground = self._fresh(dead_reckoning.ground) if not rolls and dead_reckoning.is_silent(imu.stamp_ns) else None
         accel, speed = (wheels.accel_mps2, wheels.speed_mps) if rolls else (0.0, ground.speed_mps if ground else 0.0)
         at_base = ahead + (wy**2 + wz**2) * x_m  # without what turning adds at the sensor's place
         vx, vy, vz = speed + wz * (wheels.offset_m - y_m) + wy * z_m, wz * x_m - wx * z_m, wx * y_m - wy * x_m

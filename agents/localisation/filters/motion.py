@@ -128,7 +128,11 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         Q[OFF_PLANE, OFF_PLANE] = OFF_PLANE_VARIANCE
     if model.gps_errors:
         gps = layout.gps_errors
-        scale[gps], Q[gps, gps] = _gps_motion(model.gps_errors, dt_s)
+        scale[gps], renewed = _fading(tuple([error.time_s for error in model.gps_errors]), dt_s)
+        rows = zip(_gps_covariance(model.gps_errors), renewed, strict=True)  # no arrays: they are so small
+        noise = [[value * share for value, share in zip(*row, strict=True)] for row in rows]
+        for east_or_north in (gps.start, gps.start + 1):
+            Q[east_or_north : gps.stop : 2, east_or_north : gps.stop : 2] = noise
     for state, error in enumerate(model.heading_errors, layout.heading_errors.start):
         scale[state] = math.exp(-dt_s / error.time_s)
         Q[state, state] = error.std_rad**2 * -math.expm1(-2 * dt_s / error.time_s)
@@ -159,14 +163,17 @@ def gps_covariance(errors: tuple[GpsError, ...]) -> Floats:
 
     What they have in common answers to one noise: with correlation times t and u, 2 sqrt(t u) / (t + u) of it is left.
     """
-    rows = [[_common_m2(a, b) for b in errors] for a in errors]
+    return np.array(_gps_covariance(errors))
+
+
+def _gps_covariance(errors: Sequence[GpsError]) -> list[list[float]]:
+    rows = [
+        [min(a.common_m2, b.common_m2) * 2 * math.sqrt(a.time_s * b.time_s) / (a.time_s + b.time_s) for b in errors]
+        for a in errors
+    ]
     for i, error in enumerate(errors):
         rows[i][i] = error.variance_m2
-    return np.array(rows)
-
-
-def _common_m2(a: GpsError, b: GpsError) -> float:
-    return min(a.common_m2, b.common_m2) * 2 * math.sqrt(a.time_s * b.time_s) / (a.time_s + b.time_s)
+    return rows
 
 
 def map_from_base(attitude: Floats) -> Floats:
@@ -274,22 +281,13 @@ def _slip(x: Floats, dt_s: float, along_m2: float) -> Floats:
 
 
 @lru_cache
-def _gps_motion(errors: tuple[GpsError, ...], dt_s: float) -> tuple[Floats, Floats]:
-    """Factors (2 k,) by which the errors of k receivers fade in a step, and their noise (2 k, 2 k).
+def _fading(times_s: tuple[float, ...], dt_s: float) -> tuple[Floats, tuple[tuple[float, ...], ...]]:
+    """Factors (2 k,) by which errors of k receivers fade in a step, and the shares (k, k) of them that are renewed.
 
     Exact for steps of any length: what fades is renewed, so that the covariance stays.
     """
-    scale, renewed = _fading(tuple([error.time_s for error in errors]), dt_s)
-    noise = np.zeros((len(scale), len(scale)))
-    noise[::2, ::2] = noise[1::2, 1::2] = gps_covariance(errors) * renewed  # east and north
-    return scale, noise
-
-
-@lru_cache
-def _fading(times_s: tuple[float, ...], dt_s: float) -> tuple[Floats, Floats]:
-    """The factors, and the shares (k, k) of the covariance that are renewed: variances change, these times do not."""
     fading = -dt_s / np.array(times_s)  # logarithms
-    return np.exp(fading).repeat(2), -np.expm1(np.add.outer(fading, fading))
+    return np.exp(fading).repeat(2), tuple(map(tuple, (-np.expm1(np.add.outer(fading, fading))).tolist()))
 
 
 @lru_cache
