@@ -202,8 +202,8 @@ class Pipeline:
 
     def _known_c_rr(self) -> float | None:
         """Resistance of the ground here, where the site states it and the position is sure enough."""
-        pose, areas = self.pose, self._site.known_ground
-        if not areas or not pose or not self._watch.is_clear:
+        areas = self._site.known_ground
+        if not areas or not (pose := self.pose) or not self._watch.is_clear:
             return None
         std_m = float(np.sqrt(np.linalg.eigvalsh(pose.covariance_m2)[-1]))
         margin_m = EDGE_M + 2 * std_m

@@ -120,8 +120,8 @@ class Positioning:
         if isinstance(reading, Gps) and sensor.mode == ABSOLUTE and not self._is_on_site(reading):
             self._counters["fix_outside_site"] += 1
             return ()
-        known_ns = max(reading.stamp_ns, sensor.true_ns(reading.stamp_ns))  # never before it was true
-        ended = self._order.gather(reading, known_ns)
+        true_ns = sensor.true_ns(reading.stamp_ns) if sensor.delay_s else reading.stamp_ns
+        ended = self._order.gather(reading, max(reading.stamp_ns, true_ns))  # never before it was true
         return self._accept(ended) if ended else ()
 
     def finish(self) -> Iterable[Accepted]:

@@ -27,7 +27,7 @@ class SkidSteering:
         self._looks = machine.skid_steers is None
         self._axles_m = machine.wheelbase_m or AXLES_M
         self._last: tuple[Reading, float] | None = None  # of the first wheel sensor, and the machine's angle then
-        self._ways: tuple[float, ...] = (0.0, 0.0)  # the last ticks of each wheel that were not none: their signs count
+        self._ways = (0.0, 0.0)  # the last ticks of each wheel that were not none: their signs count
         self._turned_rad = 0.0  # on the spot
         self._yaw_radps = 0.0  # low-passed
 
@@ -54,9 +54,9 @@ class SkidSteering:
     def _spins(self, last: Reading, reading: Reading, sensor: SensorConfig) -> bool | None:
         """Whether wheels turn the machine on the spot; None while they stand."""
         if isinstance(reading, Encoder) and isinstance(last, Encoder):
-            rolled = (reading.left_ticks - last.left_ticks, reading.right_ticks - last.right_ticks)
-            self._ways = tuple(new or old for new, old in zip(rolled, self._ways, strict=True))
-            return self._ways[0] * self._ways[1] < 0 if any(rolled) else None
+            left, right = reading.left_ticks - last.left_ticks, reading.right_ticks - last.right_ticks
+            self._ways = (left or self._ways[0], right or self._ways[1])
+            return self._ways[0] * self._ways[1] < 0 if left or right else None
         if isinstance(reading, Odometry) and sensor.provides("rate") and sensor.provides("speed"):
             rate, speed = abs(reading.rate_z_radps), abs(reading.speed_x_mps)
             return speed < SPOT_SHARE * self._axles_m * rate if rate or speed else None
