@@ -163,10 +163,7 @@ class Tracker:
         wheels = self._body.wheels(event, considers)
         if unplaced:
             inertial = [replace(m, considers=considers) for m in inertial]
-        slip_std = self._body.slip_std
-        fusion.model = replace(
-            fusion.model, traction=event.traction, slip_std=slip_std, heading_errors=errors, reckons=reckons
-        )
+        fusion.model = fusion.model.driven(errors, event.traction, self._body.slip_std, reckons=reckons)
         beliefs: list[Belief] = []
         for orientation in self._references.own_stamped(event):
             beliefs += self._filter_modal(fusion, self._references, orientation)

@@ -6,7 +6,7 @@ Whatever changes a belief but motions and measurements is here, since it maps th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -80,8 +80,9 @@ class Measurement:
     considers: tuple[int, ...] = ()
 
     def at(self, stamp_ns: int, z: Floats) -> "Measurement":
-        """Another value of the same sensor, with the same model."""
-        return replace(self, stamp_ns=stamp_ns, z=z)
+        """Another value of the same sensor, with the same model; `replace` takes three times as long."""
+        model, rest = (self.R, self.h, self.jacobian), (self.angles, self.gate_sigma, self.relocks)
+        return Measurement(self.sensor, stamp_ns, z, *model, *rest, self.opens, self.change, self.considers)
 
 
 @dataclass(frozen=True, slots=True)
