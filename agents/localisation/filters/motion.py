@@ -135,8 +135,8 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         Q[OFF_PLANE, OFF_PLANE] = OFF_PLANE_VARIANCE
     if model.gps_errors:
         gps = layout.gps_errors
-        scale[gps], renewed = _fading(tuple([error.time_s for error in model.gps_errors]), dt_s)
-        rows = zip(_gps_covariance(model.gps_errors), renewed, strict=True)  # no arrays: they are so small
+        scale[gps], new_shares = _fading(tuple([error.time_s for error in model.gps_errors]), dt_s)
+        rows = zip(_gps_covariance(model.gps_errors), new_shares, strict=True)  # no arrays: they are so small
         noise = [[value * share for value, share in zip(*row, strict=True)] for row in rows]
         for east_or_north in (gps.start, gps.start + 1):
             Q[east_or_north : gps.stop : 2, east_or_north : gps.stop : 2] = noise
