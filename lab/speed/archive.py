@@ -1,4 +1,4 @@
-"""How long `sitegrid fold` takes for an archive: one thread, two threads, processes, a Dask cluster.
+"""How long `sitegrid fold` takes for an archive: one thread, two threads, workers of Dask.
 
 Each variant is the whole command, in turn, started by `python -m lab.speed.archive VARIANT ARCHIVE STORE`; the
 archive was just written, so that its files are in the system's cache. Hashes of the snapshots are compared.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import resource
 import subprocess
@@ -17,13 +16,10 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, cast
-
-from distributed import LocalCluster
+from typing import Any
 
 from lab.speed.measure import ROOT, Figures, in_child, in_turn, rows_of, say
 from lab.speed.site import SITE
@@ -36,14 +32,14 @@ STORE = "0123456789abcdef"
 WORKERS = 2
 OPTIONS = {"samples": 50_000_000, "runs": 1}
 GOALS = {("jobs", "times_one_thread"): ">= 1.6"}
-VARIANTS = ("thread", "threads", "jobs", "dask")
+VARIANTS = ("thread", "threads", "jobs")
 
 
 def run(samples: int, runs: int) -> Iterator[Row]:
     """An archive of so many samples, in hourly files of ten machines' work, folded by every variant in turn.
 
-    One thread, two threads of one process, two processes, two workers of a Dask cluster on this host. wall_s, cpu_s of
-    all processes, times_one_thread: how many times as fast. RuntimeError where the maps differ.
+    One thread, two threads of one process, two workers of Dask on this host. wall_s, cpu_s of all processes,
+    times_one_thread: how many times as fast. RuntimeError where the maps differ.
     """
     with tempfile.TemporaryDirectory() as path:
         folder, hashes = Path(path), set[str]()
@@ -86,11 +82,11 @@ def fold_timed(variant: str, archive: Path, out: Path) -> dict[str, Any]:
     """Fold as one variant does it."""
     if variant == "thread":
         os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])  # which a fold respects
-    with _engine(variant) as words:
-        command = [sys.executable, "-m", "sitegrid.cli", "fold", str(archive), "--out", str(out), "--json", *words]
-        start_s = time.perf_counter()
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)  # noqa: S603
-        wall_s = time.perf_counter() - start_s
+    words = ["--jobs", str(WORKERS)] if variant == "jobs" else []
+    command = [sys.executable, "-m", "sitegrid.cli", "fold", str(archive), "--out", str(out), "--json", *words]
+    start_s = time.perf_counter()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)  # noqa: S603
+    wall_s = time.perf_counter() - start_s
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     (snapshot,) = out.glob("snapshot-*.npz")
     return {
@@ -99,18 +95,6 @@ def fold_timed(variant: str, archive: Path, out: Path) -> dict[str, Any]:
         "peak_mb": max(each.ru_maxrss for each in usage) * 1024 / 1e6,
         "hash": hashlib.sha256(snapshot.read_bytes()).hexdigest()[:16],
     }
-
-
-@contextmanager
-def _engine(variant: str) -> Iterator[list[str]]:
-    """Options of a variant, and the cluster that they name."""
-    if variant != "dask":
-        yield ["--jobs", str(WORKERS)] if variant == "jobs" else []
-        return
-    cluster_of = cast("Any", LocalCluster)  # without types
-    options = {"host": "127.0.0.1", "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
-    with cluster_of(n_workers=WORKERS, threads_per_worker=1, **options) as cluster:
-        yield ["--engine", cluster.scheduler_address.replace("tcp://", "dask://")]
 
 
 if __name__ == "__main__":

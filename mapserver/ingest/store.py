@@ -20,10 +20,9 @@ from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_
 from mapserver.ingest.batches import decode_batches
 from mapserver.ingest.block_credit import BlockCredit
 from mapserver.ingest.decisions import Decision, Decisions, plain
-from mapserver.ingest.map_info import by_machine, name_shortfalls
+from mapserver.ingest.map_info import by_machine, map_info, name_shortfalls
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store_folder import hold
-from mapserver.ingest.store_state import state_of
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import History, fold_history, read_history, release_memory
 from mapserver.journal.journal import FencedError, UnwrittenError
@@ -209,8 +208,20 @@ class Store:
         self._opened.close()
 
     def info(self) -> dict[str, Any]:
-        """State of the store in plain values, from counters."""
-        return state_of(self)
+        """State of the store in plain values, from counters: nothing is counted anew."""
+        info = map_info(self.site, self.grid, self.facts, self.version, self.newest_ns, self.now_ns())
+        return info | {
+            "descends": list(self.identity.descends),
+            "accepted": sorted(self.accepted),
+            "epoch": self.journal.epoch,
+            "replica": self.journal.replica,
+            "decided": self.decided,
+            "journalled": self.journalled,
+            "snapshot": self.snapshot_row,
+            "machines": self.machines(),
+            "shortfalls": [str(shortfall) for shortfall in self.shortfalls],
+            "counters": dict(self.counters),
+        }
 
     @property
     def decided(self) -> int:

@@ -29,7 +29,7 @@ def add_options(parser: ArgumentParser) -> None:
     for name, what in (("from", "at or after T"), ("until", "before T")):
         summary = f"only samples with a stamp {what}; T: {STAMP_HELP}"
         add(f"--{name}", type=stamp, dest=f"{name}_ns", metavar="T", help=summary)
-    add("--jobs", type=count, default=1, metavar="N", help="fold in N processes (1: this one, on two threads)")
+    add("--jobs", type=count, default=1, metavar="N", help="fold in N processes, by Dask (1: this one, on two threads)")
     add("--engine", metavar="ADDRESS", help="fold on a Dask cluster: dask://HOST:PORT of its scheduler")
 
 

@@ -23,7 +23,7 @@ from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.site_config import SiteConfig, site_toml
 from sitegrid.process.lifetime import raise_interrupts, say, tell
 from sitegrid.process.progress import Display
-from sitegrid.refold.engine import Engine, Here, Processes
+from sitegrid.refold.engine import Cluster, Engine, Here
 from sitegrid.refold.new_store import making
 from sitegrid.refold.plan import Plan, plan
 from sitegrid.refold.sources import (
@@ -75,12 +75,8 @@ def fold(arguments: Namespace) -> dict[str, Any]:
 
 def _engine(arguments: Namespace, parts: int) -> AbstractContextManager[Engine]:
     """Who does the work; never more processes than there are parts."""
-    if arguments.engine:
-        from sitegrid.refold.cluster import Cluster
-
-        return Cluster(arguments.engine)
     jobs = min(arguments.jobs, parts)
-    return nullcontext(Here(THREADS)) if jobs == 1 else Processes(jobs)
+    return Cluster(arguments.engine or "", jobs) if arguments.engine or jobs > 1 else nullcontext(Here(THREADS))
 
 
 def _build(

@@ -1,43 +1,43 @@
-"""Who does the tasks of a fold: this process, processes on this host, or a cluster (cluster.py).
+"""Who does the tasks of a fold: this process, or workers of Dask (dask.distributed) on this host or on many.
 
-A task is a function and a value, and it may be done twice: what it writes has a name that says what is in it. So
-whoever dies is replaced, and its tasks are done again.
+A task is a function and a value, and it may be done twice: what it writes has a name that says what is in it. Dask
+notices a dead worker and has its tasks done by others. What Dask waits for without an end is limited here: a worker
+that ends by `sys.exit` takes its nanny along, and no other comes in its place.
 """
 
 from __future__ import annotations
 
-import ctypes
-import multiprocessing
-import os
-import signal
+import logging
+import socket
 import sys
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Generic, Protocol, Self, TypeVar
+from importlib import import_module
+from typing import Any, Protocol, Self, TypeVar
+from uuid import uuid4
 
-from protocol.errors import SitegridError
+from protocol.errors import ConfigError, SitegridError
 
 T = TypeVar("T")
 R = TypeVar("R")
+SCHEME = "dask://"
+TASK_SAMPLES = 4_000_000  # some seconds; the evidence of smaller tasks would take longer to merge than to fold
+TRIES = 3  # rounds in a row without any task done, before a fold is given up
 PATIENCE_S = 900.0  # without any task done: the largest take half a minute
-TASK_SAMPLES = 4_000_000  # some seconds; the evidence of smaller ones would take longer to merge than to fold
-TRIES = 3  # of a task, and of all processes at once, before a fold is given up
-_PR_SET_PDEATHSIG = 1
+CONNECT_S = 20.0  # timeout of a scheduler, and of its first worker
+ALONE_S = 60.0  # without any worker: one that is asked to end finishes its task first, and then another one starts
+LOOK_S = 2.0  # between two checks of scheduler and workers
+LOST = "lost"  # status of a task whose worker died; another worker does it again
 
 
 class EngineError(SitegridError):
-    """Those who do the work are gone, or do not do it."""
+    """The workers are gone, or do nothing."""
 
 
 class StalledError(Exception):
-    """The work did not go on, and may be tried again. why: what happened; advice: for who gives up."""
-
-    def __init__(self, why: str, advice: str) -> None:
-        super().__init__(why)
-        self.why, self.advice = why, advice
+    """The work did not go on, and may be tried again."""
 
 
 class Engine(Protocol):
@@ -61,20 +61,6 @@ class Engine(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Failure:
-    """What a task has to say for itself: errors do not all survive the way to another process."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Success(Generic[R]):
-    """What came of a task."""
-
-    value: R
-
-
 class Here:
     """One task after the other, in the process that asks; a single one folds all, and nothing has to be merged."""
 
@@ -92,111 +78,156 @@ class Here:
         return results
 
 
-class Processes:
-    """Processes on this host, which end with it; use it as a context. jobs: how many at most."""
+class Cluster:
+    """Workers of one Dask scheduler; use it as a context."""
 
     threads, task_samples = 1, TASK_SAMPLES
 
-    def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
-        self._pool: ProcessPoolExecutor | None = None
-        self._others: set[Any] = set()  # children that are not of the pool
+    def __init__(self, address: str = "", jobs: int = 1) -> None:
+        """address: dask://HOST:PORT of a scheduler; without one, `jobs` workers of this host that end with the context.
 
-    def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
-        """See Engine."""
-
-        def attempt_all(left: Mapping[int, T], results: dict[int, R]) -> None:
-            try:
-                self._do(work, left, results, done)
-            except (BrokenProcessPool, TimeoutError) as error:
-                self._end()
-                why = "were killed" if isinstance(error, BrokenProcessPool) else f"did nothing for {PATIENCE_S:g} s"
-                advice = "if that is for want of memory, give fewer --jobs"
-                raise StalledError(f"processes of the fold {why}", advice) from None
-
-        return in_turns(tasks, attempt_all)
+        Those of this host speak TLS with keys of their own: no other user of the host reaches them.
+        """
+        option = "--engine" if address else "--jobs"
+        if address and not address.startswith(SCHEME):
+            raise ConfigError(option, f"{address!r} is no {SCHEME}HOST:PORT of a Dask scheduler")
+        try:
+            self._dask: Any = import_module("distributed")
+        except ModuleNotFoundError:
+            raise ConfigError(option, "dask.distributed is not installed: pip install '.[cluster]'") from None
+        self._address, self._jobs = address, jobs
+        self._who = f"the workers of {address}" if address else "the processes of the fold"
+        for name in (name for name in logging.root.manager.loggerDict if name.startswith("distributed")):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say at length is one line here
+        self._client: Any = None
+        self._local: Any = None
+        self._killed: type[Exception] = self._dask.scheduler.KilledWorker
 
     def __enter__(self) -> Self:
+        try:
+            self._client = self._connected() if self._address else self._started()
+            self._client.wait_for_workers(1, timeout=CONNECT_S)
+        except TimeoutError:
+            self.__exit__()
+            problem = f"the scheduler at {self._address} has no workers; start some with `dask worker`"
+            raise ConfigError("--engine", problem) from None
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._end()
+        for opened in (self._client, self._local):
+            with suppress(Exception):  # of a scheduler that is gone
+                opened.close(timeout=CONNECT_S)
+
+    def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
+        """See Engine; EngineError after TRIES rounds in a row in which no task was done."""
+        results: dict[int, R] = {}
+        failures = 0
+        while left := {number: task for number, task in enumerate(tasks) if number not in results}:
+            before = len(results)
+            try:
+                self._do(work, left, results, done)
+            except (StalledError, self._killed) as error:
+                failures = failures + 1 if len(results) == before else 1
+                if failures >= TRIES:
+                    why = f"did nothing for {PATIENCE_S:g} s" if isinstance(error, StalledError) else "died of one task"
+                    advice = "if that is for want of memory, give fewer --jobs, or workers with more"
+                    raise EngineError(f"{self._who} {why}, {failures} times in a row; {advice}") from None
+        return [results[number] for number in range(len(tasks))]
+
+    def _connected(self) -> Any:
+        """A client of the scheduler at the address."""
+        place = self._address.removeprefix(SCHEME)
+        host, _, port = place.rpartition(":")
+        try:
+            socket.create_connection((host, int(port)), CONNECT_S).close()
+            return _within(CONNECT_S, lambda: self._dask.Client(f"tcp://{place}", timeout=CONNECT_S))
+        except (OSError, ValueError, OverflowError):  # TimeoutError is an OSError
+            problem = f"no Dask scheduler answers at {self._address}; start one with `dask scheduler`"
+            raise ConfigError("--engine", problem) from None
+
+    def _started(self) -> Any:
+        """A client of a scheduler in this process, with workers that die with it."""
+        options = {"memory_limit": 0, "dashboard_address": None, "silence_logs": logging.CRITICAL, "security": True}
+        self._local = self._dask.LocalCluster(n_workers=self._jobs, threads_per_worker=1, **options)
+        self._local.adapt(minimum=self._jobs, maximum=self._jobs, interval="1 s")  # a nanny may end with its worker
+        return self._dask.Client(self._local, timeout=CONNECT_S)
 
     def _do(
         self, work: Callable[[T], R], tasks: Mapping[int, T], results: dict[int, R], done: Callable[[int], None]
     ) -> None:
-        """Do tasks until all are done; BrokenProcessPool where a process dies, TimeoutError where nothing is done."""
-        pool = self._begun()
-        waiting: dict[Future[Success[R] | Failure], int] = {
-            pool.submit(attempt, work, task): number for number, task in tasks.items()
-        }
+        """Do tasks until all are done; StalledError where none is done for a while."""
+        run = uuid4().hex[:8]  # a task that hangs is given to others under another name
+        waiting: dict[Any, int] = {}
+        for number, task in tasks.items():
+            key = f"{work.__name__}-{run}-{number}"
+            waiting[self._client.submit(attempt, work, task, key=key, pure=False)] = number
         try:
             while waiting:
-                finished, _ = wait(waiting, PATIENCE_S, FIRST_COMPLETED)
-                if not finished:
-                    raise TimeoutError
-                for future in finished:
+                for future in self._finished(list(waiting)):
+                    if future.status == LOST:
+                        continue
                     number = waiting.pop(future)
-                    results[number] = opened(future.result())
+                    results[number] = self._result(future)
                     done(number)
+        except (OSError, self._dask.client.FuturesCancelledError):  # its connection is closed, or it was another's
+            raise self._gone() from None
         finally:
-            for future in waiting:
-                future.cancel()
+            with suppress(Exception):  # of a scheduler that is gone
+                self._client.cancel(list(waiting), force=True)
 
-    def _begun(self) -> ProcessPoolExecutor:
-        if self._pool is None:
-            self._others = set(multiprocessing.active_children())
-            spawn = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self._jobs, spawn, _begin, (os.getpid(),))
-        return self._pool
+    def _finished(self, futures: list[Any]) -> list[Any]:
+        """Some that are finished; StalledError where there are none for long, EngineError where nobody does them."""
+        began_s = alone_s = time.monotonic()
+        while True:
+            with suppress(TimeoutError):
+                return list(self._dask.wait(futures, timeout=LOOK_S, return_when="FIRST_COMPLETED").done)
+            now_s = time.monotonic()
+            if self._client.status != "running":
+                raise self._gone()
+            if self._client.nthreads():  # by worker
+                alone_s = now_s
+            if now_s - alone_s > ALONE_S:
+                raise EngineError(f"{self._who} are gone, and no others come; start some")
+            if now_s - began_s > PATIENCE_S:
+                raise StalledError
 
-    def _end(self) -> None:
-        """End the processes, whatever they do: what they write has its name only once it is whole."""
-        if self._pool:
-            self._pool.shutdown(wait=False, cancel_futures=True)
-            for child in set(multiprocessing.active_children()) - self._others:
-                child.kill()
-                child.join()
-            self._pool = None
+    def _result(self, future: Any) -> Any:
+        if future.status == "cancelled":
+            raise self._gone()
+        if future.status == "finished":
+            return future.result(timeout=CONNECT_S)
+        error = future.exception(timeout=CONNECT_S)
+        if isinstance(error, (SitegridError, self._killed)):  # several workers died while they did this task
+            raise error
+        raise EngineError(f"one of {self._who} failed: {type(error).__name__}: {error}")
 
-
-def in_turns(tasks: Sequence[T], attempt_all: Callable[[Mapping[int, T], dict[int, R]], None]) -> list[R]:
-    """Results of tasks, in their order; EngineError after TRIES turns in a row in which none was done.
-
-    attempt_all: does what is left, by number, and enters each result; StalledError where that does not go on.
-    """
-    results: dict[int, R] = {}
-    failures = 0
-    while left := {number: task for number, task in enumerate(tasks) if number not in results}:
-        before = len(results)
-        try:
-            attempt_all(left, results)
-        except StalledError as error:
-            failures = failures + 1 if len(results) == before else 1
-            if failures >= TRIES:
-                raise EngineError(f"{error.why}, {failures} times in a row; {error.advice}") from None
-    return [results[number] for number in range(len(tasks))]
+    def _gone(self) -> EngineError:
+        return EngineError(f"the Dask scheduler at {self._address or 'this process'} is gone")
 
 
-def attempt(work: Callable[[T], R], task: T) -> Success[R] | Failure:
-    """Do a task, in whichever process this is."""
+def attempt(work: Callable[[T], R], task: T) -> R:
+    """Do a task, in whichever process this is; its error is a plain one, which survives the way to another process."""
     try:
-        return Success(work(task))
+        return work(task)
     except (SitegridError, OSError, MemoryError) as error:
-        return Failure(str(error) or "out of memory")
+        raise SitegridError(str(error) or "out of memory") from None
 
 
-def opened(result: Success[R] | Failure) -> R:
-    """What came of a task; SitegridError where it failed."""
-    if isinstance(result, Failure):
-        raise SitegridError(result.text)
-    return result.value
+def _within(seconds: float, work: Callable[[], T]) -> T:
+    """What comes of work; TimeoutError in the end: to a port that says nothing a client connects for ever."""
+    results: list[T | Exception] = []
 
+    def do() -> None:
+        try:
+            results.append(work())
+        except Exception as error:  # whatever it is, it is raised where it is waited for
+            results.append(error)
 
-def _begin(parent: int) -> None:
-    """Begin a process: Ctrl-C is its parent's business, and it does not outlive that."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with suppress(OSError, AttributeError):  # Linux has it
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
+    thread = threading.Thread(target=do, name="connect", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if not results:
+        raise TimeoutError
+    if isinstance(results[0], Exception):
+        raise results[0]
+    return results[0]

@@ -17,8 +17,8 @@ from mapserver.journal.archive import write_file
 from mapserver.journal.rows import JournalRow
 from protocol.site.site_config import SiteConfig
 from sitegrid.cli import main
-from sitegrid.refold import cluster as clusters
-from sitegrid.refold.cluster import Cluster
+from sitegrid.refold import engine
+from sitegrid.refold.engine import Cluster
 from tests.patience import PATIENCE_S, until
 from tests.unit.sitegrid.refold.archives import SITE, STORE, T0, S, samples
 
@@ -29,7 +29,7 @@ FILES = 12
 MOST_FOLDS = 8  # until a worker dies in one
 # The command with smaller tasks, so that there are many of them.
 FOLD = (
-    "import sys; from sitegrid.refold.engine import Processes as P; P.task_samples = 1; from sitegrid.cli import main; "
+    "import sys; from sitegrid.refold.engine import Cluster as C; C.task_samples = 1; from sitegrid.cli import main; "
 )
 FOLD += "sys.exit(main(sys.argv[1:]))"
 
@@ -169,7 +169,7 @@ def test_a_cluster_that_loses_all_its_workers_is_named(
     """By `sys.exit` a worker takes its nanny along, and none comes in its place."""
     from distributed.chaos import KillWorker
 
-    monkeypatch.setattr(clusters, "ALONE_S", 3.0)
+    monkeypatch.setattr(engine, "ALONE_S", 3.0)
     with distributed.Client(dask) as client:
         client.register_plugin(KillWorker(0.4, "sys.exit"))
     assert main(["fold", str(archive), "--out", str(tmp_path / "out"), "--engine", address(dask)]) == 1
@@ -194,8 +194,7 @@ def test_a_scheduler_that_dies_is_named_and_the_fold_goes_on_without_it(
         place = json.loads(port_file.read_text())["address"].replace("tcp://", "dask://")
         with subprocess.Popen([*worker, "--death-timeout", "20"], **quiet) as one:
             words = ["fold", str(archive), "--out", str(out), "--engine", place]
-            code = FOLD.replace("engine import Processes", "cluster import Cluster")
-            with subprocess.Popen([sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True) as fold:
+            with subprocess.Popen([sys.executable, "-c", FOLD, *words], stderr=subprocess.PIPE, text=True) as fold:
                 until(lambda: len(evidence(out)) >= 2 or fold.poll() is not None, "some tasks")
                 scheduler.kill()
                 _, error = fold.communicate(timeout=PATIENCE_S)

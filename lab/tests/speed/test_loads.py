@@ -33,7 +33,7 @@ SMALLEST = {
     "restart": ("--samples 1950 --hours 0.02 --runs 1", ["open, rows of 6", "fold, 2 threads", "grid", "server"]),
     "filter": ("--steps 3 --runs 1", ["stock ukf, predict", "ekf, update rate", "ukf and smoother", "agent"]),
     "sim": ("--seconds 0.5 --runs 2", ["pybullet, 1", "fast, 3"]),
-    "archive": ("--samples 20000 --runs 1", ["thread", "threads", "jobs", "dask"]),
+    "archive": ("--samples 20000 --runs 1", ["thread", "threads", "jobs"]),
     "export": ("--hours 0.05 --runs 1", ["command", "map"]),
     "followers": ("--machines 4 --seconds 2 --hours 0.02 --runs 1", ["alone", "readers", "readers and followers"]),
 }

@@ -35,7 +35,7 @@ from protocol.site.site_file import load_site
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main
-from sitegrid.refold import cluster, new_store, work
+from sitegrid.refold import engine, new_store, work
 from sitegrid.refold.sources import joined_decisions
 from tests.journals import history_beside
 from tests.unit.mapserver.data import same_evidence
@@ -391,7 +391,7 @@ def test_processes_fold_a_store_as_one_does(store: Path, tmp_path: Path, jobs: i
 
 
 def test_a_port_that_says_nothing_is_no_scheduler(store: Path, tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr(cluster, "CONNECT_S", 0.5)
+    monkeypatch.setattr(engine, "CONNECT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"dask://127.0.0.1:{server.getsockname()[1]}"
         assert "no Dask scheduler answers" in refused(capsys, store, "--out", tmp_path / "new", "--engine", address)

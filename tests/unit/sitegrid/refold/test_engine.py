@@ -13,7 +13,7 @@ import pytest
 from protocol.errors import SitegridError
 from sitegrid.process.children import wait_until
 from sitegrid.refold import engine
-from sitegrid.refold.engine import EngineError, Here, Processes
+from sitegrid.refold.engine import Cluster, EngineError, Here
 from tests.unit.sitegrid.refold.tasks import die, die_once, fail, hang, square
 
 pytestmark = [pytest.mark.processes, pytest.mark.nightly]
@@ -27,7 +27,7 @@ def running() -> list[int]:
 
 def test_tasks_are_done_in_their_order_by_processes_of_their_own() -> None:
     done: list[int] = []
-    with Processes(2) as two:
+    with Cluster(jobs=2) as two:
         results = two.each(square, range(20), done.append)
         again = two.each(square, [3])
     assert [value for value, _ in results] == [n * n for n in range(20)]
@@ -40,14 +40,14 @@ def test_tasks_are_done_in_their_order_by_processes_of_their_own() -> None:
 
 
 def test_a_process_that_is_killed_is_replaced(tmp_path: Path) -> None:
-    with Processes(2) as two:
+    with Cluster(jobs=2) as two:
         pids = two.each(die_once, [tmp_path / str(n) for n in range(3)])
     assert len(pids) == 3
     assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_processes_that_always_die_end_the_work() -> None:
-    with Processes(2) as two, pytest.raises(EngineError, match="were killed, 3 times in a row; if that"):
+    with Cluster(jobs=2) as two, pytest.raises(EngineError, match="died of one task, 3 times in a row; if that"):
         two.each(die, range(4))
     assert not running()
 
@@ -55,13 +55,13 @@ def test_processes_that_always_die_end_the_work() -> None:
 def test_processes_that_hang_end_the_work(monkeypatch) -> None:
     monkeypatch.setattr(engine, "PATIENCE_S", 1.0)
     monkeypatch.setattr(engine, "TRIES", 1)
-    with Processes(1) as one, pytest.raises(EngineError, match="did nothing for 1 s"):
+    with Cluster(jobs=1) as one, pytest.raises(EngineError, match="did nothing for 1 s"):
         one.each(hang, [1])
     assert not running(), "they are killed"
 
 
 def test_an_error_of_a_task_is_that_of_the_work() -> None:
-    with Processes(1) as one, pytest.raises(SitegridError, match="/a/file: is damaged 5"):
+    with Cluster(jobs=1) as one, pytest.raises(SitegridError, match="/a/file: is damaged 5"):
         one.each(fail, [5])
     assert not running()
 
@@ -69,10 +69,10 @@ def test_an_error_of_a_task_is_that_of_the_work() -> None:
 def test_processes_end_with_who_started_them() -> None:
     """Killed, it cannot end them itself."""
     code = (
-        "import multiprocessing, time; from sitegrid.refold.engine import Processes\n"
+        "import multiprocessing, time; from sitegrid.refold.engine import Cluster\n"
         "from tests.unit.sitegrid.refold.tasks import square\n"
         "if __name__ == '__main__':\n"
-        "    pool = Processes(2); pool.each(square, range(4))\n"
+        "    pool = Cluster(jobs=2).__enter__(); pool.each(square, range(4))\n"
         "    print(*(child.pid for child in multiprocessing.active_children()), flush=True); time.sleep(1000)\n"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
