@@ -21,7 +21,7 @@ from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal import records
 from mapserver.journal.location import JournalLocation
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from mapserver.query import road_maps, routes
 from mapserver.query.answering import Answers
 from mapserver.query.queryable import AnswerPool, MapQueryable, Replies, question
@@ -89,7 +89,7 @@ class Server:
         self._changed = readers.declare_publisher(
             keys.changed(site.name), congestion_control=zenoh.CongestionControl.DROP
         )
-        past = Past.of_store(location.folder, site.cell_m, config.fold)
+        past = StorePast.of_store(location.folder, site.cell_m, config.fold)
         self._upkeep = Upkeep(self._writer, self._publish, past)
         source = ServerSource(self._writer, self._upkeep, past)
         self.answers = Answers(source)

@@ -11,10 +11,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from mapserver.calibration import stays
 from mapserver.change import detection
 from mapserver.config import ServerConfig
 from mapserver.evidence import fold_kernels, grid
-from mapserver.fleet import stays
 from mapserver.ingest import batches, block_credit
 from mapserver.journal import records
 from mapserver.query import road_maps, routes

@@ -7,6 +7,7 @@ position is off by one and the same error, as errors of satellite positions last
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,11 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from mapserver.config import ServerConfig
-from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.journal.facts import NO_FACTS
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Admission
+from mapserver.past.checkpoint_file import OPEN_END_NS, Checkpoint
+from mapserver.past.checkpoints import save_snapshot
+from mapserver.past.past import StorePast
 from protocol.arrays import AnyArray, Floats, Table
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig
@@ -128,6 +131,13 @@ def _resistance(x: AnyArray, y: AnyArray) -> Floats:
     return resistance
 
 
+def evidence_hash(snapshot: Path) -> str:
+    """Hex digits of a snapshot's evidence: its header names the store, which is another one each time."""
+    with Checkpoint(snapshot) as checkpoint:
+        parts = [checkpoint.index.tobytes(), *checkpoint.records(checkpoint.numbers_in(None))]
+        return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
 def write_store(folder: Path, site: SiteConfig, rows: int, tail_rows: int, in_row: int = BATCH) -> None:
     """Write a journal of so many rows, and a snapshot tail_rows before its end, none where it is shorter.
 
@@ -145,7 +155,8 @@ def write_store(folder: Path, site: SiteConfig, rows: int, tail_rows: int, in_ro
         if number <= rows - tail_rows:
             grid.fold(batch, name)
         if number == rows - tail_rows:
-            snapshot.save(folder, number, grid.state(), site.cell_m, config, NO_FACTS.of_evidence())
+            depends_on = StorePast.of_store(folder, site.cell_m, config).depends_on(journal, NO_FACTS)
+            save_snapshot(folder, number, depends_on(OPEN_END_NS), grid.state())
         if number % IN_ONE_COMMIT == 0:
             journal.commit()
             journal.begin()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lab.calibration.drives import Scene
-from mapserver.fleet.correction import measured
+from mapserver.calibration.correction import measured
 from protocol.arrays import Bools, Floats, Floats32, Table
 
 Rows = Mapping[str, Table]  # samples by machine

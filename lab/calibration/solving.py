@@ -14,12 +14,12 @@ from lab.calibration.drives import Scene
 from lab.campaign.true_maps import region_of, window_of
 from lab.maps.cases import CELL_M
 from lab.maps.methods import folded
+from mapserver.calibration.calibrate import Solution, calibrate
+from mapserver.calibration.correction import LAST_NS, Correction, corrected, measured
+from mapserver.calibration.ledger import StayLedger
+from mapserver.calibration.solver import SCALE_STD, ZERO_STD
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
-from mapserver.fleet.calibration import Calibration, calibrate
-from mapserver.fleet.correction import LAST_NS, Correction, corrected, measured
-from mapserver.fleet.ledger import Ledger
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.trust.auditor import Auditor
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints, Table
 from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
@@ -90,12 +90,12 @@ def served(rows: Rows) -> dict[str, Table]:
     return {name: corrected(rows[name], of_machine(result, name)) for name in sorted(rows) if name not in distrusted}
 
 
-def of_machine(result: Calibration, name: str) -> list[Correction]:
+def of_machine(result: Solution, name: str) -> list[Correction]:
     """The corrections of one machine."""
     return [each for each in result.corrections if each.machine == name]
 
 
-def accused(rows: Rows, result: Calibration) -> dict[str, str]:
+def accused(rows: Rows, result: Solution) -> dict[str, str]:
     """Machines that the server's trust excludes, and why: it judges corrected samples, which come in turn."""
     auditor = Auditor(CELL_M)
     right = {name: corrected(table, of_machine(result, name)) for name, table in rows.items()}
@@ -106,11 +106,11 @@ def accused(rows: Rows, result: Calibration) -> dict[str, str]:
     return {name: ", ".join(verdict.reasons) for name, verdict in verdicts.items() if verdict.contradicts}
 
 
-def calibrated(rows: Rows, excluded: Collection[str] = ()) -> Calibration:
+def calibrated(rows: Rows, excluded: Collection[str] = ()) -> Solution:
     """What the server's ledger and solver make of samples."""
     config, stays = ServerConfig(), {}
     for name, table in rows.items():
-        ledger = Ledger()
+        ledger = StayLedger()
         ledger.add(table[is_foldable(table, config.fold)])
         stays[name] = ledger.stays()
     return calibrate(stays, excluded)

@@ -22,10 +22,10 @@ from lab.cooperation.drives import Arm
 from lab.cooperation.live import LiveRun
 from lab.cooperation.network import LAYERS
 from lab.maps.cases import CELL_M
+from mapserver.calibration.correction import SampleCorrections
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import FoldConfig, name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.correction import Corrections
 from mapserver.ingest.decisions import Decisions
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.rows import Event
@@ -153,4 +153,4 @@ def decided(rows: Mapping[str, Table]) -> Facts:
     bad = accused(rows, calibrated(rows))
     result = calibrated(rows, bad)
     own = [each for name in rows if name not in bad for each in of_machine(result, name)]
-    return Facts(frozenset(bad), Corrections(own))
+    return Facts(frozenset(bad), SampleCorrections(own))

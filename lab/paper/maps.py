@@ -21,7 +21,7 @@ from lab.campaign.recordings import PlannedDrive
 from lab.campaign.true_maps import window_of
 from lab.maps.methods import SERVER_LAYERS, Layers, folded, hits_of, in_order, last_write, merge_hard
 from lab.maps.uncertainty import Forecast, by_frequency, by_mean
-from mapserver.fleet.correction import corrected
+from mapserver.calibration.correction import corrected
 from protocol.arrays import Bools, Floats, Floats32, Table
 from sim.truth import TruthMap
 from sitegrid.proof.figures import root_mean_square

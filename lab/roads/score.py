@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from lab.calibration.cases import Rows
 from lab.calibration.drives import FleetDrive, Scene
 from lab.calibration.solving import calibrated, of_machine
+from mapserver.calibration.correction import corrected
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.correction import corrected
 from mapserver.roads.ledger import Ledgers, mean
 from mapserver.roads.loss import SIGMA_90, Losses, losses
 from mapserver.roads.network import network

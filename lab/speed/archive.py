@@ -6,7 +6,6 @@ archive was just written, so that its files are in the system's cache. Hashes of
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import resource
@@ -26,7 +25,7 @@ from lab.speed.site import SITE
 from mapserver.journal.archive import HOUR_NS, write_file
 from mapserver.journal.rows import JournalRow
 from sitegrid.proof.figures import Row
-from tests.site_work import BATCH, batches
+from tests.site_work import BATCH, batches, evidence_hash
 
 STORE = "0123456789abcdef"
 WORKERS = 2
@@ -88,12 +87,12 @@ def fold_timed(variant: str, archive: Path, out: Path) -> dict[str, Any]:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)  # noqa: S603
     wall_s = time.perf_counter() - start_s
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    (snapshot,) = out.glob("snapshot-*.npz")
+    (snapshot,) = out.glob("snapshot-*")
     return {
         "wall_s": wall_s,
         "cpu_s": sum(each.ru_utime + each.ru_stime for each in usage),
         "peak_mb": max(each.ru_maxrss for each in usage) * 1024 / 1e6,
-        "hash": hashlib.sha256(snapshot.read_bytes()).hexdigest()[:16],
+        "hash": evidence_hash(snapshot),
     }
 
 

@@ -20,9 +20,9 @@ from pathlib import Path
 
 from lab.speed.measure import rows_of
 from lab.speed.site import SITE
+from mapserver.calibration.correction import UNCORRECTED
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import warm_up
-from mapserver.fleet.correction import UNCORRECTED
 from mapserver.ingest.backlog import GROUP_BATCHES
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer

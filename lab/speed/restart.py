@@ -20,13 +20,15 @@ from lab.speed.measure import Figures, in_child, in_turn, rows_of, timed
 from lab.speed.site import OPTIONS as STORE_OPTIONS
 from lab.speed.site import SITE, Site, ask, forget_peak_mb, send, session
 from mapserver.config import ServerConfig
-from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid, warm_up
 from mapserver.evidence.pages import CompactPages
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES
 from mapserver.ingest.store import Store
 from mapserver.journal.history import History, fold_history
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
+from mapserver.past.checkpoint_file import Checkpoint
+from mapserver.past.checkpoints import save_snapshot, snapshot_path
+from mapserver.past.past import StorePast
 from protocol.queries.answer_codec import decode_machines
 from protocol.wire import keys
 from protocol.wire.messages import SampleBatch
@@ -150,12 +152,15 @@ def _bytes(pages: CompactPages) -> int:
 
 def _snapshot(grid: Grid) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
-        path, loaded = Path(folder) / "snapshot-1.npz", list[object]()
-        saved = timed(lambda: snapshot.save(Path(folder), 1, grid.state(), grid.cell_m, grid.config))
-        peak_mb = memory_mb("VmHWM")
-        read = timed(lambda: loaded.append(snapshot.load(path, grid.cell_m, grid.config)))
-        if loaded == [None]:
-            raise RuntimeError("the snapshot cannot be read: nothing was measured")
+        past, loaded = StorePast.of_store(Path(folder), grid.cell_m, grid.config), list[Grid]()
+        saved = timed(lambda: save_snapshot(Path(folder), 1, {}, grid.state()))
+        peak_mb, path = memory_mb("VmHWM"), snapshot_path(Path(folder), 1)
+
+        def load() -> None:
+            with Checkpoint(path) as checkpoint:
+                loaded.append(past.grid(checkpoint))
+
+        read = timed(load)
         size_mb = path.stat().st_size / MB
     return {"peak_mb": peak_mb, "snapshot_mb": size_mb, "save_s": saved["wall_s"], "load_s": read["wall_s"]}
 
@@ -172,7 +177,7 @@ def served(hours: float) -> Figures:
             rest_mb = forget_peak_mb(pid)
             name, more = next(islice(batches(), rows, None))
             send(link, SampleBatch(name, 2, 1, more, SITE.frame))
-            wait_until((Path(path) / f"snapshot-{rows + 1}.npz").exists, DEADLINE_S, "a snapshot")
+            wait_until(snapshot_path(Path(path), rows + 1).exists, DEADLINE_S, "a snapshot")
             most_mb = memory_mb("VmHWM", pid)
     return {"resident_mb": rest_mb, "with_snapshot_mb": most_mb, "times_with_snapshot": most_mb / rest_mb}
 

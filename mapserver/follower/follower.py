@@ -15,7 +15,6 @@ from typing import Any, NoReturn, TypeVar
 import zenoh
 
 from mapserver.config import ServerConfig
-from mapserver.evidence.snapshot import rows_on_disk
 from mapserver.follower.following import Following
 from mapserver.follower.replica import Replica
 from mapserver.ingest.map_info import by_machine, map_info
@@ -25,7 +24,8 @@ from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Progress
 from mapserver.journal.shortfall import Shortfall
-from mapserver.past.past import Past
+from mapserver.past.checkpoints import snapshot_rows
+from mapserver.past.past import StorePast
 from mapserver.query.answering import Answers
 from mapserver.query.queryable import MapQueryable
 from protocol.errors import LinkError, QueryError, Refusal, StoreError
@@ -133,7 +133,7 @@ class FollowerSource:
         self._lock = threading.Lock()
 
     @property
-    def past(self) -> Past:
+    def past(self) -> StorePast:
         """See `Following`."""
         return self._following.past
 
@@ -181,7 +181,7 @@ class FollowerSource:
             "accepted": sorted(accepted),
             "decided": decided,
             "journalled": self._following.journalled,
-            "snapshot": max(rows_on_disk(self.location.folder), default=0),
+            "snapshot": max(snapshot_rows(self.location.folder), default=0),
             "machines": by_machine(progress, shortfalls),
             "shortfalls": [str(each) for each in shortfalls],
             "counters": counters,

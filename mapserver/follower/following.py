@@ -16,7 +16,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from mapserver.config import ServerConfig
-from mapserver.evidence import snapshot
 from mapserver.follower.replica import Replica
 from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.journal.facts import Facts
@@ -24,7 +23,7 @@ from mapserver.journal.history import History, fold_history, read_history, relea
 from mapserver.journal.journal import JournalReader, JournalState
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Selection
-from mapserver.past.past import FoldedAnew, Past, fold_anew
+from mapserver.past.past import FoldedAnew, StorePast, fold_anew
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.site.site_config import SiteConfig
 
@@ -213,20 +212,14 @@ class Following:
         self.waits.advance(0)
         replica = Replica(self.site, self.config, reader.identity().id)
         _hear(replica, reader)
-        facts, site, fold = replica.wanted, self.site, self.config.fold
-        trusted_row = min(state.row, self.location.trusted_row(reader))
-        row, grid = snapshot.load_newest(self.location.folder, trusted_row, site.cell_m, fold, facts.of_evidence())
-        if not row:
-            folded = fold_anew(self.past, reader, facts, self._ending.is_set)
-            if folded is None:
-                return None
-            row, grid = folded.row, folded.grid
+        facts = replica.wanted
+        folded = fold_anew(self.past, reader, facts, self._ending.is_set)
         last = reader.last_row
         history, selection = History(reader, self.past.archive), Selection.by(facts)
-        if not fold_history(grid, history, row, last, selection, self._ending.is_set):
+        if not folded or not fold_history(folded.grid, history, folded.row, last, selection, self._ending.is_set):
             return None
         release_memory()
-        replica.adopt(grid, last, facts)
+        replica.adopt(folded.grid, last, facts)
         replica.checksum = history.row_checksum(last)
         # The site's now is that of the rows in the map: watermarks are of these, and of some that are folded next.
         replica.reach((machine, mark.newest_ns) for (machine, _), mark in reader.watermarks().items())
@@ -271,8 +264,8 @@ class Following:
             log.info("map folded again fact=%d without=%s", facts.number, ",".join(sorted(facts.excluded)))
         release_memory()
 
-    def _new_past(self) -> Past:
-        return Past.of_store(self.location.folder, self.site.cell_m, self.config.fold, self.location.trusted_row)
+    def _new_past(self) -> StorePast:
+        return StorePast.of_store(self.location.folder, self.site.cell_m, self.config.fold, self.location.trusted_row)
 
     def _fold_anew(self, facts: Facts) -> FoldedAnew | None:
         with self.location.reader() as reader:

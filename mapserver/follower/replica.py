@@ -58,7 +58,7 @@ class Replica:
         return self._decisions.facts
 
     def hear(self, events: Iterable[Event], where: str) -> None:
-        """Take further events in their order. StoreError for a decision of another version."""
+        """Take further events in their order. StoreError for a decision that another program wrote."""
         heard = list(events)
         self._decisions.hear(heard, where)
         for event in heard:

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from mapserver.fleet import decisions as calibration
-from mapserver.fleet.correction import LAST_NS, NO_SHARE
-from mapserver.fleet.decisions import CalibrationDecision, CalibrationDecisions
+from mapserver.calibration.correction import LAST_NS, NO_SHARE
+from mapserver.calibration.decide import CalibrationDecisions
+from mapserver.calibration.decision import KIND as CALIBRATION
+from mapserver.calibration.decision import CalibrationDecision
 from mapserver.journal.facts import Facts
 from mapserver.journal.journal import JournalQueries
 from mapserver.journal.rows import Event
@@ -19,7 +20,7 @@ from protocol.wire.codec import encode_offer
 from protocol.wire.messages import CalibrationOffer
 
 Decision = TrustDecision | CalibrationDecision
-KINDS = (trust.KIND, calibration.KIND)
+KINDS = (trust.KIND, CALIBRATION)
 
 
 class Decisions:
@@ -31,7 +32,7 @@ class Decisions:
 
     @classmethod
     def of_journal(cls, journal: JournalQueries) -> Decisions:
-        """Those that a journal has; StoreError where one is of another version."""
+        """Those that a journal has; StoreError where another program wrote one."""
         decisions = cls()
         decisions.hear(journal.events(), journal.where)
         return decisions
@@ -80,21 +81,20 @@ class Decisions:
 
 def calibrations(journal: JournalQueries) -> list[CalibrationDecision]:
     """Decisions about calibration that a journal has, in their order; StoreError as `Decisions.of_journal`."""
-    decisions = (_decision(event, journal.where) for event in journal.events(calibration.KIND))
+    decisions = (_decision(event, journal.where) for event in journal.events(CALIBRATION))
     return [decision for decision in decisions if isinstance(decision, CalibrationDecision)]
 
 
 def plain(decision: Decision) -> tuple[str, int, Mapping[str, Any]]:
     """Kind, stamp and body of the event that keeps a decision."""
     if isinstance(decision, CalibrationDecision):
-        return calibration.KIND, decision.stamp_ns, decision.body()
+        return CALIBRATION, decision.stamp_ns, decision.body()
     return trust.KIND, decision.stamp_ns, asdict(decision)
 
 
 def _decision(event: Event, where: str) -> Decision:
-    if event.kind == trust.KIND:
-        return TrustDecision(**event.body)
     try:
-        return CalibrationDecision.from_body(event.body)
-    except ValueError as error:
-        raise StoreError(where, f"event {event.id} {error}") from None
+        return TrustDecision(**event.body) if event.kind == trust.KIND else CalibrationDecision.from_body(event.body)
+    except (ValueError, TypeError, LookupError) as error:
+        problem = f"event {event.id} is of another program ({error}); open the store with that one"
+        raise StoreError(where, problem) from None

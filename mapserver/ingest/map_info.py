@@ -11,13 +11,13 @@ from dataclasses import asdict
 from typing import Any
 
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.snapshot import rows_on_disk
 from mapserver.ingest.store_folder import is_in_use
 from mapserver.journal.facts import Facts
 from mapserver.journal.journal import Journal
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import MachineTotals, Progress
 from mapserver.journal.shortfall import KIND, Shortfall, beyond, compare, marked, missing
+from mapserver.past.checkpoints import snapshot_rows
 from protocol.queries.answers import MapVersion
 from protocol.site.site_config import SiteConfig
 from protocol.version import package_version
@@ -69,7 +69,7 @@ def lacking(location: JournalLocation) -> Shortfall | None:
     It may be in use: what proves that it was longer is looked at before it, and is never ahead of it. StoreError where
     it cannot be read.
     """
-    newest = max(rows_on_disk(location.folder), default=0)
+    newest = max(snapshot_rows(location.folder), default=0)
     traces = location.traces(in_use=is_in_use(location.folder))
     with location.reader() as journal:
         last_row, events, watermarks = journal.last_row, journal.events(), journal.watermarks()

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 
 from mapserver.config import ServerConfig
-from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.decisions import Decisions
 from mapserver.journal.facts import NO_FACTS, Facts
@@ -16,6 +15,7 @@ from mapserver.journal.journal import JournalQueries, JournalReader, JournalStat
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.records import last_checksum
 from mapserver.journal.rows import JournalRows, Selection
+from mapserver.past.past import StorePast
 from protocol.errors import StoreError
 from protocol.site.site_config import SiteConfig
 
@@ -116,9 +116,9 @@ class Standby:
 
     def _load(self, reader: JournalReader, facts: Facts) -> None:
         """Begin with a snapshot of this server's folder, if it is of this journal."""
-        folder, last_row = self._location.folder, self._location.trusted_row(reader)
-        config = self._config.fold
-        self.row, self._grid = snapshot.load_newest(folder, last_row, self._site.cell_m, config, facts.of_evidence())
+        location = self._location
+        past = StorePast.of_store(location.folder, self._site.cell_m, self._config.fold, location.trusted_row)
+        self.row, self._grid = past.newest(reader, facts)
         self._checksum = reader.row_checksum(self.row) or _NO_ROW
 
     def _is_in(self, journal: JournalQueries, last_row: int) -> bool:

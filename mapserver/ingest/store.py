@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from mapserver.config import ServerConfig
-from mapserver.evidence import snapshot
 from mapserver.evidence.fold_config import name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.admission import GapError, SeenTime, Verify, admit, check_store, judge_batch, signature_problem
@@ -28,7 +27,9 @@ from mapserver.journal.history import History, fold_history, read_history, relea
 from mapserver.journal.journal import FencedError, UnwrittenError
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Admission, Selection
-from mapserver.past import checkpoints
+from mapserver.past.checkpoint_file import OPEN_END_NS
+from mapserver.past.checkpoints import remove_beyond, save_snapshot, snapshot_rows
+from mapserver.past.past import StorePast
 from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import joined
 from protocol.queries.answers import MapVersion
@@ -82,13 +83,11 @@ class Store:
             self.accepted = frozenset(event.body["store"] for event in self.journal.events(ACCEPTED))
             self._decisions, last_row = Decisions.of_journal(self.journal), self.journal.last_row
             self.facts = facts = self._decisions.facts
-            self.shortfalls = name_shortfalls(self.journal, snapshot.rows_on_disk(folder))
-            snapshot.remove_beyond(folder, self.journal.trusted_row)
-            checkpoints.remove_beyond(folder, self.journal.trusted_row)
+            self.shortfalls = name_shortfalls(self.journal, snapshot_rows(folder))
+            remove_beyond(folder, self.journal.trusted_row)
+            self._past = StorePast.of_store(folder, site.cell_m, config.fold)
             warm = standby.grid_for(self.journal, facts) if standby else None
-            self.merged, self.grid = warm or snapshot.load_newest(
-                folder, last_row, site.cell_m, config.fold, facts.of_evidence()
-            )
+            self.merged, self.grid = warm or self._past.newest(self.journal, facts)
             self.snapshot_row = 0 if warm else self.merged
             in_snapshot = self.grid.counts()
             fold_history(self.grid, self.history, self.merged, selection=Selection.by(facts))
@@ -160,11 +159,11 @@ class Store:
         """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
         if self.merged <= self.snapshot_row:
             return None
-        row, grid, facts, samples = self.merged, self.grid, self.facts, self.journal.samples
-        state = grid.state()
+        row, grid, samples, state = self.merged, self.grid, self.journal.samples, self.grid.state()
+        facts = self._past.depends_on(self.journal, self.facts)(OPEN_END_NS)
 
         def write() -> None:
-            snapshot.save(self.location.folder, row, state, self.site.cell_m, self.config.fold, facts.of_evidence())
+            save_snapshot(self.location.folder, row, facts, state)
             if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
                 self.snapshot_row, self._snapshot_samples = row, samples
 

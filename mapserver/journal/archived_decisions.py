@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from mapserver.fleet.decisions import CalibrationDecision
+from mapserver.calibration.decision import CalibrationDecision
 from mapserver.journal.archive import READABLE
 from mapserver.journal.places import FilePlace
 from protocol.errors import StoreError
@@ -31,7 +31,7 @@ def save(folder: Path, store: str, decisions: Iterable[CalibrationDecision]) -> 
 
 
 def load(folder: Path | FilePlace) -> list[CalibrationDecision]:
-    """Read what `save` wrote, nothing where there is no file; StoreError for damage, and for another version."""
+    """Read what `save` wrote, nothing where there is no file; StoreError for damage, or of another program."""
     path = folder / FILE
     try:
         table = json.loads(path.read_text(encoding="utf-8"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from mapserver.fleet.correction import UNCORRECTED, Corrections
+from mapserver.calibration.correction import UNCORRECTED, SampleCorrections
 from protocol.machine.readings import MAX_STAMP_NS
 
 
@@ -18,7 +18,7 @@ class Facts:
     """
 
     excluded: frozenset[str] = frozenset()
-    corrections: Corrections = UNCORRECTED
+    corrections: SampleCorrections = UNCORRECTED
     number: int = field(default=0, compare=False)
 
     def of_evidence(self, before_ns: int = MAX_STAMP_NS) -> Mapping[str, object]:

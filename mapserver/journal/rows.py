@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapserver.calibration.correction import UNCORRECTED, SampleCorrections
 from mapserver.evidence.fold_config import name_hash
-from mapserver.fleet.correction import UNCORRECTED, Corrections
 from mapserver.journal.facts import Facts
 from protocol.arrays import Bools, Ints, Table
 from protocol.machine.readings import MAX_STAMP_NS
@@ -166,7 +166,7 @@ class Selection:
     to_ns: int = MAX_STAMP_NS
     bounds: Bounds | None = None
     without: frozenset[str] = frozenset()
-    corrections: Corrections = UNCORRECTED
+    corrections: SampleCorrections = UNCORRECTED
 
     @classmethod
     def by(cls, facts: Facts, from_ns: int = 0, to_ns: int = MAX_STAMP_NS, bounds: Bounds | None = None) -> Selection:

@@ -18,7 +18,7 @@ from mapserver.evidence.grid import PIECE
 from mapserver.evidence.pages import PackedPages
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import ALL, Selection
-from mapserver.past.past import NamedSamples, Past, reach_of
+from mapserver.past.past import NamedSamples, StorePast, reach_of
 from protocol.arrays import AnyArray, Bools, Ints, Table
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
@@ -38,7 +38,7 @@ class CellHistory:
 
 
 def cell_history(
-    past: Past, reader: JournalReader, cell: Cell, span_ns: int, selection: Selection = ALL
+    past: StorePast, reader: JournalReader, cell: Cell, span_ns: int, selection: Selection = ALL
 ) -> CellHistory:
     """The history of a cell in spans of a length, which begin at multiples of it.
 
@@ -73,7 +73,7 @@ def _pieces(samples: Table, names: NDArray[np.uint64]) -> Iterator[NamedSamples]
         yield samples[first : first + PIECE], names[first : first + PIECE]
 
 
-def _evidence(past: Past, cell: Cell, span_ns: int, some: NamedSamples, scratch: Scratch) -> Iterator[_Part]:
+def _evidence(past: StorePast, cell: Cell, span_ns: int, some: NamedSamples, scratch: Scratch) -> Iterator[_Part]:
     """What each span has of the cell from some samples."""
     samples, names = some
     near = _near(samples, cell, past.cell_m)

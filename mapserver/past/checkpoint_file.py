@@ -1,4 +1,4 @@
-"""One checkpoint on disk: the evidence of all samples stamped before a time, block by block, each to be read alone.
+"""One checkpoint on disk: the evidence of samples stamped before a time, block by block, each to be read alone.
 
     MAGIC | blocks, each padded to 8 bytes | index, one INDEX per block in the order of places | header, JSON | TAIL
 
@@ -14,7 +14,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -24,9 +24,12 @@ from mapserver.evidence.grid_state import GridState
 from mapserver.evidence.pages import EMPTY, CompactPages
 from protocol.arrays import Ints, Table
 from protocol.errors import StoreError
+from protocol.files import PRIVATE, whole_file
+from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 MAGIC = b"SGCHECK1"
+OPEN_END_NS = MAX_STAMP_NS + 1  # closing time of a snapshot: it has every sample of its rows
 # As they lie in a block: large numbers first, so that all are aligned.
 PARTS = ("words", "table", "counts", "high", "runs", "cells", "marks")
 INDEX = np.dtype([("x", "<i4"), ("y", "<i4"), ("first", "<i8"), ("lengths", "<i4", len(PARTS)), ("crc32", "<u4")])
@@ -48,8 +51,8 @@ def file_state(stat: os.stat_result) -> FileState:
 class Header:
     """What a checkpoint is true for.
 
-    closed_ns: it has the samples stamped before this time, from all journal rows up to `row`. facts: what its evidence
-    depends on besides. The others: as of a grid's state.
+    closed_ns: it has the samples stamped before this time, from all journal rows up to `row`; OPEN_END_NS: all of them.
+    facts: what its evidence depends on besides. The others: as of a grid's state.
     """
 
     closed_ns: int
@@ -59,6 +62,10 @@ class Header:
     skipped: int = 0
     newest_ns: int = 0
     oldest_ns: int = 0
+
+    def of(self, state: GridState) -> Header:
+        """The same, of a grid with this state."""
+        return replace(self, **{field.name: getattr(state, field.name) for field in fields(GridState)[1:]})
 
     @property
     def state(self) -> GridState:
@@ -132,7 +139,7 @@ class Checkpoint:
         ends = np.cumsum(self.index["lengths"][numbers] * _WIDTHS, axis=1).tolist()
         for (x, y), record, ends_of_parts in zip(places, self.records(numbers), ends, strict=True):
             parts = zip(PARTS, _EMPTY, [0, *ends_of_parts], ends_of_parts, strict=False)
-            data = np.frombuffer(record, np.uint8)
+            data = np.frombuffer(record, np.uint8).copy()  # alone: a block that grows gives its memory back
             pages = CompactPages(
                 **{name: data[i:j].view(empty.dtype).reshape(-1, *empty.shape[1:]) for name, empty, i, j in parts}
             )
@@ -203,6 +210,15 @@ class CheckpointWriter:
         entry["first"] = self.bytes_written
         self._index.append(entry)
         self.bytes_written += self._file.write(data)
+
+
+def write_checkpoint(path: Path, header: Header, state: GridState) -> None:
+    """Write the whole state of a grid; the header says what it is true for. Raises OSError."""
+    with whole_file(path, PRIVATE) as file:
+        writer = CheckpointWriter(file)
+        for x, y, pages in state.blocks:
+            writer.add(x, y, pages)
+        writer.finish(header.of(state))
 
 
 def _padded(length: Any) -> Any:

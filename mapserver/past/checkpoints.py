@@ -1,8 +1,14 @@
-"""The checkpoints of one store: which there are, which of them can be used, and which is the nearest before a time."""
+"""The checkpoints of one store: which there are, which of them can be used, and which is the nearest before a time.
+
+A snapshot is a checkpoint that is closed now: it has all samples up to its journal row, so that a restart folds only
+the rows behind it. All are caches, never the truth: one that is damaged, of another schema or of other facts is passed
+over, and the journal is folded again.
+"""
 
 from __future__ import annotations
 
 import logging
+import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -10,17 +16,31 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from mapserver.past.checkpoint_file import Checkpoint, DamagedError, FileState, Header, file_state
+from mapserver.evidence.grid_state import GridState
+from mapserver.past.checkpoint_file import (
+    OPEN_END_NS,
+    Checkpoint,
+    DamagedError,
+    FileState,
+    Header,
+    file_state,
+    write_checkpoint,
+)
 
 FOLDER = "checkpoints"  # in the folder of a store
 FactsBefore = Callable[[int], Mapping[str, Any]]  # what evidence of samples stamped before a time depends on
 _FORMAT = "%Y-%m-%dT%H.checkpoint"
+_SNAPSHOT = re.compile(r"snapshot-(\d+)\.checkpoint")  # in the folder of the store
+KEPT_SNAPSHOTS = 2
 log = logging.getLogger("mapserver.past.checkpoints")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A checkpoint by its name. header: None where the file is damaged. usable: whether it is true for given facts."""
+    """A checkpoint by its name. header: None where the file is damaged. usable: whether it is true for given facts.
+
+    closed_ns: OPEN_END_NS of a snapshot.
+    """
 
     path: Path
     closed_ns: int
@@ -30,7 +50,7 @@ class Entry:
 
 
 class Checkpoints:
-    """The files in a folder; for any thread. One thread alone makes and removes them.
+    """The files of a store; for any thread. One thread alone makes and removes those of hours, one the snapshots.
 
     passed_over: how many damaged ones were seen. state: what there was at the last look: how many usable ones, bytes of
     all, when the newest usable one is closed, 0 for none, and `passed_over`.
@@ -38,7 +58,7 @@ class Checkpoints:
 
     def __init__(self, store: Path) -> None:
         """store: the folder of a store."""
-        self.folder = store / FOLDER
+        self.store, self.folder = store, store / FOLDER
         self.passed_over = 0
         self.state = {"count": 0, "bytes": 0, "newest_ns": 0, "passed_over": 0}
         self._lock = threading.Lock()
@@ -49,22 +69,26 @@ class Checkpoints:
         return self.folder / datetime.fromtimestamp(closed_ns // 10**9, UTC).strftime(_FORMAT)
 
     def entries(self, facts: FactsBefore, last_row: int) -> list[Entry]:
-        """All that there are, oldest first; usable are those made with these facts, of rows that there are."""
+        """Those of hours, oldest first; usable are those made with these facts, of rows that there are."""
+        return [entry for entry in self.with_snapshots(facts, last_row) if entry.closed_ns != OPEN_END_NS]
+
+    def with_snapshots(self, facts: FactsBefore, last_row: int) -> list[Entry]:
+        """As `entries`, and behind them the snapshots."""
         with self._lock:
-            paths = list(self.folder.glob("*.checkpoint"))
+            paths = [*self.folder.glob("*.checkpoint"), *self.store.glob("*.checkpoint")]
             known = [entry for path in paths if (entry := self._look(path))]
             self._seen = {path: self._seen[path] for path in paths if path in self._seen}
         entries = []
-        for entry in sorted(known, key=lambda entry: entry.closed_ns):
+        for entry in sorted(known, key=lambda entry: (entry.closed_ns, entry.header.row if entry.header else 0)):
             head = entry.header
             usable = head is not None and head.row <= last_row and head.facts == facts(entry.closed_ns)
             entries.append(replace(entry, usable=usable))
         return entries
 
-    def nearest(self, until_ns: int, facts: FactsBefore, last_row: int) -> Checkpoint | None:
-        """Open the newest usable one that is closed at `until_ns` or before; None where there is none."""
-        for entry in reversed(self.entries(facts, last_row)):
-            if entry.usable and entry.closed_ns <= until_ns:
+    def nearest(self, until_ns: int, facts: FactsBefore, last_row: int, from_ns: int = 0) -> Checkpoint | None:
+        """Open the newest usable one that is closed at `until_ns` or before, not before `from_ns`; None for none."""
+        for entry in reversed(self.with_snapshots(facts, last_row)):
+            if entry.usable and from_ns <= entry.closed_ns <= until_ns:
                 try:
                     checkpoint = Checkpoint(entry.path)
                 except (OSError, DamagedError):  # removed or replaced a moment ago
@@ -94,7 +118,7 @@ class Checkpoints:
         """What is known of a file, read anew where it changed; None where it is gone or has another name."""
         try:
             state = file_state(path.stat())
-            closed_ns = round(datetime.strptime(path.name, _FORMAT).replace(tzinfo=UTC).timestamp()) * 10**9
+            closed_ns = OPEN_END_NS if _SNAPSHOT.fullmatch(path.name) else _hour_of(path.name)
         except (OSError, ValueError):
             return None
         if path not in self._seen or self._seen[path][0] != state:
@@ -104,9 +128,10 @@ class Checkpoints:
     def _header(self, path: Path, closed_ns: int) -> Header | None:
         try:
             with Checkpoint(path) as checkpoint:
-                if checkpoint.header.closed_ns == closed_ns:
-                    return checkpoint.header
-                raise DamagedError(path, f"is closed at another time, {checkpoint.header.closed_ns} ns")
+                header = checkpoint.header
+                if header.closed_ns == closed_ns and _row_of(path) in (None, header.row):
+                    return header
+                raise DamagedError(path, f"is another one, of row {header.row}, closed at {header.closed_ns} ns")
         except (OSError, DamagedError) as error:
             self._count(path, error)
             return None
@@ -116,12 +141,50 @@ class Checkpoints:
         log.warning("checkpoint passed over path=%s error=%r", path, str(error))
 
 
+def snapshot_rows(store: Path) -> list[int]:
+    """Journal rows of the snapshots of a store, newest first."""
+    rows = map(_row_of, store.glob("snapshot-*.checkpoint"))
+    return sorted((row for row in rows if row is not None), reverse=True)
+
+
+def snapshot_path(store: Path, row: int) -> Path:
+    """Where the snapshot of a journal row lies."""
+    return store / f"snapshot-{row}.checkpoint"
+
+
+def save_snapshot(store: Path, row: int, facts: Mapping[str, Any], state: GridState) -> Path:
+    """Write the grid as of a journal row, and remove all snapshots but the newest two. Raises OSError.
+
+    facts: what its evidence depends on, closed at OPEN_END_NS.
+    """
+    path = snapshot_path(store, row)
+    for part in store.glob(".snapshot-*.part"):  # of a process that was killed: one alone writes to a store
+        part.unlink(missing_ok=True)
+    write_checkpoint(path, Header(OPEN_END_NS, row, facts), state)
+    for old in snapshot_rows(store)[KEPT_SNAPSHOTS:]:
+        snapshot_path(store, old).unlink(missing_ok=True)
+    return path
+
+
 def remove_beyond(store: Path, last_row: int) -> None:
     """Remove those made of rows that the journal does not reach: once it grew past them they would pass for true.
 
-    They are left where the journal was restored from a backup.
+    They are left where the journal was restored from a backup, or lost its end. A snapshot's name says its row, also
+    where it is damaged.
     """
-    for entry in Checkpoints(store).entries(lambda _: {}, last_row):
-        if entry.header and entry.header.row > last_row:
-            log.warning("checkpoint removed path=%s row=%d last_row=%d", entry.path, entry.header.row, last_row)
+    for entry in Checkpoints(store).with_snapshots(lambda _: {}, last_row):
+        row = entry.header.row if entry.header else _row_of(entry.path) or 0
+        if row > last_row:
+            log.warning("checkpoint removed path=%s row=%d last_row=%d", entry.path, row, last_row)
             entry.path.unlink(missing_ok=True)
+
+
+def _row_of(path: Path) -> int | None:
+    """The journal row that a snapshot's name says; None of another file."""
+    match = _SNAPSHOT.fullmatch(path.name)
+    return int(match.group(1)) if match else None
+
+
+def _hour_of(name: str) -> int:
+    """When one of an hour is closed, as its name says; ValueError for another name."""
+    return round(datetime.strptime(name, _FORMAT).replace(tzinfo=UTC).timestamp()) * 10**9

@@ -7,7 +7,7 @@ time in proportion to the samples since, and little memory beside a server's own
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import Selection
 from mapserver.past.checkpoint_file import Checkpoint, CheckpointWriter, DamagedError, Header
 from mapserver.past.checkpoints import Checkpoints
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from protocol.files import PRIVATE, whole_file
 
 FOLDED_AT_ONCE = 32_768  # samples: 30 ms
@@ -30,7 +30,7 @@ SPILL_SAMPLES = 1_000_000  # what was folded of them takes 50 MB; then it goes t
 SPILL_FILE = "spill"
 
 
-def make(past: Past, reader: JournalReader, closed_ns: int, facts: Facts) -> Iterator[None]:
+def make(past: StorePast, reader: JournalReader, closed_ns: int, facts: Facts) -> Iterator[None]:
     """Make the checkpoint that is closed at a full hour, with these facts, step by step.
 
     It is true for all rows that the journal has at the first step. Ended early, it leaves nothing. Raises OSError, and
@@ -94,7 +94,7 @@ def _write(path: Path, base: Checkpoint | None, part: Grid, header: Header) -> I
             yield
         sums = Grid.from_state(part.cell_m, part.config, (base.header if base else header).state)
         sums.merge(Grid.from_state(part.cell_m, part.config, replace(state, blocks=())))
-        writer.finish(replace(header, **{f.name: getattr(sums, f.name) for f in fields(GridState)[1:]}))
+        writer.finish(header.of(sums.state()))
 
 
 def _numbers(base: Checkpoint | None) -> dict[Block, int]:

@@ -12,24 +12,23 @@ meanwhile is folded in rounds, until a few rows are left.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.snapshot import parameters
 from mapserver.journal.archive import FOLDER, Archive
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.history import THREADS, History, fold_history, fold_samples, lent, read_history
-from mapserver.journal.journal import JournalReader
+from mapserver.journal.journal import JournalQueries, JournalReader
 from mapserver.journal.rows import LAST, JournalRows, Selection
 from mapserver.journal.stamp_index import StampIndex
-from mapserver.past.checkpoint_file import Checkpoint, DamagedError, Header
+from mapserver.past.checkpoint_file import OPEN_END_NS, Checkpoint, DamagedError, Header
 from mapserver.past.checkpoints import Checkpoints, FactsBefore
 from protocol.arrays import Table
 from protocol.site.geometry import Bounds, CellWindow, GridGeometry
@@ -40,7 +39,7 @@ MOST_ROUNDS = 20  # where batches come in as fast as they are folded, whoever go
 
 
 @dataclass(frozen=True)
-class Past:
+class StorePast:
     """What the past of one store is read from. For any thread, each with a journal's reader of its own."""
 
     archive: Archive
@@ -48,7 +47,7 @@ class Past:
     checkpoints: Checkpoints
     cell_m: float
     config: FoldConfig
-    trusted_row: Callable[[JournalReader], int]
+    trusted_row: Callable[[JournalQueries], int]
 
     @classmethod
     def of_store(
@@ -56,22 +55,23 @@ class Past:
         folder: Path,
         cell_m: float,
         config: FoldConfig,
-        trusted_row: Callable[[JournalReader], int] = lambda reader: reader.last_row,
-    ) -> Past:
+        trusted_row: Callable[[JournalQueries], int] = lambda reader: reader.last_row,
+    ) -> StorePast:
         """The past of the store in a folder.
 
         trusted_row: checkpoints of rows up to this one are of the journal; a server has removed those that are not.
         """
         return cls(Archive(folder / FOLDER), StampIndex(), Checkpoints(folder), cell_m, config, trusted_row)
 
-    def depends_on(self, reader: JournalReader, facts: Facts) -> FactsBefore:
-        """What evidence of samples stamped before a time depends on; no checkpoint made with anything else is used."""
-        store = reader.identity().id
+    def depends_on(self, journal: JournalQueries, facts: Facts) -> FactsBefore:
+        """What evidence of samples stamped before a time depends on: its form, the fold, and the facts about machines.
 
-        def before(closed_ns: int) -> Mapping[str, Any]:
-            return {"store": store, **parameters(self.cell_m, self.config, facts.of_evidence(closed_ns))}
-
-        return before
+        No checkpoint made with anything else is used.
+        """
+        bins = [ev.RESISTANCE_BINS, ev.GRADE_BINS, ev.SECTORS]
+        form = {"store": journal.identity().id, "schema": ev.SCHEMA, "cell_m": self.cell_m, "bins": bins}
+        fold = {**asdict(self.config), "std_floor_m": STD_FLOOR_M}
+        return lambda closed_ns: {**form, **facts.of_evidence(closed_ns), **fold}
 
     def samples(
         self, reader: JournalReader, selection: Selection, after: int = 0, until: int = LAST
@@ -98,7 +98,8 @@ class Past:
         if base is None:
             yield from self.samples(reader, selection, until=until)
         else:
-            yield from self.samples(reader, replace(selection, from_ns=base.closed_ns), until=base.row)
+            if base.closed_ns <= selection.to_ns:
+                yield from self.samples(reader, replace(selection, from_ns=base.closed_ns), until=base.row)
             yield from self.samples(reader, selection, after=base.row, until=until)
 
     def next_stamp(self, reader: JournalReader, from_ns: int) -> int | None:
@@ -137,12 +138,20 @@ class Past:
                 grid.fold_all(samples, names)
         return grid
 
+    def newest(self, journal: JournalQueries, facts: Facts) -> tuple[int, Grid]:
+        """The newest snapshot that is true for these facts, and its journal row; 0 and an empty grid without one."""
+        grid, header = self.nearest(journal, LAST, None, facts, OPEN_END_NS)
+        return header.row if header else 0, grid
+
     def nearest(
-        self, reader: JournalReader, to_ns: int, window: CellWindow | None, facts: Facts
+        self, journal: JournalQueries, to_ns: int, window: CellWindow | None, facts: Facts, from_ns: int = 0
     ) -> tuple[Grid, Header | None]:
-        """The evidence of the nearest checkpoint without later samples, and its header; empty where there is none."""
-        before, last_row = self.depends_on(reader, facts), self.trusted_row(reader)
-        while checkpoint := self.checkpoints.nearest(to_ns + 1, before, last_row):
+        """The evidence of the nearest checkpoint without later samples, and its header; empty where there is none.
+
+        from_ns: none that was closed before this time.
+        """
+        before, last_row = self.depends_on(journal, facts), self.trusted_row(journal)
+        while checkpoint := self.checkpoints.nearest(to_ns + 1, before, last_row, from_ns):
             with checkpoint:
                 try:
                     return self.grid(checkpoint, window), checkpoint.header
@@ -167,7 +176,7 @@ class FoldedAnew:
     rounds: int
 
 
-def fold_anew(past: Past, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> FoldedAnew | None:
+def fold_anew(past: StorePast, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> FoldedAnew | None:
     """Fold the map with these facts, up to a row that few are behind; None where `stopped` said so."""
     begun = _begun(past, reader, facts, stopped)
     if begun is None:
@@ -180,11 +189,13 @@ def fold_anew(past: Past, reader: JournalReader, facts: Facts, stopped: Callable
     return FoldedAnew(grid, row, rounds)
 
 
-def _begun(past: Past, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> tuple[Grid, int] | None:
+def _begun(
+    past: StorePast, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]
+) -> tuple[Grid, int] | None:
     """The map up to a journal row that a checkpoint makes quick, or an empty one; None where it is not wanted."""
     last = reader.last_row
     grid, base = past.nearest(reader, LAST, None, facts)
-    if base is None:
-        return grid, 0
+    if base is None or base.closed_ns == OPEN_END_NS:
+        return grid, base.row if base else 0
     samples = past.lacking(reader, base, Selection.by(facts), last)
     return (grid, last) if fold_samples(grid, samples, stopped) else None

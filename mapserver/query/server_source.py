@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from mapserver.ingest.writer import Writer
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from mapserver.query.source import MapState
 from mapserver.upkeep.refolding import write
 from mapserver.upkeep.upkeep import Upkeep
@@ -22,7 +22,7 @@ T = TypeVar("T")
 class ServerSource:
     """See `MapSource`."""
 
-    def __init__(self, writer: Writer, upkeep: Upkeep, past: Past) -> None:
+    def __init__(self, writer: Writer, upkeep: Upkeep, past: StorePast) -> None:
         self._writer, self._upkeep, self.past = writer, upkeep, past
         self.site, self.config, self.location, self.waits = writer.site, writer.config, writer.location, writer.waits
 

@@ -10,7 +10,7 @@ from mapserver.evidence.grid import Grid
 from mapserver.ingest.merge_waits import MergeWaits
 from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from protocol.queries.answers import GroundChange, MapVersion, ServerAlive
 from protocol.queries.calibration import CalibrationAnswer
 from protocol.queries.origin import Origin
@@ -62,7 +62,7 @@ class MapSource(Protocol):
         """Where the journal is."""
 
     @property
-    def past(self) -> Past:
+    def past(self) -> StorePast:
         """What maps of the past are read from."""
 
     def run(self, work: Callable[[MapState], T]) -> T:

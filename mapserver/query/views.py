@@ -23,7 +23,7 @@ from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
 from mapserver.past.cell_history import CellHistory, cell_history
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from mapserver.query.source import MapState
 from protocol.arrays import AnyArray, Floats32, Ints
 from protocol.errors import QueryError, Refusal, StoreError
@@ -116,7 +116,7 @@ class PastMaps:
     """Maps of one store as of any time. Every call opens the journal anew, so that any thread may ask."""
 
     journal: JournalLocation
-    past: Past
+    past: StorePast
     config: ServerConfig
 
     def view(self, window: CellWindow, stamp_ns: int, facts: Facts) -> View:

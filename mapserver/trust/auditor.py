@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from mapserver.calibration.select import MachineErrors
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
-from mapserver.fleet.observability import MachineState
 from mapserver.journal.rows import JournalRows
 from mapserver.roads.worklist import litres
 from mapserver.trust.coarse_map import CoarseMap, map_cell_m, pooled
@@ -107,7 +107,7 @@ class Auditor:
         sure = is_foldable(rows, self._fold)
         self._maps[machine].add(rows if sure.all() else rows[sure])
 
-    def verdicts(self, states: Mapping[str, MachineState] | None = None) -> dict[str, Verdict]:
+    def verdicts(self, states: Mapping[str, MachineErrors] | None = None) -> dict[str, Verdict]:
         """Judge every machine. states: what calibration knows of them, by name."""
         names = sorted(self._maps)
         surfaces = [self._maps[name].surface() for name in names]
@@ -182,7 +182,7 @@ def _measured(difference: Difference | None) -> dict[str, Any]:
     return {name: round(value, 3) for name, value in values.items()}
 
 
-def _calibrated(state: MachineState | None, mass_kg: float) -> dict[str, Any]:
+def _calibrated(state: MachineErrors | None, mass_kg: float) -> dict[str, Any]:
     """What calibration knows of a machine, in plain values. mass_kg: 0 where it is not known."""
     if state is None:
         return {}

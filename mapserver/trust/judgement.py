@@ -10,7 +10,7 @@ from math import hypot, log, sqrt
 
 import numpy as np
 
-from mapserver.fleet.observability import FAULT_SIGMAS, MachineState
+from mapserver.calibration.select import FAULT_SIGMAS, MachineErrors
 from mapserver.trust.comparison import CELLS_PER_DRAW, ZERO_ERROR, Difference, Gain
 from mapserver.trust.shift import Shift
 from protocol.arrays import Ints
@@ -113,7 +113,7 @@ def _offset(shift: Shift | None, sigmas: float) -> Judgement:
 # --- sensors ---------------------------------------------------------------------------------------------------------
 
 
-def beyond_data_sheet(state: MachineState | None) -> Judgement:
+def beyond_data_sheet(state: MachineErrors | None) -> Judgement:
     """Judge what calibration says of a machine: None where it says nothing."""
     if state is None:
         return _NO_JUDGEMENT

@@ -15,31 +15,27 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapserver.calibration.calibrate import Solution, calibrate, epochs_of_each, groups, joined
+from mapserver.calibration.correction import Correction
+from mapserver.calibration.ledger import StayLedger
+from mapserver.calibration.select import MachineErrors, remembered_of
 from mapserver.evidence.fold_config import is_foldable
-from mapserver.fleet.calibration import Calibration, calibrate, epochs_of_each, groups, joined
-from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, Correction, Corrections
-from mapserver.fleet.decisions import PERSON, CalibrationDecision
-from mapserver.fleet.ledger import Ledger
-from mapserver.fleet.observability import MachineState, remembered_of
 from mapserver.ingest.writer import Writer
 from mapserver.journal.rows import JournalRows, Selection
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from mapserver.past.plan import DAY_NS
 from protocol.errors import StoreError
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
-from protocol.queries.calibration import CorrectedSpan, MachineCalibration
-from protocol.queries.commands import CalibrateCommand
 
 SPAN_NS = 2 * DAY_NS  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
 AHEAD_NS = 600 * 10**9  # of the site's now: machines' clocks, and what is on its way, differ by less
 EVERY_NS = 60 * 10**9  # of site time, between two solves: a fifth of an epoch
 REST = 50.0  # times as long as a solve took: 2 % of a core, also where a log is replayed
 TURN_SAMPLES = 200_000  # read in one turn, in about 0.2 s
-Decide = Callable[[Calibration, int], object]
+Decide = Callable[[Solution, int], object]
 Group = tuple[str, ...]
 log = logging.getLogger("mapserver.upkeep.calibrating")
 RECENT = 10  # marks; a machine that was silent for longer says nothing of now, though its clock may have been ahead
-MOST_SPANS = 100  # of an answer: the last day of a machine at work
 
 
 class Calibrating:
@@ -54,29 +50,29 @@ class Calibrating:
     def __init__(
         self,
         writer: Writer,
-        past: Past,
+        past: StorePast,
         decide: Decide,
         doubtful: Callable[[], frozenset[str]],
         shown: Callable[[], Iterable[Correction]],
         ending: threading.Event,
     ) -> None:
-        self.solved: tuple[Calibration, int] = calibrate({}), 0
+        self.solved: tuple[Solution, int] = calibrate({}), 0
         self._writer, self._past, self._decide, self._doubtful, self._ending = writer, past, decide, doubtful, ending
         self._shown = shown
         self._reader = writer.location.reader()
         self._clock = SiteClock()
-        self._ledgers: dict[str, Ledger] = {}
+        self._ledgers: dict[str, StayLedger] = {}
         # By machine, from when on there may be samples of it: of one that was here before, not all are read.
         self._begins_ns = dict.fromkeys((machine for machine, _ in self._reader.watermarks()), 0)
         self._followed = 0
         self._passed_over = 0  # rows that could not be read, at the next attempt
-        self._parts: dict[Group, Calibration] = {}  # the last solve of each group
+        self._parts: dict[Group, Solution] = {}  # the last solve of each group
         self._next = -1  # of the groups
         self._from_ns: int | None = None  # of samples that are read: until it has caught up, those of the last days
         self._due_s = 0.0
         self._turn = threading.Lock()  # of all that is used here: `solve` is for any thread
 
-    def states(self) -> Mapping[str, MachineState]:
+    def states(self) -> Mapping[str, MachineErrors]:
         """What the last solve says of machines, by name."""
         return self.solved[0].machines
 
@@ -93,7 +89,7 @@ class Calibrating:
             if self._writer.config.calibration.automatic and not self._ending.is_set():
                 self._decide(solved, now_ns)
 
-    def solve(self) -> tuple[Calibration, int]:
+    def solve(self) -> tuple[Solution, int]:
         """Solve with all that is journalled by now; what came out, and the site's now [ns]. For any thread."""
         with self._turn:
             while not self._follow(TURN_SAMPLES) and not self._ending.is_set():
@@ -117,7 +113,7 @@ class Calibrating:
         self._share_room()
         return now_ns, groups(self._ledgers)
 
-    def _solve(self, names: Group, together: Sequence[Group], now_ns: int) -> Calibration:
+    def _solve(self, names: Group, together: Sequence[Group], now_ns: int) -> Solution:
         """Solve one group of machines; what it says. together: all groups."""
         began_s = time.thread_time()
         try:
@@ -179,7 +175,7 @@ class Calibrating:
         until_ns = self._clock.now_ns(self._doubtful()) + AHEAD_NS
         for name, own in parts.items():
             if name not in self._ledgers:
-                self._ledgers[name] = Ledger()
+                self._ledgers[name] = StayLedger()
                 self._share_room()
             self._ledgers[name].until_ns = until_ns
             self._ledgers[name].add(own)
@@ -227,39 +223,3 @@ class SiteClock:
         """Begin to count anew what has passed."""
         self._marked_ns |= self._last_ns
         self._marks += 1
-
-
-def calibration_of(
-    machine: str, decision: CalibrationDecision | None, state: MachineState | None, corrections: Corrections
-) -> MachineCalibration:
-    """What is known of a machine.
-
-    decision: its newest one. state: of the last solve. corrections: those that count in the map.
-    """
-    spans = corrections.spans_of(machine)[-MOST_SPANS:]
-    return MachineCalibration(
-        name=machine,
-        by=decision.by if decision else "",
-        reason=decision.reason if decision else "",
-        since_ns=decision.stamp_ns if decision else 0,
-        zero=state.zero if state else None,
-        zero_std=state.zero_std if state else None,
-        scale=state.scale / (1 + state.scale) if state else None,
-        scale_std=state.scale_std / (1 + state.scale) ** 2 if state else None,
-        across=state.across if state else None,
-        across_std=state.across_std if state else None,
-        zero_by=state.zero_by if state else (),
-        scale_by=state.scale_by if state else (),
-        spans=tuple(
-            CorrectedSpan(one.from_ns, one.to_ns, one.zero, one.scale, one.across, one.most_share) for one in spans
-        ),
-    )
-
-
-def decided_by_person(command: CalibrateCommand, stamp_ns: int) -> CalibrationDecision:
-    """What a person decides about all samples of a machine. stamp_ns: the site's now."""
-    values = {name: round(value, DIGITS) for name, value in command.values.items()}
-    usual = {"zero": 0.0, "scale": 0.0, "across": 0.0, "most_share": ANY_SHARE}
-    whole = Correction(command.machine, 0, LAST_NS, covariance=(), **{**usual, **values})
-    corrections = () if command.auto else (whole,)
-    return CalibrationDecision(command.machine, PERSON, command.reason, stamp_ns, corrections)

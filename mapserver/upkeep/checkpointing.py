@@ -16,7 +16,7 @@ from mapserver.journal.facts import Facts
 from mapserver.journal.journal import JournalReader
 from mapserver.past.checkpoints import Entry
 from mapserver.past.making import make, remove_unfinished
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from mapserver.past.plan import due, surplus, thinned
 
 PIECE_S = 0.3  # of a turn, while other jobs wait; with ten machines, an hour takes a second in all
@@ -43,7 +43,7 @@ class Checkpointing:
 
     name = "checkpoints"
 
-    def __init__(self, writer: Writer, reader: JournalReader, past: Past, ending: threading.Event) -> None:
+    def __init__(self, writer: Writer, reader: JournalReader, past: StorePast, ending: threading.Event) -> None:
         self._writer, self._reader, self._past, self._ending = writer, reader, past, ending
         self._limit_bytes = round(writer.config.store.checkpoints_gb * 1e9)
         self._making: _Making | None = None

@@ -15,13 +15,13 @@ from typing import Protocol
 
 import numpy as np
 
+from mapserver.calibration.correction import UNCORRECTED, SampleCorrections
+from mapserver.calibration.select import MachineErrors
 from mapserver.change import change_log
 from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
 from mapserver.evidence.timeline import Block, TimedPage
-from mapserver.fleet.correction import UNCORRECTED, Corrections
-from mapserver.fleet.observability import MachineState
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
@@ -35,7 +35,7 @@ LOOK_BLOCKS = 256  # for changes, at a time: the writer copies their pages, and 
 LOOK_S = 60.0  # between two looks for rows that are old enough: files are of whole hours
 KEEP_S = 3600.0  # between two looks for decisions, where no file is new
 Report = Callable[[Mapping[str, Verdict], int], None]
-Known = Callable[[], tuple[Corrections, Mapping[str, MachineState]]]
+Known = Callable[[], tuple[SampleCorrections, Mapping[str, MachineErrors]]]
 Publish = Callable[[GroundChange], None]
 log = logging.getLogger("mapserver.upkeep.jobs")
 

@@ -12,17 +12,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
+from mapserver.calibration.calibrate import Solution
+from mapserver.calibration.correction import Correction, SampleCorrections
+from mapserver.calibration.decision import CalibrationDecision
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import Correction, Corrections
-from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import Decision, Decisions
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
 from mapserver.journal.history import release_memory
 from mapserver.journal.journal import FencedError, UnwrittenError
-from mapserver.past.past import Past, fold_anew
+from mapserver.past.past import StorePast, fold_anew
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import TrustDecision
 from protocol.errors import QueryError, Refusal, SitegridError
@@ -35,7 +35,7 @@ log = logging.getLogger("mapserver.upkeep.refolding")
 class Refolding:
     """Decisions about machines, and a thread that folds the map as they say. All of it is for any thread."""
 
-    def __init__(self, writer: Writer, past: Past) -> None:
+    def __init__(self, writer: Writer, past: StorePast) -> None:
         self._writer, self._past = writer, past
         self._reader = writer.location.reader()
         self._decisions = Decisions.of_journal(self._reader)
@@ -62,7 +62,7 @@ class Refolding:
         with self._changed:
             return self._decisions.trust.newest(machine)
 
-    def corrections(self) -> Corrections:
+    def corrections(self) -> SampleCorrections:
         """Those that decisions come to, also of machines that are left out."""
         with self._changed:
             return self._decisions.calibration.corrections
@@ -90,7 +90,7 @@ class Refolding:
         if self._writer.config.trust.exclude:
             write(self._writer, lambda store: self._judge(store, verdicts, stamp_ns))
 
-    def calibrate(self, solved: Calibration, stamp_ns: int, *, asked: bool = False) -> int:
+    def calibrate(self, solved: Solution, stamp_ns: int, *, asked: bool = False) -> int:
         """Decide what the solver may decide, or all that it would where a person asks; returns a number to wait for.
 
         While the map does not follow what is decided, what the solver wants waits: folds of a large site take longer.
@@ -128,7 +128,7 @@ class Refolding:
             decisions = self._decisions.trust.judge(verdicts, stamp_ns)
         self._keep(store, decisions)
 
-    def _calibrate(self, store: Store, solved: Calibration, stamp_ns: int, *, asked: bool) -> int:
+    def _calibrate(self, store: Store, solved: Solution, stamp_ns: int, *, asked: bool) -> int:
         with self._changed:
             decisions = self._decisions.calibration.judge(solved, stamp_ns, asked=asked)
             waits = not asked and self._folded < self._decided

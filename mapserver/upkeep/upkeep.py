@@ -8,12 +8,13 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from mapserver.fleet.correction import Corrections
-from mapserver.fleet.observability import MachineState, state_of
+from mapserver.calibration.correction import SampleCorrections
+from mapserver.calibration.decision import calibration_of, decided_by_person
+from mapserver.calibration.select import MachineErrors, state_of
 from mapserver.ingest.writer import Writer
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from mapserver.trust.decisions import AUDIT, PERSON, TrustDecision
-from mapserver.upkeep.calibrating import Calibrating, calibration_of, decided_by_person
+from mapserver.upkeep.calibrating import Calibrating
 from mapserver.upkeep.checkpointing import Checkpointing
 from mapserver.upkeep.jobs import Archiving, Audit, ChangeSearch, Job, Publish
 from mapserver.upkeep.refolding import Refolding
@@ -36,7 +37,7 @@ class Upkeep:
     publish: is given each change when it is new or grows.
     """
 
-    def __init__(self, writer: Writer, publish: Publish, past: Past) -> None:
+    def __init__(self, writer: Writer, publish: Publish, past: StorePast) -> None:
         self._writer = writer
         self._reader = reader = writer.location.reader()
         self._ending = threading.Event()
@@ -127,7 +128,7 @@ class Upkeep:
         self._calibrating.close(max(0.0, end_s - time.monotonic()))
         self._reader.close()
 
-    def _known(self) -> tuple[Corrections, Mapping[str, MachineState]]:
+    def _known(self) -> tuple[SampleCorrections, Mapping[str, MachineErrors]]:
         """Corrections that are decided, and what is known of machines: by the last solve, else by an earlier one.
 
         What a person takes off was not measured, and says nothing of what is broken.

@@ -160,11 +160,10 @@ def read_store(folder: Path, now_s: float, url: str = "") -> StoreState:
     url: of its journal in PostgreSQL.
     """
     # imported here: needs the `server` extra, which a machine's host does not have
-    from mapserver.evidence import snapshot
     from mapserver.ingest.map_info import lacking
     from mapserver.journal import shortfall as short
     from mapserver.journal.location import JOURNAL_FILE, JournalLocation
-    from mapserver.past.checkpoints import Checkpoints
+    from mapserver.past.checkpoints import Checkpoints, snapshot_path, snapshot_rows
 
     location = JournalLocation(folder, url)
     if not location.exists():
@@ -179,8 +178,8 @@ def read_store(folder: Path, now_s: float, url: str = "") -> StoreState:
         site, frame, schema, replica = journal.site, journal.frame, journal.schema, journal.replica
     known = [short.Shortfall.from_event(event) for event in events if event.kind == short.KIND]
     missing = short.missing(known, watermarks)
-    newest = next(iter(snapshot.rows_on_disk(folder)), 0)
-    age_s = now_s - (folder / f"snapshot-{newest}.npz").stat().st_mtime if newest else math.inf
+    newest = next(iter(snapshot_rows(folder)), 0)
+    age_s = now_s - snapshot_path(folder, newest).stat().st_mtime if newest else math.inf
     text = str(lacks) if lacks else ""
     past = Checkpoints(folder).entries(lambda _: {}, last_row)
     sizes, damaged = sum(entry.bytes for entry in past), sum(entry.header is None for entry in past)

@@ -18,7 +18,6 @@ import numpy as np
 from agents.delivery.audit import Contents, read_audit
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
-from mapserver.evidence import snapshot
 from mapserver.evidence.grid import REFOLD_ROWS, Grid
 from mapserver.evidence.grid_state import GridState, PlacedPage
 from mapserver.evidence.pages import Page
@@ -27,6 +26,7 @@ from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import JournalRow
+from mapserver.past.past import StorePast
 from protocol.arrays import Ints
 from protocol.machine.samples import content_hash
 from protocol.site.site_config import SiteConfig
@@ -66,8 +66,7 @@ def audit_store(audits: Mapping[str, Path], folder: Path, site: SiteConfig, conf
     with location.reader() as journal:
         rows = list(history_rows(History(journal, location.archive)))
         facts = Decisions.of_journal(journal).facts
-    last = rows[-1].row if rows else 0
-    folded, grid = snapshot.load_newest(folder, last, site.cell_m, config.fold, facts.of_evidence())
+        folded, grid = StorePast.of_store(folder, site.cell_m, config.fold).newest(journal, facts)
     for row in rows:
         if row.row > folded and row.machine not in facts.excluded:
             _fold(grid, row, facts)

@@ -13,9 +13,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from importlib import import_module
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 from uuid import uuid4
 
 from protocol.errors import ConfigError, SitegridError
@@ -40,29 +41,11 @@ class StalledError(Exception):
     """The work did not go on, and may be tried again."""
 
 
-class Engine(Protocol):
-    """Does tasks."""
-
-    @property
-    def threads(self) -> int:
-        """How many threads one task may use."""
-        ...
-
-    @property
-    def task_samples(self) -> int:
-        """How many samples one task folds, about."""
-        ...
-
-    def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
-        """Results of all tasks, in their order; done: is told the number of each that is done, here.
-
-        Raises SitegridError where one fails, EngineError where nobody does them.
-        """
-        ...
-
-
 class Here:
-    """One task after the other, in the process that asks; a single one folds all, and nothing has to be merged."""
+    """One task after the other, in the process that asks; a single one folds all, and nothing has to be merged.
+
+    threads: how many one task may use; task_samples: how many samples it folds, about.
+    """
 
     task_samples = sys.maxsize
 
@@ -70,7 +53,10 @@ class Here:
         self.threads = threads
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
-        """See Engine."""
+        """Results of all tasks, in their order; done: is told the number of each that is done.
+
+        Raises SitegridError where one fails, EngineError where nobody does them.
+        """
         results = []
         for number, task in enumerate(tasks):
             results.append(work(task))
@@ -119,7 +105,7 @@ class Cluster:
                 opened.close(timeout=CONNECT_S)
 
     def each(self, work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None] = lambda _: None) -> list[R]:
-        """See Engine; EngineError after TRIES rounds in a row in which no task was done."""
+        """As `Here.each`; EngineError after TRIES rounds in a row in which no task was done."""
         results: dict[int, R] = {}
         failures = 0
         while left := {number: task for number, task in enumerate(tasks) if number not in results}:
@@ -205,6 +191,9 @@ class Cluster:
         return EngineError(f"the Dask scheduler at {self._address or 'this process'} is gone")
 
 
+Engine = Here | Cluster
+
+
 def attempt(work: Callable[[T], R], task: T) -> R:
     """Do a task, in whichever process this is; its error is a plain one, which survives the way to another process."""
     try:
@@ -215,19 +204,13 @@ def attempt(work: Callable[[T], R], task: T) -> R:
 
 def _within(seconds: float, work: Callable[[], T]) -> T:
     """What comes of work; TimeoutError in the end: to a port that says nothing a client connects for ever."""
-    results: list[T | Exception] = []
+    future: Future[T] = Future()
 
     def do() -> None:
         try:
-            results.append(work())
+            future.set_result(work())
         except Exception as error:  # whatever it is, it is raised where it is waited for
-            results.append(error)
+            future.set_exception(error)
 
-    thread = threading.Thread(target=do, name="connect", daemon=True)
-    thread.start()
-    thread.join(seconds)
-    if not results:
-        raise TimeoutError
-    if isinstance(results[0], Exception):
-        raise results[0]
-    return results[0]
+    threading.Thread(target=do, name="connect", daemon=True).start()
+    return future.result(seconds)

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mapserver.calibration.decision import CalibrationDecision
 from mapserver.config import ServerConfig
-from mapserver.evidence import snapshot
 from mapserver.evidence.grid_state import GridState
-from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import calibrations, plain
 from mapserver.ingest.store import Store
 from mapserver.ingest.store_folder import hold_place
@@ -21,6 +20,9 @@ from mapserver.journal.archive import FOLDER, file_name
 from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import SpoolKey, Watermark
+from mapserver.past.checkpoint_file import OPEN_END_NS
+from mapserver.past.checkpoints import save_snapshot
+from mapserver.past.past import StorePast
 from protocol.errors import ConfigError, SitegridError, StoreError
 from protocol.files import sync_folder, write_whole
 from protocol.site.site_config import SiteConfig
@@ -53,7 +55,9 @@ class NewStore:
 
     def save_map(self, state: GridState, config: ServerConfig, facts: Facts) -> None:
         """Write the snapshot that the store starts from."""
-        snapshot.save(self.folder, self.rows, state, self.site.cell_m, config.fold, facts.of_evidence())
+        with JournalLocation(self.folder).reader() as journal:
+            depends_on = StorePast.of_store(self.folder, self.site.cell_m, config.fold).depends_on(journal, facts)
+        save_snapshot(self.folder, self.rows, depends_on(OPEN_END_NS), state)
 
     def fill_journal(self, watermarks: Mapping[SpoolKey, Watermark], decisions: Sequence[CalibrationDecision]) -> None:
         """Have the journal go on after the archive, with the decisions about the samples in it."""

@@ -34,7 +34,7 @@ Taken = Mapping[SpoolKey, tuple[Interval, ...]]  # disjoint, in order
 
 
 @dataclass(frozen=True)
-class Origin:
+class PartOrigin:
     """What a part says of itself. identity: hex digits that other contents do not have. site: where it is known."""
 
     identity: str
@@ -51,12 +51,12 @@ class FilePart:
 
     path: Path | FilePlace
 
-    def origin(self) -> Origin:
+    def origin(self) -> PartOrigin:
         """What its header says."""
         file = ArchiveFile(self.path)
         header = file.header
         identity = f"{file.identity}-{header.store}-{file.first_row}-{file.samples}"
-        return Origin(identity, header.site.name, header.frame, header.machines, (header.store,), header.site)
+        return PartOrigin(identity, header.site.name, header.frame, header.machines, (header.store,), header.site)
 
     def read(self, columns: Sequence[str] = COLUMNS) -> Iterator[JournalRows]:
         """Its rows, with these columns of their samples at least; StoreError where it is damaged."""
@@ -78,7 +78,7 @@ class JournalPart:
     until: int
     host: str
 
-    def origin(self) -> Origin:
+    def origin(self) -> PartOrigin:
         """What the journal says; its rows are read for their checksum."""
         with self._reader() as journal:
             store = journal.identity()
@@ -87,7 +87,7 @@ class JournalPart:
                 crc32 = zlib.crc32(rows.samples.tobytes(), crc32)
             machines = tuple(sorted({machine for machine, _ in journal.watermarks()}))
             identity = f"{crc32:08x}-{store.id}-{self.after}-{self.until}"
-            return Origin(identity, journal.site, journal.frame, machines, (store.id,), None)
+            return PartOrigin(identity, journal.site, journal.frame, machines, (store.id,), None)
 
     def read(self, columns: Sequence[str] = COLUMNS) -> Iterator[JournalRows]:  # noqa: ARG002 # rows are whole records
         """Its rows; StoreError where they are damaged."""
@@ -125,7 +125,7 @@ class Contents:
     """
 
     part: Part
-    origin: Origin
+    origin: PartOrigin
     first_ns: int = 0
     rows: int = 0
     samples: int = 0
@@ -136,7 +136,7 @@ class Contents:
 
 
 @dataclass(frozen=True)
-class Look:
+class LookTask:
     """A task: look at a part. selection: machines and stamps; taken: numbers that another part has as well."""
 
     part: Part
@@ -144,7 +144,7 @@ class Look:
     taken: Taken = field(default_factory=dict)
 
 
-def look(task: Look) -> Contents:
+def look(task: LookTask) -> Contents:
     """Read through a part; StoreError where it is damaged."""
     origin = task.part.origin()
     first_ns, rows_kept, samples = 0, 0, 0

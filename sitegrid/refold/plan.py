@@ -18,7 +18,7 @@ from protocol.arrays import Table
 from protocol.errors import ConfigError, StoreError
 from protocol.machine.samples import RAW_SAMPLE
 from sitegrid.refold.engine import Engine
-from sitegrid.refold.parts import Contents, Interval, Look, Part, by_spool, look
+from sitegrid.refold.parts import Contents, Interval, LookTask, Part, by_spool, look
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class Comparison:
 
 
 def plan(parts: Sequence[Part], selection: Selection, engine: Engine) -> Plan:
-    """Look through all parts; StoreError where a sample is in two of them with different contents."""
-    contents = engine.each(look, [Look(part, selection) for part in parts])
+    """LookTask through all parts; StoreError where a sample is in two of them with different contents."""
+    contents = engine.each(look, [LookTask(part, selection) for part in parts])
     _require_one_site(contents)
     contents.sort(key=lambda each: (each.first_ns, each.origin.machines, each.origin.identity, str(each.part)))
     overlaps = list(_overlaps(contents))
@@ -81,7 +81,7 @@ def plan(parts: Sequence[Part], selection: Selection, engine: Engine) -> Plan:
     for at, _, spool, interval in overlaps:
         taken[at][spool] = (*taken[at].get(spool, ()), interval)
     again = [at for at, some in enumerate(taken) if some]
-    looked = engine.each(look, [Look(contents[at].part, selection, taken[at]) for at in again])
+    looked = engine.each(look, [LookTask(contents[at].part, selection, taken[at]) for at in again])
     for at, each in zip(again, looked, strict=True):
         contents[at] = each
     return Plan(tuple(contents), tuple(taken), selection)

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from mapserver.calibration.decision import CalibrationDecision
 from mapserver.config import ServerConfig
-from mapserver.fleet.decisions import CalibrationDecision
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.map_info import lacking
 from mapserver.ingest.store import ACCEPTED

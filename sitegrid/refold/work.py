@@ -23,19 +23,19 @@ from numpy.typing import NDArray
 
 import mapserver
 import protocol
+from mapserver.calibration.correction import SampleCorrections
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridState
 from mapserver.evidence.pages import CompactPages
-from mapserver.fleet.correction import Corrections
 from mapserver.journal.archive import READABLE, ArchiveWriter
 from mapserver.journal.archive_file import seal
 from mapserver.journal.history import PIECE, fold_samples
 from mapserver.journal.rows import JournalRows, Selection, SpoolKey
-from mapserver.past.checkpoint_file import Checkpoint, CheckpointWriter, DamagedError, Header
+from mapserver.past.checkpoint_file import Checkpoint, DamagedError, Header, write_checkpoint
 from protocol.arrays import Ints, Table
 from protocol.errors import StoreError
-from protocol.files import PRIVATE, whole_file
+from protocol.files import whole_file
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 from protocol.site.site_config import SiteConfig
 from sitegrid.refold.parts import Interval, Part, chosen
@@ -55,7 +55,7 @@ class Fold:
     site: SiteConfig
     config: FoldConfig
     selection: Selection
-    corrections: Corrections
+    corrections: SampleCorrections
     code: str
 
     def check(self) -> None:
@@ -242,12 +242,7 @@ def _kept(fold: Fold, part: PartWork) -> Iterator[JournalRows]:
 
 def _write(path: Path, store: str, state: GridState) -> None:
     try:
-        with whole_file(path, PRIVATE) as file:
-            writer = CheckpointWriter(file)
-            for x, y, pages in state.blocks:
-                writer.add(x, y, pages)
-            totals = (state.folded, state.skipped, state.newest_ns, state.oldest_ns)
-            writer.finish(Header(0, 0, {"store": store}, *totals))
+        write_checkpoint(path, Header(0, 0, {"store": store}), state)
     except OSError as error:
         raise StoreError(path.parent, f"cannot be written: {error.strerror or error}") from None
 

@@ -74,7 +74,7 @@ def _files(site: ChaosSite) -> list[tuple[Path, Callable[[Path], Content]]]:
     """Files, and how to read what they say."""
     store = site.folder / "store"
     definition = load_site(site.folder / "site.toml")
-    snapshot = max(store.glob("snapshot-*.npz"), key=lambda path: path.stat().st_mtime)
+    snapshot = max(store.glob("snapshot-*"), key=lambda path: path.stat().st_mtime)
 
     def look_at_store(path: Path) -> Content:
         return read_store(path.parent, definition)

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapserver.calibration.correction import LAST_NS, Correction, SampleCorrections
+from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.correction import LAST_NS, Correction, Corrections
-from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest.store import Store
 from mapserver.journal.history import history_rows
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
@@ -32,8 +32,8 @@ from tests.integration.site_run import SiteRun, kill
 from tests.integration.test_evidence import Senders
 from tests.journals import history_beside
 from tests.reference.correction import in_numpy
+from tests.unit.mapserver.calibration.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
 from tests.unit.mapserver.data import same
-from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive
 
 pytestmark = pytest.mark.processes
 
@@ -61,7 +61,7 @@ def stored(folder: Path, site: SiteRun) -> closing[Store]:
     return closing(Store(JournalLocation(folder), load_site(site.site_file), ServerConfig(), time.time_ns))
 
 
-def folded(site: SiteRun, corrections: Corrections, sent: dict[str, Table]) -> Grid:
+def folded(site: SiteRun, corrections: SampleCorrections, sent: dict[str, Table]) -> Grid:
     """The fold of all that was sent from the start, corrected in numpy."""
     grid = Grid(load_site(site.site_file).cell_m, ServerConfig().fold)
     for name, rows in sent.items():
@@ -74,8 +74,8 @@ def folded(site: SiteRun, corrections: Corrections, sent: dict[str, Table]) -> G
     return grid
 
 
-def by_person(machine: str) -> Corrections:
-    return Corrections([Correction(machine, 0, LAST_NS, ZERO, 0.0, 0.0, ())])
+def by_person(machine: str) -> SampleCorrections:
+    return SampleCorrections([Correction(machine, 0, LAST_NS, ZERO, 0.0, 0.0, ())])
 
 
 def sample_bytes(journal: Path) -> dict[tuple[str, int], bytes]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import subprocess
@@ -20,6 +19,7 @@ from sitegrid.cli import main
 from sitegrid.refold import engine
 from sitegrid.refold.engine import Cluster
 from tests.patience import PATIENCE_S, until
+from tests.site_work import evidence_hash
 from tests.unit.sitegrid.refold.archives import SITE, STORE, T0, S, samples
 
 pytest.importorskip("pyarrow.parquet")
@@ -61,13 +61,10 @@ def expected(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 
 
 def contents(store: Path) -> dict[str, str]:
-    """Hashes of all that does not have the store's random id in it, and the names of the others."""
+    """All that does not have the store's random id in it, and the names of the others."""
     files = {path for path in store.rglob("*") if path.is_file() and path.name not in ("lock", "journal.db-mark")}
-    hashed = (path.suffix in (".npz", ".toml") for path in files)
-    return {
-        str(path.relative_to(store)): hashlib.sha256(path.read_bytes()).hexdigest() if hash_it else ""
-        for path, hash_it in zip(files, hashed, strict=True)
-    }
+    hashes = {".toml": Path.read_text, ".checkpoint": evidence_hash}
+    return {str(path.relative_to(store)): hashes.get(path.suffix, lambda _: "")(path) for path in files}
 
 
 def started(*words: object) -> subprocess.Popen[bytes]:
@@ -75,11 +72,8 @@ def started(*words: object) -> subprocess.Popen[bytes]:
 
 
 def children_of(pid: int) -> set[int]:
-    """Processes that a process has started; Python's tracker of resources is one."""
-    try:
-        return {int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()}
-    except FileNotFoundError:
-        return set()
+    """Processes that any thread of a process has started; Python's tracker of resources is one."""
+    return {int(word) for path in Path(f"/proc/{pid}/task").glob("*/children") for word in path.read_text().split()}
 
 
 def evidence(out: Path) -> list[Path]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapserver.fleet.correction import ANY_SHARE, HEADINGS, UNIT_VECTORS, Correction
+from mapserver.calibration.correction import ANY_SHARE, HEADINGS, UNIT_VECTORS, Correction
 from protocol.arrays import Table
 from protocol.machine.samples import LIMITS
 

@@ -6,7 +6,7 @@ from lab.calibration.drives import Scene
 from protocol.arrays import Table
 from sim.truth import TruthMap
 from sitegrid.proof.tracks import LoadTrack
-from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive, height_slope, soils
+from tests.unit.mapserver.calibration.drives import LOW, RAMP, RAMP_AGAIN, Errors, drive, height_slope, soils
 
 ROUTES = {"a": (LOW, Errors(0.004, -0.05)), "b": (RAMP, Errors(-0.006, 0.04)), "c": (RAMP_AGAIN, Errors(0.008, 0.03))}
 

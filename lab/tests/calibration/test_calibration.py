@@ -13,7 +13,7 @@ from lab.calibration.experiment import row_of
 from lab.calibration.solving import FIGURES, MAPS, CaseResult, JudgedMap, solved, true_errors
 from lab.tests.calibration.scenes import ROUTES, made_scene, track
 from protocol.arrays import Table
-from tests.unit.mapserver.fleet.drives import RAMP, Errors, drive
+from tests.unit.mapserver.calibration.drives import RAMP, Errors, drive
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import pytest
 from lab.cooperation.live import LiveRun, arrivals
 from lab.cooperation.maps import Timeline
 from lab.tests.cooperation.samples import SECOND_NS, driving
-from mapserver.fleet.correction import LAST_NS, Correction
-from mapserver.fleet.decisions import SOLVER, CalibrationDecision
+from mapserver.calibration.correction import LAST_NS, Correction
+from mapserver.calibration.decision import SOLVER, CalibrationDecision
 from mapserver.ingest.decisions import plain
 from mapserver.journal.rows import JournalRow
 from mapserver.trust.decisions import AUDIT, TrustDecision

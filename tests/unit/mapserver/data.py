@@ -23,7 +23,7 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal.journal import Journal
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Admission, JournalRow
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from protocol.arrays import Table
 from protocol.errors import MessageError, QueryError
 from protocol.machine.samples import empty
@@ -205,8 +205,8 @@ def open_writer(
     return Writer(open_store(folder, config, site), clock)
 
 
-def past_of(writer: Writer) -> Past:
-    return Past.of_store(writer.location.folder, writer.site.cell_m, writer.config.fold)
+def past_of(writer: Writer) -> StorePast:
+    return StorePast.of_store(writer.location.folder, writer.site.cell_m, writer.config.fold)
 
 
 @contextmanager

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from mapserver.fleet.calibration import calibrate
-from mapserver.fleet.ledger import Ledger
+from mapserver.calibration.calibrate import calibrate
+from mapserver.calibration.ledger import StayLedger
 from mapserver.trust.auditor import Auditor
 from protocol.machine.samples import GRADE, RESISTANCE
 from tests.unit.mapserver.roads.drives import along, passes
@@ -31,9 +31,9 @@ def test_a_machine_that_sends_nothing_else_is_not_judged_and_accuses_nobody():
 
 
 def test_calibration_learns_nothing_from_them():
-    true = Ledger()
+    true = StayLedger()
     true.add(passes(LINE, 20))
-    blind = Ledger()
+    blind = StayLedger()
     blind.add(nothing_measured(passes(LINE, 20)))
     assert not len(blind.stays())
     with_blind = calibrate({"a": true.stays(), "blind": blind.stays()})

@@ -26,7 +26,7 @@ from mapserver.journal.rows import LAST
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.journal.table_writer import meta_line
 from mapserver.past.making import make
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal, StoreError
@@ -292,7 +292,7 @@ def test_a_journal_damaged_beneath_a_follower_takes_no_map_away_and_gives_none_t
         damage(path)
         wait_for(lambda: "cannot follow problem=" in caplog.text and one.behind()[1] > 0.5)
         assert version(one).row == 3
-        for snapshot in tmp_path.glob("*.npz"):
+        for snapshot in tmp_path.glob("snapshot-*"):
             snapshot.unlink()
         with following(tmp_path) as new:
             wait_for(lambda: new._problem)
@@ -338,7 +338,7 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
         for seed in (1, 2, 3):
             store.commit([incoming(random_samples(40, seed), 1, spool_id=seed)])
         with location.reader() as reader:
-            past = Past.of_store(location.folder, SITE.cell_m, CONFIG.fold)
+            past = StorePast.of_store(location.folder, SITE.cell_m, CONFIG.fold)
             assert list(make(past, reader, (NOW_NS // HOUR_NS + 1) * HOUR_NS, store.facts))
     database.sql("DELETE FROM sitegrid.journal WHERE row > 1; DELETE FROM sitegrid.extent WHERE row > 1")
     database.sql(

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapserver.fleet.correction import LAST_NS, NO_SHARE, Correction
-from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision
+from mapserver.calibration.correction import LAST_NS, NO_SHARE, Correction
+from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest import standby as standby_module
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
@@ -287,7 +287,7 @@ def test_only_its_owner_reads_the_files_of_a_store(tmp_path):
         store.close()
     finally:
         os.umask(before)
-    assert {"journal.db", "journal.db-wal", "journal.db-mark", "lock", "snapshot-1.npz"} <= modes.keys()
+    assert {"journal.db", "journal.db-wal", "journal.db-mark", "lock", "snapshot-1.checkpoint"} <= modes.keys()
     assert set(modes.values()) == {0o600}
 
 
@@ -296,14 +296,14 @@ def test_a_snapshot_beyond_the_journal_is_named_before_it_is_removed(tmp_path, c
     store.commit([incoming(samples(3))])
     store.save_snapshot()
     store.close()
-    (tmp_path / "snapshot-1.npz").rename(tmp_path / "snapshot-7.npz")
+    (tmp_path / "snapshot-1.checkpoint").rename(tmp_path / "snapshot-7.checkpoint")
     store = open_store(tmp_path)
     assert store.info()["shortfalls"] == [
         "a snapshot of row 7 lies beyond the journal; 6 journal rows after row 1 are gone"
     ]
     assert "acknowledged samples are missing" in caplog.text
-    assert "snapshot removed row=7" in caplog.text
-    assert not (tmp_path / "snapshot-7.npz").exists()
+    assert "snapshot-7.checkpoint row=7 last_row=1" in caplog.text
+    assert not (tmp_path / "snapshot-7.checkpoint").exists()
     store.close()
     store = open_store(tmp_path)
     assert len(store.info()["shortfalls"]) == 1, "it is kept, and not said again"

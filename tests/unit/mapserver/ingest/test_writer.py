@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mapserver.config import ServerConfig, StoreConfig
-from mapserver.evidence import snapshot
 from mapserver.ingest import backlog, merge_waits, snapshot_times
+from mapserver.ingest import store as store_module
 from mapserver.ingest import writer as writer_module
 from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, GROUP_BYTES, MOST_RETRY_S, Backlog, WorkRate
 from mapserver.ingest.merge_waits import MergeWaits
@@ -21,6 +21,7 @@ from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
 from mapserver.journal.sqlite.journal import SqliteJournal
+from mapserver.past.checkpoints import save_snapshot, snapshot_rows
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import ServerAlive
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
@@ -149,7 +150,7 @@ def test_closing_finishes_what_is_waiting(start, tmp_path):
         closing.start()
     closing.join(WAIT_S)
     assert [a.watermark for a in replies.wait(7)] == [1, 2, 3, 4, 5, 6, 7]
-    assert max(snapshot.rows_on_disk(tmp_path)) == 7
+    assert max(snapshot_rows(tmp_path)) == 7
     again = start()
     assert again.info()["snapshot"] == again.info()["merged"] == 7
 
@@ -208,34 +209,34 @@ def test_a_snapshot_is_made_once_a_restart_would_take_long(start, tmp_path):
     for row in range(1, 8):
         send(writer, [incoming(samples(1), row)])
         turn(writer)
-        wait_for(lambda row=row: snapshot.rows_on_disk(tmp_path) == expected[row // 3 * 3] and is_written(writer))
+        wait_for(lambda row=row: snapshot_rows(tmp_path) == expected[row // 3 * 3] and is_written(writer))
 
 
 def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start, tmp_path, monkeypatch):
-    release, entered, real, clock = threading.Event(), threading.Event(), snapshot.save, Clock()
+    release, entered, real, clock = threading.Event(), threading.Event(), save_snapshot, Clock()
 
     def slow(*args):
         entered.set()
         assert release.wait(WAIT_S)
         return real(*args)
 
-    monkeypatch.setattr(snapshot, "save", slow)
+    monkeypatch.setattr(store_module, "save_snapshot", slow)
     writer = start(restart_samples=2, clock=clock)
     for row in range(1, 7):
         assert send(writer, [incoming(samples(1), row)]) == [Ack(row, row, store=writer.store_id)]
     assert entered.wait(WAIT_S)
-    assert snapshot.rows_on_disk(tmp_path) == []
+    assert snapshot_rows(tmp_path) == []
     clock.now_s += 3.0
     release.set()
     wait_for(lambda: is_written(writer))
     turn(writer)
-    assert snapshot.rows_on_disk(tmp_path) == [2]
+    assert snapshot_rows(tmp_path) == [2]
     clock.now_s += 3.0 * (1 / SHARE - 1) - 0.01
     turn(writer)
-    assert snapshot.rows_on_disk(tmp_path) == [2]  # it took 3 s: nothing for a minute
+    assert snapshot_rows(tmp_path) == [2]  # it took 3 s: nothing for a minute
     clock.now_s += 0.02
     turn(writer)
-    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [6, 2])
+    wait_for(lambda: snapshot_rows(tmp_path) == [6, 2])
     writer.close()
     assert start().info()["snapshot"] == 6
 
@@ -246,16 +247,16 @@ def test_a_snapshot_is_made_when_its_time_has_come_even_if_nothing_comes(start, 
     send(writer, [incoming(samples(1))])
     clock.now_s += 59.9
     turn(writer)
-    assert snapshot.rows_on_disk(tmp_path) == []
+    assert snapshot_rows(tmp_path) == []
     clock.now_s += 0.1
     turn(writer)
-    wait_for(lambda: snapshot.rows_on_disk(tmp_path) == [1] and is_written(writer))
+    wait_for(lambda: snapshot_rows(tmp_path) == [1] and is_written(writer))
     clock.now_s += 60.0
     turn(writer)
-    assert snapshot.rows_on_disk(tmp_path) == [1]  # nothing new
+    assert snapshot_rows(tmp_path) == [1]  # nothing new
     send(writer, [incoming(samples(1), 2)])
     turn(writer)
-    assert snapshot.rows_on_disk(tmp_path) == [1]  # and it was looked at a moment ago
+    assert snapshot_rows(tmp_path) == [1]  # and it was looked at a moment ago
 
 
 def test_a_snapshot_that_fails_is_tried_again_only_after_a_while(start, tmp_path, monkeypatch):
@@ -265,7 +266,7 @@ def test_a_snapshot_that_fails_is_tried_again_only_after_a_while(start, tmp_path
         tries.append(args[1])
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(snapshot, "save", full)
+    monkeypatch.setattr(store_module, "save_snapshot", full)
     writer = start(restart_samples=3, snapshot_s=60.0, clock=clock)
     for i in range(7):
         if i == 5:
@@ -326,7 +327,7 @@ def test_after_a_bug_a_restart_folds_what_was_committed(start, monkeypatch, tmp_
         writer.submit(incoming(samples(4)), lambda _: None)
         wait_for(lambda: writer.failed)
         writer.close()
-    assert snapshot.rows_on_disk(tmp_path) == []  # a grid that may be half-folded is not kept
+    assert snapshot_rows(tmp_path) == []  # a grid that may be half-folded is not kept
     again = start()
     assert send(again, [incoming(samples(4))]) == [Ack(4, 1, trimmed=4, store=writer.store_id)]
     assert again.info()["samples_merged"] == 4

@@ -16,7 +16,6 @@ from typing import Any
 import psycopg
 import pytest
 
-from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
@@ -27,6 +26,7 @@ from mapserver.journal.location import JournalLocation
 from mapserver.journal.postgres import session
 from mapserver.journal.postgres.connection import shown
 from mapserver.journal.postgres.session import WriterSession
+from mapserver.past.checkpoints import snapshot_rows
 from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import ConfigError, QueryError, Refusal, SitegridError, StoreError
@@ -311,7 +311,7 @@ def test_rows_that_a_restore_takes_away_are_named_and_asked_for_again(tmp_path, 
     with closing(open_store(tmp_path / "one", restored)) as store:
         assert "10 acknowledged samples of a are gone" in str(store.shortfalls[0])
         assert store.journal.epoch == 3, "beyond the epoch that the backup does not know"
-        assert snapshot.rows_on_disk(tmp_path / "one") == []
+        assert snapshot_rows(tmp_path / "one") == []
         assert same(store.grid, folded_by(store))
         assert send(store, 6).watermark == 10
 

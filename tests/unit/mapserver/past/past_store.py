@@ -12,7 +12,7 @@ from mapserver.journal.facts import Facts
 from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past.making import make
-from mapserver.past.past import Past
+from mapserver.past.past import StorePast
 from mapserver.past.plan import HOUR_NS
 from protocol.arrays import Table
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, put
@@ -28,7 +28,7 @@ class PastStore:
         self.folder = folder
         self.journal = SqliteJournal(folder / "journal.db", SITE.name, SITE.frame)
         self.reader = SqliteReader(self.journal.path)
-        self.past = Past.of_store(folder, cell_m, config)
+        self.past = StorePast.of_store(folder, cell_m, config)
         self.sent: list[tuple[str, Table]] = []
 
     def add(self, rows: Table, machine: str = "a") -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.fleet.correction import Correction, Corrections
+from mapserver.calibration.correction import Correction, SampleCorrections
 from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
 from mapserver.query import road_maps
@@ -149,7 +149,7 @@ def test_facts_count_for_samples(writer):
     answers = answers_of(writer)
     raw = {one.id: one.resistance for one in segments(answers).segments}
     taken = Correction("a", 0, FOREVER, 0.02, 0.0, 0.0, ())
-    writer.run(lambda store: setattr(store, "facts", Facts(corrections=Corrections([taken]), number=1)))
+    writer.run(lambda store: setattr(store, "facts", Facts(corrections=SampleCorrections([taken]), number=1)))
     right = {one.id: one.resistance for one in segments(answers).segments}
     assert right["3_0_e"] == pytest.approx(raw["3_0_e"] - 0.02, abs=1e-4)
     assert all(right[name] == raw[name] for name in raw if name.split("_")[1] != "0")
@@ -439,7 +439,9 @@ def test_a_journal_that_fails_ends_no_making(repaired, monkeypatch):
 @pytest.mark.parametrize(
     "facts",
     [
-        Facts(corrections=Corrections([Correction(name, 0, FOREVER, 0.02, 0.0, 0.0, ()) for name in "ab"]), number=1),
+        Facts(
+            corrections=SampleCorrections([Correction(name, 0, FOREVER, 0.02, 0.0, 0.0, ()) for name in "ab"]), number=1
+        ),
         Facts(frozenset({"b"}), number=1),
     ],
     ids=["calibration", "distrust"],

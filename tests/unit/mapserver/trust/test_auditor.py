@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from mapserver.fleet.observability import MachineState
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD
+from mapserver.calibration.select import MachineErrors
+from mapserver.calibration.solver import SCALE_STD, ZERO_STD
 from mapserver.journal.rows import JournalRows
 from mapserver.trust import coarse_map
 from mapserver.trust.auditor import Auditor, Verdict
@@ -120,9 +120,9 @@ def test_gain_and_displacement_together_are_both_found_and_measured() -> None:
     assert evidence["disagrees_with"] == ("a", "b", "c")
 
 
-def state(zero: float, scale: float) -> MachineState:
+def state(zero: float, scale: float) -> MachineErrors:
     beyond = (abs(zero) / ZERO_STD, abs(scale) / SCALE_STD)
-    return MachineState(zero, 0.001, scale, 0.01, 0.0, 0.001, ("heights",), ("edges",), beyond)
+    return MachineErrors(zero, 0.001, scale, 0.01, 0.0, 0.001, ("heights",), ("edges",), beyond)
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.6), (0.0, -0.35), (0.03, 0.0)])

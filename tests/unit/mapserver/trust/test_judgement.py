@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapserver.fleet.observability import FAULT_SIGMAS, MachineState
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD
+from mapserver.calibration.select import FAULT_SIGMAS, MachineErrors
+from mapserver.calibration.solver import SCALE_STD, ZERO_STD
 from mapserver.journal.rows import Event
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.coarse_map import LEVEL_FLOOR, CoarseMap, Surface, pooled
@@ -84,7 +84,7 @@ def test_between_maps_that_have_nothing_in_common_gain_and_offset_mean_nothing(c
     assert {judgement.state for judgement in judge(None, sigmas=0.0).values()} == {UNKNOWN}
 
 
-STATE = MachineState(0.0, 0.001, 0.0, 0.01, 0.0, 0.001, ("heights",), ("edges",), (0.0, 0.0))
+STATE = MachineErrors(0.0, 0.001, 0.0, 0.01, 0.0, 0.001, ("heights",), ("edges",), (0.0, 0.0))
 ZERO_LIMIT, SCALE_LIMIT = FAULT_SIGMAS
 
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
+from mapserver.calibration import calibrate as solving
+from mapserver.calibration.calibrate import Solution, calibrate
+from mapserver.calibration.correction import corrected
 from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet import calibration
-from mapserver.fleet.calibration import Calibration, calibrate
-from mapserver.fleet.correction import corrected
 from mapserver.ingest.writer import Writer
 from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.location import JOURNAL_FILE
@@ -27,8 +27,8 @@ from mapserver.upkeep.upkeep import Upkeep
 from protocol.arrays import Table
 from protocol.errors import Refusal
 from protocol.queries.commands import CalibrateCommand
+from tests.unit.mapserver.calibration.drives import LOW, RAMP, RAMP_AGAIN, START_NS, Errors, drive
 from tests.unit.mapserver.data import SITE, WAIT_S, grid_copy, incoming, open_writer, past_of, refused, same, send
-from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, START_NS, Errors, drive
 
 DRIVES = {
     "a": drive(LOW, Errors(zero=0.008), seed=1, seconds=300),
@@ -57,20 +57,20 @@ def writer(tmp_path: Path) -> Iterator[Writer]:
 def calibrating(writer: Writer, *doubtful: str) -> tuple[Calibrating, list[int]]:
     decided: list[int] = []
 
-    def decide(_: Calibration, now_ns: int) -> None:
+    def decide(_: Solution, now_ns: int) -> None:
         decided.append(now_ns)
 
     job = Calibrating(writer, past_of(writer), decide, lambda: frozenset(doubtful), list, threading.Event())
     return job, decided
 
 
-def solved(writer: Writer, *doubtful: str) -> Calibration:
+def solved(writer: Writer, *doubtful: str) -> Solution:
     job, _ = calibrating(writer, *doubtful)
     with closing(job):
         return of_ledgers(job)
 
 
-def of_ledgers(job: Calibrating) -> Calibration:
+def of_ledgers(job: Calibrating) -> Solution:
     """What the ledgers come to. Since when there may be samples is more or less known, and no matter of theirs."""
     return replace(job.solve()[0], begins_ns={})
 
@@ -213,11 +213,11 @@ def test_rows_that_cannot_be_read_do_not_keep_the_others_from_counting(writer, t
 
 
 def test_a_large_fleet_is_solved_in_groups_that_take_turns(writer, monkeypatch):
-    monkeypatch.setattr(calibration, "MOST_MACHINES", 2)
-    monkeypatch.setattr(calibration, "MOST_EPOCHS", 4)
+    monkeypatch.setattr(solving, "MOST_MACHINES", 2)
+    monkeypatch.setattr(solving, "MOST_EPOCHS", 4)
     together: list[set[str]] = []
 
-    def note(stays: Mapping[str, Table], *more: Any) -> Calibration:
+    def note(stays: Mapping[str, Table], *more: Any) -> Solution:
         together.append({*stays})
         return calibrate(stays, *more)
 
@@ -274,8 +274,8 @@ def test_one_clock_that_was_ahead_does_not_stop_the_calibration_of_the_site(tmp_
 
 def test_what_a_clock_stamped_that_was_ahead_has_no_part_in_a_solve(tmp_path, monkeypatch):
     """A machine drives with a clock that is 20 h ahead, and then with one that is right, in both for some epochs."""
-    monkeypatch.setattr(calibration, "MOST_EPOCHS", 1)
-    monkeypatch.setattr("mapserver.fleet.ledger._PENDING_ROWS", 10)
+    monkeypatch.setattr(solving, "MOST_EPOCHS", 1)
+    monkeypatch.setattr("mapserver.calibration.ledger._PENDING_ROWS", 10)
     with closing(open_writer(tmp_path)) as writer:
         job, _ = calibrating(writer)
         with closing(job):
@@ -292,7 +292,7 @@ def test_what_a_clock_stamped_that_was_ahead_has_no_part_in_a_solve(tmp_path, mo
 
 
 def test_a_running_server_knows_no_more_of_machines_that_left_than_one_that_is_started(tmp_path, monkeypatch):
-    monkeypatch.setattr(calibration, "MOST_EPOCHS", 20)
+    monkeypatch.setattr(solving, "MOST_EPOCHS", 20)
     with closing(open_writer(tmp_path)) as writer:
         job, _ = calibrating(writer)
         with closing(job):

@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapserver.calibration.calibrate import Solution
+from mapserver.calibration.correction import LAST_NS, LEVEL_SHARE, Correction
+from mapserver.calibration.decide import EVERY_NS
+from mapserver.calibration.decision import SOLVER, CalibrationDecision
+from mapserver.calibration.select import CommonScale
 from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
-from mapserver.evidence import snapshot
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import LAST_NS, LEVEL_SHARE, Correction
-from mapserver.fleet.decisions import EVERY_NS, SOLVER, CalibrationDecision
-from mapserver.fleet.observability import CommonScale
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
-from mapserver.journal.facts import Facts
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past import past
+from mapserver.past.checkpoint_file import Checkpoint
 from mapserver.past.making import make
 from mapserver.past.plan import HOUR_NS
 from mapserver.trust.auditor import Verdict
@@ -145,9 +145,9 @@ def test_decisions_during_a_fold_are_folded_together_and_the_old_fold_is_given_u
         assert same(writer.run(grid_copy), map_without("bcd", 5))
 
 
-def solved(zero: float) -> Calibration:
+def solved(zero: float) -> Solution:
     sure = ((1e-7, 0.0, 0.0), (0.0, 1e-5, 0.0), (0.0, 0.0, 1e-7))
-    return Calibration((Correction("a", NOW_NS, LAST_NS, zero, 0.0, 0.0, sure),), {}, CommonScale(True, 0.0, ""))
+    return Solution((Correction("a", NOW_NS, LAST_NS, zero, 0.0, 0.0, sure),), {}, CommonScale(True, 0.0, ""))
 
 
 def test_the_solver_decides_nothing_new_until_the_map_follows_unless_it_is_asked(writer, fold):
@@ -372,7 +372,8 @@ def test_a_snapshot_that_lacks_a_fact_is_folded_again(tmp_path):
         fleet.send(empty_writer, 15)
     files = tmp_path.glob("snapshot-*")  # a slow machine may have made one before
     old = max(files, key=lambda path: int(path.stem.removeprefix("snapshot-")))
-    assert snapshot.load(old, SITE.cell_m, CONFIG.fold, Facts().of_evidence())
+    with Checkpoint(old) as checkpoint:
+        assert checkpoint.header.facts["excluded"] == []
     with closing(open_store(tmp_path)) as store:
         store.decide(correction_of("a"))
         assert store.fact == 0, "killed before the map was folded again"

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapserver.calibration.correction import UNCORRECTED, Correction, SampleCorrections
+from mapserver.calibration.decision import CalibrationDecision
+from mapserver.calibration.select import MachineErrors
 from mapserver.config import CalibrationConfig, ServerConfig, StoreConfig, TrustConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.correction import UNCORRECTED, Correction, Corrections
-from mapserver.fleet.decisions import CalibrationDecision
-from mapserver.fleet.observability import MachineState
 from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER
@@ -279,8 +279,8 @@ def test_corrected_samples_are_judged_also_those_that_came_before_the_correction
         rows["c_rr"] += 0.6 * (rows["c_rr"] + rows["grade_e"])
     for name, (first, second) in sent.items():
         send(writer, [incoming(np.concatenate([first, second]), 1, name)])
-    whole = Corrections([Correction("c", 0, 2**62, 0.0, 0.375, 0.0, ())])
-    state = MachineState(0.0, 0.001, 0.6, 0.01, 0.0, 0.001, (), (), (0.0, 13.0))
+    whole = SampleCorrections([Correction("c", 0, 2**62, 0.0, 0.375, 0.0, ())])
+    state = MachineErrors(0.0, 0.001, 0.6, 0.01, 0.0, 0.001, (), (), (0.0, 13.0))
     known: list[Any] = [UNCORRECTED, {}]
     audit = audit_of(writer, reader, lambda *_: None, known=lambda: known)
     audit.run()

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mapserver.calibration.correction import UNCORRECTED
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import FoldConfig
-from mapserver.fleet.correction import UNCORRECTED
 from mapserver.journal.archive import write_file
 from mapserver.journal.rows import ALL, JournalRow, Selection
 from protocol.arrays import Table

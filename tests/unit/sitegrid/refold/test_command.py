@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapserver.calibration.correction import LAST_NS, Correction
+from mapserver.calibration.decide import CalibrationDecisions
+from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
-from mapserver.fleet.correction import LAST_NS, Correction
-from mapserver.fleet.decisions import PERSON, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import FOLDER, HOUR_NS, archive
@@ -434,7 +435,7 @@ def test_what_is_done_is_kept_when_a_later_step_fails_and_used_when_the_fold_goe
 ):
     with monkeypatch.context() as disk:
         disk.setattr(
-            new_store.snapshot, "save", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+            new_store, "save_snapshot", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
         )
         error = refused(capsys, store, "--out", tmp_path / "new")
         assert f"what is done is kept in {tmp_path}/new.part, and the same command goes on" in error

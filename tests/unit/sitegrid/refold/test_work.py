@@ -14,7 +14,7 @@ from mapserver.evidence.grid_state import GridState
 from mapserver.journal.rows import ALL, JournalRow, Selection
 from protocol.errors import SitegridError, StoreError
 from sitegrid.refold import work
-from sitegrid.refold.parts import Look, look
+from sitegrid.refold.parts import LookTask, look
 from sitegrid.refold.work import Fold, FoldTask, PartWork, fold_parts, merge_tile, merged_state, tiles
 from tests.unit.mapserver.data import same_state
 from tests.unit.sitegrid.refold.archives import SITE, fold_in, samples, write
@@ -44,7 +44,7 @@ def works(folder: Path, files: list[list[JournalRow]], selection: Selection = AL
     """Files as parts, numbered one behind the other."""
     parts, row = [], 1
     for number, rows in enumerate(files):
-        held = look(Look(write(folder / str(number), rows), selection))
+        held = look(LookTask(write(folder / str(number), rows), selection))
         parts.append(PartWork(held.part, held.origin.identity, held.first_ns, row, held.rows, held.samples, ()))
         row += held.rows
     return parts

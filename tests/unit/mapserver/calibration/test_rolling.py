@@ -9,16 +9,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import Calibration, calibrate
-from mapserver.fleet.correction import LAST_NS, Correction, corrected
-from mapserver.fleet.decisions import SOLVER, CalibrationDecision
-from mapserver.fleet.hysteresis import differs
-from mapserver.fleet.observability import Rolling, state_of
+from mapserver.calibration.calibrate import Solution, calibrate
+from mapserver.calibration.correction import LAST_NS, Correction, corrected
+from mapserver.calibration.decide import differs
+from mapserver.calibration.decision import SOLVER, CalibrationDecision
+from mapserver.calibration.select import Rolling, state_of
 from mapserver.trust.auditor import Auditor
 from protocol.arrays import Floats, Table
 from protocol.units import DIESEL_J_PER_L
 from tests.reference.correction import in_numpy
-from tests.unit.mapserver.fleet.drives import LOW, RAMP, RAMP_AGAIN, Errors, Site, drive, ledgers, soils
+from tests.unit.mapserver.calibration.drives import LOW, RAMP, RAMP_AGAIN, Errors, Site, drive, ledgers, soils
 
 FLEET = {
     "low": (LOW, Errors(0.004, -0.05, 0.002)),
@@ -43,7 +43,7 @@ def rolling(rows: Table, share: float, drag: float = 0.0) -> Table:
 
 
 @cache
-def solved(*odd: tuple[str, float, float]) -> tuple[Calibration, Mapping[str, Table]]:
+def solved(*odd: tuple[str, float, float]) -> tuple[Solution, Mapping[str, Table]]:
     """The fleet, of which these machines roll harder by a share and a drag; its solve, and its corrected samples."""
     harder = {name: (share, drag) for name, share, drag in odd}
     rows = {name: rolling(driven(name), *harder.get(name, (0.0, 0.0))) for name in FLEET}
@@ -51,7 +51,7 @@ def solved(*odd: tuple[str, float, float]) -> tuple[Calibration, Mapping[str, Ta
     return result, {n: corrected(t, [c for c in result.corrections if c.machine == n]) for n, t in rows.items()}
 
 
-def unlike(result: Calibration) -> dict[str, bool]:
+def unlike(result: Solution) -> dict[str, bool]:
     """Machines that are said to roll unlike the others, and whether they are named for it."""
     return {name: state.rolling.is_named for name, state in result.machines.items() if state.rolling}
 

@@ -16,10 +16,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapserver.fleet import sources as src
-from mapserver.fleet.equations import eliminate
-from mapserver.fleet.observability import SURE, Rolling, without_data_sheet
-from mapserver.fleet.solver import SCALE_STD, Estimate, Problem, inverse, prior_equations
+from mapserver.calibration import sources as src
+from mapserver.calibration.equations import eliminate
+from mapserver.calibration.select import SURE, Rolling, without_data_sheet
+from mapserver.calibration.solver import SCALE_STD, Estimate, FleetProblem, inverse, prior_equations
 from protocol.arrays import Floats, Ints
 from protocol.units import GRAVITY_MPS2
 
@@ -31,7 +31,7 @@ MET_EPOCHS = 2  # in which a machine has to meet others: in one it may be rain
 ROUNDS = 5  # of weighing anew
 
 
-def rolling(pb: Problem, result: Estimate) -> tuple[dict[int, Rolling], tuple[int, ...]]:
+def rolling(pb: FleetProblem, result: Estimate) -> tuple[dict[int, Rolling], tuple[int, ...]]:
     """Machines, by their indices, that roll unlike the others beyond doubt; and all that slopes tell scales of.
 
     The others' scales are within their data sheets, as far as anybody knows, and stand for how they roll.
@@ -71,7 +71,7 @@ def rolling(pb: Problem, result: Estimate) -> tuple[dict[int, Rolling], tuple[in
 
 
 def _solved(
-    free: Problem, on_slopes: Sequence[int], m: src.Means, place: Ints, result: Estimate
+    free: FleetProblem, on_slopes: Sequence[int], m: src.Means, place: Ints, result: Estimate
 ) -> tuple[Floats, Floats]:
     """Parameters and their covariance where machines roll as they like, by cells within epochs.
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from mapserver.fleet.equations import AT_ONCE, Equations, eliminate, equations, sparse
+from mapserver.calibration.equations import AT_ONCE, Equations, eliminate, equations, sparse
 
 N, UNKNOWNS = 300, 20
 

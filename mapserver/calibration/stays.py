@@ -12,7 +12,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from mapserver.fleet.correction import HEADING_TABLE, heading_index, measured
+from mapserver.calibration.correction import HEADING_TABLE, heading_index, measured
 from protocol.arrays import Ints, Table
 from protocol.machine.samples import APPLIED
 

@@ -5,21 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.fleet.correction import (
+from mapserver.calibration.correction import (
     ANY_SHARE,
     HEADINGS,
     LEVEL_SHARE,
     NO_SHARE,
     Correction,
-    Corrections,
+    SampleCorrections,
     corrected,
     measured,
 )
 from protocol.arrays import Floats, Table
 from protocol.machine.samples import APPLIED, LIMITS
 from tests.reference.correction import in_numpy
+from tests.unit.mapserver.calibration.drives import RAMP, START_NS, Errors, drive
 from tests.unit.mapserver.data import random_samples
-from tests.unit.mapserver.fleet.drives import RAMP, START_NS, Errors, drive
 
 EVER = (0, 2**62)
 
@@ -112,29 +112,29 @@ def test_samples_of_all_machines_are_corrected_as_those_of_each():
     rows, draw = wild(7), np.random.default_rng(7)
     rows["stamp_ns"] = START_NS + draw.integers(0, 1800, len(rows)) * 10**9
     machine = draw.integers(0, 3, len(rows))
-    out = Corrections(MANY).applied(rows, ["c", "b", "a"], machine)
+    out = SampleCorrections(MANY).applied(rows, ["c", "b", "a"], machine)
     for index, name in enumerate("cba"):
         own = [each for each in MANY if each.machine == name]
         assert out[machine == index].tobytes() == corrected(rows[machine == index], own).tobytes()
     assert out[machine == 0].tobytes() == rows[machine == 0].tobytes()
     assert (out[machine == 2] != rows[machine == 2]).any()
-    assert Corrections(MANY).applied(rows, ["c"], np.zeros(len(rows), np.int64)) is rows
+    assert SampleCorrections(MANY).applied(rows, ["c"], np.zeros(len(rows), np.int64)) is rows
 
 
 def test_equal_corrections_are_those_that_do_the_same():
-    assert Corrections(MANY) == Corrections(MANY[::-1])
+    assert SampleCorrections(MANY) == SampleCorrections(MANY[::-1])
     less_sure = [replace(each, covariance=((1.0,),)) for each in MANY]
-    assert Corrections(less_sure) == Corrections(MANY)
+    assert SampleCorrections(less_sure) == SampleCorrections(MANY)
     for changed in ({"machine": "d"}, {"zero": 0.02}, {"most_share": 0.2}, {"to_ns": 9}):
-        assert Corrections([replace(MANY[0], **changed), *MANY[1:]]) != Corrections(MANY)
+        assert SampleCorrections([replace(MANY[0], **changed), *MANY[1:]]) != SampleCorrections(MANY)
 
 
 def test_a_digest_before_a_time_is_of_what_is_done_until_then():
-    some, later = Corrections(MANY), Correction("b", START_NS + 900 * 10**9, 2**62, 0.5, 0.0, 0.0, ())
-    more = Corrections([*MANY, later])
+    some, later = SampleCorrections(MANY), Correction("b", START_NS + 900 * 10**9, 2**62, 0.5, 0.0, 0.0, ())
+    more = SampleCorrections([*MANY, later])
     assert more.digest() != some.digest()
     assert more.digest(START_NS + 900 * 10**9) == some.digest(START_NS + 900 * 10**9)
     assert more.digest(START_NS + 900 * 10**9 + 1) != some.digest(START_NS + 900 * 10**9 + 1)
     cut = [replace(MANY[0], to_ns=START_NS + 200 * 10**9), *MANY[1:]]
-    assert Corrections(cut).digest(START_NS + 200 * 10**9) == some.digest(START_NS + 200 * 10**9)
-    assert Corrections(MANY[1:]).digest(START_NS) == Corrections().digest() == ""
+    assert SampleCorrections(cut).digest(START_NS + 200 * 10**9) == some.digest(START_NS + 200 * 10**9)
+    assert SampleCorrections(MANY[1:]).digest(START_NS) == SampleCorrections().digest() == ""

@@ -4,8 +4,8 @@ A direction is a sum of parameters, each in units of its prior. Directions whose
 prior's are observed. All others stay at the data sheet: there an estimate would be the noise of weak evidence, or what
 the prior shares out among the machines.
 
-`MachineState` is what comes of it for one machine, of which a scale is remembered once its evidence is gone;
-`Applied` is the part of an estimate that is applied, and names who is beyond what a data sheet may mean.
+`MachineErrors` is what comes of it for one machine, of which a scale is remembered once its evidence is gone;
+`AppliedPart` is the part of an estimate that is applied, and names who is beyond what a data sheet may mean.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.fleet import sources as src
-from mapserver.fleet.correction import ANY_SHARE, Correction
-from mapserver.fleet.passages import Epochs
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, inverse
+from mapserver.calibration import sources as src
+from mapserver.calibration.correction import ANY_SHARE, Correction
+from mapserver.calibration.passages import Epochs
+from mapserver.calibration.solver import SCALE_STD, ZERO_STD, Estimate, FleetProblem, Prior, inverse
 from protocol.arrays import Bools, Floats, Ints
 
 OBSERVED = 0.25  # of the prior's variance: half its standard deviation
@@ -47,7 +47,7 @@ class CommonScale:
 
 
 @dataclass(frozen=True)
-class Observed:
+class ObservedPart:
     """An estimate's part that may be applied: x (p,), and the covariance (p, p) of what is left of the errors then.
 
     by: for each machine and each of "zero" and "scale" the sources that show it. absolute (m,): whether the evidence
@@ -61,7 +61,7 @@ class Observed:
     common: CommonScale
 
 
-def observe(pb: Problem, result: Estimate) -> Observed:
+def observe(pb: FleetProblem, result: Estimate) -> ObservedPart:
     """Split an estimate into what is observed and what is not."""
     layout = pb.layout
     x, covariance = observed_part(result)
@@ -70,7 +70,7 @@ def observe(pb: Problem, result: Estimate) -> Observed:
     std = float(np.sqrt(evidence[layout.scales, layout.scales].mean()))
     observed = std**2 < OBSERVED * SCALE_STD**2
     common = CommonScale(observed, min(std, SCALE_STD), "" if observed else result.edges or "no_slope_both_ways")
-    return Observed(x, covariance, _by(pb, result), absolute, common)
+    return ObservedPart(x, covariance, _by(pb, result), absolute, common)
 
 
 def observed_part(result: Estimate) -> tuple[Floats, Floats]:
@@ -88,13 +88,13 @@ def observed_part(result: Estimate) -> tuple[Floats, Floats]:
     return applied, (units * left) @ units.T
 
 
-def _by_evidence(pb: Problem, result: Estimate) -> Floats:
+def _by_evidence(pb: FleetProblem, result: Estimate) -> Floats:
     """Covariance without the data sheets' word on scales: that of many machines together is no evidence."""
     matrix = result.prior.matrix + sum(each.matrix for each in result.information.values())
     return inverse(without_data_sheet(pb, matrix, range(len(pb.names))))
 
 
-def without_data_sheet(pb: Problem, matrix: Floats, machines: Sequence[int]) -> Floats:
+def without_data_sheet(pb: FleetProblem, matrix: Floats, machines: Sequence[int]) -> Floats:
     """An information matrix (p, p), which is changed, without the data sheets' word on the scales of machines."""
     scales, own = pb.layout.scales, np.array([p.covariance[1][1] for p in pb.priors])
     weak = np.isin(np.arange(len(own)), machines) & (own >= OBSERVED * SCALE_STD**2)
@@ -103,7 +103,7 @@ def without_data_sheet(pb: Problem, matrix: Floats, machines: Sequence[int]) -> 
     return matrix
 
 
-def _by(pb: Problem, result: Estimate) -> dict[str, dict[str, tuple[str, ...]]]:
+def _by(pb: FleetProblem, result: Estimate) -> dict[str, dict[str, tuple[str, ...]]]:
     """Which sources show zero and scale of each machine, each source alone beside the ground that all share."""
     layout = pb.layout
     present = [name for name in NAMED if name in result.information]
@@ -143,7 +143,7 @@ class Rolling:
 
 
 @dataclass(frozen=True)
-class MachineState:
+class MachineErrors:
     """What is known of one machine: zero of its newest epoch, scale error k, lateral zero, and standard deviations.
 
     zero_by, scale_by: the sources that show them, none where the data sheet has to do; the scale is 0 then. beyond:
@@ -163,7 +163,7 @@ class MachineState:
     rolling: Rolling | None = None
 
 
-def is_surer(prior: Prior, state: MachineState | None) -> bool:
+def is_surer(prior: Prior, state: MachineErrors | None) -> bool:
     """Whether what is remembered of a scale is surer than what a solve without it says."""
     return state is not None and state.scale_std**2 > prior.covariance[1][1]
 
@@ -179,11 +179,11 @@ def remembered_of(shown: Iterable[Correction]) -> dict[str, Prior]:
     return out
 
 
-def state_of(correction: Correction) -> MachineState:
+def state_of(correction: Correction) -> MachineErrors:
     """What a correction by the solver says of its machine, where nothing has been solved yet."""
     k = correction.scale / (1 - correction.scale)
     zero_std, scale_std, across_std = np.sqrt(np.diag(correction.covariance)).tolist()
-    return MachineState(
+    return MachineErrors(
         zero=correction.zero,
         zero_std=zero_std,
         scale=k,
@@ -200,10 +200,10 @@ def state_of(correction: Correction) -> MachineState:
 
 
 @dataclass(frozen=True)
-class Applied:
+class AppliedPart:
     """The part of an estimate that is applied: x (p,), and the covariance (p, p) of what is left.
 
-    scaled (m,): whether a machine has a scale of its own. beyond (m, 2): see MachineState.
+    scaled (m,): whether a machine has a scale of its own. beyond (m, 2): see MachineErrors.
     """
 
     x: Floats
@@ -212,7 +212,7 @@ class Applied:
     beyond: Floats
 
 
-def applied_part(pb: Problem, result: Estimate, observed: Observed, others: CommonScale) -> Applied:
+def applied_part(pb: FleetProblem, result: Estimate, observed: ObservedPart, others: CommonScale) -> AppliedPart:
     """Scales count where the evidence shows them, and where they are so far off that any value is better than none.
 
     There the estimate itself is taken: what is not observed of it is no more than what the data sheet leaves open. But
@@ -240,10 +240,10 @@ def applied_part(pb: Problem, result: Estimate, observed: Observed, others: Comm
         left[at, :] = left[:, at] = 0.0
         left[at, at] = ZERO_STD**2
     left[zeros, zeros] += moved(pb.epochs, x[zeros], left[zeros, zeros])
-    return Applied(x, left, absolute | far, beyond)
+    return AppliedPart(x, left, absolute | far, beyond)
 
 
-def _unnamed(pb: Problem, zero: Floats, variance: Floats) -> Ints:
+def _unnamed(pb: FleetProblem, zero: Floats, variance: Floats) -> Ints:
     """Machines of which only differences are known, too large ones for sound machines: who is off cannot be said.
 
     zero, variance: of all epochs (e,).
@@ -269,7 +269,7 @@ def moved(epochs: Epochs, zero: Floats, variance: Floats) -> Floats:
     return np.asarray(np.maximum(np.append(apart, 0.0), np.append(0.0, apart)), np.float64)
 
 
-def beyond_data_sheet(pb: Problem, result: Estimate, others_std: float = 0.0) -> Floats:
+def beyond_data_sheet(pb: FleetProblem, result: Estimate, others_std: float = 0.0) -> Floats:
     """By how many standard deviations of the data sheet the largest zero and the scale (m, 2) are off, for sure.
 
     others_std: of the scale of those against whose ground the machine was solved.

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapserver.fleet import stays as st
-from mapserver.fleet.ledger import CELL_M, EPOCH_SLOTS
+from mapserver.calibration import stays as st
+from mapserver.calibration.ledger import CELL_M, EPOCH_SLOTS
 from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 
 MOST_SAMPLES = 4000  # of a stay: no machine drives so many in 10 s, and the sums of more have overflowed

@@ -1,10 +1,12 @@
-"""Which corrections count: decisions by the solver and by people, as journal events keep them.
+"""Which corrections count, and why: what a person decided, else what the solver decided, else what was sent.
 
-What the solver says replaces what counts as `hysteresis` has it, of all machines at once and seldom, since a map that
-follows has to be folded again. What a person decides about a machine stands until a person takes it back.
+A person's decision about a machine stands until a person takes it back. The solver changes its mind with every sample,
+and old maps are to stay as people know them. So hysteresis: its correction replaces the one that counts if two solves
+in a row differ from that by more than their standard deviation, of all machines at once and seldom, since the map is
+folded again then. In the first minutes of a machine of which nothing counts one solve is enough: nobody knows that map.
 
-A machine has one scale and one lateral zero: what is known of them late is known of all its samples, and repaints
-those of which nobody knew. A zero is that of its epoch.
+A machine has one scale and one lateral bias: if they become known late, they count for all its older samples of which
+nothing was known. A bias is that of its epoch. All times are site time.
 """
 
 from __future__ import annotations
@@ -12,68 +14,31 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
-from typing import Any
 
-from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import (
+from mapserver.calibration.calibrate import Solution
+from mapserver.calibration.correction import (
     ANY_SHARE,
     LAST_NS,
     LEVEL_SHARE,
     UNCORRECTED,
     Correction,
-    Corrections,
+    SampleCorrections,
+    at,
     paint,
     values,
 )
-from mapserver.fleet.hysteresis import Hysteresis
-from mapserver.fleet.ledger import EPOCH_NS, NOTHING_STATED, Stated
-from mapserver.fleet.observability import FAULT_SIGMAS, OBSERVED, state_of
+from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
+from mapserver.calibration.ledger import EPOCH_NS, NOTHING_STATED, Stated
+from mapserver.calibration.select import FAULT_SIGMAS, OBSERVED, state_of
 
-KIND = "calibration"
-VERSION = 1  # of the event
-SOLVER, PERSON = "solver", "person"
-# The solver decides at most so often: each time, samples are folded again. In the first minutes of machines, when it
-# learns most and there is little to fold, as soon as they have driven twice as long as at the last decision.
-EVERY_NS = 600 * 10**9
-
-
-@dataclass(frozen=True)
-class CalibrationDecision:
-    """What was decided about the samples of a machine, as an event keeps it.
-
-    by: the solver or a person. corrections: each replaces what the same one decided before of its span; none of a
-    person takes all back that people decided of this machine. stamp_ns: the site's now. remembered: the scale is one
-    that was shown earlier, not by the evidence of now.
-    """
-
-    machine: str
-    by: str
-    reason: str
-    stamp_ns: int
-    corrections: tuple[Correction, ...]
-    remembered: bool = False
-
-    def body(self) -> dict[str, Any]:
-        """Plain values."""
-        spans = [_span(one) for one in self.corrections]
-        head = {"version": VERSION, "machine": self.machine, "by": self.by, "reason": self.reason}
-        return {**head, "stamp_ns": self.stamp_ns, "remembered": self.remembered, "spans": spans}
-
-    @classmethod
-    def from_body(cls, body: Mapping[str, Any]) -> CalibrationDecision:
-        """Undo `body`; ValueError where it is of another version."""
-        if body.get("version") != VERSION:
-            raise ValueError(f"has a correction of version {body.get('version')!r}, this program knows {VERSION}")
-        machine = body["machine"]
-        corrections = tuple(
-            Correction(machine, from_ns, to_ns, zero, scale, across, tuple(map(tuple, covariance)), most_share, *rolls)
-            for from_ns, to_ns, zero, scale, across, most_share, covariance, *rolls in body["spans"]
-        )
-        numbers = chain(*((*values(one), *chain(*one.covariance)) for one in corrections))
-        if not all(map(math.isfinite, numbers)) or any(one.rolls <= -1 for one in corrections):
-            raise ValueError(f"has a correction of {machine} that no solver made")
-        return cls(machine, body["by"], body["reason"], body["stamp_ns"], corrections, body["remembered"])
+# Between two decisions of the solver, each of which folds samples again; in a machine's first minutes, when there is
+EVERY_NS = 600 * 10**9  # little to fold, as soon as it has driven twice as long as at the last decision
+IN_A_ROW = 2  # solves that have to differ from what counts; one, of a new machine of which nothing counts
+LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better
+LEAST_ROLLS, TYPICAL_C_RR = 0.04, 0.04  # two deviations at best of how a machine rolls, and the ground it is judged on
+FIRST_NS = 600 * 10**9  # so long after it was first seen, a machine's map is new
+FROZEN_NS = 4 * 3600 * 10**9  # so long after it was first seen, an epoch keeps its zero
+MOST_STEP_NS = 600 * 10**9  # of site time between two judgements: more is a jump, of a wrong clock or at night
 
 
 class CalibrationDecisions:
@@ -98,7 +63,7 @@ class CalibrationDecisions:
             self.add(decision)
 
     @property
-    def corrections(self) -> Corrections:
+    def corrections(self) -> SampleCorrections:
         """All that count."""
         if self._changed:
             self._corrections = self._corrections.replaced({name: self._of(name) for name in self._changed})
@@ -150,7 +115,7 @@ class CalibrationDecisions:
                     self._shown[machine] = one
         self._changed.add(machine)
 
-    def judge(self, calibration: Calibration, now_ns: int, *, asked: bool = False) -> list[CalibrationDecision]:
+    def judge(self, calibration: Solution, now_ns: int, *, asked: bool = False) -> list[CalibrationDecision]:
         """What the solver decides; the caller keeps it, then calls `add`, or the same waits for the next judgement.
 
         calibration: of some machines; what is wanted of others waits as well. asked: by a person, who wants the best
@@ -179,7 +144,7 @@ class CalibrationDecisions:
         wanted = (each for name, each in sorted(self._waiting.items()) if not self._spans[PERSON].get(name))
         return [replace(each, stamp_ns=now_ns) for each in wanted]
 
-    def _due_ns(self, calibration: Calibration, now_ns: int) -> int:
+    def _due_ns(self, calibration: Solution, now_ns: int) -> int:
         """The site's now from which on the solver may decide again what it says of some machines."""
         assert self.decided_ns is not None
         first_ns = min(calibration.begins_ns.values(), default=0)
@@ -192,13 +157,6 @@ class CalibrationDecisions:
         for one in self._spans[PERSON].get(machine, ()):
             paint(spans, one)
         return spans
-
-
-def _span(one: Correction) -> list[Any]:
-    """One correction; how its machine rolls stands last, where it rolls unlike the others."""
-    *first, rolls, drags = values(one)
-    rolling = [rolls, drags] if rolls or drags else []
-    return [one.from_ns, one.to_ns, *first, one.covariance, *rolling]
 
 
 def _as_of_ns(newest: Correction, now_ns: int) -> int:
@@ -226,11 +184,7 @@ def _before(
 
 
 def _filled(counts: Sequence[Correction], changed: Sequence[Correction]) -> list[Correction]:
-    """What counts, with what was not known then of the scale and the lateral zero, and is now; zeros stay.
-
-    What evidence showed then stays, too: where a machine was mended since, it was right then. Nor was a fault always
-    there.
-    """
+    """What counts, with what was unknown then of scale and lateral zero and is known now; what was known stays."""
     now, out = changed[-1], []
     known = now.most_share >= ANY_SHARE and state_of(now).beyond[1] <= FAULT_SIGMAS[1]
     for one in counts:
@@ -256,3 +210,91 @@ def _by_machine(corrections: Iterable[Correction]) -> dict[str, list[Correction]
         ends = [*(after.from_ns for after in spans[1:]), LAST_NS]
         spans[:] = [replace(one, to_ns=end_ns) for one, end_ns in zip(spans, ends, strict=True)]
     return out
+
+
+@dataclass
+class _Epoch:
+    """One epoch of a machine. seen_ns: when it was first solved for; differs: how often in a row."""
+
+    seen_ns: int
+    differs: int = 0
+
+
+class Hysteresis:
+    """Judges what a solver says of machines, solve by solve."""
+
+    def __init__(self) -> None:
+        self._epochs: dict[str, dict[int, _Epoch]] = {}  # by machine and beginning, of its last solve
+        self._watched_ns = 0  # site time without its jumps, since the first judgement
+        self._judged_ns: int | None = None  # the site's now in the last one
+
+    def watch(self, now_ns: int) -> None:
+        """Note the site's now at a solve. In what was jumped over nobody learned anything."""
+        self._watched_ns += min(max(now_ns - (self._judged_ns or now_ns), 0), MOST_STEP_NS)
+        self._judged_ns = now_ns
+
+    def replacing(
+        self,
+        machine: str,
+        proposed: Sequence[Correction],
+        counts: Sequence[Correction],
+        stated: Mapping[int, Stated],
+        *,
+        asked: bool,
+    ) -> list[Correction]:
+        """Those of a machine that are to replace what counts.
+
+        proposed, counts: in order of time. stated: by epoch, what the machine applied itself. asked: by a person, who
+        wants all that differs at all.
+        """
+        known, newest_ns = self._epochs.get(machine), proposed[-1].from_ns
+        # Of what counts since before this server began, an epoch is as old as it is for its machine.
+        begins = known is None and len(counts) > 0
+        own = self._epochs[machine] = {
+            one.from_ns: (known or {}).get(one.from_ns)
+            or _Epoch(self._watched_ns - (newest_ns - one.from_ns if begins else 0))
+            for one in proposed
+        }
+        is_new = self._watched_ns < min(epoch.seen_ns for epoch in own.values()) + FIRST_NS
+        needed = 1 if is_new and not counts else IN_A_ROW
+        out = []
+        for one in proposed:
+            epoch, now = own[one.from_ns], at(counts, one.from_ns)
+            applied = stated.get(one.from_ns // EPOCH_NS, NOTHING_STATED)
+            epoch.differs = epoch.differs + 1 if differs(one, now, applied) else 0
+            frozen = now is not None and self._watched_ns > epoch.seen_ns + FROZEN_NS
+            wanted = (now is None or values(now) != values(one)) if asked else epoch.differs >= needed and not frozen
+            if wanted:
+                out.append(one)
+        return out
+
+    def differs_now(self, machine: str, from_ns: int) -> bool:
+        """Whether the last solve differed from what counts at a beginning."""
+        return self._epochs[machine][from_ns].differs > 0
+
+    def decided(self, machine: str, corrections: Sequence[Correction]) -> None:
+        """Begin to count anew what was decided."""
+        for from_ns, epoch in self._epochs.get(machine, {}).items():
+            if any(one.from_ns <= from_ns < one.to_ns for one in corrections):
+                epoch.differs = 0
+
+
+def differs(one: Correction, counts: Correction | None, stated: Stated = NOTHING_STATED) -> bool:
+    """Whether a correction differs from what counts by more than its standard deviation, and by enough to be seen.
+
+    counts: None where samples stay as they were sent, with what the machine applied itself.
+    """
+    if counts:
+        zero, scale, across = (abs(a - b) for a, b in zip(values(one)[:3], values(counts)[:3], strict=True))
+    else:
+        zero, across = math.hypot(one.zero - stated.zero, stated.zero_std), abs(one.across)
+        scale = math.hypot(one.scale - stated.scale, stated.scale_std) if one.most_share >= ANY_SHARE else 0.0
+    before = counts.rolls + counts.drags / TYPICAL_C_RR if counts else 0.0
+    zero_std, scale_std, across_std = (math.sqrt(one.covariance[i][i]) for i in range(3))
+    return (
+        zero > max(zero_std, LEAST_ZERO)
+        or scale > max(scale_std, LEAST_SCALE)
+        or across > max(across_std, LEAST_ZERO)
+        or abs(one.rolls + one.drags / TYPICAL_C_RR - before) > LEAST_ROLLS
+        or (counts is not None and one.most_share != counts.most_share)
+    )

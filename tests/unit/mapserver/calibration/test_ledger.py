@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from mapserver.fleet import stays as st
-from mapserver.fleet.ledger import EPOCH_NS, EPOCH_SLOTS, EPOCHS, Ledger, epochs_of
-from mapserver.fleet.passages import links, passages
+from mapserver.calibration import stays as st
+from mapserver.calibration.ledger import EPOCH_NS, EPOCH_SLOTS, EPOCHS, StayLedger, epochs_of
+from mapserver.calibration.passages import links, passages
 from protocol.arrays import Table
+from tests.unit.mapserver.calibration.drives import LOW, drive
 from tests.unit.mapserver.data import random_samples
-from tests.unit.mapserver.fleet.drives import LOW, drive
 
 
 def stays_of(parts: list[Table]) -> Table:
-    ledger = Ledger()
+    ledger = StayLedger()
     for part in parts:
         ledger.add(part)
     return ledger.stays()
@@ -40,7 +40,7 @@ def test_a_clock_that_is_ahead_displaces_nothing_whenever_its_samples_come() -> 
     ahead = np.concatenate([drive(LOW, seconds=5.0, start_s=72_000.0 + 300.0 * i) for i in range(EPOCHS + 5)])
     rng, until_ns = np.random.default_rng(0), int(right["stamp_ns"].max())
     rows = rng.permutation(np.concatenate([right, ahead]))
-    ledger = Ledger()
+    ledger = StayLedger()
     ledger.until_ns = until_ns
     for part in np.array_split(rows, 40):
         ledger.add(part)
@@ -53,7 +53,7 @@ def test_a_clock_that_is_ahead_displaces_nothing_whenever_its_samples_come() -> 
 
 def test_what_is_older_than_asked_for_is_not_there() -> None:
     rows = np.concatenate([drive(LOW, seconds=5.0, start_s=300.0 * i) for i in range(4)])
-    ledger = Ledger()
+    ledger = StayLedger()
     assert ledger.newest_ns == 0
     ledger.add(rows)
     begins_ns = [int(epoch) * EPOCH_NS for epoch in np.unique(epochs_of(ledger.stays()))]

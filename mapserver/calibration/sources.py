@@ -1,7 +1,7 @@
 """The sources of evidence: what stays of machines say of zero, scale and lateral zero, as equations.
 
-With the signs of `mapserver.fleet.correction`, parameters z of each epoch, k and a of each machine, m and b of those
-that roll unlike the others (`mapserver.fleet.rolling`):
+With the signs of `correction.py`, parameters z of each epoch, k and a of each machine, m and b of those that roll
+unlike the others (`rolling.py`):
 
 - `same_ground`: c_rr of a cell is the same for all machines and in both directions.
 - `crossings`: so is its gradient, which machines measure in their own frames, each with its zeros.
@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from mapserver.fleet.equations import Equations, equations, sparse, stacked
-from mapserver.fleet.passages import Links, Passages, grouped, links
+from mapserver.calibration.equations import Equations, equations, sparse, stacked
+from mapserver.calibration.passages import Links, Passages, grouped, links
 from protocol.arrays import AnyArray, Floats, Ints
 
 SAME_GROUND, CROSSINGS, HEIGHTS, EDGES, KNOWN_GROUND = "same_ground", "crossings", "heights", "edges", "known_ground"
@@ -47,7 +47,7 @@ SECTORS = 8  # of headings that are summed
 EDGE_SECTORS = 4
 
 
-class Layout(NamedTuple):
+class Parameters(NamedTuple):
     """Where parameters lie: z of all epochs, k and a of all machines, what slopes have in common, and rolls.
 
     unlike: indices of the machines that roll unlike the others, in order.
@@ -166,7 +166,9 @@ def repeated(count: AnyArray) -> Floats:
     return np.sqrt((1 - SAME) / count + SAME)
 
 
-def same_ground(m: Means, layout: Layout, ground: GroundState, known: Floats, place: Ints | None = None) -> Equations:
+def same_ground(
+    m: Means, layout: Parameters, ground: GroundState, known: Floats, place: Ints | None = None
+) -> Equations:
     """c_i = c (1 + m) + b + d z + d k (d c + s), the share d c + s by the ground as it is known so far.
 
     Taken from the same stay, its noise would explain itself by the scale. known (cells,): NaN where the site states no
@@ -182,7 +184,7 @@ def same_ground(m: Means, layout: Layout, ground: GroundState, known: Floats, pl
     )
 
 
-def known_ground(m: Means, layout: Layout, ground: GroundState, known: Floats) -> Equations:
+def known_ground(m: Means, layout: Parameters, ground: GroundState, known: Floats) -> Equations:
     """The same where c is known, but for an error that all cells of the same value share."""
     at = np.flatnonzero(np.isfinite(m.c_rr) & np.isfinite(known[m.cell]))
     c_rr = known[m.cell[at]]
@@ -195,7 +197,7 @@ def known_ground(m: Means, layout: Layout, ground: GroundState, known: Floats) -
     return stacked(measured, stated)
 
 
-def _balance(m: Means, at: Ints, layout: Layout, c_rr: Floats, ground: GroundState) -> sp.csr_matrix:
+def _balance(m: Means, at: Ints, layout: Parameters, c_rr: Floats, ground: GroundState) -> sp.csr_matrix:
     """Columns of z and k, and of m and b, of balances on ground c_rr."""
     d, slope = m.direction[at], (ground.gradient[m.cell[at]] * m.ahead[at]).sum(axis=1)
     share = d * np.maximum(c_rr, LEAST_C_RR) + slope
@@ -207,7 +209,7 @@ def _balance(m: Means, at: Ints, layout: Layout, c_rr: Floats, ground: GroundSta
     return sparse(len(at), layout.size, *terms)
 
 
-def crossings(m: Means, layout: Layout, cells: int) -> Equations:
+def crossings(m: Means, layout: Parameters, cells: int) -> Equations:
     """A gradient g in the frame of a machine, h ahead and n to the left: g h = along + z, g n = across - a."""
     n, (east, north) = len(m.cell), m.ahead.T
     ahead = equations(
@@ -227,7 +229,7 @@ def crossings(m: Means, layout: Layout, cells: int) -> Equations:
     return stacked(ahead, left)
 
 
-def heights(p: Passages, layout: Layout, cells: int) -> Equations:
+def heights(p: Passages, layout: Parameters, cells: int) -> Equations:
     """From cell to cell h_j - h_i = rise + z times the distance, which counts down in reverse."""
     all_links = links(p)
     first, group, count = grouped(all_links.epoch, all_links.start * cells + all_links.end, all_links.bend_m > 0)
@@ -240,7 +242,7 @@ def heights(p: Passages, layout: Layout, cells: int) -> Equations:
     return equations(sparse(n, layout.size, (link.epoch, -per_zero)), ground, rise, std, blocks=0)
 
 
-def edges(p: Passages, layout: Layout, ground: GroundState) -> Equations:
+def edges(p: Passages, layout: Parameters, ground: GroundState) -> Equations:
     """Over bends of the slope dc = d k ds + b d|s| + the step of the place itself, which is the ground here."""
     slope = (ground.gradient[p.cell] * p.ahead).sum(axis=1)
     i, j = _across_bends(p, slope)

@@ -8,14 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import calibrate
-from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
-from mapserver.fleet.decisions import EVERY_NS, SOLVER, CalibrationDecision, CalibrationDecisions
-from mapserver.fleet.ledger import EPOCH_NS, Ledger, newest, stated
-from mapserver.fleet.observability import REMEMBERED_STD, remembered_of
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD
+from mapserver.calibration.calibrate import calibrate
+from mapserver.calibration.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
+from mapserver.calibration.decide import EVERY_NS, CalibrationDecisions
+from mapserver.calibration.decision import SOLVER, CalibrationDecision
+from mapserver.calibration.ledger import EPOCH_NS, StayLedger, newest, stated
+from mapserver.calibration.select import REMEMBERED_STD, remembered_of
+from mapserver.calibration.solver import SCALE_STD, ZERO_STD
 from protocol.arrays import Floats, Table
-from tests.unit.mapserver.fleet.drives import (
+from tests.unit.mapserver.calibration.drives import (
     FOOT_M,
     LOW,
     OPEN,
@@ -40,7 +41,7 @@ KNOWN = [Correction(name, 0, 1, 0.0, e.scale / (1 + e.scale), 0.0, SURE) for nam
 
 def test_a_scale_that_was_observed_stays_where_nothing_shows_it_any_more() -> None:
     """On a ramp for 15 minutes, then on the level, until no evidence of the ramp is left."""
-    sites, decisions = {name: Ledger() for name in ERRORS}, CalibrationDecisions()
+    sites, decisions = {name: StayLedger() for name in ERRORS}, CalibrationDecisions()
     for quarter in range(3):
         for i, (name, ledger) in enumerate(sites.items()):
             route = LOW if quarter else ROUTES[name]

@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import Calibration
-from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, at, paint
-from mapserver.fleet.decisions import EVERY_NS, PERSON, SOLVER, CalibrationDecision, CalibrationDecisions
-from mapserver.fleet.hysteresis import FROZEN_NS
-from mapserver.fleet.ledger import EPOCH_NS, Stated
-from mapserver.fleet.observability import CommonScale
+from mapserver.calibration.calibrate import Solution
+from mapserver.calibration.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, Correction, at, paint
+from mapserver.calibration.decide import EVERY_NS, FROZEN_NS, CalibrationDecisions
+from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
+from mapserver.calibration.ledger import EPOCH_NS, Stated
+from mapserver.calibration.select import CommonScale
 
 SURE = ((2.5e-7, 0.0, 0.0), (0.0, 2.5e-5, 0.0), (0.0, 0.0, 2.5e-7))  # 0.5e-3, 0.5 %, 0.5e-3
 NOW_NS = 1000 * EPOCH_NS
@@ -35,9 +35,9 @@ def one(
     return Correction(machine, epoch * EPOCH_NS, to_ns, zero, scale, across, rows, **more)
 
 
-def solved(*corrections: Correction, begins_ns: int = LAST_NS) -> Calibration:
+def solved(*corrections: Correction, begins_ns: int = LAST_NS) -> Solution:
     begins_ns_of = {one.machine: begins_ns for one in corrections}
-    return Calibration(corrections, {}, CommonScale(True, 0.005, ""), begins_ns=begins_ns_of)
+    return Solution(corrections, {}, CommonScale(True, 0.005, ""), begins_ns=begins_ns_of)
 
 
 class Solver:
@@ -187,12 +187,6 @@ def test_a_person_s_correction_stands_until_it_is_taken_back():
     assert (solver.zero(), solver.zero(3)) == (0.003, None)
     assert solver.decisions.newest("a").by == SOLVER
     assert [solver.hears(one(0.05)) for _ in range(2)] == [0, 1]
-
-
-def test_what_another_version_wrote_is_refused():
-    body = person(0.02).body() | {"version": 2, "spans": {"another": "form"}}
-    with pytest.raises(ValueError, match=r"version 2.*knows 1"):
-        CalibrationDecision.from_body(body)
 
 
 @pytest.mark.parametrize(

@@ -11,24 +11,24 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapserver.fleet.calibration import (
+from mapserver.calibration.calibrate import (
     MOST_EPOCHS,
     MOST_MACHINES,
-    Calibration,
+    Solution,
     calibrate,
     epochs_of_each,
     groups,
     joined,
 )
-from mapserver.fleet.correction import ANY_SHARE, LAST_NS, Correction, corrected
-from mapserver.fleet.hysteresis import differs
-from mapserver.fleet.ledger import EPOCH_NS, EPOCHS, newest
-from mapserver.fleet.observability import FAULT_SIGMAS, MachineState, state_of
-from mapserver.fleet.passages import passages
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD, known_cells
+from mapserver.calibration.correction import ANY_SHARE, LAST_NS, Correction, corrected
+from mapserver.calibration.decide import differs
+from mapserver.calibration.ledger import EPOCH_NS, EPOCHS, newest
+from mapserver.calibration.passages import passages
+from mapserver.calibration.select import FAULT_SIGMAS, MachineErrors, state_of
+from mapserver.calibration.solver import SCALE_STD, ZERO_STD, known_cells
 from protocol.arrays import Floats, Table
 from protocol.site.site_config import KnownGround
-from tests.unit.mapserver.fleet.drives import (
+from tests.unit.mapserver.calibration.drives import (
     FOOT_M,
     LOW,
     OPEN,
@@ -60,17 +60,17 @@ def fleet(site: Site = soils, errors: Mapping[str, Errors] | None = None) -> dic
     }
 
 
-def solve(rows: Mapping[str, Table], excluded: tuple[str, ...] = (), **more: object) -> Calibration:
+def solve(rows: Mapping[str, Table], excluded: tuple[str, ...] = (), **more: object) -> Solution:
     return calibrate(ledgers(rows), excluded, **more)  # type: ignore[arg-type]
 
 
 @cache
-def usual() -> Calibration:
+def usual() -> Solution:
     """Of the fleet as it is."""
     return solve(fleet())
 
 
-def check(state: MachineState, errors: Errors, zero: float = 0.0016, scale: float = 0.02) -> None:
+def check(state: MachineErrors, errors: Errors, zero: float = 0.0016, scale: float = 0.02) -> None:
     assert state.zero == pytest.approx(errors.zero, abs=zero)
     assert state.scale == pytest.approx(errors.scale, abs=scale)
 
@@ -249,7 +249,7 @@ def with_bad(
     return rows
 
 
-def of_others(result: Calibration) -> tuple[Correction, ...]:
+def of_others(result: Solution) -> tuple[Correction, ...]:
     return tuple(each for each in result.corrections if each.machine != "bad")
 
 

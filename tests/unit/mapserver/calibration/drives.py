@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.fleet.ledger import Ledger
+from mapserver.calibration.ledger import StayLedger
 from protocol.arrays import Floats, Table
 from protocol.machine.samples import empty
 
@@ -118,7 +118,7 @@ def ledgers(rows: Mapping[str, Table]) -> dict[str, Table]:
     """Stays of machines by name."""
     out = {}
     for name, table in rows.items():
-        ledger = Ledger()
+        ledger = StayLedger()
         ledger.add(table)
         out[name] = ledger.stays()
     return out

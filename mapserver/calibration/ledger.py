@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapserver.fleet.correction import LAST_NS
-from mapserver.fleet.stays import SLOT_NS, SLOT_SHIFT, STAY, VALUE_UNITS, merged, stays
+from mapserver.calibration.correction import LAST_NS
+from mapserver.calibration.stays import SLOT_NS, SLOT_SHIFT, STAY, VALUE_UNITS, merged, stays
 from protocol.arrays import Ints, Table
 from protocol.machine.samples import APPLIED
 
@@ -22,7 +22,7 @@ EPOCHS = 48  # that are remembered: 4 h of driving; older corrections stay as th
 _PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
 
 
-class Ledger:
+class StayLedger:
     """Stays of one machine. cell_m: edge of the cells.
 
     epochs: how many it remembers. until_ns: what is stamped later was stamped by a clock that was ahead, or will be of

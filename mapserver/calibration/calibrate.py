@@ -12,24 +12,24 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mapserver.fleet.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
-from mapserver.fleet.ledger import EPOCH_NS, EPOCHS, Stated, newest, stated
-from mapserver.fleet.observability import (
+from mapserver.calibration.correction import ANY_SHARE, DIGITS, LAST_NS, LEVEL_SHARE, NO_SHARE, Correction
+from mapserver.calibration.ledger import EPOCH_NS, EPOCHS, Stated, newest, stated
+from mapserver.calibration.passages import sound
+from mapserver.calibration.rolling import rolling
+from mapserver.calibration.select import (
     FAULT_SIGMAS,
     FAULTY_SIGMAS,
-    Applied,
+    AppliedPart,
     CommonScale,
-    MachineState,
-    Observed,
+    MachineErrors,
+    ObservedPart,
     Rolling,
     applied_part,
     beyond_data_sheet,
     is_surer,
     observe,
 )
-from mapserver.fleet.passages import sound
-from mapserver.fleet.rolling import rolling
-from mapserver.fleet.solver import SCALE_STD, Estimate, Prior, Problem, against, estimate, problem
+from mapserver.calibration.solver import SCALE_STD, Estimate, FleetProblem, Prior, against, estimate, problem
 from protocol.arrays import Floats, Table
 from protocol.site.site_config import KnownGround
 
@@ -47,7 +47,7 @@ AT_ONCE = 0.1
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Solution:
     """What a solve says: corrections in the order of stamps, states of all machines, and their common scale.
 
     stated: by machine and number of the epoch, what the machine applied itself. remembered: machines whose scale is no
@@ -55,7 +55,7 @@ class Calibration:
     """
 
     corrections: tuple[Correction, ...]
-    machines: Mapping[str, MachineState]
+    machines: Mapping[str, MachineErrors]
     common: CommonScale
     stated: Mapping[str, Mapping[int, Stated]] = field(default_factory=dict)
     remembered: frozenset[str] = frozenset()
@@ -67,7 +67,7 @@ def calibrate(
     excluded: Collection[str] = (),
     areas: Sequence[KnownGround] = (),
     remembered: Mapping[str, Prior] | None = None,
-) -> Calibration:
+) -> Solution:
     """Solve for all machines.
 
     ledgers: stays by machine, as `Ledger.stays` has them, MOST_MACHINES at most. excluded: machines without a say,
@@ -77,7 +77,7 @@ def calibrate(
     sane = {name: stays for name, table in ledgers.items() if len(stays := sound(table))}
     known = {name: newest(table, epochs_of_each(len(sane))) for name, table in sane.items()}
     if not set(known) - set(excluded):
-        return Calibration((), {}, CommonScale(False, SCALE_STD, "no_machine"))
+        return Solution((), {}, CommonScale(False, SCALE_STD, "no_machine"))
     solved = _solved(known, excluded, areas, {})
     states = solved.machines
     silent = {name: prior for name, prior in (remembered or {}).items() if is_surer(prior, states.get(name))}
@@ -99,7 +99,7 @@ def groups(machines: Iterable[str]) -> list[tuple[str, ...]]:
     return [tuple(names[first::count]) for first in range(count)]
 
 
-def joined(parts: Sequence[Calibration]) -> Calibration:
+def joined(parts: Sequence[Solution]) -> Solution:
     """What the solves of several groups say together; the common scale is the least known of theirs."""
     states = {name: state for part in parts for name, state in part.machines.items()}
     applied = {name: of_machine for part in parts for name, of_machine in part.stated.items()}
@@ -107,7 +107,7 @@ def joined(parts: Sequence[Calibration]) -> Calibration:
     common = max((part.common for part in parts), key=lambda common: (not common.observed, common.std))
     remembered = frozenset(name for part in parts for name in part.remembered)
     begins_ns = {name: begin_ns for part in parts for name, begin_ns in part.begins_ns.items()}
-    return Calibration(corrections, dict(sorted(states.items())), common, applied, remembered, begins_ns)
+    return Solution(corrections, dict(sorted(states.items())), common, applied, remembered, begins_ns)
 
 
 def _solved(
@@ -115,7 +115,7 @@ def _solved(
     excluded: Collection[str],
     areas: Sequence[KnownGround],
     priors: Mapping[str, Prior],
-) -> Calibration:
+) -> Solution:
     """What a solve with these priors says."""
     trusted = {name: table for name, table in known.items() if name not in excluded}
     pb, result, unlike = _with_rolling(*_common_ground(trusted, areas, priors))
@@ -127,19 +127,19 @@ def _solved(
         alone = against(own, pb, result)
         more, state = _said(own, alone, observe(own, alone), {}, observed.common)
         corrections, states = corrections + more, states | state
-    return Calibration(tuple(corrections), dict(sorted(states.items())), observed.common)
+    return Solution(tuple(corrections), dict(sorted(states.items())), observed.common)
 
 
 def _common_ground(
     trusted: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]
-) -> tuple[Problem, Estimate]:
+) -> tuple[FleetProblem, Estimate]:
     """The ground of all machines but those that are at fault: one alone can put the slopes of a whole site in doubt.
 
     Where slopes are in doubt, less is odd. But if nobody's absence ends the doubt, the ground itself is the reason, and
     only those are left out that are at fault for sure; nobody where most seem to be.
     """
 
-    def solved(some: Mapping[str, Table]) -> tuple[Problem, Estimate]:
+    def solved(some: Mapping[str, Table]) -> tuple[FleetProblem, Estimate]:
         pb = problem(some, areas, priors)
         return pb, estimate(pb)
 
@@ -150,7 +150,7 @@ def _common_ground(
     return others if fewer[1].edges else fewer
 
 
-def _with_rolling(pb: Problem, result: Estimate) -> tuple[Problem, Estimate, Mapping[int, Rolling]]:
+def _with_rolling(pb: FleetProblem, result: Estimate) -> tuple[FleetProblem, Estimate, Mapping[int, Rolling]]:
     """Solved again with machines that roll unlike the others as such, which pull on no other one's scale then.
 
     Where nobody can be named all are: then slopes alone show scales, which are the less sure for it.
@@ -166,10 +166,10 @@ def _with_rolling(pb: Problem, result: Estimate) -> tuple[Problem, Estimate, Map
 
 def _without_odd(
     trusted: Mapping[str, Table],
-    first: tuple[Problem, Estimate],
+    first: tuple[FleetProblem, Estimate],
     in_doubt: float,
-    solved: Callable[[Mapping[str, Table]], tuple[Problem, Estimate]],
-) -> tuple[Problem, Estimate]:
+    solved: Callable[[Mapping[str, Table]], tuple[FleetProblem, Estimate]],
+) -> tuple[FleetProblem, Estimate]:
     """Solved without the oddest machine, and the next, as long as there is one; the first where not most would remain.
 
     trusted: all machines. first: as solved with those that have a say still. in_doubt: standard deviations of a scale
@@ -186,21 +186,25 @@ def _without_odd(
     return now
 
 
-def _odd(pb: Problem, result: Estimate, sigmas: tuple[float, float]) -> list[str]:
+def _odd(pb: FleetProblem, result: Estimate, sigmas: tuple[float, float]) -> list[str]:
     """Machines whose zero or scale is off by more standard deviations of the data sheet, the furthest first."""
     far = (beyond_data_sheet(pb, result) / sigmas).max(axis=1)
     return [pb.names[index] for index in np.argsort(-far, kind="stable").tolist() if far[index] > 1]
 
 
 def _said(
-    pb: Problem, result: Estimate, observed: Observed, unlike: Mapping[int, Rolling], others: CommonScale = KNOWN
-) -> tuple[list[Correction], dict[str, MachineState]]:
+    pb: FleetProblem,
+    result: Estimate,
+    observed: ObservedPart,
+    unlike: Mapping[int, Rolling],
+    others: CommonScale = KNOWN,
+) -> tuple[list[Correction], dict[str, MachineErrors]]:
     """Corrections and states of the machines of a problem. others: of those whose ground it was solved against."""
     applied = applied_part(pb, result, observed, others)
     return _corrections(pb, applied, unlike), _states(pb, applied, observed.by)
 
 
-def _corrections(pb: Problem, applied: Applied, unlike: Mapping[int, Rolling]) -> list[Correction]:
+def _corrections(pb: FleetProblem, applied: AppliedPart, unlike: Mapping[int, Rolling]) -> list[Correction]:
     """One correction for each epoch; the newest of a machine holds on. What measures no force has no scale."""
     layout, epochs = pb.layout, pb.epochs
     both = zip(applied.x[layout.rolls], applied.x[layout.drags], strict=True)
@@ -238,8 +242,8 @@ def _covariance(covariance: Floats) -> tuple[tuple[float, ...], ...]:
 
 
 def _states(
-    pb: Problem, applied: Applied, shown: Mapping[str, Mapping[str, tuple[str, ...]]]
-) -> dict[str, MachineState]:
+    pb: FleetProblem, applied: AppliedPart, shown: Mapping[str, Mapping[str, tuple[str, ...]]]
+) -> dict[str, MachineErrors]:
     """States of the machines of a problem. shown: by which sources."""
     layout = pb.layout
     x, std = applied.x, np.sqrt(np.diag(applied.covariance))
@@ -247,7 +251,7 @@ def _states(
     for index, name in enumerate(pb.names):
         epoch = int(np.flatnonzero(pb.epochs.machine == index)[-1])
         scale, across = layout.scales.start + index, layout.lateral.start + index
-        out[name] = MachineState(
+        out[name] = MachineErrors(
             zero=float(x[epoch]),
             zero_std=float(np.hypot(std[epoch], ZERO_FLOOR)),
             scale=float(x[scale]),

@@ -6,7 +6,7 @@ A sample of direction d (+1 ahead, -1 in reverse) on ground c with slope s ahead
 
 and d c_rr + slope ahead is the drive force over weight as it was measured, (1 + k) (d c + s): in it the zero cancels.
 So with scale = k / (1 + k) nothing but the sample itself is needed to undo all three. Of a machine that rolls unlike
-the others what is left then is c (1 + m) + b (`mapserver.fleet.rolling`), which m and b undo.
+the others what is left then is c (1 + m) + b (`mapserver.calibration.rolling`), which m and b undo.
 
 A machine that calibrates itself has taken a zero and a scale off already, and states them in each sample. Then the sum
 above is (1 - applied scale) of the drive force over weight, so that what was measured follows (`measured`), and a
@@ -14,7 +14,7 @@ correction takes off the difference alone: it does not matter who calibrated whe
 
 Only + - * / and a table of headings: kernels and machines would differ in the last bit of a sine, and so would maps.
 
-Corrections of one machine in the order of time: what covers what, and what lies at a time.
+SampleCorrections of one machine in the order of time: what covers what, and what lies at a time.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class _Spans:
         self.values = np.array([values(one) for one in self.each], np.float64).reshape(-1, len(VALUES))
 
 
-class Corrections:
+class SampleCorrections:
     """Corrections of all machines as one value: equal ones change every sample alike.
 
     The spans of one machine do not overlap. There may be many: what is changed for one machine costs nothing for the
@@ -95,16 +95,16 @@ class Corrections:
             by_machine.setdefault(one.machine, []).append(one)
         self._take({machine: _Spans(own) for machine, own in by_machine.items()})
 
-    def replaced(self, machines: Mapping[str, Sequence[Correction]]) -> Corrections:
+    def replaced(self, machines: Mapping[str, Sequence[Correction]]) -> SampleCorrections:
         """The same but for all corrections of some machines."""
         return self._with(self._machines | {name: _Spans(each) for name, each in machines.items()})
 
-    def without(self, machines: Collection[str]) -> Corrections:
+    def without(self, machines: Collection[str]) -> SampleCorrections:
         """Those of the other machines."""
         return self._with({name: own for name, own in self._machines.items() if name not in machines})
 
-    def _with(self, machines: Mapping[str, _Spans]) -> Corrections:
-        out = Corrections()
+    def _with(self, machines: Mapping[str, _Spans]) -> SampleCorrections:
+        out = SampleCorrections()
         out._take(machines)
         return out
 
@@ -127,7 +127,7 @@ class Corrections:
         return len(self._spans)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Corrections) and self._key == other._key
+        return isinstance(other, SampleCorrections) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
@@ -170,12 +170,12 @@ class Corrections:
         return out
 
 
-UNCORRECTED = Corrections()
+UNCORRECTED = SampleCorrections()
 
 
 def corrected(rows: Table, corrections: Iterable[Correction]) -> Table:
-    """Samples (n,) of one machine without its errors. corrections: of this machine; see `Corrections.applied`."""
-    own = Corrections(corrections)
+    """Samples (n,) of one machine without its errors. corrections: of this machine; see `SampleCorrections.applied`."""
+    own = SampleCorrections(corrections)
     names = [one.machine for one in own.each[:1]]
     return own.applied(rows, names, np.zeros(len(rows), np.int64))
 

@@ -1,7 +1,7 @@
 """Zero, scale and lateral zero of all machines of a site by what they measured on the same ground.
 
-Robust least squares over all sources of evidence (`mapserver.fleet.sources`) and what data sheets promise. Each round
-eliminates the ground, solves for the parameters of the machines, puts the ground back in, and weighs anew; the shares
+Robust least squares over all sources of evidence (`sources.py`) and what data sheets promise. Each round eliminates
+the ground, solves for the parameters of the machines, puts the ground back in, and weighs anew; the shares
 of drive force, which are products of unknowns, follow the ground. No source is a vote: a closed tour shows the zero and
 a foot of a ramp the scale of one machine alone, so that a majority that is off by the same is put right too.
 """
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from mapserver.fleet import sources as src
-from mapserver.fleet import stays
-from mapserver.fleet.equations import NO_GROUND, Equations, Information, eliminate, equations
-from mapserver.fleet.ledger import CELL_M, EPOCH_NS
-from mapserver.fleet.passages import Epochs, Passages, passages
-from mapserver.fleet.sources import GroundState, Layout
+from mapserver.calibration import sources as src
+from mapserver.calibration import stays
+from mapserver.calibration.equations import NO_GROUND, Equations, Information, eliminate, equations
+from mapserver.calibration.ledger import CELL_M, EPOCH_NS
+from mapserver.calibration.passages import Epochs, Passages, passages
+from mapserver.calibration.sources import GroundState, Parameters
 from protocol.arrays import Floats, Ints, Table
 from protocol.site.site_config import KnownGround
 
@@ -53,7 +53,7 @@ DATA_SHEET = Prior()
 
 
 @dataclass(frozen=True)
-class Problem:
+class FleetProblem:
     """What is solved. names: in order. cells: their numbers. known (cells,): c_rr that the site states, NaN: none.
 
     unlike: indices of the machines that roll unlike the others.
@@ -68,9 +68,9 @@ class Problem:
     unlike: tuple[int, ...] = ()
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> Parameters:
         """Of the parameters."""
-        return Layout(len(self.epochs.number), len(self.names), self.unlike)
+        return Parameters(len(self.epochs.number), len(self.names), self.unlike)
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,11 @@ class Estimate:
         return inverse(self.prior.matrix + sum(self.information[name].matrix for name in chosen))
 
 
-def problem(ledgers: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]) -> Problem:
+def problem(ledgers: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]) -> FleetProblem:
     """Stays by machine as `Ledger.stays` has them; areas: whose c_rr is stated; priors: where not the data sheet."""
     names = tuple(sorted(name for name, table in ledgers.items() if len(table)))
     p, epochs, cells = passages({name: ledgers[name] for name in names})
-    return Problem(
+    return FleetProblem(
         names, p, epochs, cells, known_cells(cells, areas), tuple(priors.get(name, DATA_SHEET) for name in names)
     )
 
@@ -115,14 +115,14 @@ def known_cells(cells: Ints, areas: Sequence[KnownGround]) -> Floats:
     return out
 
 
-def estimate(pb: Problem) -> Estimate:
+def estimate(pb: FleetProblem) -> Estimate:
     """Solve; where the slopes' edges contradict each other, or the ground itself changes there, without them."""
     result = _rounds(pb, with_edges=True)
     reason = _doubt(result, pb.layout)
     return _rounds(pb, with_edges=False, reason=reason) if reason else result
 
 
-def against(pb: Problem, others: Problem, result: Estimate) -> Estimate:
+def against(pb: FleetProblem, others: FleetProblem, result: Estimate) -> Estimate:
     """Solve a machine that has no say: against the ground of the others, which stays as it is.
 
     Its edges count where theirs do: with a gain or an antenna that is wrong it may share little of their ground.
@@ -140,7 +140,7 @@ def inverse(information: Floats) -> Floats:
     return np.asarray((out + out.T) / 2, np.float64)
 
 
-def _rounds(pb: Problem, *, with_edges: bool, reason: str = "", frozen: GroundState | None = None) -> Estimate:
+def _rounds(pb: FleetProblem, *, with_edges: bool, reason: str = "", frozen: GroundState | None = None) -> Estimate:
     """Iterate until nothing moves any more. frozen: ground that is known from elsewhere."""
     layout, cells = pb.layout, len(pb.cells)
     means, ground = src.means(pb.passages), src.first_ground(pb.passages, cells)
@@ -175,7 +175,7 @@ def _rounds(pb: Problem, *, with_edges: bool, reason: str = "", frozen: GroundSt
     return Estimate(x, information, data_sheet, ground, unknowns.get(src.EDGES, NO_GROUND), reason, rounds)
 
 
-def _ground(pb: Problem, unknowns: Mapping[str, Floats], before: GroundState) -> GroundState:
+def _ground(pb: FleetProblem, unknowns: Mapping[str, Floats], before: GroundState) -> GroundState:
     """The ground that fits; c_rr where the site states it."""
     c_rr = np.where(np.isfinite(pb.known), pb.known, unknowns[src.SAME_GROUND])
     gradient = unknowns[src.CROSSINGS].reshape(2, -1).T
@@ -189,7 +189,7 @@ def _filled(first: GroundState, second: GroundState) -> GroundState:
     return GroundState(c_rr, gradient)
 
 
-def prior_equations(pb: Problem) -> Equations:
+def prior_equations(pb: FleetProblem) -> Equations:
     """Data sheets, and zeros that wander from epoch to epoch within them."""
     layout, n = pb.layout, len(pb.epochs.number)
     machine, number = pb.epochs.machine, pb.epochs.number
@@ -208,7 +208,7 @@ def prior_equations(pb: Problem) -> Equations:
     return equations(A.tocsr(), None, b, std)
 
 
-def _doubt(result: Estimate, layout: Layout) -> str:
+def _doubt(result: Estimate, layout: Parameters) -> str:
     """Why edges of slopes must not count: a word."""
     ramps, std = result.x[layout.ramps], np.sqrt(result.covariance()[layout.ramps, layout.ramps])
     if abs(ramps) > max(RAMPS_LIMIT, RAMPS_SIGMAS * std):
