@@ -63,7 +63,7 @@ class Header:
     newest_ns: int = 0
     oldest_ns: int = 0
 
-    def of(self, state: GridState) -> Header:
+    def with_totals(self, state: GridState) -> Header:
         """The same, of a grid with this state."""
         return replace(self, **{field.name: getattr(state, field.name) for field in fields(GridState)[1:]})
 
@@ -218,7 +218,7 @@ def write_checkpoint(path: Path, header: Header, state: GridState) -> None:
         writer = CheckpointWriter(file)
         for x, y, pages in state.blocks:
             writer.add(x, y, pages)
-        writer.finish(header.of(state))
+        writer.finish(header.with_totals(state))
 
 
 def _padded(length: Any) -> Any:

@@ -94,7 +94,7 @@ def _write(path: Path, base: Checkpoint | None, part: Grid, header: Header) -> I
             yield
         sums = Grid.from_state(part.cell_m, part.config, (base.header if base else header).state)
         sums.merge(Grid.from_state(part.cell_m, part.config, replace(state, blocks=())))
-        writer.finish(header.of(sums.state()))
+        writer.finish(header.with_totals(sums.state()))
 
 
 def _numbers(base: Checkpoint | None) -> dict[Block, int]:

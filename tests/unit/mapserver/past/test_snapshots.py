@@ -75,16 +75,6 @@ def test_with_any_snapshot_the_map_of_now_is_a_fold_from_the_start(tmp_path):
         assert same(store.as_of(OPEN_END_NS - 1), store.folded(OPEN_END_NS))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
-def test_a_truncated_snapshot_is_passed_over_for_the_one_before(store, share):
-    save(store, 1)
-    path = save(store, 2)
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    row, grid = newest(store)
-    assert row == 1
-    assert same(grid, folded(samples(3)))
-
-
 def test_a_snapshot_whose_block_is_damaged_is_passed_over_for_the_one_before(store):
     save(store, 1)
     path = save(store, 2)
