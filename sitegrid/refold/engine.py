@@ -8,6 +8,7 @@ that ends by `sys.exit` takes its nanny along, and no other comes in its place.
 from __future__ import annotations
 
 import logging
+import signal
 import socket
 import sys
 import threading
@@ -134,7 +135,11 @@ class Cluster:
     def _started(self) -> Any:
         """A client of a scheduler in this process, with workers that die with it."""
         options = {"memory_limit": 0, "dashboard_address": None, "silence_logs": logging.CRITICAL, "security": True}
-        self._local = self._dask.LocalCluster(n_workers=self._jobs, threads_per_worker=1, **options)
+        known = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which what starts here inherits: Ctrl-C is for us alone
+        try:
+            self._local = self._dask.LocalCluster(n_workers=self._jobs, threads_per_worker=1, **options)
+        finally:
+            signal.signal(signal.SIGINT, known)
         self._local.adapt(minimum=self._jobs, maximum=self._jobs, interval="1 s")  # a nanny may end with its worker
         return self._dask.Client(self._local, timeout=CONNECT_S)
 

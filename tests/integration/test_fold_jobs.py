@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -98,6 +99,21 @@ def test_a_fold_that_is_killed_goes_on(archive: Path, expected: dict[str, str], 
         assert fold.wait(PATIENCE_S) == 0
     assert contents(out) == expected
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.nightly
+def test_a_fold_that_is_interrupted_at_its_terminal_says_so_in_one_line(archive: Path, tmp_path: Path) -> None:
+    """Ctrl-C reaches its workers, too."""
+    words = ["fold", str(archive), "--out", str(tmp_path / "out"), "--jobs", "2"]
+    pipe = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen([sys.executable, "-c", FOLD, *words], **pipe) as fold:
+        until(lambda: len(evidence(tmp_path / "out")) >= 2, "some tasks")
+        workers = children_of(fold.pid)
+        os.killpg(fold.pid, signal.SIGINT)
+        _, error = fold.communicate(timeout=PATIENCE_S)
+    assert fold.returncode == 130
+    assert error.count("\n") <= 1, error
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers), "the end of its processes")
 
 
 # --- a cluster -------------------------------------------------------------------------------------------------------
