@@ -15,6 +15,7 @@ import pytest
 from mapserver.calibration.correction import LAST_NS, NO_SHARE, Correction
 from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.ingest import standby as standby_module
+from mapserver.ingest.decisions import KINDS
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
 from mapserver.journal.facts import Facts
@@ -519,3 +520,11 @@ def test_a_decision_of_another_course_is_not_kept(location, standby, database):
         store.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
         assert events == 1, "what is missing is an event"
     wait_for(lambda: standby.follow(0.1) or standby._facts.excluded == {"c"})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_decision_of_another_program_is_named(tmp_path, kind):
+    with closing(open_store(tmp_path)) as store:
+        store.journal.append_event(kind, 1, {"another": "form"})
+    with pytest.raises(StoreError, match=r"journal.db: event 1 is of another program \("):
+        open_store(tmp_path)
