@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums, weights
+from mapserver.error_model import MACHINE_SHARE
 from mapserver.evidence import cells as ev
 from mapserver.evidence.timeline import TimedPage, packed_votes
 from protocol.arrays import Bools, Floats, Ints
@@ -28,7 +29,6 @@ BINS = (
 )
 LEAST_C_RR = 0.005  # likewise, on concrete, by what machines' zeros are off by; from 0.023 on bins ask for more
 SIGMAS = 3.0  # least difference of the medians, in the deviations that samples state: a site has hundreds of stretches
-MACHINE_SHARE = 0.5  # of the variance that samples state: zero and scale before calibration, which all passes share
 WEIGHT_M = 0.3  # least evidence on either side of a cut: a sample's vote in a cell beside its own is no pass
 MOST_CHANGES = 4  # of one cell, in all that its pages remember
 LEAST_SHARE = 0.5  # of a square of size_m that changed, where all else in it is not known

@@ -6,7 +6,6 @@ import pytest
 
 from mapserver.change.detection import (
     BINS,
-    MACHINE_SHARE,
     SIGMAS,
     VARIATION,
     WEIGHT_M,
@@ -19,6 +18,7 @@ from mapserver.change.detection import (
     reach_blocks,
 )
 from mapserver.change.kernels import differ, likeliest_cuts, medians, sums
+from mapserver.error_model import MACHINE_SHARE
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
