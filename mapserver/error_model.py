@@ -24,7 +24,8 @@ PLACE_STD, PLACE_SHARE = 0.002, 0.05
 # The same recordings were off by 0.7e-3 on average. On 13 drives of three others maps were off by 0.1 to 3.5 % along a
 # whole line, 2 % in the root mean square.
 COMMON_STD, COMMON_SHARE = 0.001, 0.02
-ALIKE_M = 25.0  # of way, over which errors are alike: slow errors of positions, and the lag of a machine's estimator
+ALIKE_M = 25.0  # of way, over which a place's errors are alike
+PASS_ALIKE_M = 10.0  # of way, over which the noise of one pass is alike: its estimator settles
 # c_rr of ground that was driven on and not measured, from the ground before and behind it, as a share.
 GAP_SHARE = 0.35
 UNKNOWN_SHARE = 0.5  # of the price of ground where nobody was

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapserver.error_model import ALIKE_M, GAP_SHARE, NINETY, resistance_variance
+from mapserver.error_model import GAP_SHARE, NINETY, PASS_ALIKE_M, resistance_variance
 from mapserver.roads.ledger import Ledger, filled, mean, resistance
 from mapserver.roads.segments import SegmentTable
 from mapserver.roads.tally import PER_C, PER_M, squares_of
@@ -110,7 +110,7 @@ def _std(ledger: Ledger) -> Floats:
     count = np.maximum(np.add.reduceat(known, ledger.ends[:-1]), 1e-9) if len(known) else np.zeros(0)
     within = _by_segment(np.where(known, variance, 0.0), ledger.ends) / count
     driven_m = _by_segment(measured / PER_M, ledger.ends)
-    noise = within / np.maximum(driven_m / ALIKE_M, 1.0)
+    noise = within / np.maximum(driven_m / PASS_ALIKE_M, 1.0)
     c_rr = mean(resistance(ledger), ledger.ends)
     gaps = 1 - count / np.diff(ledger.ends) if len(known) else count
     gap = gaps * GAP_SHARE * c_rr
