@@ -34,8 +34,8 @@ COMMENT = re.compile(r"^(?: *|.* {2})# (.*)$", re.MULTILINE)  # as the formatter
 class Module:
     """A file of code: its path in the checkout, its lines, and the lines of each of its functions.
 
-    words: of docstrings and comments. constants: numeric ones at the module's level, and defaults of fields. flags: options of the command line
-    that it declares. imports: modules of the checkout, as the first level of the module imports them.
+    words: of docstrings and comments. constants: numeric ones of the module, and defaults of fields. flags: options of
+    the command line that it declares. imports: modules of the checkout, as the first level of the module imports them.
     """
 
     path: Path

@@ -19,9 +19,9 @@ from mapserver.evidence.fold_config import is_foldable
 from mapserver.fleet.calibration import Calibration, calibrate
 from mapserver.fleet.correction import LAST_NS, Correction, corrected, measured
 from mapserver.fleet.ledger import Ledger
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from mapserver.trust.auditor import Auditor
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints, Table
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
 from sitegrid.proof.map_score import border_distance, driven_cells
 

@@ -29,8 +29,9 @@ from mapserver.fleet.observability import (
 )
 from mapserver.fleet.passages import sound
 from mapserver.fleet.rolling import rolling
-from mapserver.fleet.solver import SCALE_STD, Estimate, Prior, Problem, against, estimate, problem
+from mapserver.fleet.solver import Estimate, Prior, Problem, against, estimate, problem
 from protocol.arrays import Floats, Table
+from protocol.machine.samples import SCALE_STD
 from protocol.site.site_config import KnownGround
 
 KNOWN = CommonScale(True, 0.0, "")  # of machines that are solved together: what their estimate says is all there is

@@ -18,8 +18,9 @@ import numpy as np
 from mapserver.fleet import sources as src
 from mapserver.fleet.correction import ANY_SHARE, Correction
 from mapserver.fleet.passages import Epochs
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD, Estimate, Prior, Problem, inverse
+from mapserver.fleet.solver import Estimate, Prior, Problem, inverse
 from protocol.arrays import Bools, Floats, Ints
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 
 OBSERVED = 0.25  # of the prior's variance: half its standard deviation
 WEAK = 0.01  # of the weight of data sheets: evidence has to do without

@@ -19,8 +19,9 @@ import numpy as np
 from mapserver.fleet import sources as src
 from mapserver.fleet.equations import eliminate
 from mapserver.fleet.observability import SURE, Rolling, without_data_sheet
-from mapserver.fleet.solver import SCALE_STD, Estimate, Problem, inverse, prior_equations
+from mapserver.fleet.solver import Estimate, Problem, inverse, prior_equations
 from protocol.arrays import Floats, Ints
+from protocol.machine.samples import SCALE_STD
 from protocol.units import GRAVITY_MPS2
 
 # By so much machines of one kind may roll unlike each other for sure, by tyres, loads, and masses known to 3 %; and so

@@ -25,8 +25,9 @@ from mapserver.fleet.hysteresis import differs
 from mapserver.fleet.ledger import EPOCH_NS, EPOCHS, newest
 from mapserver.fleet.observability import FAULT_SIGMAS, MachineState, state_of
 from mapserver.fleet.passages import passages
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD, known_cells
+from mapserver.fleet.solver import known_cells
 from protocol.arrays import Floats, Table
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 from protocol.site.site_config import KnownGround
 from tests.unit.mapserver.fleet.drives import (
     FOOT_M,

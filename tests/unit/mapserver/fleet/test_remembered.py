@@ -13,8 +13,8 @@ from mapserver.fleet.correction import ANY_SHARE, LAST_NS, LEVEL_SHARE, NO_SHARE
 from mapserver.fleet.decisions import EVERY_NS, SOLVER, CalibrationDecision, CalibrationDecisions
 from mapserver.fleet.ledger import EPOCH_NS, Ledger, newest, stated
 from mapserver.fleet.observability import REMEMBERED_STD, remembered_of
-from mapserver.fleet.solver import SCALE_STD, ZERO_STD
 from protocol.arrays import Floats, Table
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 from tests.unit.mapserver.fleet.drives import (
     FOOT_M,
     LOW,
