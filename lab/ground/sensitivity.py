@@ -54,8 +54,8 @@ def variants() -> list[VariedGround]:
 
 def run(runner: Runner, seeds: Sequence[int], seconds: float) -> tuple[Report, None]:
     """Vary all constants; a row for each, with what its figures move by, and which of them beyond their intervals."""
-    found, _ = experiment.run(runner, seeds, seconds, variants())
-    whole, *others = found["rows"]
+    report, _ = experiment.run(runner, seeds, seconds, variants())
+    whole, *others = report["rows"]
     rows = [moved(whole, *pair) for pair in zip(others[::2], others[1::2], strict=True)]
     return {"seeds": list(seeds), "seconds": seconds, "as_it_is": _figures(whole), "rows": rows}, None
 
