@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.balance import Balance
+from agents.estimation.balance import MAX_GAP_NS, Balance
 from agents.estimation.closed_tours import Tour
 from agents.estimation.offers import intersected
 from agents.estimation.tuning import TUNING, EstimationTuning
@@ -25,7 +25,6 @@ from protocol.arrays import Floats
 from protocol.machine.samples import APPLIED, LIMITS, SCALE_STD, ZERO_STD, ZERO_WALK
 from protocol.wire.messages import CalibrationOffer
 
-MAX_GAP_NS = 300_000_000  # a stretch without a balance for so long is interrupted
 KEPT = 400  # stretches: 200 m of distance
 MOST_ZERO, MOST_SCALE = (LIMITS[name][1] for name in APPLIED)  # that a sample may state as applied
 EDGE_M = 3.0  # a machine is on known ground so far inside, and twice the standard deviation of its position
