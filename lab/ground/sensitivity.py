@@ -41,7 +41,8 @@ class VariedGround(GroundConfiguration):
         if not self.constant:
             return TUNING
         value = getattr(TUNING, self.constant)
-        changes: dict[str, Any] = {self.constant: type(value)(value * self.factor)}
+        changed = value * self.factor
+        changes: dict[str, Any] = {self.constant: round(changed) if isinstance(value, int) else changed}
         return replace(TUNING, **changes)
 
 
