@@ -22,6 +22,7 @@ import numpy as np
 from agents.clock_offsets import ClockOffsets, Offset
 from agents.estimation.calibration import EDGE_M, Calibration
 from agents.estimation.ground import GroundEstimator
+from agents.estimation.tuning import TUNING, EstimationTuning
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
@@ -43,10 +44,15 @@ class Pipeline:
     """Localisation, ground estimation and sampling of one machine."""
 
     def __init__(
-        self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig, calibration: Calibration | None = None
+        self,
+        site: SiteConfig,
+        machine: MachineConfig,
+        config: PipelineConfig,
+        calibration: Calibration | None = None,
+        tuning: EstimationTuning = TUNING,
     ) -> None:
         """calibration: of the ground estimator, from before."""
-        self._site, self._machine = site, in_name_order(machine)
+        self._site, self._machine, self._tuning = site, in_name_order(machine), tuning
         self._config, self._smooths = config, config.localisation.smoothing_s > 0
         self._positioning = Positioning(site, machine, config)
         self._counters: Counter[str] = Counter()
@@ -212,7 +218,7 @@ class Pipeline:
     def _start(self, known: Calibration | None) -> None:
         """Start with nothing known but the calibration, as after power-up or a jump of the clock."""
         config, machine = self._config, self._machine
-        self._estimator = GroundEstimator(machine, config.estimation, known)
+        self._estimator = GroundEstimator(machine, config.estimation, known, self._tuning)
         self._sampler, self._watch = Sampler(machine.load_centre_m), self._positioning.localiser.watch
         self._sampler.is_clear = lambda stamp_ns: not self._watch.off_m(stamp_ns)
         self._odometer = Odometer()

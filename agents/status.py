@@ -6,13 +6,13 @@ A hindrance is a problem where somebody has to mend something. Else it passes, o
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from agents.estimation.calibration import ZERO_STD
 from agents.localisation.alignment import DISTANCE_M
 from agents.localisation.localiser import PROVEN_S, UNSIGNED_M
 from agents.sampling import MAX_STD_M
 from protocol.machine.clock_watch import GAP_NS
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Encoder, Gps, GpsVelocity, Imu, Odometry, Reading, Torque
+from protocol.machine.samples import ZERO_STD
 
 WAIT_NS = 30 * 10**9  # in the readings' time; a machine that drives off has its heading after 10 to 20 s
 SILENT_S = 10.0  # without a reading: sensors send each second

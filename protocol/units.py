@@ -1,4 +1,4 @@
-"""Units that logs come in, their factor to the unit that a field's suffix names, and standard gravity."""
+"""Units that logs come in, their factor to the unit that a field's suffix names; spans of time, standard gravity."""
 
 import math
 import re
@@ -6,6 +6,9 @@ from datetime import UTC, datetime
 
 GRAVITY_MPS2 = 9.80665  # standard gravity (ISO 80000-3)
 DIESEL_J_PER_L = 35.8e6  # lower heating value
+MINUTE_NS = 60 * 10**9
+HOUR_NS = 60 * MINUTE_NS
+DAY_NS = 24 * HOUR_NS
 
 # unit -> {suffix of a field: factor from the unit to what the suffix means}
 _UNITS: dict[str, dict[str, float]] = {

@@ -25,7 +25,6 @@ from sim.receivers.receiver import wire
 from sim.recorder import write_truth
 from sim.simulator import Simulator
 
-MATCH_POLL_S = 0.05
 PROGRESS_S = 0.2
 WAIT_S = 30.0  # for subscribers: agents that are started by hand after the simulator have that long
 
@@ -172,7 +171,7 @@ def _await_subscribers(
     while (missing := [s.machine for s in streams if not s.has_subscriber]) and not stop.is_set():
         if clock() >= deadline:
             return missing
-        stop.wait(MATCH_POLL_S)
+        stop.wait(0.05)
     return []
 
 

@@ -31,7 +31,6 @@ from protocol.wire import keys
 AGAIN_S = 0.1
 PAST_S = 120.0  # how much longer an answer may take that has to be folded from the journal
 LOOK_S = 1.0  # between two looks for followers, each 0.1 ms of the router
-LOOK_WAIT_S = 1.0
 KNOWN_S = 1.0  # for the router's news of who answers
 AVOID_S = 10.0  # a follower that did not answer: after the lease of its link its token is gone
 FOLLOWERS_TRIED = 2  # for one question, before the server is asked: each may take half of the time that is left
@@ -88,7 +87,7 @@ class Followers:
 
     def look(self) -> set[str]:
         """Names of those whose tokens are there."""
-        replies = self._session.liveliness().get(keys.followers_alive_all(self._site), timeout=LOOK_WAIT_S)
+        replies = self._session.liveliness().get(keys.followers_alive_all(self._site), timeout=1.0)
         return {name for reply in replies if reply.ok is not None and (name := _name(str(reply.ok.key_expr)))}
 
     def avoid(self, name: str) -> None:

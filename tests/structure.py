@@ -34,8 +34,8 @@ COMMENT = re.compile(r"^(?: *|.* {2})# (.*)$", re.MULTILINE)  # as the formatter
 class Module:
     """A file of code: its path in the checkout, its lines, and the lines of each of its functions.
 
-    words: of docstrings and comments. constants: numeric ones at the module's level. flags: options of the command line
-    that it declares. imports: modules of the checkout, as the first level of the module imports them.
+    words: of docstrings and comments. constants: numeric ones of the module, and defaults of fields. flags: options of
+    the command line that it declares. imports: modules of the checkout, as the first level of the module imports them.
     """
 
     path: Path
@@ -180,7 +180,8 @@ def _module(root: Path, path: Path) -> Module:
         sizes,
         ast.get_docstring(tree) or "",
         words=sum(len(prose.split()) for prose in _prose(nodes, text)),
-        constants=sum(map(_constants, tree.body)),
+        constants=sum(map(_constants, tree.body))
+        + sum(_defaults(node) for node in nodes if isinstance(node, ast.ClassDef)),
         flags=frozenset(_flags(nodes)),
         imports=frozenset(_imports(root, tree)),
     )
@@ -203,6 +204,12 @@ def _constants(statement: ast.stmt) -> int:
         return 0
     named = [node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
     return sum(name.upper() == name for name in named) if _is_numeric(statement.value) else 0
+
+
+def _defaults(kind: ast.ClassDef) -> int:
+    """How many of its fields have a numeric default, but for 0 and 1, with which sums and products begin."""
+    values = [each.value for each in kind.body if isinstance(each, ast.AnnAssign) and _is_numeric(each.value)]
+    return sum(not (isinstance(value, ast.Constant) and value.value in (0, 1)) for value in values)
 
 
 def _is_numeric(value: ast.expr | None) -> bool:

@@ -23,7 +23,6 @@ from protocol.wire.messages import Corrections
 
 log = logging.getLogger("agents.corrections")
 
-POLL_S = 0.1
 GATHER_S = 0.1  # the frames of a second come together; the router lets through 50 messages a second
 MESSAGE_BYTES = 8192  # of frames in one, half of what is let through
 RETRY_S, MAX_RETRY_S = 1.0, 60.0  # casters shut out who comes too often
@@ -96,7 +95,7 @@ class Relay:
         """Take what has come in, and publish what is due; False once nothing more will come."""
         try:
             self._stream = self._stream or self._opened()
-            data = self._stream.read(POLL_S)
+            data = self._stream.read(0.1)
         except LinkError as error:
             return self._break(str(error))
         except OSError as error:

@@ -29,6 +29,7 @@ from protocol.units import GRAVITY_MPS2
 
 STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
 MAX_PAUSE_S = 1.0  # of the IMU, or of readings of wheels and brakes, before their last values no longer count
+MAX_GAP_NS = 300_000_000  # what follows balances is interrupted where there is none for so long
 MAX_GROUND_NS = 2_000_000_000  # and so of a speed over ground, of which there may be one a second
 SLOW_MPS = 2.0  # a slower machine pitches by its own forces rather than by the ground
 MOVES_MPS = 0.2  # a slower machine is held by friction and brakes, nobody knows which way

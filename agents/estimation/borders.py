@@ -18,15 +18,8 @@ import math
 import numpy as np
 
 from agents.estimation.balance import BalanceStep
+from agents.estimation.tuning import TUNING, EstimationTuning
 
-FIRST_C_RR, FIRST_STD = 0.03, 0.1
-JUMP_STD = 0.1  # of c_rr behind a border, from what it was before: as unknown as at first
-BORDERS_PER_M = 0.02  # a border every 50 m; maps with five times as many hardly differ
-# Noise is no sooner gone than a torque's error of a second, and a bump of the ground looks like a change of it: so many
-# times the variance of white noise, or small borders are seen where there are none.
-COLOURED = 2.0
-UNEVEN = 5e-4  # random walk of c_rr [1/sqrt(m)] on one ground
-LIKELY = 9.0  # squares beyond so many times the variance count as so many: a single jolt is no border
 MOST, KEPT = 80, 60  # histories at most; of more, so many of the likeliest
 # What a row of the histories has: l, t, their variances and covariance, the score, and how far the trailing axle is
 # from the last border [m], 0 or less once it has come up.
@@ -36,10 +29,12 @@ LEAD, TRAIL, LEAD_VAR, COVARIANCE, TRAIL_VAR, SCORE, BEHIND_M = range(7)
 class BorderSearch:
     """Searches for borders step by step. remembered: of how many steps the borders are of interest."""
 
-    def __init__(self, remembered: int) -> None:
-        self._remembered = remembered
-        variance = FIRST_STD**2
-        self._rows = np.array([[FIRST_C_RR], [FIRST_C_RR], [variance], [variance], [variance], [0.0], [0.0]])
+    def __init__(self, remembered: int, tuning: EstimationTuning = TUNING) -> None:
+        self._remembered, self._tuning = remembered, tuning
+        variance = tuning.unknown_std**2
+        self._rows = np.array(
+            [[tuning.first_c_rr], [tuning.first_c_rr], [variance], [variance], [variance], [0.0], [0.0]]
+        )
         self._borders: list[tuple[int, ...]] = [()]
         self._direction = 0.0
 
@@ -52,7 +47,7 @@ class BorderSearch:
         self._branch(number, step)
         rows = self._rows
         rows[BEHIND_M] -= step.distance_m
-        rows[LEAD_VAR] += UNEVEN**2 * step.distance_m
+        rows[LEAD_VAR] += self._tuning.uneven**2 * step.distance_m
         on_one_ground = rows[BEHIND_M] <= 0
         for of_trail, of_lead in ((TRAIL, LEAD), (COVARIANCE, LEAD_VAR), (TRAIL_VAR, LEAD_VAR)):
             np.copyto(rows[of_trail], rows[of_lead], where=on_one_ground)
@@ -75,7 +70,7 @@ class BorderSearch:
         if direction == -self._direction:
             rows = self._rows
             half_way = rows[BEHIND_M] > 0
-            rows[LEAD_VAR, half_way] += JUMP_STD**2
+            rows[LEAD_VAR, half_way] += self._tuning.unknown_std**2
             rows[BEHIND_M, half_way] = 0.0
         self._direction = direction
 
@@ -87,10 +82,10 @@ class BorderSearch:
         if step.distance_m <= 0 or scores[parent] == -np.inf:
             return
         level, variance = rows[LEAD, parent], rows[LEAD_VAR, parent]
-        expected = BORDERS_PER_M * step.distance_m
+        expected = self._tuning.borders_per_m * step.distance_m
         odds = expected + math.log(-math.expm1(-expected))  # logarithm: one or more of a Poisson process, against none
         behind_m = step.wheelbase_m + step.distance_m / 2  # a step shows the ground at its middle
-        new = [level, level, JUMP_STD**2, 0.0, variance, scores[parent] + odds, behind_m]
+        new = [level, level, self._tuning.unknown_std**2, 0.0, variance, scores[parent] + odds, behind_m]
         self._rows = np.column_stack([rows, new])
         recent = (border for border in self._borders[parent] if border > number - self._remembered)
         self._borders.append((*recent, number))
@@ -101,11 +96,11 @@ class BorderSearch:
         trail = step.regressor - lead
         with_lead = lead * rows[LEAD_VAR] + trail * rows[COVARIANCE]  # covariances with what is measured
         with_trail = lead * rows[COVARIANCE] + trail * rows[TRAIL_VAR]
-        variance = lead * with_lead + trail * with_trail + COLOURED * r
+        variance = lead * with_lead + trail * with_trail + self._tuning.coloured * r
         innovation = raw - lead * rows[LEAD] - trail * rows[TRAIL]
         square = innovation**2 / variance
-        rows[SCORE] -= 0.5 * (np.minimum(square, LIKELY) + np.log(variance))
-        innovation *= np.sqrt(LIKELY / np.maximum(square, LIKELY))
+        rows[SCORE] -= 0.5 * (np.minimum(square, self._tuning.likely) + np.log(variance))
+        innovation *= np.sqrt(self._tuning.likely / np.maximum(square, self._tuning.likely))
         rows[LEAD] += with_lead / variance * innovation
         rows[TRAIL] += with_trail / variance * innovation
         rows[LEAD_VAR] -= with_lead**2 / variance

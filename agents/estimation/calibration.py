@@ -17,31 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.dead_reckoning import DeadReckoning
-from agents.estimation.balance import Balance
+from agents.estimation.balance import MAX_GAP_NS, Balance
 from agents.estimation.closed_tours import Tour
 from agents.estimation.offers import intersected
+from agents.estimation.tuning import TUNING, EstimationTuning
 from protocol.arrays import Floats
-from protocol.machine.samples import APPLIED, LIMITS
+from protocol.machine.samples import APPLIED, LIMITS, SCALE_STD, ZERO_STD, ZERO_WALK
 from protocol.wire.messages import CalibrationOffer
 
-# Standard deviations before anything is measured: of the zero, as a share of gravity (0.044 m/s2), and of the scale of
-# drive force over weight.
-ZERO_STD, SCALE_STD = 0.0045, 0.045
-ZERO_WALK = 8e-5  # random walk of the zero [1/sqrt(s)]: as unsure as at first after an hour
-STRETCH_M = 0.5  # distance that is averaged: as long as a sample stands for
-STRETCH_STD = 0.008  # of the mean unbalanced of one stretch
-MAX_GAP_NS = 300_000_000  # a stretch without a balance for so long is interrupted
-# Two passages are over the same ground if they are so near, in so nearly the same direction, so soon: dead reckoning,
-# by which they are matched, drifts.
-PAIR_M, PAIR_RAD, PAIR_S = 0.7, 0.15, 120.0
 KEPT = 400  # stretches: 200 m of distance
 MOST_ZERO, MOST_SCALE = (LIMITS[name][1] for name in APPLIED)  # that a sample may state as applied
-FLOOR = 0.0007  # error of the model: no number of pairs makes the zero surer than this, or the scale than ten times it
-GATE_SIGMA = 3.0  # pairs further off are excluded
-GATE_OFFER_SIGMA = 4.0  # an offer is of many samples: further off, one of both is wrong, and a person has to look
-# So many excluded in a row are right, and the calibration is wrong: a sensor worse than its class. Tours are minutes
-# apart, stretches half a metre.
-RELOCK, RELOCK_TOURS = 12, 3
 EDGE_M = 3.0  # a machine is on known ground so far inside, and twice the standard deviation of its position
 
 
@@ -89,9 +74,9 @@ class _Stretch:
 class Calibrator:
     """Matches stretches to pairs, and improves a calibration by them."""
 
-    def __init__(self, calibration: Calibration | None = None) -> None:
+    def __init__(self, calibration: Calibration | None = None, tuning: EstimationTuning = TUNING) -> None:
         """calibration: from before."""
-        start = calibration or UNCALIBRATED
+        start, self._tuning = calibration or UNCALIBRATED, tuning
         self.counters: Counter[str] = Counter()
         self._x = np.array([start.zero, start.scale])
         self._P = np.array(start.covariance)
@@ -106,7 +91,10 @@ class Calibrator:
     def calibration(self) -> Calibration:
         """The present one."""
         (zz, zs), (_, ss) = self._P.tolist()
-        zz, ss = max(zz, FLOOR**2), max(ss, (10 * FLOOR) ** 2)  # raised variances keep a covariance definite
+        zz, ss = (
+            max(zz, self._tuning.floor**2),
+            max(ss, (10 * self._tuning.floor) ** 2),
+        )  # raised variances keep a covariance definite
         zero, scale = np.clip(self._x, (-MOST_ZERO, -MOST_SCALE), (MOST_ZERO, MOST_SCALE)).tolist()
         return Calibration(zero, scale, ((zz, zs), (zs, ss)), self._stamp_ns, self._passages, self._offer_ns)
 
@@ -121,9 +109,11 @@ class Calibrator:
         if newest.direction != balance.direction or balance.stamp_ns - newest.stamp_ns > MAX_GAP_NS:
             self._stretch.clear()
         self._stretch.append(balance)
-        if balance.distance_m - self._stretch[0].distance_m < STRETCH_M:
+        if balance.distance_m - self._stretch[0].distance_m < self._tuning.stretch_m:
             return
-        variance = STRETCH_STD**2 + shaking_var / len(self._stretch) ** 2  # a body that shakes goes nowhere
+        variance = (
+            self._tuning.stretch_std**2 + shaking_var / len(self._stretch) ** 2
+        )  # a body that shakes goes nowhere
         stretch = self._end_stretch(dead_reckoning)
         if known_c_rr is not None:
             cosine = math.cos(balance.slope_x)
@@ -148,10 +138,12 @@ class Calibrator:
         self.age(now_ns)
         passed_s = max(now_ns - offer.stamp_ns, 0) * 1e-9
         offered: Floats = np.array([offer.zero, offer.scale])
-        zz = max(offer.zero_var, FLOOR**2) + ZERO_WALK**2 * passed_s
-        B: Floats = np.array([[zz, offer.covariance], [offer.covariance, max(offer.scale_var, (10 * FLOOR) ** 2)]])
+        zz = max(offer.zero_var, self._tuning.floor**2) + ZERO_WALK**2 * passed_s
+        B: Floats = np.array(
+            [[zz, offer.covariance], [offer.covariance, max(offer.scale_var, (10 * self._tuning.floor) ** 2)]]
+        )
         off = offered - self._x
-        if float(off @ np.linalg.solve(self._P + B, off)) > GATE_OFFER_SIGMA**2:
+        if float(off @ np.linalg.solve(self._P + B, off)) > self._tuning.gate_offer_sigma**2:
             self.counters["refused_offer_off"] += 1
             return
         self._x, self._P = intersected(self._x, self._P, offered, B)
@@ -173,7 +165,7 @@ class Calibrator:
     def _end_stretch(self, dead_reckoning: DeadReckoning) -> _Stretch:
         pose, n = dead_reckoning.pose, len(self._stretch)
         newest = self._stretch[-1]
-        half = newest.direction * 0.5 * STRETCH_M  # the middle of it lies behind
+        half = newest.direction * 0.5 * self._tuning.stretch_m  # the middle of it lies behind
         x, y = pose.x_m - half * math.cos(pose.angle_rad), pose.y_m - half * math.sin(pose.angle_rad)
         unbalanced, share = (sum(getattr(b, name) for b in self._stretch) / n for name in ("unbalanced", "share"))
         self._stretch = [newest]
@@ -181,16 +173,16 @@ class Calibrator:
 
     def _partner(self, stretch: _Stretch) -> _Stretch | None:
         """The nearest stretch of the other direction over the same ground."""
-        partner, nearest_m = None, PAIR_M
+        partner, nearest_m = None, self._tuning.pair_m
         for other in reversed(self._past):
-            if (stretch.stamp_ns - other.stamp_ns) * 1e-9 > PAIR_S:
+            if (stretch.stamp_ns - other.stamp_ns) * 1e-9 > self._tuning.pair_s:
                 break
             if other.direction == stretch.direction:
                 continue
             distance_m = math.hypot(stretch.x_m - other.x_m, stretch.y_m - other.y_m)
             if distance_m >= nearest_m:
                 continue
-            if abs(math.remainder(stretch.angle_rad - other.angle_rad, math.tau)) < PAIR_RAD:
+            if abs(math.remainder(stretch.angle_rad - other.angle_rad, math.tau)) < self._tuning.pair_rad:
                 partner, nearest_m = other, distance_m
         return partner
 
@@ -201,11 +193,11 @@ class Calibrator:
         Ph = self._P @ h
         S = float(h @ Ph) + variance
         innovation = measured - float(h @ self._x)
-        if innovation**2 > GATE_SIGMA**2 * S:
+        if innovation**2 > self._tuning.gate_sigma**2 * S:
             self.counters["off"] += 1
             excluded = self._excluded[is_tour]
             excluded.append(innovation)
-            if len(excluded) < (RELOCK_TOURS if is_tour else RELOCK):
+            if len(excluded) < (self._tuning.relock_tours if is_tour else self._tuning.relock):
                 return
             self._P[0, 0] += float(np.mean(np.square(excluded)))
             self.counters["relocked"] += 1

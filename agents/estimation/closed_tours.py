@@ -17,20 +17,19 @@ too (the loop erasure of Lawler 1980), and what tours show is independent.
 import math
 from dataclasses import dataclass
 
-from agents.estimation.balance import Balance
+from agents.estimation.attitude import MAX_SINE
+from agents.estimation.balance import MAX_GAP_NS, Balance
 from agents.localisation.filters.belief import PoseBelief
 
 STEP_M = 2.0  # of wheel travel; of shorter ones the noise of positions would be a part
 CELL_M = 2.0
 LEAST_M = 60.0  # a shorter tour shows less than the data sheet
 JUMP_M = 1.0  # of a position against the wheels' travel, beside half of it: it was not driven, or wheels spun
-MAX_GAP_NS = 300_000_000  # between balances
 MAX_JOLT_S = 2.0  # one that lasts longer is a broken accelerometer, or a machine that digs in
 MOST_STD_M = 3.0  # a less sure position is no place to come back to
 KEPT = 5000  # marks: 10 km, an hour on a haul road
 # Standard deviation of the rise of a tour: of unevenness where it closes, and per root of a metre driven.
 CLOSING_M, RISE_NOISE = 0.15, 0.013
-MAX_SINE = 0.7  # steeper than any machine stands
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 from agents.dead_reckoning import LOADING_S, DeadReckoning
 from agents.estimation.balance import Balance, Balancer, BalanceStep
-from agents.estimation.calibration import UNCALIBRATED, ZERO_STD, Calibration, Calibrator
+from agents.estimation.calibration import UNCALIBRATED, Calibration, Calibrator
 from agents.estimation.closed_tours import ClosedTours
 from agents.estimation.offers import Offers
 from agents.estimation.plausibility import FAULTS, SLOPE_TOO, Plausibility
@@ -21,9 +21,11 @@ from agents.estimation.resistance_kalman import KalmanResistance
 from agents.estimation.resistance_rls import RecursiveGrade, RecursiveResistance
 from agents.estimation.shaking import LongerSteps
 from agents.estimation.skid_steering import SkidSteering
+from agents.estimation.tuning import TUNING, EstimationTuning
 from agents.localisation.filters.belief import PoseBelief
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Reading
+from protocol.machine.samples import ZERO_STD
 
 ESTIMATORS = ("kalman", "rls")
 MASSES = ("message", "known", "estimated")
@@ -32,7 +34,6 @@ NEAR_NS = 200_000_000  # a stamp this far from a step has no slope
 SILENT_NS = 1_000_000_000  # other sensors have readings, but no step was made for so long
 JOLTS = frozenset({"accelerometer", "slip"})  # then the accelerometer does not show the slope ahead
 MAX_LOADED = 4.0  # loaded mass over empty mass; forces that say more are no mass
-MODEL_STD = 0.0015  # error of the balance itself [-], which no calibration removes
 
 
 @dataclass(frozen=True)
@@ -98,21 +99,25 @@ class GroundEstimator:
     """Estimator of one machine; `update` expects readings in the order of their stamps."""
 
     def __init__(
-        self, machine: MachineConfig, config: EstimationConfig, calibration: Calibration | None = None
+        self,
+        machine: MachineConfig,
+        config: EstimationConfig,
+        calibration: Calibration | None = None,
+        tuning: EstimationTuning = TUNING,
     ) -> None:
         """calibration: from before."""
-        self._machine, self._config = machine, config
+        self._machine, self._config, self._tuning = machine, config, tuning
         self._balancer = Balancer(machine, weighs=config.mass == "message")
         self._plausibility = Plausibility(machine.wheelbase_m)
         self._longer = LongerSteps()
         self._skid_steering = SkidSteering(machine)
-        self._calibrator = Calibrator(calibration)
+        self._calibrator = Calibrator(calibration, tuning)
         self._tours = ClosedTours()
         self._offers = Offers(machine.name, calibration.offer_ns if calibration else 0)
         self._applied = UNCALIBRATED
         estimates_mass = config.mass == "estimated"
         self._resistance: KalmanResistance | RecursiveResistance = (
-            KalmanResistance(estimates_mass=estimates_mass)
+            KalmanResistance(estimates_mass=estimates_mass, tuning=tuning)
             if config.estimator == "kalman"
             else RecursiveResistance(estimates_mass=estimates_mass)
         )
@@ -208,7 +213,7 @@ class GroundEstimator:
         if resistance:
             cosine = math.cos(judged.slope_x)
             c_rr = resistance[0]
-            variance = resistance[1] + applied.variance(balance.share) / cosine**2 + MODEL_STD**2
+            variance = resistance[1] + applied.variance(balance.share) / cosine**2 + self._tuning.model_std**2
         reason = judged.reason or ("" if resistance else "settling")
         slope_x = math.tan(judged.slope_x + applied.zero)  # the accelerometer's zero is an error of the slope too
         # The mean of both directions: work shows the zero ahead; across, nothing shows how the sensor is mounted.

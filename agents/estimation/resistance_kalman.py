@@ -30,19 +30,14 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.estimation.balance import BalanceStep
-from agents.estimation.borders import FIRST_C_RR, FIRST_STD, JUMP_STD, BorderSearch
+from agents.estimation.borders import BorderSearch
+from agents.estimation.tuning import TUNING, EstimationTuning
 from protocol.arrays import Floats
 
 LEAD, TRAIL, SCALE = 0, 1, 2
 KEPT = 100  # steps: 5 s, more than a sample waits for what comes after it
 NEAR_NS = 150_000_000  # a stamp this far from a usable step has no estimate
 PAUSE_S = 0.1  # steps further apart do not follow one another
-NOISE = 0.004  # least density of the noise of raw c_rr [1/sqrt(Hz)]; larger noise is measured
-NOISE_S = 20.0  # over which noise is measured
-OUTLIER = 16.0  # squares beyond so many times the mean are no noise, but a border
-WALK = 0.002  # random walk of c_rr [1/sqrt(m)]: ground of one kind is never quite even
-SCALE_WALK = 1e-3  # random walk of the scale error [1/sqrt(s)]
-SCALE_STD = 0.2  # standard deviation of the scale error at first, and when the load has changed: 3.5 t of 17.5 t
 
 IDENTITY = np.eye(3)
 TRAIL_IS_LEAD = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -90,12 +85,12 @@ class _Filtered(NamedTuple):
 class KalmanResistance:
     """The default estimator. estimates_mass: whether the scale error is a state."""
 
-    def __init__(self, *, estimates_mass: bool = False) -> None:
-        self._estimates_mass = estimates_mass
+    def __init__(self, *, estimates_mass: bool = False, tuning: EstimationTuning = TUNING) -> None:
+        self._estimates_mass, self._tuning = estimates_mass, tuning
         self._steps: list[_Filtered] = []
-        self._first = _start(SCALE_STD**2 if estimates_mass else 0.0)  # the last step that is not kept
-        self._noise = _Noise()
-        self._search = BorderSearch(2 * KEPT + 1)
+        self._first = _start(tuning, tuning.load_std**2 if estimates_mass else 0.0)  # the last step that is not kept
+        self._noise = _Noise(tuning)
+        self._search = BorderSearch(2 * KEPT + 1, tuning)
         self._count = 0  # of all steps
         self._load_has_changed = False  # since the last step
 
@@ -107,15 +102,15 @@ class KalmanResistance:
     def update(self, step: BalanceStep) -> None:
         """Filter a step, and search for a border."""
         self._noise.update(step)
-        scale_var = SCALE_WALK**2 * step.dt_s if self._estimates_mass else 0.0
+        scale_var = self._tuning.scale_walk**2 * step.dt_s if self._estimates_mass else 0.0
         if self._load_has_changed:
-            scale_var, self._load_has_changed = SCALE_STD**2, False
+            scale_var, self._load_has_changed = self._tuning.load_std**2, False
         lead, share = step.lead_share, step.share if self._estimates_mass else 0.0
         h = np.array([step.regressor * lead, step.regressor * (1 - lead), share])
         before = self._before(len(self._steps))
         distance_m = before.measured.distance_m + step.distance_m
         measured = _Measured(step, distance_m, h, self._noise.density / step.dt_s, scale_var)
-        self._steps.append(_filtered(before, measured, border=False))
+        self._steps.append(_filtered(before, measured, self._tuning, border=False))
         self._count += 1
         raw = step.raw - share * float(before.x[SCALE])
         self._set_borders(self._search.update(self._count, step, raw, measured.r))
@@ -141,7 +136,9 @@ class KalmanResistance:
         for i, old in enumerate(self._steps):
             step = old.measured.step
             step = replace(step, raw=step.raw - zero - scale * step.share)
-            self._steps[i] = _filtered(self._before(i), old.measured._replace(step=step), border=old.border)
+            self._steps[i] = _filtered(
+                self._before(i), old.measured._replace(step=step), self._tuning, border=old.border
+            )
         # Ahead and in reverse a zero counts with opposite signs: what both come to, the filter knows.
         self._search.shift(float(self._before(len(self._steps)).x[LEAD]) - believed)
 
@@ -170,7 +167,7 @@ class KalmanResistance:
         borders = [number in numbers for number in range(first, self._count + 1)]
         changed = next((i for i, old in enumerate(self._steps) if old.border != borders[i]), len(borders))
         for i in range(changed, len(borders)):
-            self._steps[i] = _filtered(self._before(i), self._steps[i].measured, border=borders[i])
+            self._steps[i] = _filtered(self._before(i), self._steps[i].measured, self._tuning, border=borders[i])
 
     def _smoothed(self, index: int) -> tuple[Floats, Floats]:
         newest = self._steps[-1]
@@ -193,8 +190,8 @@ class _Noise:
     The ground's part of a difference is small; that of a border is an outlier.
     """
 
-    def __init__(self) -> None:
-        self.density = NOISE**2
+    def __init__(self, tuning: EstimationTuning) -> None:
+        self.density, self._tuning = tuning.noise**2, tuning
         self._last: BalanceStep | None = None
 
     def interrupt(self) -> None:
@@ -205,9 +202,9 @@ class _Noise:
         last, self._last = self._last, step
         if last is None or last.regressor * step.regressor < 0 or _pause_s(last, step) > PAUSE_S:
             return
-        measured = min(0.5 * (step.raw - last.raw) ** 2 * step.dt_s, OUTLIER * self.density)
-        share = min(step.dt_s / NOISE_S, 1.0)
-        self.density = max(self.density + share * (measured - self.density), NOISE**2)
+        measured = min(0.5 * (step.raw - last.raw) ** 2 * step.dt_s, self._tuning.outlier * self.density)
+        share = min(step.dt_s / self._tuning.noise_s, 1.0)
+        self.density = max(self.density + share * (measured - self.density), self._tuning.noise**2)
 
 
 def _pause_s(last: BalanceStep, step: BalanceStep) -> float:
@@ -215,15 +212,15 @@ def _pause_s(last: BalanceStep, step: BalanceStep) -> float:
     return (step.stamp_ns - last.stamp_ns) * 1e-9 - step.dt_s
 
 
-def _start(scale_var: float) -> _Filtered:
+def _start(tuning: EstimationTuning, scale_var: float) -> _Filtered:
     """The belief before the first step."""
-    x, P = np.array([FIRST_C_RR, FIRST_C_RR, 0.0]), _same_ground(FIRST_STD**2)
+    x, P = np.array([tuning.first_c_rr, tuning.first_c_rr, 0.0]), _same_ground(tuning.unknown_std**2)
     P[SCALE, SCALE] = scale_var
     measured = _Measured(BalanceStep(0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, np.zeros(3), 1.0, 0.0)
     return _Filtered(measured, False, math.nan, IDENTITY, x, P, x, P)
 
 
-def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filtered:
+def _filtered(before: _Filtered, measured: _Measured, tuning: EstimationTuning, *, border: bool) -> _Filtered:
     """Predict from the step before, and correct by the measurement."""
     step = measured.step
     middle_m = measured.distance_m - step.distance_m / 2  # a step counts at its end, and shows the ground at its middle
@@ -231,13 +228,13 @@ def _filtered(before: _Filtered, measured: _Measured, *, border: bool) -> _Filte
     A, free = IDENTITY, 0.0
     if before.is_crossing and before.measured.step.regressor * step.regressor < 0:
         # Back across a border that only one axle had crossed: the axle that led is the trailing one now.
-        A, crossing_m, free = TRAIL_IS_LEAD, math.nan, JUMP_STD**2
+        A, crossing_m, free = TRAIL_IS_LEAD, math.nan, tuning.unknown_std**2
     elif border:
-        A, free = LEAD_UNKNOWN, JUMP_STD**2
+        A, free = LEAD_UNKNOWN, tuning.unknown_std**2
     if measured.distance_m - crossing_m >= step.wheelbase_m:  # the trailing axle has come up
         A, crossing_m = (TRAIL_IS_LEAD @ A if step.wheelbase_m else TRAIL_IS_LEAD * [0, 0, 1]), math.nan
     on_one_ground = math.isnan(crossing_m)
-    walk = WALK**2 * step.distance_m
+    walk = tuning.walk**2 * step.distance_m
     Q = _same_ground(walk + free) if on_one_ground else np.diag([walk + free, 0.0, 0.0])
     Q[SCALE, SCALE] = measured.scale_var
     x0 = (TRAIL_IS_LEAD if on_one_ground else IDENTITY) @ before.x

@@ -15,17 +15,16 @@ import math
 import numpy as np
 
 from agents.estimation.balance import BalanceStep
+from agents.estimation.tuning import TUNING
 from protocol.arrays import Floats
 
 NEAR_NS = 500_000_000  # a stamp this far from a usable step has no estimate
-FIRST_C_RR = 0.03
 FIRST_SCALE_VARIANCE = 1e-3  # in units of the noise, as that of c_rr, which is 1
 MAX_VARIANCE = np.array([1e-2, 1.0])  # of scale and c_rr: what is not excited must not be forgotten without end
 # Share of the past that still counts a second later: the ground changes at once, the load at stops minutes apart.
 FORGET = 0.6
 FORGET_MASS = 0.995
 FORGET_GRADE = 0.2
-NOISE = 0.004  # of one raw c_rr, as a density [1/sqrt(Hz)]
 MAX_GRADE_SINE = 0.9
 
 
@@ -52,7 +51,7 @@ class RecursiveResistance:
     def __init__(self, *, estimates_mass: bool = False) -> None:
         variance = np.array([FIRST_SCALE_VARIANCE if estimates_mass else 0.0, 1.0])
         forget, most = np.array([FORGET_MASS, FORGET]), MAX_VARIANCE * [estimates_mass, 1]
-        self._squares = MultipleForgetting(np.array([0.0, FIRST_C_RR]), variance, forget, most)
+        self._squares = MultipleForgetting(np.array([0.0, TUNING.first_c_rr]), variance, forget, most)
         self._stamp_ns = 0
         self._force = (0.0, 1.0)  # share and regressor of the last step
 
@@ -84,7 +83,7 @@ class RecursiveResistance:
         """
         if not self._stamp_ns or self._stamp_ns < stamp_ns - NEAR_NS:
             return None
-        return float(self._squares.parameters[1]), NOISE**2 * -math.log(FORGET) / 2
+        return float(self._squares.parameters[1]), TUNING.noise**2 * -math.log(FORGET) / 2
 
 
 class RecursiveGrade:

@@ -17,11 +17,11 @@ from lab.maps.methods import folded
 from mapserver.calibration.calibrate import Solution, calibrate
 from mapserver.calibration.correction import LAST_NS, Correction, corrected, measured
 from mapserver.calibration.ledger import StayLedger
-from mapserver.calibration.solver import SCALE_STD, ZERO_STD
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
 from mapserver.trust.auditor import Auditor
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints, Table
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
 from sitegrid.proof.map_score import border_distance, driven_cells
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.estimation.ground import EstimationConfig
+from agents.estimation.tuning import TUNING, EstimationTuning
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.sampling import LAG_S
@@ -59,6 +60,11 @@ class GroundConfiguration:
         """The agent's."""
         calibrate = PRESETS[self.preset][1]
         return PipelineConfig(estimation=EstimationConfig(estimator=self.estimator, calibrate=calibrate))
+
+    @property
+    def tuning(self) -> EstimationTuning:
+        """Of its estimators."""
+        return TUNING
 
 
 ROWS = tuple(GroundConfiguration(estimator, preset) for estimator in ESTIMATORS for preset in PRESETS)
@@ -155,7 +161,8 @@ def _interval(numbers: Sequence[float]) -> float | None:
 def _estimate(task: Task[GroundConfiguration], cache: Path) -> PipelineOutput:
     """Run one row on one recording."""
     recording = task.recording(cache)
-    pipeline, readings = Pipeline(recording.site, recording.machine, task.variant.options), recording.readings
+    what, readings = task.variant, recording.readings
+    pipeline = Pipeline(recording.site, recording.machine, what.options, tuning=what.tuning)
     began_s = time.process_time()
     made = [pipeline.step(readings[i : i + CHUNK]).final for i in range(0, len(readings), CHUNK)]
     samples = np.concatenate([*made, pipeline.finish().final])

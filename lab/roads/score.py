@@ -13,10 +13,11 @@ from lab.calibration.cases import Rows
 from lab.calibration.drives import FleetDrive, Scene
 from lab.calibration.solving import calibrated, of_machine
 from mapserver.calibration.correction import corrected
+from mapserver.error_model import NINETY
 from mapserver.evidence.fold_config import FoldConfig, is_foldable, name_hash
 from mapserver.evidence.grid import Grid
 from mapserver.roads.ledger import Ledgers, mean
-from mapserver.roads.loss import SIGMA_90, Losses, losses
+from mapserver.roads.loss import Losses, losses
 from mapserver.roads.network import network
 from mapserver.roads.segments import SegmentTable, segments
 from mapserver.roads.skeleton import Skeletons
@@ -24,7 +25,7 @@ from mapserver.roads.tally import PER_M, Tally
 from mapserver.roads.worklist import TIE_SHARE, ranked
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.site.geometry import CellWindow
-from protocol.units import GRAVITY_MPS2
+from protocol.units import DAY_NS, GRAVITY_MPS2
 from sim.recorder import TRACKS_FOLDER
 
 
@@ -114,7 +115,6 @@ SPACING_M = 0.5  # of points on roads that are looked at
 LEAST_PASSES = 1.5  # true ones, for a segment to be judged
 TOP = 10
 SHARE_OFF = 0.1  # of metres that go in one direction: more is the wrong direction
-DAY_NS = 86_400_000_000_000
 STEP_M = 0.02  # in a tenth of a second: a machine that moves
 EVERYWHERE = CellWindow(-20_000, -20_000, 40_000, 40_000)
 
@@ -242,7 +242,7 @@ def traffic_figures(recorded: Recorded, whole: SegmentTable) -> dict[str, float]
         "c_pct": 100.0 * float(np.sqrt(np.mean((off / true.c_rr[measured]) ** 2))),
         "c_ground_pct": 100.0 * float(np.sqrt(np.mean(off_ground**2))),
         "c_median_pct": 100.0 * float(np.median(np.abs(off / true.c_rr[measured]))),
-        "inside_pct": 100.0 * float((np.abs(off) <= SIGMA_90 * known.c_std[measured]).mean()),
+        "inside_pct": 100.0 * float((np.abs(off) <= NINETY * known.c_std[measured]).mean()),
         **_list_figures(known, true, judged),
     }
 

@@ -22,8 +22,9 @@ from typing import Any
 
 from lab.speed.measure import ROOT, Figures, in_child, in_turn, rows_of, say
 from lab.speed.site import SITE
-from mapserver.journal.archive import HOUR_NS, write_file
+from mapserver.journal.archive import write_file
 from mapserver.journal.rows import JournalRow
+from protocol.units import HOUR_NS
 from sitegrid.proof.figures import Row
 from tests.site_work import BATCH, batches, evidence_hash
 

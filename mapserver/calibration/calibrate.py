@@ -29,8 +29,9 @@ from mapserver.calibration.select import (
     is_surer,
     observe,
 )
-from mapserver.calibration.solver import SCALE_STD, Estimate, FleetProblem, Prior, against, estimate, problem
+from mapserver.calibration.solver import Estimate, FleetProblem, Prior, against, estimate, problem
 from protocol.arrays import Floats, Table
+from protocol.machine.samples import SCALE_STD
 from protocol.site.site_config import KnownGround
 
 KNOWN = CommonScale(True, 0.0, "")  # of machines that are solved together: what their estimate says is all there is

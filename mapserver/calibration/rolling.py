@@ -19,8 +19,9 @@ import numpy as np
 from mapserver.calibration import sources as src
 from mapserver.calibration.equations import eliminate
 from mapserver.calibration.select import SURE, Rolling, without_data_sheet
-from mapserver.calibration.solver import SCALE_STD, Estimate, FleetProblem, inverse, prior_equations
+from mapserver.calibration.solver import Estimate, FleetProblem, inverse, prior_equations
 from protocol.arrays import Floats, Ints
+from protocol.machine.samples import SCALE_STD
 from protocol.units import GRAVITY_MPS2
 
 # By so much machines of one kind may roll unlike each other for sure, by tyres, loads, and masses known to 3 %; and so

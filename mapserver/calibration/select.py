@@ -18,8 +18,9 @@ import numpy as np
 from mapserver.calibration import sources as src
 from mapserver.calibration.correction import ANY_SHARE, Correction
 from mapserver.calibration.passages import Epochs
-from mapserver.calibration.solver import SCALE_STD, ZERO_STD, Estimate, FleetProblem, Prior, inverse
+from mapserver.calibration.solver import Estimate, FleetProblem, Prior, inverse
 from protocol.arrays import Bools, Floats, Ints
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 
 OBSERVED = 0.25  # of the prior's variance: half its standard deviation
 WEAK = 0.01  # of the weight of data sheets: evidence has to do without

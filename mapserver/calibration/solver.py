@@ -21,12 +21,9 @@ from mapserver.calibration.ledger import CELL_M, EPOCH_NS
 from mapserver.calibration.passages import Epochs, Passages, passages
 from mapserver.calibration.sources import GroundState, Parameters
 from protocol.arrays import Floats, Ints, Table
+from protocol.machine.samples import SCALE_STD, ZERO_STD, ZERO_WALK
 from protocol.site.site_config import KnownGround
 
-# Standard deviations by data sheets: of the zero, as a share of gravity, ahead and to the left, and of the scale of the
-# drive force over weight. ZERO_WALK: of the zero [1/sqrt(s)]. The agents' own calibration begins with the same.
-ZERO_STD, SCALE_STD = 0.0045, 0.045
-ZERO_WALK = 8e-5
 ZERO_S = 2 * ZERO_STD**2 / ZERO_WALK**2  # a Gauss-Markov process with this walk stays within the data sheet
 # Of machines that roll unlike the others: half of the ground's c_rr, and what a brake costs on any ground.
 ROLLS_STD, DRAGS_STD = 0.5, 0.02

@@ -16,29 +16,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums, weights
+from mapserver.error_model import MACHINE_SHARE
 from mapserver.evidence import cells as ev
 from mapserver.evidence.timeline import TimedPage, packed_votes
 from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_positive
 from protocol.site.geometry import BLOCK_CELLS
 
-VARIATION = 0.6  # total variation of two histograms, 0 to 1, above which they contradict each other
-BINS = (
-    1.5  # least difference of their medians, in bins (22 % of c_rr, 0.031 of gradient): medians are no finer than one
-)
-LEAST_C_RR = 0.005  # likewise, on concrete, by what machines' zeros are off by; from 0.023 on bins ask for more
-SIGMAS = 3.0  # least difference of the medians, in the deviations that samples state: a site has hundreds of stretches
-MACHINE_SHARE = 0.5  # of the variance that samples state: zero and scale before calibration, which all passes share
-WEIGHT_M = 0.3  # least evidence on either side of a cut: a sample's vote in a cell beside its own is no pass
-MOST_CHANGES = 4  # of one cell, in all that its pages remember
-LEAST_SHARE = 0.5  # of a square of size_m that changed, where all else in it is not known
-ALIKE_BINS = 1.0  # kinds of ground nearer to each other are the same; cells whose pages are nearer did not change
-# Bins of each value that is looked at, their centres, and the least difference of two medians.
-_PARTS = (
-    (ev.RESISTANCE, ev.RESISTANCE_CENTRES, LEAST_C_RR),
-    (ev.GRADE_EAST, ev.GRADE_CENTRES, 0.0),
-    (ev.GRADE_NORTH, ev.GRADE_CENTRES, 0.0),
-)
+
+@dataclass(frozen=True)
+class ChangeTuning:
+    """What is a change.
+
+    variation: least total variation of two histograms, 0 to 1. bins: least difference of their medians, in bins (22 %
+    of c_rr, 0.031 of gradient), as medians are no finer than one; c_rr: likewise on concrete, by what machines' zeros
+    are off by (from 0.023 on bins ask for more); sigmas: likewise, in the deviations that samples state, as a site has
+    hundreds of stretches. weight_m: least evidence on either side of a cut, as a sample's vote in a cell beside its own
+    is no pass. most: changes of one cell, in all that its pages remember. share: of a square of size_m that changed,
+    where all else in it is not known. alike_bins: kinds of ground nearer to each other are the same.
+    """
+
+    variation: float = 0.6
+    bins: float = 1.5
+    c_rr: float = 0.005
+    sigmas: float = 3.0
+    weight_m: float = 0.3
+    most: int = 4
+    share: float = 0.5
+    alike_bins: float = 1.0
+
+
+TUNING = ChangeTuning()
+_PARTS = (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH)
 
 
 @dataclass(frozen=True)
@@ -83,25 +92,25 @@ def _unchanged() -> Cuts:
 UNCHANGED = _unchanged()  # one for all blocks without a change, which are most: 8 KB each, kept with their pages
 
 
-def cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
+def cuts(pages: Sequence[TimedPage], config: ChangeConfig, tuning: ChangeTuning = TUNING) -> Cuts:
     """Find the last change in every cell of a block."""
     if len(pages) < 2 or not config.detect:
         return UNCHANGED
     last = _unchanged()
     votes_of_pages, ends = packed_votes(pages)
-    least, most = 0.1 * WEIGHT_M * ev.WEIGHT_UNITS_PER_M, min(ALIKE_BINS, BINS / 2)
-    for part, centres, least_step in _PARTS:
+    least, most = 0.1 * tuning.weight_m * ev.WEIGHT_UNITS_PER_M, min(tuning.alike_bins, tuning.bins / 2)
+    for part in _PARTS:
         cells = np.flatnonzero(differ(votes_of_pages, ends, part.start, part.stop, least, most))
         if not len(cells):
             continue
         votes = _histograms(votes_of_pages, ends, part, cells)
         left = np.arange(len(cells))
-        for _ in range(MOST_CHANGES):
+        for _ in range(tuning.most):
             first = last.first[cells[left]]
-            cut, kind, step = _best_cut(votes[:, :, left], first, centres, least_step)
+            cut, kind, step = _best_cut(votes[:, :, left], first, part, tuning)
             changed = cut > first
             if part == ev.RESISTANCE and changed.any():
-                changed[changed] = step[changed] > SIGMAS * _doubt(
+                changed[changed] = step[changed] > tuning.sigmas * _doubt(
                     pages, votes_of_pages, ends, cells[left[changed]], first[changed], cut[changed]
                 )
             left, cut, kind = left[changed], cut[changed], kind[changed]
@@ -133,18 +142,18 @@ class Known:
     until_ns: Floats
 
 
-def known(pages: Sequence[TimedPage]) -> Known:
+def known(pages: Sequence[TimedPage], tuning: ChangeTuning = TUNING) -> Known:
     """What is known of the cells (256,) of a block."""
     packed, ends = packed_votes(pages)
     span = ev.RESISTANCE.start, ev.RESISTANCE.stop
     weight = weights(packed, ends, *span) / ev.WEIGHT_UNITS_PER_M
     median = medians(sums(packed, *span) / ev.WEIGHT_UNITS_PER_M)
-    kind = np.where(weight.sum(axis=0) >= 2 * WEIGHT_M, median, np.nan)
-    begins_ns = _begins_ns(pages)
-    return Known(kind, _reached(weight, begins_ns), _reached(weight[::-1], begins_ns[::-1]))
+    kind = np.where(weight.sum(axis=0) >= 2 * tuning.weight_m, median, np.nan)
+    begins_ns, least_m = _begins_ns(pages), tuning.weight_m
+    return Known(kind, _reached(weight, begins_ns, least_m), _reached(weight[::-1], begins_ns[::-1], least_m))
 
 
-def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig) -> Bools:
+def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig, tuning: ChangeTuning = TUNING) -> Bools:
     """Changed cells (rows, columns) that are no position errors; all values are images.
 
     A wrong position moves the ground of one side of a border to the other. So a strip of changed cells counts where it
@@ -161,17 +170,17 @@ def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig) -
     whole = np.rint(np.where(changed, kind, np.nan))
     near, agrees = np.zeros((2, *changed.shape), np.bool_)
     for one in np.unique(whole[np.isfinite(whole)]):
-        alike = ~changed & (np.abs(cells.kind - one) <= ALIKE_BINS)
+        alike = ~changed & (np.abs(cells.kind - one) <= tuning.alike_bins)
         beside_ns = np.where(_opened(alike, edge), -np.inf, cells.from_ns)
         near |= (whole == one) & (_least(beside_ns, _opened(alike, -(-edge // 2)), 2 * edge) <= cuts_of.old_ns)
         agrees |= alike & _grown(whole == one, edge)
     new = changed & np.isfinite(kind) & ~near
     old_ns, new_ns = -_least(-cuts_of.old_ns, changed, edge), _least(cuts_of.new_ns, changed, edge)
     against = ~changed & ~agrees & (cells.from_ns <= old_ns) & (cells.until_ns >= new_ns)
-    believed = _opened(changed, 2 * edge) | _opened(new, edge) | _strips(new, ~changed & ~against, edge)
+    believed = _opened(changed, 2 * edge) | _opened(new, edge) | _strips(new, ~changed & ~against, edge, tuning.share)
     out, untouched = believed.copy(), changed & ~_grown(against, 1)
     for one in np.unique(whole[believed & np.isfinite(whole)]):
-        alike = untouched & (np.abs(kind - one) <= ALIKE_BINS)
+        alike = untouched & (np.abs(kind - one) <= tuning.alike_bins)
         part = alike & believed & (whole == one)
         for _ in range(2 * edge):  # not further: what a cell shows is to depend on blocks near it alone
             part = alike & _grown(part, 1)
@@ -190,11 +199,11 @@ def _begins_ns(pages: Sequence[TimedPage]) -> Floats:
     return np.array([float(timed.first_ns) for timed in pages])
 
 
-def _reached(weight: Floats, time_ns: Floats) -> Floats:
+def _reached(weight: Floats, time_ns: Floats, least_m: float) -> Floats:
     """Time (cells,) of the page at which a cell's votes (pages, cells), summed up, reach what a cut needs; or NaN."""
     if not len(weight):
         return np.full(weight.shape[1], np.nan)
-    enough = np.cumsum(weight, axis=0) >= WEIGHT_M
+    enough = np.cumsum(weight, axis=0) >= least_m
     return np.where(enough.any(axis=0), time_ns[enough.argmax(axis=0)], np.nan)
 
 
@@ -222,8 +231,8 @@ def _opened(cells: Bools, edge: int) -> Bools:
     return np.asarray(cv2.dilate(corners, square, anchor=(last, last), borderValue=0) > 0, np.bool_)
 
 
-def _strips(cells: Bools, unknown: Bools, edge: int) -> Bools:
-    """Those that lie in a square of `edge` cells which they cross from side to side, and half of which they are.
+def _strips(cells: Bools, unknown: Bools, edge: int, share: float) -> Bools:
+    """Those that lie in a square of `edge` cells which they cross from side to side, and a share of which they are.
 
     All others in it are unknown, as is what lies outside of the image.
     """
@@ -236,7 +245,7 @@ def _strips(cells: Bools, unknown: Bools, edge: int) -> Bools:
     square = np.ones((n, n), np.uint8)
     count = cv2.filter2D(some, cv2.CV_32F, square.astype(np.float32), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
     fits = cv2.erode(free.astype(np.uint8), square, anchor=(0, 0), borderValue=0) > 0
-    corners = fits & crossed & (np.asarray(count) >= LEAST_SHARE * n**2)
+    corners = fits & crossed & (np.asarray(count) >= share * n**2)
     opened = cv2.dilate(corners.astype(np.uint8), square, anchor=(last, last), borderValue=0) > 0
     return np.asarray(cells & opened[n:-n, n:-n])
 
@@ -251,16 +260,19 @@ def _histograms(votes: NDArray[np.uint64], ends: Ints, part: slice, cells: Ints)
     return metres
 
 
-def _best_cut(votes: Floats, first: Ints, centres: Floats, least_step: float) -> tuple[Ints, Floats, Floats]:
+def _best_cut(votes: Floats, first: Ints, part: slice, tuning: ChangeTuning) -> tuple[Ints, Floats, Floats]:
     """Index of the page (cells,) at which the ground changed, the given first page where it did not.
 
-    votes: (pages, bins, cells); pages before `first` do not count. centres (bins,): their values; medians differ by
-    least_step or more. Also returns the median (cells,) after it, in bins, and by what values the medians differ.
+    votes: (pages, bins, cells); pages before `first` do not count. Also returns the median (cells,) after it, in bins,
+    and by what values the medians differ.
     """
-    best, variation, before, after = likeliest_cuts(votes, first, WEIGHT_M)
+    best, variation, before, after = likeliest_cuts(votes, first, tuning.weight_m)
+    is_resistance = part == ev.RESISTANCE
+    centres = ev.RESISTANCE_CENTRES if is_resistance else ev.GRADE_CENTRES
     values_before, values_after = (np.interp(median, np.arange(len(centres)), centres) for median in (before, after))
     step = np.abs(values_before - values_after)
-    changed = (best > 0) & (variation > VARIATION) & (np.abs(before - after) >= BINS) & (step >= least_step)
+    changed = (best > 0) & (variation > tuning.variation) & (np.abs(before - after) >= tuning.bins)
+    changed &= step >= (tuning.c_rr if is_resistance else 0.0)
     return np.where(changed, best, first), after, step
 
 

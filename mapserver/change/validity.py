@@ -8,7 +8,17 @@ from typing import TypeVar
 
 import numpy as np
 
-from mapserver.change.detection import ChangeConfig, Cuts, Known, credible, cuts, known, reach_blocks
+from mapserver.change.detection import (
+    TUNING,
+    ChangeConfig,
+    ChangeTuning,
+    Cuts,
+    Known,
+    credible,
+    cuts,
+    known,
+    reach_blocks,
+)
 from mapserver.evidence.timeline import Block, TimedPage, TimedPages
 from protocol.arrays import AnyArray, Ints
 from protocol.site.geometry import BLOCK_CELLS
@@ -18,13 +28,15 @@ Ages = Mapping[Block, Ints]  # since when (256,) the ground of cells is as it is
 T = TypeVar("T")
 
 
-def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig, ages: Ages | None = None) -> dict[Block, Ints]:
+def valid_pages(
+    pages: Pages, cell_m: float, config: ChangeConfig, ages: Ages | None = None, tuning: ChangeTuning = TUNING
+) -> dict[Block, Ints]:
     """For each block, index (256,) of the first page that holds now in each of its cells, 0 where nothing changed.
 
     Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted. ages: what
     is known of changes beside that.
     """
-    last = {block: _cuts(block_pages, config) for block, block_pages in pages.items()}
+    last = {block: _cuts(block_pages, config, tuning) for block, block_pages in pages.items()}
     first = {block: last[block].first for block in pages}
     changed = [block for block in first if last[block].has_change]
     valid = dict(first)
@@ -32,8 +44,8 @@ def valid_pages(pages: Pages, cell_m: float, config: ChangeConfig, ages: Ages | 
     for some in clusters(changed, reach):
         near = {block for one in some for block in around(one, reach) if block in pages}
         images, corner = _images(Cuts, {block: last[block] for block in near})
-        cells, _ = _images(Known, {block: _known(pages[block]) for block in near})
-        holds = credible(images, cells, cell_m, config)
+        cells, _ = _images(Known, {block: _known(pages[block], tuning) for block in near})
+        holds = credible(images, cells, cell_m, config, tuning)
         for block in some:
             valid[block] = np.where(cells_of(holds, corner, block), first[block], 0)
     for block in (ages or {}).keys() & pages.keys():
@@ -68,14 +80,14 @@ def clusters(blocks: Iterable[Block], reach: int) -> list[list[Block]]:
     return parts
 
 
-def _cuts(pages: Sequence[TimedPage], config: ChangeConfig) -> Cuts:
+def _cuts(pages: Sequence[TimedPage], config: ChangeConfig, tuning: ChangeTuning) -> Cuts:
     """As `cuts`, found once for the same pages."""
-    return _derived(pages, config, lambda: cuts(pages, config))
+    return _derived(pages, (config, tuning), lambda: cuts(pages, config, tuning))
 
 
-def _known(pages: Sequence[TimedPage]) -> Known:
+def _known(pages: Sequence[TimedPage], tuning: ChangeTuning) -> Known:
     """As `known`, found once for the same pages."""
-    return _derived(pages, known, lambda: known(pages))
+    return _derived(pages, tuning, lambda: known(pages, tuning))
 
 
 def _derived(pages: Sequence[TimedPage], key: object, derive: Callable[[], T]) -> T:

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from mapserver.journal.rows import Admission, StoreIdentity
 from protocol.errors import MessageError, Refusal
 from protocol.site.site_config import SiteConfig
+from protocol.units import DAY_NS
 from protocol.wire import keys
 from protocol.wire.messages import SampleBatch
 
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
-DAY_NS = 86_400_000_000_000
 FUTURE_NS = DAY_NS  # clocks that nobody set to the right zone or day are less wrong than that
 FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01: a server's clock before this program was written is wrong
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from protocol.errors import QueryError, Refusal
 
 MOST_WAITING = 1000  # a few kB each
-RETRY_AFTER_S = 2.0
 Then = Callable[[QueryError | None], None]
 
 
@@ -43,7 +42,7 @@ class MergeWaits:
             if is_waiting := row > self._merged:
                 if len(self._waiting) >= MOST_WAITING:
                     problem = "too many queries wait for journal rows; ask again later"
-                    raise QueryError(Refusal.OVERLOADED, problem, RETRY_AFTER_S)
+                    raise QueryError(Refusal.OVERLOADED, problem, retry_after_s=2.0)
                 self._waiting.append(_Wait(row, wait_s, time.monotonic() + wait_s, then))
                 self._next_row = min(self._next_row, row)
                 self._news.notify()

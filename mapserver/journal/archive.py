@@ -24,11 +24,11 @@ from protocol.errors import StoreError
 from protocol.files import sync_folder, whole_file
 from protocol.machine.samples import COLUMNS, SAMPLE_DTYPE
 from protocol.site.site_config import SiteConfig
+from protocol.units import HOUR_NS
 
 FOLDER = "archive"  # in the folder of a store
 FILE_SAMPLES = 2_000_000  # about; an hour with more is cut into several files
 GROUP_SAMPLES = 50_000  # of a row group, about: a batch is never cut
-HOUR_NS = 3_600_000_000_000
 TEMPORARY = "next.parquet.tmp"
 READABLE = 0o640  # its files never change and are for other programs too: their users come into its owner's group
 ReceivedRow = tuple[JournalRow, int]  # and when it came in [ns]

@@ -16,6 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from mapserver import error_model
 from mapserver.evidence import cells as ev
 from mapserver.layers.gap_filling import AREA_LAYERS, Area
 from mapserver.layers.statistics import linear_count, ratio, robust_centre, robust_spread
@@ -28,11 +29,6 @@ LOG_STEP = math.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0])  # betw
 GRADE_STEP = float(ev.GRADE_CENTRES[1] - ev.GRADE_CENTRES[0])
 MAX_REACH_M = 50.0  # every window is widened by it, and its kernel has its square of cells
 SURE_AXIS = 0.2  # least length of the mean axis, 0 to 1, that is a preferred one
-# What all votes of a cell err in alike, so that more of them do not take it off (docs/layers.md): of c_rr, what is
-# left of zeros after calibration [-], and a share that the balance of forces misses; of the gradient, unevenness that
-# a machine bridges and sensors that lag [m/m], and how machines sit on slopes, as a share of the slope.
-ZERO_STD, MODEL_SHARE = 0.0015, 0.05
-UNEVEN_STD, SLOPE_SHARE = 0.0045, 0.05
 # The centre of the votes for c_rr is off by so much of what they differ by, however many there are.
 SPREAD_SHARE = 0.5
 # Votes for the class that leads less are mostly errors of places: shares to this power are right as often as they say.
@@ -111,7 +107,7 @@ def resistance_std(cells: CellEvidence) -> Floats:
     """Standard deviation of `resistance` [-]: half of what votes differ by, and what they err in alike."""
     c_rr = resistance(cells)
     spread = SPREAD_SHARE * c_rr * LOG_STEP * robust_spread(cells.votes(ev.RESISTANCE))
-    deviation: Floats = np.sqrt(spread**2 + ZERO_STD**2 + (MODEL_SHARE * c_rr) ** 2)
+    deviation: Floats = np.sqrt(spread**2 + error_model.resistance_variance(c_rr))
     return deviation
 
 
@@ -147,7 +143,7 @@ def grade_std(cells: CellEvidence) -> Floats:
     """Standard deviation of one component of the gradient [m/m], root mean square of the two, as `resistance_std`."""
     east, north = (robust_spread(cells.votes(part)) for part in (ev.GRADE_EAST, ev.GRADE_NORTH))
     spread = GRADE_STEP * np.hypot(east, north) / math.sqrt(2)
-    deviation: Floats = np.sqrt(spread**2 + UNEVEN_STD**2 + (SLOPE_SHARE * grade(cells)) ** 2)
+    deviation: Floats = np.sqrt(spread**2 + error_model.gradient_variance(grade(cells)))
     return deviation
 
 

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from mapserver.error_model import GRADE_PRIOR_STD, RESISTANCE_PRIOR_STD
 from protocol.arrays import Bools, Floats
 
-RESISTANCE_PRIOR_STD = 1.3  # of log(c_rr): anything between 0.004 and 0.4 is equally likely (log 100 / sqrt 12)
-GRADE_PRIOR_STD = 0.1  # of one component [m/m]
 PRIOR_M2 = 0.1  # the prior weighs as much as this area of sure ground right at the cell
 HALF_SURE_M = 1.0  # a cell with so many metres of evidence counts half: more do not describe the ground beside it
 # Less evidence than this [m2] is none: beyond 0.94 of the reach a single cell has no effect, and the filters' rounding

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-HOUR_NS = 3_600_000_000_000
-DAY_NS = 24 * HOUR_NS
+from protocol.units import DAY_NS, HOUR_NS
+
 GRACE_NS = 300 * 10**9  # after an hour's end, most of what machines still had of it has come in
 
 

@@ -27,7 +27,6 @@ READ_BYTES = 2**24  # layers of cells that one answer is made of, where larger c
 MOST_OPEN = 16  # regions that are read at the same time
 IDLE_S = 30.0  # a region of which nobody takes a piece for so long makes room; one piece takes 20 s at 300 kbit/s
 OPEN_S = 600.0  # ... and one that is open for so long, since its pages leave the grid one by one
-RETRY_AFTER_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -142,7 +141,7 @@ class OpenRegions:
                 read = next((cursor for cursor, one in self._open.items() if one.is_read), None)
                 if read is None:
                     problem = f"{len(self._open)} large regions are being read; ask again later, or for a smaller one"
-                    raise QueryError(Refusal.OVERLOADED, problem, RETRY_AFTER_S)
+                    raise QueryError(Refusal.OVERLOADED, problem, retry_after_s=2.0)
                 del self._open[read]
 
     def _is_full(self, past_blocks: int) -> bool:

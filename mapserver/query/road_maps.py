@@ -32,13 +32,14 @@ from mapserver.roads.passes import PassTally
 from mapserver.roads.repairs import Repair, ages, repairs
 from mapserver.roads.segments import SegmentTable, segments
 from mapserver.roads.skeleton import Pages, Skeletons
-from mapserver.roads.tally import HOUR_NS, Tally, between
+from mapserver.roads.tally import Tally, between
 from protocol.arrays import Ints, Table
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
+from protocol.units import HOUR_NS
 
 log = logging.getLogger("mapserver.query.road_maps")
 # How much older than a question its roads may be: a repair is seen after two or three passes, which take minutes, and a

@@ -13,13 +13,13 @@ from mapserver.roads.ledger import Ledger
 from mapserver.roads.loss import Losses, losses
 from mapserver.roads.repairs import Repair
 from mapserver.roads.segments import SegmentTable
-from mapserver.roads.tally import HOUR_NS
-from mapserver.roads.worklist import DAY_NS, Daily, daily, litres, ranked, seconds, trends
+from mapserver.roads.worklist import Daily, daily, litres, ranked, seconds, trends
 from protocol.arrays import Floats, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import roads as answers
 from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.site.geometry import Bounds
+from protocol.units import DAY_NS, HOUR_NS
 
 MOST_SEGMENTS = 10_000  # of one answer: 250 km of roads, 3 MB
 MOST_CHANGES = 1000  # of one worklist, the newest

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapserver.error_model import GAP_SHARE, NINETY, PASS_ALIKE_M, resistance_variance
 from mapserver.roads.ledger import Ledger, filled, mean, resistance
 from mapserver.roads.segments import SegmentTable
 from mapserver.roads.tally import PER_C, PER_M, squares_of
@@ -17,12 +18,6 @@ from protocol.arrays import Bools, Floats, Ints
 from protocol.units import GRAVITY_MPS2
 
 GUESSED_KG = 30_000.0  # of a machine where no sample states a mass: between a loader and a loaded truck
-SIGMA_90 = 1.645
-# Standard deviation of what is left of a machine's zero after calibration, and of c_rr that all machines share: the
-# balance of forces leaves out the wind and the tyres.
-ZERO_STD, MODEL_SHARE = 0.003, 0.06
-CORRELATED_M = 10.0  # errors of one pass are alike over so much of the way
-GAP_SHARE = 0.35  # of c_rr, by which a slice that nobody measured is off
 
 
 @dataclass(frozen=True)
@@ -77,8 +72,8 @@ def losses(ledger: Ledger, segments: SegmentTable, target: float, level: Floats 
         c_std=std,
         grade=mean(slope, ledger.ends),
         work_j=np.nan_to_num(work(none)),
-        low_j=np.nan_to_num(work(-SIGMA_90 * std)),
-        high_j=np.nan_to_num(work(SIGMA_90 * std)),
+        low_j=np.nan_to_num(work(-NINETY * std)),
+        high_j=np.nan_to_num(work(NINETY * std)),
         kg=segment_kg,
         guessed=guessed,
         unmeasured=mean(~measured, ledger.ends),
@@ -104,8 +99,7 @@ def _slope(ledger: Ledger, segments: SegmentTable, owner: Ints) -> Floats:
 def _std(ledger: Ledger) -> Floats:
     """Standard deviation (k,) of the mean c_rr of segments; NaN where nothing was measured.
 
-    Noise of single passes, as slices repeat it; what calibration leaves of the machines' zeros; what all share; and
-    slices that nobody measured.
+    Noise of single passes, as slices repeat it; what all passes err in alike; and slices that nobody measured.
     """
     measured = ledger.of_slices("measured").sum(axis=1)
     known = measured > 0
@@ -116,11 +110,9 @@ def _std(ledger: Ledger) -> Floats:
     count = np.maximum(np.add.reduceat(known, ledger.ends[:-1]), 1e-9) if len(known) else np.zeros(0)
     within = _by_segment(np.where(known, variance, 0.0), ledger.ends) / count
     driven_m = _by_segment(measured / PER_M, ledger.ends)
-    noise = within / np.maximum(driven_m / CORRELATED_M, 1.0)
-    totals = ledger.totals()
-    machines = np.bitwise_count(np.bitwise_or(totals["machines"][:, 0], totals["machines"][:, 1]))
+    noise = within / np.maximum(driven_m / PASS_ALIKE_M, 1.0)
     c_rr = mean(resistance(ledger), ledger.ends)
     gaps = 1 - count / np.diff(ledger.ends) if len(known) else count
     gap = gaps * GAP_SHARE * c_rr
-    std = np.sqrt(noise + ZERO_STD**2 / np.maximum(machines, 1) + (MODEL_SHARE * c_rr) ** 2 + gap**2)
+    std = np.sqrt(noise + resistance_variance(c_rr) + gap**2)
     return np.asarray(std, np.float64)

@@ -10,28 +10,44 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mapserver.error_model import PLACE_SHARE, PLACE_STD
 from mapserver.evidence.timeline import Block
 from mapserver.roads.passes import MINUTE_NS, Passes
 from mapserver.roads.segments import SegmentTable
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-BEFORE = 6  # passes, at least, that a segment is known by: of fewer, most machines have but one
-KNOWN_BY = 32  # passes, at most: the newest ones, as ground wears
-AGREE = (2, 3)  # passes in a row that show a change, at least and at most
-SIGMAS, SIGMAS_EACH = 5.0, 2.0  # of all of them together, and of each, they are from what is expected
-SHARE = 0.25  # of what is expected, on average
-# Standard deviation of passes before any were seen: what calibration leaves of a zero, and a share of c_rr; how many
-# passes this counts as beside those that were.
-ZERO, OWN_SHARE, PRIOR = 0.002, 0.05, 8
 HALF_WIDTH_M = 3.0  # of the strip that is driven, with the errors of positions; half the distance of two lanes
-LEAST_C = 0.001  # that shares are of
+
+
+class RepairTuning(NamedTuple):
+    """What a repair is; a tuple, as kernels take it.
+
+    least_known, most_known: passes before, of which the newest count, as ground wears. least_agree, most_agree: passes
+    in a row that show a change. sigmas, sigmas_each: how far they are from what is expected, together and each; share:
+    of what is expected, on average. place_std, place_share: of passes before any were seen, and how many passes that
+    counts as, prior.
+    """
+
+    least_known: int = 6
+    most_known: int = 32
+    least_agree: int = 2
+    most_agree: int = 3
+    sigmas: float = 5.0
+    sigmas_each: float = 2.0
+    share: float = 0.25
+    prior: int = 8
+    place_std: float = PLACE_STD
+    place_share: float = PLACE_SHARE
+
+
+TUNING = RepairTuning()
 
 
 @dataclass(frozen=True)
@@ -58,11 +74,11 @@ class Repair:
         return (self.seen + 1) * MINUTE_NS
 
 
-def repairs(passes: Passes) -> tuple[list[Repair], int]:
+def repairs(passes: Passes, tuning: RepairTuning = TUNING) -> tuple[list[Repair], int]:
     """All changes, and how many passes were looked at. After one, a segment is known by later passes alone."""
     out: list[Repair] = []
     bounds = np.flatnonzero(np.diff(passes.segment, prepend=-1, append=-1))
-    cuts, looks = _cuts(passes.c_rr, passes.machine, 2 * passes.machine + passes.direction, bounds)
+    cuts, looks = _cuts(passes.c_rr, passes.machine, 2 * passes.machine + passes.direction, bounds, tuning)
     for first, at, sure, end in cuts.tolist():
         before, after = (float(np.median(passes.c_rr[part])) for part in (slice(first, at), slice(at, end)))
         minute, seen = passes.minute[[at, sure]].tolist()
@@ -71,24 +87,24 @@ def repairs(passes: Passes) -> tuple[list[Repair], int]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _cuts(c_rr: Any, machine: Any, group: Any, bounds: Any) -> tuple[Any, int]:
+def _cuts(c_rr: Any, machine: Any, group: Any, bounds: Any, tuning: Any) -> tuple[Any, int]:
     """Of each change (n, 4): first pass before it, first after it, the one that showed it, end of all after.
 
     group: of passes that err alike, a machine in one direction. bounds: where the passes of each segment begin, and the
     end of all. Also how many passes were looked at.
     """
     cuts, count, looks = np.empty((len(c_rr), 4), np.int64), 0, 0
-    groups, means = np.empty((2, KNOWN_BY), np.int64), np.empty(KNOWN_BY)
+    groups, means = np.empty((2, tuning.most_known), np.int64), np.empty(tuning.most_known)
     for k in range(len(bounds) - 1):
         begin, first_cut = bounds[k], count
-        for at in range(bounds[k] + BEFORE, bounds[k + 1] - AGREE[0] + 1):
-            if at - begin < BEFORE:
+        for at in range(bounds[k] + tuning.least_known, bounds[k + 1] - tuning.least_agree + 1):
+            if at - begin < tuning.least_known:
                 continue
             looks += 1
-            first = max(begin, at - KNOWN_BY)
-            expected = _expected(c_rr[first:at], group[first:at], groups, means)
-            later = slice(at, min(at + AGREE[1], bounds[k + 1]))
-            for end in _differing(c_rr[later], group[later], expected, groups, means) + at:
+            first = max(begin, at - tuning.most_known)
+            expected = _expected(c_rr[first:at], group[first:at], groups, means, tuning)
+            later = slice(at, min(at + tuning.most_agree, bounds[k + 1]))
+            for end in _differing(c_rr[later], group[later], expected, groups, means, tuning) + at:
                 if _agree(machine[first:at], machine[at:end]):
                     cuts[count, 0], cuts[count, 1], cuts[count, 2] = begin, at, end - 1
                     count += 1
@@ -100,7 +116,7 @@ def _cuts(c_rr: Any, machine: Any, group: Any, bounds: Any) -> tuple[Any, int]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _expected(c_rr: Any, group: Any, groups: Any, means: Any) -> tuple[int, float, float, float]:
+def _expected(c_rr: Any, group: Any, groups: Any, means: Any, tuning: Any) -> tuple[int, float, float, float]:
     """What passes (n,) say of later ones: number of groups, level, and variances within groups and between them.
 
     Errors repeat: a machine has a zero of its own, and its estimate settles from the same side wherever ground changes
@@ -122,12 +138,13 @@ def _expected(c_rr: Any, group: Any, groups: Any, means: Any) -> tuple[int, floa
         within += step * (c_rr[i] - means[k])
     for k in range(count):
         between += (means[k] - level) ** 2
-    known = PRIOR * (ZERO**2 + (OWN_SHARE * level) ** 2)
-    return count, level, (known + within) / (PRIOR + len(c_rr) - count), (known + between) / (PRIOR + count - 1)
+    prior = tuning.prior
+    known = prior * (tuning.place_std**2 + (tuning.place_share * level) ** 2)
+    return count, level, (known + within) / (prior + len(c_rr) - count), (known + between) / (prior + count - 1)
 
 
 @numba.njit(cache=True, nogil=True)
-def _differing(c_rr: Any, group: Any, expected: tuple[int, float, float, float], groups: Any, means: Any) -> Any:
+def _differing(c_rr: Any, group: Any, expected: Any, groups: Any, means: Any, tuning: Any) -> Any:
     """How many of these passes, from the first on, differ alike from what is expected, beyond noise and by enough."""
     count, level, within, between = expected
     out, side, sigmas, share = np.zeros(len(c_rr), np.bool_), 0.0, 0.0, 0.0
@@ -141,11 +158,13 @@ def _differing(c_rr: Any, group: Any, expected: tuple[int, float, float, float],
         side = side or (1.0 if c_rr[i] > own else -1.0)
         off = side * (c_rr[i] - own)
         apart = off / np.sqrt(within + 1.0 / weight)
-        if apart < SIGMAS_EACH:
+        if apart < tuning.sigmas_each:
             break
-        sigmas, share = sigmas + apart, share + off / max(own, LEAST_C)
+        sigmas, share = sigmas + apart, share + off / max(own, 0.001)  # c_rr of no ground is less
         passes = i + 1
-        out[i] = passes >= AGREE[0] and sigmas > SIGMAS * np.sqrt(passes) and share > SHARE * passes
+        out[i] = (
+            passes >= tuning.least_agree and sigmas > tuning.sigmas * np.sqrt(passes) and share > tuning.share * passes
+        )
     return np.flatnonzero(out) + 1
 
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from mapserver.roads.cutting import LATTICE_M
 from protocol.arrays import Floats, Ints, Table
+from protocol.units import HOUR_NS
 
 CELL_M = LATTICE_M / 10  # so that cells end where segments do
-HOUR_NS = 3_600_000_000_000
 HOURS = 120  # with driving that are remembered; what is older is read from the journal
 SECTORS = 16  # of the direction of travel, the first one centred on east
 PER_M = 1000  # metres, and places in the cell

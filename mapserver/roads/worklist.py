@@ -9,16 +9,15 @@ import numpy as np
 
 from mapserver.roads.ledger import Ledger
 from mapserver.roads.loss import Losses
-from mapserver.roads.tally import HOUR_NS, PER_C
+from mapserver.roads.tally import PER_C
 from protocol.arrays import Floats, Ints
-from protocol.units import DIESEL_J_PER_L
+from protocol.units import DAY_NS, DIESEL_J_PER_L
 
 # Of a hauler at full power, over its mass: what work takes longer costs at this rate. Assumed; a loaded truck has 5, an
 # empty one 11.
 ENGINE_W_PER_KG = 6.0
 TIE_SHARE = 0.05  # of the highest loss: stretches that differ by less have the same rank
 TREND_DAYS = 3  # with measurements; fewer are weather
-DAY_NS = 24 * HOUR_NS
 
 
 class Ranked(NamedTuple):

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from mapserver.layers.gap_filling import RESISTANCE_PRIOR_STD
+from mapserver.error_model import RESISTANCE_PRIOR_STD
 from mapserver.routes.ground import Squares
 from protocol.arrays import AnyArray, Bools, Floats, Ints
 

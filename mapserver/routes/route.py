@@ -9,6 +9,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from mapserver.error_model import ALIKE_M, GAP_SHARE, NINETY, UNKNOWN_SHARE, UNKNOWN_SLOPE_STD, line_variance
 from mapserver.routes.drive import Drive, drive, smoothed
 from mapserver.routes.ground import Squares, Steps, limits, squares_at, steps
 from mapserver.routes.prices import EAST, NORTH, RESISTANCE, Prices
@@ -27,18 +28,9 @@ LAYERS = (
     "confidence",
 )
 STEP_M = 1.0  # of the drive; what is answered is of longer ones
-ALIKE_M = 25.0  # over so much way errors of the map are alike: positions, and what a machine's estimator lags behind
-COMMON_STD = 0.001  # what calibration leaves in the zeros of machines, the same everywhere [-]
-# Of the resistance along a whole line, as a share: scales of machines, and estimators that round off what changes. On
-# 13 drives of three recordings of the simulator, maps were off by 0.1 to 3.5 %, 2 % in the root mean square.
-COMMON_SHARE = 0.02
-UNKNOWN_STD = 0.5  # of the price of unknown ground, as a share of it
-UNMEASURED_STD = 0.25  # of that of ground that was driven on and not measured, beside what its two ends differ by
-UNKNOWN_SLOPE_STD = 0.05  # of its slope, which is taken for as even as the ground around lets it be [m/m]
 # What drives differ by though ground and machine are the same, as shares: drivers, other machines that cross. Found on
 # three recordings of the simulator, whose drives differed from those over the true map by 2 to 5 %, and by 1 to 2 %.
 ENERGY_STD, TIME_STD = 0.03, 0.015
-NINETY = 1.645  # standard deviations to each side that hold 90 %
 
 
 @dataclass(frozen=True)
@@ -77,14 +69,14 @@ def ground_along(squares: Squares, cut: Steps, prices: Prices) -> Ground:
     if unmeasured.any():
         between, differs = _between(resistance, measured)
         resistance = np.where(unmeasured, between, resistance)
-        std = np.where(unmeasured, np.hypot(UNMEASURED_STD * between, differs / 2), std)
+        std = np.where(unmeasured, np.hypot(GAP_SHARE * between, differs / 2), std)
     if (bare := unknown | ~driven).any():
         if prices.given is None and unknown.all() and not np.isfinite(squares.layers["resistance_filled"]).any():
             raise QueryError(Refusal.OUT_OF_RANGE, "nobody has driven near this line yet: say what `unknown` ground is")
         wanted = squares_at(cut.position_m[bare], squares.cell_m, squares.edge)
         of_bare = prices.squares(wanted).at(cut.position_m)
         price, even = of_bare[RESISTANCE], of_bare[EAST] * east + of_bare[NORTH] * north
-        std = np.where(unknown, UNKNOWN_STD * price, np.where(bare, np.hypot(std, price - resistance), std))
+        std = np.where(unknown, UNKNOWN_SHARE * price, np.where(bare, np.hypot(std, price - resistance), std))
         resistance, slope = np.where(bare, price, resistance), np.where(bare & np.isfinite(even), even, slope)
     slope_std = np.where(flat, UNKNOWN_SLOPE_STD, along["grade_filled_std"])
     # machines measure the force that both together take: a resistance is wrong by as much as a slope, the other way
@@ -110,14 +102,11 @@ def _between(resistance: Floats, measured: Bools) -> tuple[Floats, Floats]:
     return between, np.abs(behind - before)
 
 
-def mean_std(std: Floats, length_m: Floats) -> float:
-    """Deviation of the mean of values along steps (n,), whose errors are alike over ALIKE_M and partly everywhere.
-
-    Errors of two steps correlate by exp(-way between / ALIKE_M).
-    """
-    distance_m = float(length_m.sum())
-    weighted = std * length_m / distance_m
-    return math.sqrt(_correlated(weighted, np.exp(-length_m / ALIKE_M)) + COMMON_STD**2)
+def line_std(ground: Ground, length_m: Floats) -> float:
+    """Deviation of the mean of resistance and slope along steps; those of two are alike by exp(-way / ALIKE_M)."""
+    weighted = ground.sum_std * length_m / float(length_m.sum())
+    of_steps = _correlated(weighted, np.exp(-length_m / ALIKE_M))
+    return math.sqrt(of_steps + line_variance(float(ground.resistance.mean())))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -163,8 +152,7 @@ def route(
             f"the machine cannot climb at {x:.0f}, {y:.0f} m: resistance and slope make {climbs:.1f} % of its weight"
         )
         raise QueryError(Refusal.OUT_OF_RANGE, f"{problem}; more `power`, less `mass` or another line")
-    of_steps = mean_std(ground.sum_std, cut.length_m)
-    off = NINETY * math.hypot(of_steps, COMMON_SHARE * float(ground.resistance.mean()))
+    off = NINETY * line_std(ground, cut.length_m)
     low, high = (drive(cut.length_m, resistance + by, slope, limit, machine) for by in (-off, off))
     return _by_step(cut, ground, done, step_m), _totals(cut, ground, machine, done, (low, high))
 

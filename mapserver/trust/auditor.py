@@ -41,7 +41,6 @@ from protocol.queries.roads import WorklistQuery
 
 # Standard errors that are added to each limit: a vote may be doubtful where several are needed, a verdict may not.
 PAIR_SIGMAS, VERDICT_SIGMAS = 1.0, 2.0
-HOUR_S = 3600.0
 _PRINTED = {AGREE: "agrees_with", DISAGREE: "disagrees_with", UNKNOWN: "undecided_with"}
 
 Pairs = dict[tuple[str, str], dict[Reason, Judgement]]  # of the first of two machines
@@ -193,7 +192,7 @@ def _calibrated(state: MachineErrors | None, mass_kg: float) -> dict[str, Any]:
         values |= {"rolls": rolling.share, "rolls_std": rolling.std}
         known_by |= {"rolls_named": rolling.is_named}
         if mass_kg:
-            work_j = np.array(rolling.work_jpkgs * mass_kg * HOUR_S)
+            work_j = np.array(rolling.work_jpkgs * mass_kg * 3600.0)
             values["rolls_litres_ph"] = float(litres(work_j, WorklistQuery.efficiency))
     return {name: round(value, 5) for name, value in values.items()} | known_by
 

@@ -23,9 +23,9 @@ from mapserver.evidence.fold_config import is_foldable
 from mapserver.ingest.writer import Writer
 from mapserver.journal.rows import JournalRows, Selection
 from mapserver.past.past import StorePast
-from mapserver.past.plan import DAY_NS
 from protocol.errors import StoreError
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
+from protocol.units import DAY_NS
 
 SPAN_NS = 2 * DAY_NS  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
 AHEAD_NS = 600 * 10**9  # of the site's now: machines' clocks, and what is on its way, differ by less

@@ -63,6 +63,10 @@ LIMITS: dict[str, tuple[float, float]] = {
     "applied_scale": (-0.5, 0.5),
     "mass_kg": (1.0, 1e6),
 }
+# What machines differ by before any calibration, by data sheets, as machines and map server assume: standard deviations
+# of an accelerometer's zero over gravity (0.044 m/s2) and of the scale of drive force over weight; random walk of the
+# zero [1/sqrt(s)], by which it is as unsure as at first after an hour.
+ZERO_STD, SCALE_STD, ZERO_WALK = 0.0045, 0.045, 8e-5
 
 
 def empty(n: int = 0) -> Table:

@@ -20,7 +20,6 @@ from protocol.wire.fields import pack, take, unpack
 TILE_CELLS = 64
 AREA = TILE_CELLS * TILE_CELLS
 MAX_TILES = 100_000  # of one answer: a square of 20 km
-MAX_TILES_BYTES = 2**28
 Plane = NDArray[np.uint8]
 
 
@@ -129,7 +128,7 @@ def encode_tiles(answer: TilesAnswer) -> bytes:
 
 def decode_tiles(data: bytes) -> TilesAnswer:
     """Undo `encode_tiles`; refuses tiles whose planes are not those of PLANES."""
-    table = unpack(data, MAX_TILES_BYTES, MAX_TILES)
+    table = unpack(data, 2**28, MAX_TILES)
     if (names := take(table, "planes", list)) != list(PLANES):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{names!s:.80} are not {', '.join(PLANES)}", field="planes")
     tiles = tuple(_tile(row, index) for index, row in enumerate(take(table, "tiles", list)))

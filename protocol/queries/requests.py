@@ -23,7 +23,6 @@ from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 
 MAX_SPANS = 2000  # of one history
-MAX_SPAN_S = 1e9
 MAX_RESOLUTION_M = 1000.0
 WITHOUT_MEAN = ("heading", "resistance_class", "slope_class", "resistance_class_filled")  # layers, in larger cells
 X, Y = "east of the site's origin [m]", "north of it [m]"
@@ -127,7 +126,7 @@ class HistoryQuery(Fresh[answers.HistoryAnswer]):
     from_ns: int | None = asked(STAMP, "from", "samples from this time on", None)
     to_ns: int | None = asked(STAMP, "to", "samples up to this time; default the newest", None)
     span_s: float | None = asked(
-        number(1.0, MAX_SPAN_S, "s"), "span", "length of one span [s]; default that of a bucket, 5 minutes", None
+        number(1.0, 1e9, "s"), "span", "length of one span [s]; default that of a bucket, 5 minutes", None
     )
 
     name = "history"

@@ -38,8 +38,6 @@ from protocol.site.site_config import NAME
 MAX_LENGTH_M = 100_000.0
 MIN_STEP_M, MAX_STEP_M = 1.0, 10_000.0
 MAX_STEPS = 10_000
-MAX_GRADE = 1.0
-MAX_MARGIN_M = 100.0
 ENERGY, TIME = "energy", "time"
 DEAREST, REFUSE = "dearest", "refuse"  # of unknown ground: as dear as the dearest tenth around, uphill; or not at all
 
@@ -188,11 +186,9 @@ class WayQuery(LineQuery):
     start: Place = asked(PLACE, "from", "x,y [m]")
     end: Place = asked(PLACE, "to", "x,y [m]")
     cost: str = asked(choice({ENERGY: ENERGY, TIME: TIME}), "cost", "energy or time", ENERGY)
-    max_grade: float = asked(
-        number(0.0, MAX_GRADE, above=True), "max_grade", "steepest ground that it leads over [m/m]", 0.3
-    )
+    max_grade: float = asked(number(0.0, 1.0, above=True), "max_grade", "steepest ground that it leads over [m/m]", 0.3)
     margin_m: float = asked(
-        number(0.0, MAX_MARGIN_M, "m"), "margin", "from what it may not lead over, and from `avoid` [m]", 0.0
+        number(0.0, 100.0, "m"), "margin", "from what it may not lead over, and from `avoid` [m]", 0.0
     )
     avoid: tuple[Place, ...] = asked(places(), "avoid", "x,y,x,y,... [m], as parked machines", ())
 

@@ -18,7 +18,6 @@ from sim.simulator import Simulator
 DRIVE_S = 20.0  # simulated time after which the views are taken
 LEAST_PX, GAP_PX, CAPTION_PX = 1200, 14, 30
 WIDE, TALL = 0.66, 0.37  # the overview's share of the picture's width, and its height over that width
-CLOSEUPS = 2
 
 
 def draw(config: SimConfig, path: Path) -> list[Path]:
@@ -37,7 +36,7 @@ def draw(config: SimConfig, path: Path) -> list[Path]:
 
 def _views(simulator: Simulator, width: int) -> Image:
     """The whole site, and beside it a machine of each kind, in a strip of this width [px]."""
-    shown = _kinds(simulator.models)[:CLOSEUPS]
+    shown = _kinds(simulator.models)[:2]
     wide = round(WIDE * width)
     narrow, height = width - wide - GAP_PX, round(TALL * width)
     low = (height - (len(shown) - 1) * (CAPTION_PX + GAP_PX)) // len(shown)

@@ -22,7 +22,6 @@ from sitegrid.security.join import join
 
 HELP = "follow a site's journal and answer queries of its map, so that the server need not"
 EXTRA = "server"
-TEND_S = 0.5
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -59,7 +58,7 @@ def run(arguments: Namespace) -> int:
         journal = JournalLocation(arguments.store, arguments.journal)
         follower = opened.enter_context(closing(Follower(session, name, journal, site, config, time.time_ns)))
         is_ready = False
-        while not stop.wait(TEND_S):
+        while not stop.wait(0.5):
             if follower.ended:
                 raise LinkError(f"follower {name}", f"{follower.ended}; this one ends")
             follower.tend()

@@ -37,7 +37,6 @@ from sitegrid.security.register import ROUTER, Register, RegisterEntry, common_n
 from sitegrid.security.signing import make_signing_key
 
 AUTHORITY = "authority"
-AUTHORITY_DAYS = 3650
 EARLY = timedelta(minutes=10)  # valid from before now: the clocks of machines differ
 UNUSED = (
     "content_commitment",
@@ -54,7 +53,7 @@ def make_folder(folder: Path, site: str, now: datetime) -> None:
     _private_folder(folder)
     write_private(folder / ".gitignore", b"*\n")  # keys belong into no repository
     _private_folder(folder / AUTHORITY)
-    authority = make_authority(site, now, now + timedelta(days=AUTHORITY_DAYS))
+    authority = make_authority(site, now, now + timedelta(days=3650))
     write_private(folder / AUTHORITY / KEY_FILE, authority.key)
     write_private(folder / AUTHORITY / CERTIFICATE_FILE, authority.certificate)
 

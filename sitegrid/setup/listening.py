@@ -16,7 +16,6 @@ from agents.drivers.transports import Transport, open_transport, split_address, 
 from protocol.errors import ConfigError
 from sitegrid.setup.hearing import Ear, HeardLine
 
-POLL_S = 0.1
 MOST_FILE_BYTES = 1 << 22  # of a recording: an hour of a receiver
 
 
@@ -62,7 +61,7 @@ def _hear(transport: Transport, ear: Ear, seconds: float) -> str:
     end_s, is_greeted = time.monotonic() + max(seconds, TRY_S), False
     while (left_s := end_s - time.monotonic()) > 0:
         try:
-            data = transport.read(min(left_s, POLL_S))
+            data = transport.read(min(left_s, 0.1))
         except OSError as error:
             return error.strerror or str(error)
         if data is None or ear.n_bytes > MOST_FILE_BYTES:

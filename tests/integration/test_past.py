@@ -15,12 +15,12 @@ from mapserver.evidence.grid import Grid
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.rows import Admission
 from mapserver.journal.sqlite.journal import SqliteJournal
-from mapserver.past.plan import HOUR_NS
 from mapserver.query.views import read_cells, view_of
 from protocol.arrays import Table
 from protocol.config import toml_lines
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import SiteConfig
+from protocol.units import HOUR_NS
 from protocol.wire.messages import SampleBatch
 from protocol.wire.session import free_endpoint
 from sitegrid import connect

@@ -7,12 +7,14 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
+from protocol.units import DAY_NS
+
 TIME = "time"  # stream of messages that show the time alone, as early as it can be known
 FIX, VELOCITY, HEADING, IMU, WHEELS = "fix", "velocity", "heading", "imu", "wheels"
 # Kinds of the readings that they make.
 STREAMS = {FIX: "gps", VELOCITY: "gps_velocity", HEADING: "attitude", IMU: "imu", WHEELS: "encoder"}
 NO_TILT_RAD2 = 100.0  # roll and pitch of a heading: the highest variance that a reading may have
-WEEK_NS = 7 * 86_400 * 10**9
+WEEK_NS = 7 * DAY_NS
 # A receiver counts weeks in 10 bits, so an old one states a time 1024 weeks ago, or twice that: before 2019-04-07, when
 # the count began again last. This holds until 2038-11.
 EARLIEST_NS = 1_554_595_200 * 10**9

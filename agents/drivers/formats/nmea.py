@@ -10,10 +10,9 @@ from datetime import UTC, datetime
 
 from agents.drivers import formats
 from agents.drivers.formats import Message
-from protocol.units import ddmm_deg, factor
+from protocol.units import DAY_NS, ddmm_deg, factor
 
 SENTENCES = frozenset(("RMC", "ZDA", "GGA", "GST", "VTG", "HDT", "THS"))  # a method of the receiver each
-DAY_NS = 86_400 * 10**9
 # By GGA's quality: its name, and the error of a range [m], which HDOP turns into a position's where no GST states it.
 QUALITIES = {1: ("autonomous", 3.0), 2: ("differential", 1.5), 4: ("fixed", 0.02), 5: ("float", 0.3)}
 KNOT_MPS = factor("kn", "speed_mps")

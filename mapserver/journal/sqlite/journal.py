@@ -31,7 +31,6 @@ from protocol.disk.high_water_mark import HighWaterMark, Traces, look_beside, ma
 from protocol.errors import StoreError
 from protocol.files import make_private
 
-_WAL_LIMIT = 64 * 2**20
 SPARE = 0.25  # share of free pages above which a file is made smaller
 
 
@@ -54,7 +53,7 @@ class SqliteJournal(TableWriter, SqliteQueries):
                 self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")  # only a new file takes it
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
-                self._db.execute(f"PRAGMA journal_size_limit={_WAL_LIMIT}")
+                self._db.execute(f"PRAGMA journal_size_limit={64 * 2**20}")
                 self._create_or_check(site, frame, descends)
                 self._row = super().last_row
                 self.check()

@@ -15,6 +15,7 @@ from agents.estimation.calibration import Calibration
 from agents.estimation.ground import EstimationConfig, GroundEstimate, GroundEstimator
 from agents.estimation.resistance_kalman import KalmanResistance
 from agents.estimation.resistance_rls import RecursiveResistance
+from agents.estimation.tuning import TUNING, EstimationTuning
 from agents.localisation.filters.belief import PoseBelief
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
@@ -76,11 +77,12 @@ class EstimatorRun:
         config: EstimationConfig | None = None,
         *,
         calibration: Calibration | None = None,
+        tuning: EstimationTuning = TUNING,
         known_c_rr: float | None = None,
         knows_place: bool = False,
     ) -> None:
         """knows_place: by dead reckoning."""
-        self.estimator = GroundEstimator(machine, config or EstimationConfig(), calibration)
+        self.estimator = GroundEstimator(machine, config or EstimationConfig(), calibration, tuning)
         self.dead_reckoning = DeadReckoning(machine, 0.0)
         self.estimates: list[tuple[int, GroundEstimate]] = []
         self._machine, self._known_c_rr = machine, known_c_rr

@@ -18,13 +18,14 @@ import pytest
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal import archived_decisions
-from mapserver.journal.archive import FOLDER, HOUR_NS, archive
+from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.history import History, history_rows
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.trust.decisions import PERSON, TrustDecision
 from protocol.arrays import Table
 from protocol.disk.high_water_mark import HighWaterMark, mark_path
 from protocol.site.site_config import SiteConfig, site_toml
+from protocol.units import HOUR_NS
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.backup import _making

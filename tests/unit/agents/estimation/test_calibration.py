@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from agents.dead_reckoning import DeadReckonedPose, DeadReckoning
-from agents.estimation import calibration as module
 from agents.estimation.balance import Balance
-from agents.estimation.calibration import FLOOR, SCALE_STD, STRETCH_STD, ZERO_STD, ZERO_WALK, Calibration, Calibrator
+from agents.estimation.calibration import Calibration, Calibrator
 from agents.estimation.calibration_file import _checksum, load, save
 from agents.estimation.closed_tours import Tour
 from agents.estimation.ground import EstimationConfig
 from agents.estimation.offers import AHEAD_NS, TOO_OLD_NS, Offers, intersected
+from agents.estimation.tuning import TUNING, EstimationTuning
 from protocol.errors import StoreError
-from protocol.machine.samples import LIMITS
+from protocol.machine.samples import LIMITS, SCALE_STD, ZERO_STD, ZERO_WALK
 from protocol.wire.codec import encode_offer
 from protocol.wire.messages import CalibrationOffer
 from tests.unit.agents.drives import START_NS, VEHICLE, Leg, drive
@@ -102,8 +102,8 @@ class Course:
         )
 
 
-def course(calibration: Calibration | None = None, **options: object) -> Course:
-    return Course(Calibrator(calibration), **options)  # type: ignore[arg-type]
+def course(calibration: Calibration | None = None, tuning: EstimationTuning = TUNING, **options: object) -> Course:
+    return Course(Calibrator(calibration, tuning), **options)  # type: ignore[arg-type]
 
 
 # --- there and back --------------------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ def test_what_is_the_same_ground(change: dict[str, float], pairs: bool) -> None:
 def test_pairs_beyond_three_standard_deviations_are_excluded() -> None:
     """Those of the zero are 0.0045, of the mean of two stretches 0.008 / sqrt(2)."""
     for sigmas, excluded in ((3.3, True), (2.7, False)):
-        on = course(zero=sigmas * math.hypot(ZERO_STD, STRETCH_STD / math.sqrt(2)))
+        on = course(zero=sigmas * math.hypot(ZERO_STD, TUNING.stretch_std / math.sqrt(2)))
         on.there_and_back(1)
         assert bool(on.calibrator.counters["off"]) is excluded
 
@@ -186,7 +186,7 @@ def test_a_zero_far_beyond_its_class_is_found_in_the_end() -> None:
     on = course(zero=0.03, noise=NOISE, seed=5)
     on.there_and_back(40, 6)
     assert on.calibrator.counters["relocked"] >= 1
-    assert on.calibrator.counters["off"] >= module.RELOCK
+    assert on.calibrator.counters["off"] >= TUNING.relock
     assert on.calibrator.calibration.zero == pytest.approx(0.03, abs=0.003)
 
 
@@ -201,19 +201,18 @@ def test_known_ground_on_a_slope_counts_with_its_cosine_in_both_directions() -> 
 # --- how sure it is --------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def no_floor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "FLOOR", 1e-12)
+NO_FLOOR = replace(TUNING, floor=1e-12)
 
 
-@pytest.mark.usefixtures("no_floor")
 def test_covariance_is_honest() -> None:
     """Rms of normalised errors over drives with zero and scale as they are assumed to be."""
     errors = []
     for seed in range(25):
         rng = np.random.default_rng(1000 + seed)
         zero, scale = ZERO_STD * rng.standard_normal(), SCALE_STD * rng.standard_normal()
-        on = course(zero=zero, scale=scale, slope=lambda x: 0.2 if x > 10 else 0.0, noise=NOISE, seed=seed)
+        on = course(
+            tuning=NO_FLOOR, zero=zero, scale=scale, slope=lambda x: 0.2 if x > 10 else 0.0, noise=NOISE, seed=seed
+        )
         on.there_and_back(20, 2)
         c = on.calibrator.calibration
         off_zero, off_scale = c.zero - zero, c.scale - scale
@@ -228,19 +227,18 @@ def test_no_number_of_pairs_gets_below_the_floor() -> None:
     on = course(slope=lambda x: 0.2 if x > 10 else 0.0)
     on.there_and_back(20, 40)
     (zz, _), (_, ss) = on.calibrator.calibration.covariance
-    assert math.sqrt(zz) == pytest.approx(FLOOR)
-    assert math.sqrt(ss) == pytest.approx(10 * FLOOR)
+    assert math.sqrt(zz) == pytest.approx(TUNING.floor)
+    assert math.sqrt(ss) == pytest.approx(10 * TUNING.floor)
 
 
 def given(age_s: float = 0.0) -> Calibration:
     return Calibration(0.005, 0.01, ((1e-6, 0.0), (0.0, 1e-4)), START_NS - round(age_s * 1e9), 50)
 
 
-@pytest.mark.usefixtures("no_floor")
 @pytest.mark.parametrize(("age_s", "std"), [(0.0, 1e-3), (400.0, math.hypot(1e-3, 1.6e-3)), (1e7, 4.5e-3)])
 def test_zero_grows_unsure_as_time_passes_but_never_more_than_at_first(age_s: float, std: float) -> None:
     """Its random walk is 8e-5 per root of a second; the scale stays."""
-    calibrator = Calibrator(given(age_s))
+    calibrator = Calibrator(given(age_s), NO_FLOOR)
     calibrator.age(START_NS)
     (zz, _), (_, ss) = calibrator.calibration.covariance
     assert math.sqrt(zz) == pytest.approx(std, rel=1e-3)
@@ -267,12 +265,12 @@ def test_a_tour_is_one_measurement_of_the_zero() -> None:
 
 def test_one_tour_that_is_far_off_is_excluded_and_three_that_agree_are_right() -> None:
     calibrator = Calibrator()
-    for i in range(module.RELOCK_TOURS):
+    for i in range(TUNING.relock_tours):
         assert abs(calibrator.calibration.zero) < 1e-12
         calibrator.add_tour(tour(0.03, 90.0 * i))
     calibrator.add_tour(tour(0.03, 300.0))
     assert calibrator.calibration.zero == pytest.approx(0.03, abs=1e-3)
-    assert (calibrator.counters["off"], calibrator.counters["relocked"]) == (module.RELOCK_TOURS, 1)
+    assert (calibrator.counters["off"], calibrator.counters["relocked"]) == (TUNING.relock_tours, 1)
 
 
 def test_what_is_applied_can_be_stated_in_a_sample() -> None:
@@ -341,8 +339,8 @@ def test_an_offer_is_no_surer_than_the_floor_and_grows_unsure_with_its_age() -> 
         calibrator = own()
         calibrator.take(replace(OFFER, zero_var=1e-9, scale_var=1e-7, covariance=0.0), START_NS + round(age_s * 1e9))
         (zz, _), (_, ss) = calibrator.calibration.covariance
-        assert zz == pytest.approx(FLOOR**2 + ZERO_WALK**2 * age_s, rel=1e-6)
-        assert ss == pytest.approx((10 * FLOOR) ** 2, rel=1e-6)
+        assert zz == pytest.approx(TUNING.floor**2 + ZERO_WALK**2 * age_s, rel=1e-6)
+        assert ss == pytest.approx((10 * TUNING.floor) ** 2, rel=1e-6)
 
 
 def test_what_is_offered_again_and_again_shows_nothing_new() -> None:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.estimation import ground
-from agents.estimation.calibration import SCALE_STD, ZERO_STD, Calibration
+from agents.estimation.calibration import Calibration
 from agents.estimation.ground import ESTIMATORS, NOTHING_KNOWN, EstimationConfig, GroundEstimate
+from agents.estimation.tuning import TUNING
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import Imu, Reading, Torque
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 from protocol.units import GRAVITY_MPS2
 from tests.unit.agents.drives import START_NS, VEHICLE, Drive, Ground, Leg, drive, machine, noisy, thinned
 from tests.unit.agents.ground import EstimatorRun
@@ -62,7 +63,7 @@ def test_estimates_state_the_mass_as_it_is_weighed(mass: str, stated_kg: float) 
 # --- how sure it is --------------------------------------------------------------------------------------------------
 
 
-def test_variance_has_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variance_has_its_parts() -> None:
     """That of the model, of zero and of scale, beside the filter's."""
     made = drive(FORWARDS, VEHICLE)
     base = last_estimate(VEHICLE, made).c_rr_var
@@ -73,8 +74,8 @@ def test_variance_has_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
         vague = Calibration(0.0, 0.0, ((zero_std**2, 0.0), (0.0, scale_std**2)))
         run = EstimatorRun(VEHICLE, EstimationConfig(), calibration=vague).feed(made.readings)
         assert run.last.c_rr_var - base == pytest.approx(more, rel=1e-3)
-    monkeypatch.setattr(ground, "MODEL_STD", 0.01)
-    assert last_estimate(VEHICLE, made).c_rr_var - base == pytest.approx(0.01**2 - 0.0015**2)
+    run = EstimatorRun(VEHICLE, tuning=replace(TUNING, model_std=0.01)).feed(made.readings)
+    assert run.last.c_rr_var - base == pytest.approx(0.01**2 - 0.0015**2)
 
 
 @pytest.mark.slow

@@ -2,45 +2,28 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from agents.estimation import borders as border_search
-from agents.estimation import resistance_kalman
 from agents.estimation.balance import BalanceStep
-from agents.estimation.borders import COLOURED, FIRST_C_RR, FIRST_STD, JUMP_STD, MOST, UNEVEN, BorderSearch
-from agents.estimation.resistance_kalman import NOISE, KalmanResistance
+from agents.estimation.borders import MOST, BorderSearch
+from agents.estimation.resistance_kalman import KEPT, KalmanResistance
+from agents.estimation.tuning import TUNING, EstimationTuning
 from protocol.arrays import Floats
 from tests.unit.agents.drives import START_NS
 from tests.unit.agents.ground import STEP_S, feed, level_steps, white_noise
 
 QUIET = 0.002  # half of the noise that is assumed at least: none is measured beyond it
-NO_BORDERS = {"BORDERS_PER_M": 1e-300}
-STILL = {"WALK": 1e-9, **NO_BORDERS}  # a ground that does not change
+NO_BORDERS = replace(TUNING, borders_per_m=1e-300)
+STILL = replace(NO_BORDERS, walk=1e-9)  # a ground that does not change
 STEP_NS = round(STEP_S * 1e9)
 
-Tune = Callable[..., None]
 
-
-@pytest.fixture
-def tune(monkeypatch: pytest.MonkeyPatch) -> Tune:
-    """Changes constants of the filter, and of the search for borders."""
-
-    def change(**constants: float) -> None:
-        for name, value in constants.items():
-            homes = [module for module in (resistance_kalman, border_search) if hasattr(module, name)]
-            assert homes, name
-            for module in homes:
-                monkeypatch.setattr(module, name, value)
-
-    return change
-
-
-def fed(raw: Iterable[float]) -> KalmanResistance:
-    kalman = KalmanResistance()
+def fed(raw: Iterable[float], tuning: EstimationTuning = TUNING) -> KalmanResistance:
+    kalman = KalmanResistance(tuning=tuning)
     feed(kalman, level_steps(raw))
     return kalman
 
@@ -66,17 +49,17 @@ def scale_of(kalman: KalmanResistance) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(("border", "wheelbase_m"), [(12, 0.0), (None, 0.5), (12, 0.5)])
-def test_smoother_is_the_joint_gaussian(tune: Tune, border: int | None, wheelbase_m: float) -> None:
+def test_smoother_is_the_joint_gaussian(border: int | None, wheelbase_m: float) -> None:
     """All states at once: c_rr walks, jumps where a border is; a step sees the ground of both axles."""
     seed, n = 2, 30
     rng = np.random.default_rng(seed)
-    tune(WALK=0.02, JUMP_STD=0.08, **NO_BORDERS)
-    kalman = KalmanResistance()
+    tuning = replace(NO_BORDERS, walk=0.02, unknown_std=0.08)
+    kalman = KalmanResistance(tuning=tuning)
     raw = 0.05 + np.cumsum(0.003 * rng.standard_normal(n)) + white_noise(QUIET, n, rng)
     feed(kalman, [replace(s, lead_share=0.6, wheelbase_m=wheelbase_m, lead_m=0.2) for s in level_steps(raw)])
     if border:
         kalman._set_borders({border + 1})
-    x, P = joint(raw, border, wheelbase_m)
+    x, P = joint(raw, border, tuning, wheelbase_m)
     for index in range(n):
         centre = index
         if border and wheelbase_m and 0 <= index - border < 2:  # 0.2 m ahead of it: the load centre has not come up
@@ -84,22 +67,22 @@ def test_smoother_is_the_joint_gaussian(tune: Tune, border: int | None, wheelbas
         assert at_step(kalman, index) == pytest.approx((x[centre], P[centre, centre]), rel=1e-3), f"{seed=} {index=}"
 
 
-def joint(raw: Floats, border: int | None, wheelbase_m: float = 0.0) -> tuple[Floats, Floats]:
+def joint(raw: Floats, border: int | None, tuning: EstimationTuning, wheelbase_m: float = 0.0) -> tuple[Floats, Floats]:
     """Posterior mean (n,) and covariance (n, n) of c_rr under the leading axle at all steps."""
     n = len(raw)
-    walk = resistance_kalman.WALK**2 * 2.0 * STEP_S
-    mean, variance = np.full(n, FIRST_C_RR), FIRST_STD**2 + walk * np.arange(1, n + 1)
+    walk = tuning.walk**2 * 2.0 * STEP_S
+    mean, variance = np.full(n, tuning.first_c_rr), tuning.unknown_std**2 + walk * np.arange(1, n + 1)
     new = np.zeros(n, bool)
     if border is not None:  # what was known before is forgotten but for the value
         new[border:] = True
-        mean[border:] = joint(raw[:border], None)[0][-1]
-        variance[border:] = border_search.JUMP_STD**2 + walk * np.arange(1, n - border + 1)
+        mean[border:] = joint(raw[:border], None, tuning)[0][-1]
+        variance[border:] = tuning.unknown_std**2 + walk * np.arange(1, n - border + 1)
     prior = np.where(new[:, None] == new, np.minimum(variance[:, None], variance), 0.0)
     H = np.eye(n)
     if border is not None and wheelbase_m:
         for i in range(border, border + round(wheelbase_m / 0.1)):  # until the trailing axle has come up
             H[i, i], H[i, border - 1] = 0.6, 0.4
-    gain = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + NOISE**2 / STEP_S * np.eye(n))
+    gain = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + tuning.noise**2 / STEP_S * np.eye(n))
     return mean + gain @ (raw - H @ mean), prior - gain @ H @ prior
 
 
@@ -107,13 +90,12 @@ def joint(raw: Floats, border: int | None, wheelbase_m: float = 0.0) -> tuple[Fl
 
 
 @pytest.mark.slow
-def test_border_is_dated_to_where_it_began(tune: Tune) -> None:
-    tune(NOISE=0.002)
+def test_border_is_dated_to_where_it_began() -> None:
     before, step, is_dated = 100, -0.02, []
     for seed in range(6):
         rng = np.random.default_rng(seed)
         raw = 0.05 + np.where(np.arange(before + 50) < before, 0.0, step) + white_noise(0.002, before + 50, rng)
-        kalman = fed(raw)
+        kalman = fed(raw, replace(TUNING, noise=0.002))
         is_dated.append(nearest_border(kalman, before) <= 2)
         assert len(borders(kalman)) == 1, f"{seed=}"
     assert sum(is_dated) >= 5
@@ -175,14 +157,13 @@ def test_back_across_a_border_half_crossed() -> None:
     assert kalman.at(home[-1].stamp_ns)[0] == pytest.approx(0.03, abs=0.01)
 
 
-def test_memory_is_bounded_and_answers_stay_right(tune: Tune) -> None:
-    tune(**STILL)
+def test_memory_is_bounded_and_answers_stay_right() -> None:
     rng = np.random.default_rng(8)
     raw = 0.05 + white_noise(QUIET, 3000, rng)
-    kalman, recent = KalmanResistance(), KalmanResistance()
+    kalman, recent = KalmanResistance(tuning=STILL), KalmanResistance(tuning=STILL)
     steps = level_steps(raw)
     feed(kalman, steps)
-    assert len(kalman._steps) <= 2 * resistance_kalman.KEPT
+    assert len(kalman._steps) <= 2 * KEPT
     assert at_step(kalman, 2999)[0] == pytest.approx(raw.mean(), abs=1e-6)
     assert at_step(kalman, 2999)[1] == pytest.approx(0.004**2 / (3000 * STEP_S), rel=1e-3)
     assert at_step(kalman, 2910)[0] == pytest.approx(raw.mean(), abs=1e-6)
@@ -235,7 +216,7 @@ def test_load_that_changes_at_a_stop_is_found_again() -> None:
 @pytest.mark.parametrize("steps", [30, 230])
 def test_recalibrated_is_as_if_all_steps_had_had_the_new_calibration(steps: int) -> None:
     rng = np.random.default_rng(3)
-    raw = np.where(np.arange(300) < steps - 20, 0.04, 0.1) + white_noise(NOISE, 300, rng)
+    raw = np.where(np.arange(300) < steps - 20, 0.04, 0.1) + white_noise(TUNING.noise, 300, rng)
     changed = fed(raw[:steps])
     before = borders(changed)
     assert before
@@ -245,7 +226,7 @@ def test_recalibrated_is_as_if_all_steps_had_had_the_new_calibration(steps: int)
     feed(changed, level_steps(new)[steps:])
     always = fed(new)
     assert borders(changed) == borders(always)
-    for index in range(max(250 - resistance_kalman.KEPT, 20), 300, 7):
+    for index in range(max(250 - KEPT, 20), 300, 7):
         assert at_step(changed, index) == pytest.approx(at_step(always, index), abs=3e-5)
 
 
@@ -256,7 +237,7 @@ def test_a_change_of_the_calibration_soon_after_a_turn_is_no_border() -> None:
     reverse, zero = 20, 0.01
     n = 300 + reverse + 100
     direction = np.where(np.arange(n) < 300, 1.0, -1.0)
-    raw = direction * 0.04 + zero + white_noise(NOISE, n, rng)
+    raw = direction * 0.04 + zero + white_noise(TUNING.noise, n, rng)
     steps = [replace(s, regressor=d, raw=r) for s, d, r in zip(level_steps(raw), direction, raw, strict=True)]
     kalman = KalmanResistance()
     feed(kalman, steps[: 300 + reverse])
@@ -273,36 +254,37 @@ R = WHITE**2 / STEP_S
 STEP_M = 0.1
 
 
-def borders_after(steps: Sequence[BalanceStep], remembered: int = 200) -> list[tuple[int, ...]]:
+def borders_after(
+    steps: Sequence[BalanceStep], remembered: int = 200, tuning: EstimationTuning = TUNING
+) -> list[tuple[int, ...]]:
     """The borders after each step, by its index."""
-    search = BorderSearch(remembered)
+    search = BorderSearch(remembered, tuning)
     return [search.update(index, step, step.raw, R) for index, step in enumerate(steps)]
 
 
 def evidence(raw: Floats, history: Sequence[int]) -> float:
     """How likely raw values (n,) of one axle are, in logarithms, with borders before these: Gaussians, part by part."""
-    total, mean, first_var = 0.0, FIRST_C_RR, FIRST_STD**2
+    total, mean, first_var = 0.0, TUNING.first_c_rr, TUNING.unknown_std**2
     for begin, end in itertools.pairwise([0, *history, len(raw)]):
-        part, walked = raw[begin:end], np.arange(1, end - begin + 1) * UNEVEN**2 * STEP_M
+        part, walked = raw[begin:end], np.arange(1, end - begin + 1) * TUNING.uneven**2 * STEP_M
         prior = first_var + np.minimum(walked[:, None], walked)
-        covariance = prior + COLOURED * R * np.eye(len(part))
+        covariance = prior + TUNING.coloured * R * np.eye(len(part))
         off = part - mean
         solved = np.linalg.solve(covariance, off)
         total -= 0.5 * (off @ solved + np.linalg.slogdet(covariance)[1])
-        mean, first_var = mean + float(prior[-1] @ solved), JUMP_STD**2
-    return total + len(history) * math.log(math.expm1(border_search.BORDERS_PER_M * STEP_M))
+        mean, first_var = mean + float(prior[-1] @ solved), TUNING.unknown_std**2
+    return total + len(history) * math.log(math.expm1(TUNING.borders_per_m * STEP_M))
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_no_history_is_likelier_than_the_one_that_is_found(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+def test_no_history_is_likelier_than_the_one_that_is_found(seed: int) -> None:
     """All with two borders at most. A border is known by what is behind it, so the last steps have none."""
-    monkeypatch.setattr(border_search, "LIKELY", 1e12)
     rng = np.random.default_rng(seed)
     levels = rng.choice([0.02, 0.06, 0.1, 0.25], 3, replace=False)
     raw = levels[np.minimum(np.arange(30) // 10, 2)] + white_noise(WHITE, 30, rng)
     histories = [h for count in range(3) for h in itertools.combinations(range(1, 30), count)]
     likeliest = max(histories, key=lambda history: evidence(raw, history))
-    assert borders_after(level_steps(raw))[-1] == likeliest
+    assert borders_after(level_steps(raw), tuning=replace(TUNING, likely=1e12))[-1] == likeliest
 
 
 def test_one_ground_has_no_border_and_a_jolt_is_none() -> None:

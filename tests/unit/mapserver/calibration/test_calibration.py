@@ -25,8 +25,9 @@ from mapserver.calibration.decide import differs
 from mapserver.calibration.ledger import EPOCH_NS, EPOCHS, newest
 from mapserver.calibration.passages import passages
 from mapserver.calibration.select import FAULT_SIGMAS, MachineErrors, state_of
-from mapserver.calibration.solver import SCALE_STD, ZERO_STD, known_cells
+from mapserver.calibration.solver import known_cells
 from protocol.arrays import Floats, Table
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 from protocol.site.site_config import KnownGround
 from tests.unit.mapserver.calibration.drives import (
     FOOT_M,

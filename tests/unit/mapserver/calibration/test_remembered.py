@@ -14,8 +14,8 @@ from mapserver.calibration.decide import EVERY_NS, CalibrationDecisions
 from mapserver.calibration.decision import SOLVER, CalibrationDecision
 from mapserver.calibration.ledger import EPOCH_NS, StayLedger, newest, stated
 from mapserver.calibration.select import REMEMBERED_STD, remembered_of
-from mapserver.calibration.solver import SCALE_STD, ZERO_STD
 from protocol.arrays import Floats, Table
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 from tests.unit.mapserver.calibration.drives import (
     FOOT_M,
     LOW,

@@ -5,11 +5,7 @@ import numpy as np
 import pytest
 
 from mapserver.change.detection import (
-    BINS,
-    MACHINE_SHARE,
-    SIGMAS,
-    VARIATION,
-    WEIGHT_M,
+    TUNING,
     ChangeConfig,
     Cuts,
     Known,
@@ -19,6 +15,7 @@ from mapserver.change.detection import (
     reach_blocks,
 )
 from mapserver.change.kernels import differ, likeliest_cuts, medians, sums
+from mapserver.error_model import MACHINE_SHARE
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
@@ -78,7 +75,7 @@ def test_the_kind_of_a_change_is_the_ground_after_it():
 
 
 def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for_a_cut():
-    enough, little = {0.04: WEIGHT_M + 0.02}, {0.04: 0.6 * WEIGHT_M}
+    enough, little = {0.04: TUNING.weight_m + 0.02}, {0.04: 0.6 * TUNING.weight_m}
     for grounds, first, last in (
         ((enough, enough, enough), 0, 2),
         ((little, enough, little), 1, 1),
@@ -95,8 +92,8 @@ def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for
 
 def test_medians_nearer_than_bins_are_no_change():
     old = float(ev.RESISTANCE_CENTRES[8])
-    assert firsts(passes(old, old * np.exp((BINS + 0.1) * BIN))) == [1]
-    assert firsts(passes(old, old * np.exp((BINS - 0.1) * BIN))) == [0]
+    assert firsts(passes(old, old * np.exp((TUNING.bins + 0.1) * BIN))) == [1]
+    assert firsts(passes(old, old * np.exp((TUNING.bins - 0.1) * BIN))) == [0]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +107,7 @@ def test_concrete_does_not_change_by_what_zeros_of_machines_differ(old, new, cha
 def test_a_change_is_more_than_its_samples_state_by_machines_and_by_passes(machines, passes_each):
     old, new = ev.RESISTANCE_CENTRES[[8, 12]].tolist()
     shared = MACHINE_SHARE / machines + (1 - MACHINE_SHARE) / (machines * passes_each)
-    limit = (new - old) / (SIGMAS * np.sqrt(2 * shared))
+    limit = (new - old) / (TUNING.sigmas * np.sqrt(2 * shared))
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     for std, change in ((0.9 * limit, 1), (1.1 * limit, 0)):
         grid = Grid(1.0, FoldConfig(keep_buckets=100))
@@ -138,13 +135,16 @@ def test_a_cell_on_a_border_that_was_repaved_with_something_between_is_changed()
 
 
 def test_histograms_that_have_more_in_common_than_variation_are_no_change():
-    for moved, change in ((VARIATION + 0.05, 1), (VARIATION - 0.05, 0)):  # share of the metres on other ground
+    for moved, change in (
+        (TUNING.variation + 0.05, 1),
+        (TUNING.variation - 0.05, 0),
+    ):  # share of the metres on other ground
         assert firsts(two_passes({0.04: 0.8, 0.2: 0.2}, {0.04: 0.8 - moved, 0.2: 0.2 + moved})) == [change]
 
 
 @pytest.mark.parametrize("old_is_less", [True, False])
 def test_less_evidence_than_weight_on_either_side_is_no_change(old_is_less):
-    for metres, change in ((WEIGHT_M + 0.02, 1), (WEIGHT_M - 0.02, 0)):
+    for metres, change in ((TUNING.weight_m + 0.02, 1), (TUNING.weight_m - 0.02, 0)):
         old, new = (metres, 2.0) if old_is_less else (2.0, metres)
         assert firsts(two_passes({0.04: old}, {0.2: new})) == [change]
 

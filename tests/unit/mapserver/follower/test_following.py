@@ -20,7 +20,7 @@ from mapserver.follower.follower import Follower
 from mapserver.follower.following import Following
 from mapserver.follower.replica import Replica
 from mapserver.ingest.writer import Writer
-from mapserver.journal.archive import HOUR_NS, archive
+from mapserver.journal.archive import archive
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import LAST
 from mapserver.journal.sqlite.reader import SqliteReader
@@ -31,6 +31,7 @@ from mapserver.trust.decisions import PERSON, TrustDecision
 from mapserver.upkeep.refolding import Refolding
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import GroundChange, MapVersion
+from protocol.units import HOUR_NS
 from tests import postgres_server as server
 from tests.unit.mapserver.data import (
     CONFIG,

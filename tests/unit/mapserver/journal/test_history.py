@@ -15,7 +15,7 @@ from mapserver.evidence.grid import Grid
 from mapserver.journal import archive as ar
 from mapserver.journal import archive_file
 from mapserver.journal import history as module
-from mapserver.journal.archive import FOLDER, HOUR_NS, Archive, archive, next_file
+from mapserver.journal.archive import FOLDER, Archive, archive, next_file
 from mapserver.journal.archive_file import ArchiveFile
 from mapserver.journal.history import History, ahead, fold_history, history_rows
 from mapserver.journal.location import JOURNAL_FILE
@@ -27,6 +27,7 @@ from protocol import files
 from protocol.errors import ConfigError, StoreError
 from protocol.site.geometry import Bounds
 from protocol.site.site_config import KnownGround
+from protocol.units import HOUR_NS
 from tests.journals import history_beside
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, put, random_samples, same, samples
 

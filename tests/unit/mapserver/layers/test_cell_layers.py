@@ -3,16 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapserver.error_model import gradient_variance, resistance_variance
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.layers.cell_layers import (
     LAYERS,
-    MODEL_SHARE,
-    SLOPE_SHARE,
     SPREAD_SHARE,
-    UNEVEN_STD,
-    ZERO_STD,
     ReadConfig,
     read,
     select,
@@ -72,11 +69,11 @@ def test_class_is_that_of_the_zone_and_sure(index, zone):
 
 def deviation(c_rr: float, spread: float) -> float:
     """Of c_rr, whose votes spread so much in their logarithm."""
-    return float(np.sqrt((SPREAD_SHARE * spread * c_rr) ** 2 + ZERO_STD**2 + (MODEL_SHARE * c_rr) ** 2))
+    return float(np.sqrt((SPREAD_SHARE * spread * c_rr) ** 2 + resistance_variance(c_rr)))
 
 
 def grade_deviation(grade: float, spread: float) -> float:
-    return float(np.sqrt(spread**2 + UNEVEN_STD**2 + (SLOPE_SHARE * grade) ** 2))
+    return float(np.sqrt(spread**2 + gradient_variance(grade)))
 
 
 @pytest.mark.parametrize(("share", "likely"), [(0.7, 0.781), (0.9, 0.964), (1.0, 1.0)])
@@ -119,9 +116,9 @@ def test_noise_does_not_bias_the_gradient(start, noise):
     assert value(grid, "grade_east") == pytest.approx(true, abs=0.0012)
 
 
-def test_a_zero_of_the_machines_is_a_larger_share_of_firm_ground():
+def test_what_all_votes_err_in_is_a_larger_share_of_firm_ground():
     stds = [value(folded(samples(30, c_rr=c_rr)), "resistance_std") / c_rr for c_rr in (0.008, 0.04, 0.25)]
-    assert stds == pytest.approx([0.194, 0.0625, 0.050], abs=0.003)
+    assert stds == pytest.approx([0.255, 0.0707, 0.0506], abs=0.003)
 
 
 @pytest.mark.parametrize("start", [0.0, 0.25, 0.5])

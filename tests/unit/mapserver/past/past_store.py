@@ -13,8 +13,8 @@ from mapserver.journal.sqlite.journal import SqliteJournal
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past.making import make
 from mapserver.past.past import StorePast
-from mapserver.past.plan import HOUR_NS
 from protocol.arrays import Table
+from protocol.units import HOUR_NS
 from tests.unit.mapserver.data import NOW_NS, SITE, batch, put
 
 FOLD = FoldConfig()

@@ -19,8 +19,9 @@ from mapserver.past import making
 from mapserver.past.checkpoint_file import MAGIC, Checkpoint, CheckpointWriter, DamagedError, Header
 from mapserver.past.checkpoints import remove_beyond
 from mapserver.past.making import make
-from mapserver.past.plan import DAY_NS, GRACE_NS, HOUR_NS, due, surplus, thinned
+from mapserver.past.plan import GRACE_NS, due, surplus, thinned
 from protocol.site.geometry import CellWindow
+from protocol.units import DAY_NS, HOUR_NS
 from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same
 from tests.unit.mapserver.past.past_store import PastStore, S
 

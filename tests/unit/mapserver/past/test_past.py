@@ -12,8 +12,8 @@ from mapserver.journal.facts import NO_FACTS
 from mapserver.journal.rows import Selection
 from mapserver.past import cell_history as module
 from mapserver.past.cell_history import cell_history
-from mapserver.past.plan import HOUR_NS
 from protocol.site.geometry import CellWindow
+from protocol.units import HOUR_NS
 from tests.unit.mapserver.data import NOW_NS, folded, random_samples, same, samples
 from tests.unit.mapserver.past.past_store import PastStore, S
 

@@ -6,7 +6,7 @@ import pytest
 from mapserver.evidence.fold_config import name_hash
 from mapserver.roads.ledger import Ledgers
 from mapserver.roads.passes import PassTally
-from mapserver.roads.repairs import AGREE, BEFORE, KNOWN_BY, Repair, ages, repairs
+from mapserver.roads.repairs import TUNING, Repair, ages, repairs
 from tests.unit.mapserver.roads.drives import START_NS, along, passes, roads
 
 LINE = along([(10, 10), (110, 10)])
@@ -82,7 +82,7 @@ def test_a_change_is_seen_once_passes_agree(values, machines, minutes):
         (BEFORE_BOTH * 5, "ab"),
         ([*HARD[:10], *HARD[:2]], "ab"),
         ([*SIX, *[0.034] * 6], "ab"),
-        ([*[0.04] * (BEFORE - 1), *[0.02] * AGREE[0]], "ab"),
+        ([*[0.04] * (TUNING.least_known - 1), *[0.02] * TUNING.least_agree], "ab"),
     ],
     ids=["one odd pass", "one machine", "machines that differ", "two passes", "less than a quarter", "hardly known"],
 )
@@ -98,11 +98,11 @@ def test_a_second_change_is_compared_with_what_came_after_the_first():
 
 def test_ground_that_wears_is_compared_with_the_newest_passes():
     """Half a percent more from pass to pass is no change; over all passes it would hide the repair in the end."""
-    worn = [0.02 * 1.005**i for i in range(2 * KNOWN_BY)]
+    worn = [0.02 * 1.005**i for i in range(2 * TUNING.most_known)]
     repaired, looks = shown(fleet([*worn, 0.014, 0.014], noise=0.0))
     assert {each.segment for each in repaired} == {0, 1, 2, 3, 4}
     assert all(each.minute > START_NS // MINUTE_NS + 150 * len(worn) // 60 - 3 for each in repaired)
-    assert looks == 5 * (len(worn) + 2 - BEFORE - AGREE[0] + 1)
+    assert looks == 5 * (len(worn) + 2 - TUNING.least_known - TUNING.least_agree + 1)
 
 
 def cells_of(blocks):

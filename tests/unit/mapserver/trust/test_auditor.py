@@ -8,13 +8,12 @@ import pytest
 from scipy.signal import lfilter
 
 from mapserver.calibration.select import MachineErrors
-from mapserver.calibration.solver import SCALE_STD, ZERO_STD
 from mapserver.journal.rows import JournalRows
 from mapserver.trust import coarse_map
 from mapserver.trust.auditor import Auditor, Verdict
 from mapserver.trust.judgement import Reason
 from protocol.arrays import Table
-from protocol.machine.samples import empty
+from protocol.machine.samples import SCALE_STD, ZERO_STD, empty
 from protocol.site.ground_classes import ZONES
 from tests.unit.mapserver.data import NOW_NS, samples
 

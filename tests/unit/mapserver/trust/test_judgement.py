@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from mapserver.calibration.select import FAULT_SIGMAS, MachineErrors
-from mapserver.calibration.solver import SCALE_STD, ZERO_STD
 from mapserver.journal.rows import Event
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.coarse_map import LEVEL_FLOOR, CoarseMap, Surface, pooled
@@ -35,6 +34,7 @@ from mapserver.trust.judgement import (
 )
 from mapserver.trust.shift import Shift
 from protocol.arrays import Ints, Table
+from protocol.machine.samples import SCALE_STD, ZERO_STD
 from tests.unit.mapserver.data import random_samples, samples
 
 ALIKE = Difference(10**9, Gain(0.0, 0.0, 1.0, 1e9), Shift(0.0, 0.0, 0.0, 1.0), 1.0, (0.5, 0.5))

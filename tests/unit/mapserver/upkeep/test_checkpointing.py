@@ -15,10 +15,10 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal.facts import Facts
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.sqlite.reader import SqliteReader
-from mapserver.past.plan import HOUR_NS
 from mapserver.upkeep import checkpointing
 from mapserver.upkeep.checkpointing import RESERVE_BYTES, Checkpointing
 from protocol.arrays import Table
+from protocol.units import HOUR_NS
 from tests.unit.mapserver.data import NOW_NS, SITE, incoming, past_of, random_samples, same, send
 
 TURNS = 500

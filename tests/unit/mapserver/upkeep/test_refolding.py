@@ -29,13 +29,13 @@ from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.past import past
 from mapserver.past.checkpoint_file import Checkpoint
 from mapserver.past.making import make
-from mapserver.past.plan import HOUR_NS
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.decisions import DISTRUST_AFTER, KIND, PERSON, TrustDecision
 from mapserver.trust.judgement import Reason
 from mapserver.upkeep.refolding import Refolding
 from protocol.arrays import Table
 from protocol.errors import QueryError, Refusal
+from protocol.units import HOUR_NS
 from tests.reference.correction import in_numpy
 from tests.reference.grid import by_definition, of_grid, plain
 from tests.unit.mapserver.data import (

@@ -21,7 +21,7 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal import archived_decisions
-from mapserver.journal.archive import FOLDER, HOUR_NS, archive
+from mapserver.journal.archive import FOLDER, archive
 from mapserver.journal.history import history_rows
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.rows import JournalRow
@@ -33,6 +33,7 @@ from protocol.files import load_toml
 from protocol.machine.samples import empty
 from protocol.site.site_config import SiteConfig, site_toml
 from protocol.site.site_file import load_site
+from protocol.units import HOUR_NS
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.cli import main
