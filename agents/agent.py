@@ -22,6 +22,7 @@ from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
 from agents.pipeline import Pipeline
 from agents.presence import Presence
+from agents.recorder import ReadingsRecorder
 from agents.sampling import Samples
 from agents.status import Status, described
 from protocol.errors import StoreError
@@ -74,6 +75,7 @@ class Agent:
         self._uplink = Uplink(machine.name, site.frame, config.uplink.timeout_s)
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
         self._corrections = corrections
+        self._recorder = ReadingsRecorder(config.record, site.name, machine) if config.record.folder else None
         self._unsaved, self._spool_problem = WriteBuffer(), ""
         self._status, self._clocks, self._unsampled = Status(machine), "", ""
         self._faults: dict[str, str] = {}  # of sensors, as they were last told
@@ -110,6 +112,8 @@ class Agent:
             if clock() >= second_s:
                 second_s = clock() + EVERY_S
                 self._write()
+                if self._recorder:
+                    self._recorder.tend()
                 self._consider_offer()
                 self._calibration_file.write(self._pipeline.calibration)
                 self._yield_name()
@@ -156,12 +160,15 @@ class Agent:
             },
             "holdout": self._holdout.report() if self._holdout else None,
             "corrections": self._corrections.report() if self._corrections else None,
+            "record": self._recorder.report() if self._recorder else None,
         }
 
     def close(self) -> None:
         """End the uplink, leave the network, close the spool."""
         if self._corrections:
             self._corrections.close()
+        if self._recorder:
+            self._recorder.close()
         self._uplink_thread.close()
         self._presence.close()
         self._spool.close()
@@ -171,6 +178,8 @@ class Agent:
         self._readings += len(readings)
         if readings:
             self._newest_ns = readings[-1].stamp_ns
+        if self._recorder:
+            self._recorder.take(readings)
         before = self._pipeline.pose
         self._status.take(readings)
         self._take(self._pipeline.step(self._holdout.split(readings) if self._holdout else readings))

@@ -12,6 +12,7 @@ from agents.drivers.tables import DriverConfig, check_drivers
 from agents.holdout import HoldoutConfig
 from agents.localisation.localiser import LocalisationConfig
 from agents.positioning import PipelineConfig
+from agents.recorder import RecordConfig
 from protocol.config import from_table, section
 from protocol.errors import ConfigError
 from protocol.files import load_toml
@@ -26,8 +27,8 @@ MOST_LAG_S = 180.0
 class AgentConfig:
     """Options of one agent.
 
-    driver: what its sensors are read from; empty: bundles on its key `sensors`. linger_s: how long to wait at the end
-    for the last samples to be acknowledged.
+    driver: what its sensors are read from; empty: bundles on its key `sensors`. record: where readings are recorded.
+    linger_s: how long to wait at the end for the last samples to be acknowledged.
     """
 
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
@@ -35,6 +36,7 @@ class AgentConfig:
     uplink: UplinkConfig = field(default_factory=UplinkConfig)
     holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
     corrections: CorrectionsConfig = field(default_factory=CorrectionsConfig)
+    record: RecordConfig = field(default_factory=RecordConfig)
     linger_s: float = 30.0
     driver: tuple[DriverConfig, ...] = ()
 

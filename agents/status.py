@@ -163,8 +163,8 @@ def _of_sensors(report: Mapping[str, Any]) -> Iterator[Hindrance]:
         yield Hindrance(problem)
     for name, fault in report["pipeline"]["faults"].items():
         yield Hindrance(f"{name} {fault}")
-    corrections = report["corrections"] or {}
-    for problem in filter(None, (report["clocks"], corrections.get("problem"), report["calibration_problem"])):
+    beside = ((report[name] or {}).get("problem") for name in ("corrections", "record"))
+    for problem in filter(None, (report["clocks"], *beside, report["calibration_problem"])):
         yield Hindrance(problem)
 
 

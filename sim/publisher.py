@@ -11,13 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import zenoh
-
 from protocol.errors import LinkError
-from protocol.machine.readings import Reading
-from protocol.wire import keys
-from protocol.wire.codec import encode_bundle
-from protocol.wire.messages import SensorBundle
+from protocol.wire.bundle_stream import BundleStream, StreamClock
 from protocol.wire.session import SessionConfig, open_session
 from sim.config import SimConfig
 from sim.receivers.ports import Ports
@@ -40,50 +35,6 @@ class SimReport:
     readings: int
     late_s: float
     stopped: bool
-
-
-class BundleStream:
-    """The bundles of one machine, counted 1, 2, 3..."""
-
-    def __init__(self, session: zenoh.Session, site: str, machine: str) -> None:
-        self.machine = machine
-        self._counter = 0
-        # readings must not be dropped when an agent is slow: the simulation waits instead
-        block = zenoh.CongestionControl.BLOCK
-        self._publisher: Any = session.declare_publisher(keys.sensors(site, machine), congestion_control=block)
-
-    @property
-    def has_subscriber(self) -> bool:
-        """Whether an agent subscribes."""
-        return bool(self._publisher.matching_status.matching)
-
-    def put(self, readings: tuple[Reading, ...] = (), *, last: bool = False) -> None:
-        """Publish the next bundle."""
-        self._counter += 1
-        self._publisher.put(encode_bundle(SensorBundle(self.machine, self._counter, readings, last)))
-
-    def close(self) -> None:
-        """Publish the closing bundle and withdraw."""
-        self.put(last=True)
-        self._publisher.undeclare()
-
-
-class SimulationClock:
-    """Holds simulated time back to `speed` times the clock's; speed 0 never waits."""
-
-    def __init__(self, speed: float, stop: threading.Event, clock: Callable[[], float]) -> None:
-        self._speed, self._stop, self._clock = speed, stop, clock
-        self._start = clock()
-        self.late_s = 0.0
-
-    def wait(self, simulated_s: float) -> None:
-        """Wait until this simulated time is due, or the run is stopped."""
-        if not self._speed:
-            return
-        early_s = self._start + simulated_s / self._speed - self._clock()
-        self.late_s = max(self.late_s, -early_s)
-        if early_s > 0:
-            self._stop.wait(early_s)
 
 
 def run(
@@ -129,7 +80,7 @@ def _drive(
     progress: Callable[[float], None] | None,
 ) -> SimReport:
     start, bundles, readings = clock(), 0, 0
-    pace = SimulationClock(simulator.config.speed, stop, clock)
+    pace = StreamClock(simulator.config.speed, stop, clock)
     planned = simulator.bundles
     for _ in itertools.count() if planned is None else range(planned):
         if stop.is_set():

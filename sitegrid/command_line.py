@@ -28,7 +28,7 @@ from sitegrid.process.logs import start_logging
 
 INTERRUPTED = 130  # as a shell has it: 128 and the number of SIGINT
 # What any command may need beside its own extra (`EXTRA` of its module, and `BESIDE` for some of its options).
-BESIDE = {"cryptography": "security", "filterpy": "paper"}
+BESIDE = {"cryptography": "security", "filterpy": "paper", "mcap": "record"}
 OURS = ("protocol", "agents", "mapserver", "sim", "sitegrid", "lab")
 ADVICE = {
     errno.EACCES: "run this as a user who may, or choose another place",

@@ -10,7 +10,7 @@ so that every command describes itself in any install, and `sitegrid --help` is 
 GROUPS = {
     "run a site": ("router", "server", "agent", "corrections", "web", "sim", "follow", "demo"),
     "ask": ("query", "calibrate", "trust", "distrust"),
-    "look": ("plot", "log", "export"),
+    "look": ("plot", "log", "export", "record", "replay"),
     "keep": ("backup", "restore", "verify", "accept", "fold"),
     "set up": ("probe", "init", "up", "doctor", "keys"),
 }

@@ -74,7 +74,7 @@ def grant(role: str, site: str, name: str) -> Grant:
             answer=(keys.follower_queries(site, name), keys.follower_owner(site, name)),
             alive=(keys.follower_alive(site, name),),
         ),
-        "sim": Grant(publish=(_sensors_all(site),)),
+        "sim": Grant(publish=(_sensors_all(site),), subscribe=(health,)),
     }
     return grants[role]
 

@@ -26,7 +26,7 @@ SPOOL = {"depth": 0, "pending": 0, "dropped": 0, "given_up": 0, "unsaved": 0}
 def report(pipeline: Pipeline, **known: Any) -> dict[str, Any]:
     """As an agent has it that nothing else hinders."""
     parts = {"driver_problems": [], "spool_problem": "", "spool_damage": "", "calibration_problem": "", "silent_s": 0.0}
-    rest = {"corrections": None, "uplink": {"problem": ""}, "spool": SPOOL, "acknowledged": 0}
+    rest = {"corrections": None, "record": None, "uplink": {"problem": ""}, "spool": SPOOL, "acknowledged": 0}
     return {**parts, **rest, "pipeline": pipeline.health(), "clocks": pipeline.clocks(), **known}
 
 

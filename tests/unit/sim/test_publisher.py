@@ -9,11 +9,12 @@ import pytest
 
 from protocol.errors import LinkError
 from protocol.wire import keys
+from protocol.wire.bundle_stream import StreamClock
 from protocol.wire.codec import decode_bundle
 from protocol.wire.messages import SensorBundle
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig, resolve
-from sim.publisher import SimulationClock, run
+from sim.publisher import run
 from sim.simulator import Simulator
 
 CONFIG = SimConfig(site="pit", world="fast", machines=2, seed=3, seconds=0.5, speed=0.0)
@@ -128,7 +129,7 @@ def test_run_takes_as_long_as_its_speed_says() -> None:
 @pytest.mark.parametrize(("speed", "wall_s"), [(1.0, 12.0), (4.0, 3.0), (0.0, 0.0)])
 def test_pace_holds_to_the_speed(speed: float, wall_s: float) -> None:
     stop = FakeStop()
-    pace = SimulationClock(speed, stop, lambda: stop.now)
+    pace = StreamClock(speed, stop, lambda: stop.now)
     for i in range(1, 241):
         pace.wait(i * 0.05)
     assert stop.now - 100.0 == pytest.approx(wall_s)
@@ -137,7 +138,7 @@ def test_pace_holds_to_the_speed(speed: float, wall_s: float) -> None:
 
 def test_pace_catches_up_and_tells_how_late_it_was() -> None:
     stop = FakeStop()
-    pace = SimulationClock(1.0, stop, lambda: stop.now)
+    pace = StreamClock(1.0, stop, lambda: stop.now)
     stop.now += 2.0
     pace.wait(0.5)
     assert pace.late_s == pytest.approx(1.5)

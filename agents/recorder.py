@@ -1,0 +1,112 @@
+"""[record]: an agent writes the readings that it takes into files, the oldest of which make room for new ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from protocol.config import require_positive
+from protocol.machine.machine_config import MachineConfig
+from protocol.machine.readings import Reading
+from protocol.machine.recorded_readings import record_reading
+from protocol.recording import Recording
+
+FILES = 20  # that max_mb is shared by: so much of it is lost when the oldest one goes
+AGAIN_S = 60.0  # after an error of the disk
+
+
+@dataclass(frozen=True)
+class RecordConfig:
+    """Where readings are recorded. folder: empty: nowhere. max_mb: of all files of the machine there [MB]."""
+
+    folder: str = ""
+    max_mb: float = 2000.0
+
+    def __post_init__(self) -> None:
+        require_positive(self, ("max_mb",))
+
+
+class ReadingsRecorder:
+    """Records the readings of one machine. While there is no room they are not recorded, and the machine goes on."""
+
+    def __init__(
+        self,
+        config: RecordConfig,
+        site: str,
+        machine: MachineConfig,
+        now_ns: Callable[[], int] = time.time_ns,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """ModuleNotFoundError where the extra `record` is not installed; OSError where there can be no such folder."""
+        import mcap.writer  # noqa: F401 - now, and not with the first reading
+
+        self._folder, self._file_bytes = Path(config.folder), config.max_mb * 1e6 / FILES
+        self._machine, self._sensors = machine.name, {sensor.name for sensor in machine.sensors}
+        self._about = {"site": site, "machine": machine.name}
+        self._now_ns, self._clock, self._again_s = now_ns, clock, 0.0
+        self._recording: Recording | None = None
+        self._counts = {"readings": 0, "missed": 0}
+        self._problem = ""
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def take(self, readings: Sequence[Reading]) -> None:
+        """Record readings, of the machine's own sensors: no others make samples."""
+        own = [reading for reading in readings if reading.sensor in self._sensors]
+        if self._clock() < self._again_s:
+            self._counts["missed"] += len(own)
+            return
+        log_ns = self._now_ns()
+        try:
+            for reading in own:
+                self._recording = self._recording or self._open(log_ns)
+                record_reading(self._recording, self._machine, log_ns, reading)
+                self._counts["readings"] += 1
+                self._problem = ""
+        except OSError as error:
+            self._fail(error)
+
+    def tend(self) -> None:
+        """Flush, and begin the next file where this one is full; every second."""
+        if not self._recording:
+            return
+        try:
+            self._recording.tend()
+            if self._recording.size > self._file_bytes:
+                self.close()
+        except OSError as error:
+            self._fail(error)
+
+    def report(self) -> dict[str, Any]:
+        """How it does, in plain values."""
+        return {**self._counts, "problem": self._problem}
+
+    def close(self) -> None:
+        """Complete the file that is being written."""
+        if self._recording:
+            try:
+                self._recording.finish()
+            except OSError as error:
+                self._fail(error)
+            self._recording = None
+
+    def _open(self, log_ns: int) -> Recording:
+        """The next file, once there is room for it."""
+        kept_bytes = FILES * self._file_bytes - self._file_bytes
+        for path in sorted(self._folder.glob(f"{self._machine}.*.mcap*"), reverse=True):
+            kept_bytes -= path.stat().st_size
+            if kept_bytes < 0:
+                path.unlink()
+        begin = datetime.fromtimestamp(log_ns * 1e-9, UTC)
+        return Recording(self._folder / f"{self._machine}.{begin:%Y%m%dT%H%M%S.%fZ}.mcap", self._about, self._clock)
+
+    def _fail(self, error: OSError) -> None:
+        """Leave what is written, which can be read, and try again later."""
+        self._problem = f"readings are not recorded: {error.filename}: {error.strerror}"
+        self._again_s = self._clock() + AGAIN_S
+        if self._recording:
+            self._recording.abandon()
+            self._recording = None

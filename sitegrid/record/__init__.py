@@ -1,0 +1,1 @@
+"""Recordings of a running site, and their replay."""
