@@ -25,7 +25,7 @@ from mapserver.query.region_pieces import PIECE_BYTES, OpenRegions, PieceGrid, R
 from mapserver.query.road_maps import RoadMaps
 from mapserver.query.routes import Routes
 from mapserver.query.source import MapSource, MapState
-from mapserver.query.views import PastMaps, StillMap, View, check_past, view_now, widened
+from mapserver.query.views import PastMaps, StillMap, View, check_past, read_lanes, view_now, widened
 from protocol.arrays import Floats32, Ints
 from protocol.errors import QueryError, Refusal
 from protocol.queries import answer_codec as codec
@@ -40,6 +40,7 @@ from protocol.queries.answers import (
     Region,
 )
 from protocol.queries.coverage import Coverage, CoverageQuery
+from protocol.queries.lanes import LanesAnswer, LanesQuery
 from protocol.queries.map_tiles import TilesAnswer, TilesQuery
 from protocol.queries.reasons import CellReasons
 from protocol.queries.request import Compared, MapQuery, Size
@@ -90,6 +91,7 @@ class Answers:
             TilesQuery: self.tiles,
             WhyQuery: self.why,
             CoverageQuery: self.coverage,
+            LanesQuery: self.lanes,
             HistoryQuery: self.history,
             SegmentsQuery: lambda query: roads.segments(self._roads.read, query),
             WorklistQuery: lambda query: roads.worklist(self._roads.read, query),
@@ -245,12 +247,22 @@ class Answers:
 
     def coverage(self, query: CoverageQuery) -> Coverage:
         """How much ground is driven and known."""
-        window = self._site.geometry.window(query.bounds) if query.bounds else None
-        bounds, names = self._source.run(lambda state: (state.grid.bounds(), _names_in(state)))
-        west, south, east, north = bounds or (0, 0, 1, 1)
+        names = self._source.run(_names_in)
+        view, window = self._known(query.bounds, query.as_of_ns)
+        return coverage(view, window, names, self._site.cell_m, self._config)
+
+    def lanes(self, query: LanesQuery) -> LanesAnswer:
+        """Where machines drove, by heading."""
+        view, window = self._known(query.bounds)
+        return read_lanes(view, window, query.since_ns, self._site.cell_m, self._config)
+
+    def _known(self, bounds: Bounds | None, as_of_ns: int | None = None) -> tuple[View, CellWindow | None]:
+        """All that is known of a rectangle, None for all of the map, and its cells; refused where that is too much."""
+        window = self._site.geometry.window(bounds) if bounds else None
+        west, south, east, north = self._source.run(lambda state: state.grid.bounds()) or (0, 0, 1, 1)
         area = window or CellWindow(west, south, east - west, north - south)
         self._source.run(lambda state: check_past(state, area, self._reach))
-        return coverage(self._view(area, query.as_of_ns), window, names, self._site.cell_m, self._config)
+        return self._view(area, as_of_ns), window
 
     def _version(self) -> MapVersion:
         return self._source.run(lambda state: state.version)

@@ -22,12 +22,14 @@ from mapserver.journal.journal import JournalReader
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import Selection
 from mapserver.layers import cell_layers
+from mapserver.layers.lanes import lane_tile
 from mapserver.past.cell_history import CellHistory, cell_history
 from mapserver.past.past import StorePast
 from mapserver.query.source import MapState
 from protocol.arrays import AnyArray, Floats32, Ints
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import MapVersion
+from protocol.queries.lanes import LanesAnswer
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 # Of known ground that one question may read, 4 km2 with cells of 1 m: looking at them takes whoever owns the map 0.2 s,
@@ -166,6 +168,17 @@ def read_cells(
             for block, of_block in zip(some, values, strict=True):
                 place(out[name], window, block, of_block)
     return out
+
+
+def read_lanes(
+    view: View, window: CellWindow | None, since_ns: int | None, cell_m: float, config: ServerConfig
+) -> LanesAnswer:
+    """Squares that a window touches, None for all of the view. since_ns: those with newer samples alone."""
+    first = valid_pages(view.pages, cell_m, config.change, view.ages)
+    blocks = [block for block in sorted(view.pages) if window is None or _touches(block, window)]
+    tiles = (lane_tile(block, view.pages[block], first[block], view.stamp_ns) for block in blocks)
+    known = tuple(tile for tile in tiles if tile and (since_ns is None or tile.newest_ns > since_ns))
+    return LanesAnswer(view.version, view.stamp_ns, cell_m, known)
 
 
 def place(out: Floats32, window: CellWindow, block: Block, values: AnyArray) -> None:

@@ -13,6 +13,7 @@ from protocol.queries import answer_codec as codec
 from protocol.queries import answers
 from protocol.queries.calibration import CalibrationAnswer, decode_calibration, encode_calibration
 from protocol.queries.coverage import CoverageQuery
+from protocol.queries.lanes import LanesQuery
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.parameters import METRES, STAMP, WORDS, check_order, count, number, refusal
 from protocol.queries.places import AREA, Place, around, places
@@ -227,6 +228,7 @@ QUERIES: dict[str, type[MapQuery[Any]]] = {
         AliveQuery,
         InfoQuery,
         CoverageQuery,
+        LanesQuery,
     )
 }
 

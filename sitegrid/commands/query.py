@@ -40,7 +40,7 @@ WORDS: dict[str, tuple[str, tuple[str, ...] | str]] = {
     "way": ("from a place to another, in metres", ("from_x_m", "from_y_m", "to_x_m", "to_y_m")),
 }
 PLACED = ("x", "y", "places", "bounds", "polygon", "line", "from", "to")  # parameters that these words give
-FOR_PROGRAMS = ("piece", "tiles")
+FOR_PROGRAMS = ("piece", "tiles", "lanes")
 FOLLOWERS = "followers that answer, and how far behind they are"
 
 

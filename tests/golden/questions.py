@@ -9,6 +9,7 @@ from __future__ import annotations
 from protocol.queries.answers import MapVersion
 from protocol.queries.commands import AcceptCommand, CalibrateCommand, TrustCommand
 from protocol.queries.coverage import CoverageQuery
+from protocol.queries.lanes import LanesQuery
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.requests import (
     AliveQuery,
@@ -72,6 +73,8 @@ QUESTIONS = (
     AliveQuery(),
     CoverageQuery(),
     CoverageQuery(RECTANGLE, as_of_ns=T0, **FRESH),
+    LanesQuery(),
+    LanesQuery(RECTANGLE, T0),
 )
 COMMANDS = (
     TrustCommand("loader-2", True),

@@ -1,0 +1,60 @@
+"""Lanes: metres driven by heading, of which those fade that lie long back, or before many others of that direction.
+
+A road that is moved, a face that is dug away: nobody says so, but machines drive elsewhere from then on. So in a square
+of 16 x 16 cells a pass counts by what was driven there later, in the same direction or nearly so, and by its age:
+
+    metres = sum of passes exp(-later metres / FADES_M) 2^(-age / FADES_DAYS)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mapserver.evidence import cells as ev
+from mapserver.evidence.settling import DAY_S
+from mapserver.evidence.timeline import Block, TimedPage
+from protocol.arrays import Floats, Ints
+from protocol.queries.lanes import SCALE_M, LaneTile
+from protocol.site.geometry import BLOCK_CELLS
+
+FADES_M = 8 * BLOCK_CELLS * 1.0  # eight passes: fewer know the lane's middle less well, more hold on to a moved road
+FADES_DAYS = 7.0  # in which a lane that nobody drives counts half
+LEAST_M = 0.1  # less of a cell is left out
+
+
+def lane_tile(block: Block, pages: Sequence[TimedPage], first: Ints, stamp_ns: int) -> LaneTile | None:
+    """Lanes of one block; first: index (256,) of the page from which on each cell counts. None where nobody drove."""
+    metres, later_m = np.zeros((ev.SECTORS, ev.CELLS)), np.zeros(ev.SECTORS)
+    visits, machines = np.zeros(ev.CELLS, np.uint64), np.uint64(0)
+    newest_ns, days = 0, set()
+    for index, timed in reversed(list(enumerate(pages))):
+        cells = timed.page.cells[first[timed.page.cells["cell"]] <= index]
+        if not len(cells):
+            continue
+        driven = _by_sector(timed, first, index)
+        ended_ns = int(cells["newest_ns"].max())
+        age = max(stamp_ns - ended_ns, 0) / (DAY_S * 1e9)
+        metres += driven * np.exp(-later_m / FADES_M)[:, None] * 2 ** (-age / FADES_DAYS)
+        along_m = driven.sum(axis=1)
+        later_m += along_m + np.roll(along_m, 1) + np.roll(along_m, -1)
+        visits[cells["cell"]] |= cells["visits"]
+        machines |= np.bitwise_or.reduce(cells["machines"])
+        newest_ns = max(newest_ns, ended_ns)
+        days.add(ended_ns // (DAY_S * 10**9))
+    if not newest_ns:
+        return None
+    passes = int(np.bitwise_count(visits).max())
+    plane = SCALE_M.quantised(np.where(metres < LEAST_M, np.nan, metres))
+    return LaneTile(*block, newest_ns, passes, len(days), int(machines.bit_count()), plane)
+
+
+def _by_sector(timed: TimedPage, first: Ints, index: int) -> Floats:
+    """Metres (16, 256) of a page in each sector of heading, of the cells in which it counts."""
+    plane, cell = np.divmod(timed.page.votes["place"].astype(np.int64), ev.CELLS)
+    heading = (plane >= ev.HEADING.start) & (plane < ev.HEADING.stop) & (first[cell] <= index)
+    place = (plane[heading] - ev.HEADING.start) * ev.CELLS + cell[heading]
+    weight = timed.page.votes["count"][heading] / ev.WEIGHT_UNITS_PER_M
+    metres: Floats = np.bincount(place, weight, ev.SECTORS * ev.CELLS)  # type: ignore[assignment] # weights are floats
+    return metres.reshape(ev.SECTORS, ev.CELLS)

@@ -1,0 +1,126 @@
+"""Lanes: where machines drove, by heading; the query `lanes`, its answer, and its bytes."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.errors import MessageError, Refusal
+from protocol.machine.readings import MAX_STAMP_NS
+from protocol.queries.answers import MapVersion
+from protocol.queries.map_tiles import Scale
+from protocol.queries.parameters import RECTANGLE, STAMP
+from protocol.queries.request import Codec, MapQuery, Size, asked
+from protocol.site.geometry import BLOCK_CELLS, Bounds
+from protocol.wire.codec import MAX_SEQ
+from protocol.wire.fields import pack, take, take_int, take_store, unpack
+
+SECTORS = 16  # of heading, the first one centred on east
+SHAPE = (SECTORS, BLOCK_CELLS * BLOCK_CELLS)
+SCALE_M = Scale("log", 0.1, 100.0)  # metres driven in 8 bits: a step is 2.8 %
+MOST_TILES = 16_384  # of one answer: 4 km2 of driven ground with cells of 1 m
+MAX_LANES_BYTES = 2**26
+MOST = 2**31 - 1  # of a place, and of passes
+LEVEL = 6  # of deflate
+
+
+@dataclass(frozen=True)
+class LaneTile:
+    """Lanes of a square of 16 x 16 cells.
+
+    x, y: its column and row. newest_ns: stamp of its newest sample. passes: most that one of its cells has seen;
+    days: on how many it was driven, machines: by how many. metres: (16, 256) by sector of heading and cell, row by row
+    from the south, in steps of SCALE_M, 0 for none; what was driven long ago, and before many others, counts less.
+    """
+
+    x: int
+    y: int
+    newest_ns: int
+    passes: int
+    days: int
+    machines: int
+    metres: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class LanesAnswer:
+    """Squares of a version of the map into which evidence came since a stamp, or all. stamp_ns: the site's now."""
+
+    version: MapVersion
+    stamp_ns: int
+    cell_m: float
+    tiles: tuple[LaneTile, ...]
+
+
+_WHOLE = (("x", -MOST, MOST), ("y", -MOST, MOST), ("newest_ns", 0, MAX_STAMP_NS))
+_COUNTS = tuple((name, 0, MOST) for name in ("passes", "days", "machines"))
+HEAD = (*_WHOLE, *_COUNTS)
+
+
+def encode_lanes(answer: LanesAnswer) -> bytes:
+    """The squares' numbers column by column, and all metres deflated together."""
+    version, tiles = answer.version, answer.tiles
+    columns = {name: np.array([getattr(tile, name) for tile in tiles], "<i8").tobytes() for name, _, _ in HEAD}
+    metres = b"".join(tile.metres.tobytes() for tile in tiles)
+    table = {"store": version.store, "row": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
+    head = {"cell_m": answer.cell_m, "n": len(tiles), "cols": columns}
+    return pack({**table, **head, "metres": zlib.compress(metres, LEVEL)})
+
+
+def decode_lanes(data: bytes) -> LanesAnswer:
+    """Undo `encode_lanes`; a MessageError says what is wrong."""
+    table = unpack(data, MAX_LANES_BYTES)
+    n, cell_m, cols = take_int(table, "n", 0, MOST_TILES), take(table, "cell_m", float), take(table, "cols", dict)
+    _check(0.01 <= cell_m <= 100, "cell_m", f"{cell_m} is not between 0.01 and 100")
+    columns = [_column(cols, name, n, low, high) for name, low, high in HEAD]
+    metres = _inflated(take(table, "metres", bytes), n * SHAPE[0] * SHAPE[1]).reshape(n, *SHAPE)
+    x, y, newest_ns, passes, days, machines = columns
+    tiles = tuple(map(LaneTile, x, y, newest_ns, passes, days, machines, metres))
+    version = MapVersion(take_store(table), take_int(table, "row", 0, MAX_SEQ), take_int(table, "fact", 0, MAX_SEQ))
+    return LanesAnswer(version, take_int(table, "stamp_ns", 0, MAX_STAMP_NS), cell_m, tiles)
+
+
+def _column(cols: dict[str, object], name: str, n: int, low: int, high: int) -> list[int]:
+    data: bytes = take(cols, name, bytes)
+    _check(len(data) == 8 * n, f"cols.{name}", f"{len(data)} bytes for {n} squares", Refusal.COLUMN_LENGTH)
+    values = np.frombuffer(data, "<i8")
+    _check(bool(((values >= low) & (values <= high)).all()), f"cols.{name}", f"not between {low} and {high}")
+    whole: list[int] = values.tolist()
+    return whole
+
+
+def _inflated(data: bytes, size: int) -> NDArray[np.uint8]:
+    stream = zlib.decompressobj()
+    try:
+        plain = stream.decompress(data, size + 1)
+    except zlib.error as error:
+        raise MessageError(Refusal.WRONG_TYPE, f"not deflated: {error}", field="metres") from None
+    problem = f"{len(plain)} bytes, the squares take {size}"
+    _check(len(plain) == size and stream.eof, "metres", problem, Refusal.COLUMN_LENGTH)
+    return np.frombuffer(plain, np.uint8)
+
+
+def _check(holds: bool, field: str, problem: str, reason: Refusal = Refusal.OUT_OF_RANGE) -> None:  # noqa: FBT001
+    if not holds:
+        raise MessageError(reason, problem, field=field)
+
+
+@dataclass(frozen=True)
+class LanesQuery(MapQuery[LanesAnswer]):
+    """Lanes of a rectangle, None for all of the map; since_ns: of squares with samples after this stamp alone."""
+
+    bounds: Bounds | None = asked(RECTANGLE, "bounds", "west,south,east,north [m]; default all of the map", None)
+    since_ns: int | None = asked(STAMP, "since", "squares with samples after this time alone", None)
+
+    name = "lanes"
+    help = "where machines drove, by heading, for machines that find their lane by it"
+    codec = Codec(encode_lanes, decode_lanes)
+    size = Size.SEARCH
+
+    @property
+    def is_long(self) -> bool:
+        """See `MapQuery`."""
+        return True

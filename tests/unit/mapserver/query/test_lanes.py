@@ -1,0 +1,105 @@
+"""Lanes are what the fold has by heading; of those that nobody drives any more little is left."""
+
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapserver.config import ServerConfig
+from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
+from mapserver.evidence.grid import Grid
+from mapserver.query.views import read_lanes, view_of
+from protocol.errors import MessageError
+from protocol.machine.samples import empty
+from protocol.queries.lanes import SCALE_M, LanesQuery, decode_lanes, encode_lanes
+from protocol.queries.requests import parse_query
+from protocol.site.geometry import Bounds, CellWindow
+from tests.unit.mapserver.data import SITE, incoming, open_writer, random_samples, send
+from tests.unit.mapserver.query.fake_upkeep import answers_of
+
+DAY_NS = 86_400 * 10**9
+NORTH = 4  # sector
+BEGIN_NS = 1_750_000_000 * 10**9 // DAY_NS * DAY_NS
+
+
+def passes(x_m, count, begin_ns):
+    """Passes northwards along a line, one a minute."""
+    y_m = np.tile(np.arange(0.0, 64.0, 0.5), count)
+    rows = empty(len(y_m))
+    rows["stamp_ns"] = begin_ns + np.repeat(np.arange(count), 128) * 60 * 10**9 + np.tile(np.arange(128), count) * 10**8
+    rows["x_m"], rows["y_m"], rows["heading_rad"], rows["distance_m"] = x_m, y_m, np.pi / 2, 0.5
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.1
+    rows["c_rr"], rows["c_rr_var"], rows["grade_var"] = 0.03, 1e-4, 1e-4
+    return rows
+
+
+def lanes_of(*tables):
+    grid = Grid(1.0, FoldConfig())
+    for number, rows in enumerate(tables):
+        grid.fold(rows, f"loader-{number}")
+    view = view_of(grid, CellWindow(-64, -64, 192, 192), ServerConfig())
+    return read_lanes(view, None, None, 1.0, ServerConfig())
+
+
+def metres(answer, x, y, column):
+    (tile,) = (tile for tile in answer.tiles if (tile.x, tile.y) == (x, y))
+    values = np.nan_to_num(SCALE_M.values())[tile.metres].reshape(ev.SECTORS, 16, 16)
+    return values[NORTH, :, column].mean()
+
+
+def test_lanes_are_the_metres_driven_by_heading():
+    answer = lanes_of(passes(8.5, 3, BEGIN_NS))
+    inner = [tile for tile in answer.tiles if tile.x == 0 and 0 <= tile.y < 4]
+    assert [(tile.passes, tile.days, tile.machines) for tile in inner] == [(3, 1, 1)] * 4
+    assert metres(answer, 0, 1, 8) == pytest.approx(metres(answer, 0, 2, 8), rel=0.05)
+    for tile in inner:
+        assert not np.delete(tile.metres, NORTH, axis=0).any()
+
+
+def test_a_lane_fades_as_machines_drive_beside_it_and_with_its_age():
+    old, new = passes(4.5, 6, BEGIN_NS), passes(10.5, 24, BEGIN_NS + DAY_NS)
+    answer = lanes_of(old, new)
+    assert metres(answer, 0, 1, 4) < 0.1 * metres(lanes_of(old), 0, 1, 4)
+    far = passes(80.5, 1, BEGIN_NS + 7 * DAY_NS)  # the site's now is a week later
+    assert metres(lanes_of(old, far), 0, 1, 4) == pytest.approx(0.5 * metres(lanes_of(old), 0, 1, 4), rel=0.05)
+
+
+def test_lanes_are_asked_for_whole_by_place_and_by_news(tmp_path):
+    rows = random_samples(2000, seed=3)
+    later = replace_stamps(passes(8.5, 2, 0), int(rows["stamp_ns"].max()) + 1)
+    with closing(open_writer(tmp_path / "store")) as writer:
+        send(writer, [incoming(rows, machine="a"), incoming(later, machine="b")])
+        answers = answers_of(writer)
+
+        def ask(query):
+            sent = parse_query("lanes", query.parameters())
+            assert sent == query
+            return query.decode(answers.answer(sent))
+
+        whole = ask(LanesQuery())
+        west = ask(LanesQuery(Bounds(-100.0, -100.0, 0.0, 100.0)))
+        news = ask(LanesQuery(since_ns=int(rows["stamp_ns"].max())))
+    assert {(tile.x, tile.y) for tile in west.tiles} == {(t.x, t.y) for t in whole.tiles if t.x < 0}
+    assert 0 < len(news.tiles) < len(whole.tiles)
+    assert {tile.x for tile in news.tiles} <= {-1, 0, 1}
+    assert whole.cell_m == SITE.cell_m
+
+
+def replace_stamps(rows, first_ns):
+    rows["stamp_ns"] += first_ns - rows["stamp_ns"][0]
+    return rows
+
+
+def test_damaged_lanes_are_refused_by_name():
+    answer = lanes_of(passes(8.5, 1, BEGIN_NS))
+    data = encode_lanes(replace(answer, version=replace(answer.version, store="0123456789abcdef")))
+    assert len(decode_lanes(data).tiles) == len(answer.tiles)
+    refused = 0
+    for at in range(0, len(data), 7):
+        try:
+            decode_lanes(data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :])
+        except MessageError as error:
+            refused += bool(error.reason)
+    assert refused > len(data) / 7 / 3
