@@ -20,6 +20,7 @@ from agents.delivery.write_buffer import WriteBuffer
 from agents.drivers import Driver
 from agents.estimation.calibration_file import CalibrationFile
 from agents.holdout import Holdout
+from agents.lane_link import LaneLink
 from agents.pipeline import Pipeline
 from agents.presence import Presence
 from agents.recorder import ReadingsRecorder
@@ -76,6 +77,7 @@ class Agent:
         self._uplink_thread = UplinkThread(session, site.name, self._uplink, self._spool, sign, check)
         self._corrections = corrections
         self._recorder = ReadingsRecorder(config.record, site.name, machine) if config.record.folder else None
+        self._lane_link = LaneLink(session, site.name) if self._pipeline.lanes else None
         self._unsaved, self._spool_problem = WriteBuffer(), ""
         self._status, self._clocks, self._unsampled = Status(machine), "", ""
         self._faults: dict[str, str] = {}  # of sensors, as they were last told
@@ -115,6 +117,7 @@ class Agent:
                 if self._recorder:
                     self._recorder.tend()
                 self._consider_offer()
+                self._take_lanes()
                 self._calibration_file.write(self._pipeline.calibration)
                 self._yield_name()
                 self._tell_faults()
@@ -161,6 +164,7 @@ class Agent:
             "holdout": self._holdout.report() if self._holdout else None,
             "corrections": self._corrections.report() if self._corrections else None,
             "record": self._recorder.report() if self._recorder else None,
+            "lanes": self._lanes(),
         }
 
     def close(self) -> None:
@@ -233,6 +237,17 @@ class Agent:
         offer, self._uplink.offer = self._uplink.offer, None  # one that comes in between comes again
         if offer is not None:
             self._pipeline.consider(offer)
+
+    def _take_lanes(self) -> None:
+        """Have the newest lanes of the site, for places around the machine; until they come, those from before."""
+        aid, link = self._pipeline.lanes, self._lane_link
+        if aid and link and (lanes := link.look(self._pipeline.pose)):
+            aid.lanes = lanes
+
+    def _lanes(self) -> dict[str, Any] | None:
+        """What lanes there are, and whether they are used; None where they are not to be."""
+        aid, link = self._pipeline.lanes, self._lane_link
+        return {**aid.report(), "counters": dict(link.counters)} if aid and link else None
 
     def _yield_name(self) -> None:
         """Send nothing while an earlier agent of the same name runs; the samples wait in the spool."""

@@ -26,6 +26,7 @@ from agents.estimation.tuning import TUNING, EstimationTuning
 from agents.localisation.filters.belief import PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.filters.state import SPEED
+from agents.localisation.lanes.aid import LaneAid
 from agents.positioning import Accepted, PipelineConfig, Positioning, in_name_order
 from agents.sampling import NOTHING, Odometer, Sampler, Samples, joined
 from protocol.arrays import Floats
@@ -94,6 +95,11 @@ class Pipeline:
         samples = self.settle()
         self._withhold_waiting()
         return samples
+
+    @property
+    def lanes(self) -> LaneAid | None:
+        """The lanes of all machines, as this one uses them; None where it does not."""
+        return self._positioning.lanes
 
     def consider(self, offer: Any) -> None:
         """Judge what the map server offers for the calibration."""

@@ -12,6 +12,7 @@ from agents.localisation.antennas import Antennas
 from agents.localisation.filters.belief import DivergedError, PoseBelief
 from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.imu_steps import Sensed
+from agents.localisation.lanes.aid import LaneAid
 from agents.localisation.localiser import HeadingRefutedError, LocalisationConfig, Localiser
 from agents.localisation.wheels.judge import WheelJudge
 from agents.sampling import PoseHistory
@@ -47,7 +48,10 @@ class Accepted(NamedTuple):
 
 
 class Positioning:
-    """Dead reckoning and localisation of one machine, and the history of its poses."""
+    """Dead reckoning and localisation of one machine, and the history of its poses.
+
+    lanes: of all machines, as this one uses them; None where it does not.
+    """
 
     def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
         self._machine, self._config = in_name_order(machine), config.localisation
@@ -59,6 +63,7 @@ class Positioning:
         is_default = config.localisation.profile == "default"  # the paper's method judges no wheels
         self.judge = WheelJudge(self._machine, self._projection) if is_default else None
         self._antennas = Antennas(self._machine, self._projection)
+        self.lanes = LaneAid(machine.load_centre_m) if config.localisation.uses_lanes else None
         self._start()
 
     @property
@@ -77,7 +82,8 @@ class Positioning:
     @property
     def counters(self) -> Counter[str]:
         """What was used and refused, before restarts too."""
-        return self._counters + self._order.counters + self.localiser.counters
+        of_lanes = self.lanes.counters if self.lanes else Counter[str]()
+        return self._counters + self._order.counters + self.localiser.counters + of_lanes
 
     @property
     def faults(self) -> dict[str, str]:
@@ -200,7 +206,11 @@ class Positioning:
         """Start with nothing known, as after power-up or a jump of the clock."""
         weighs = self._mass == "message"
         self.dead_reckoning = DeadReckoning(self._machine, self._config.slip, weighs=weighs)
-        self.localiser = Localiser(self._machine, self._projection, self._config, is_weighed=self._is_weighed())
+        if self.lanes:
+            self.lanes.restart()
+        self.localiser = Localiser(
+            self._machine, self._projection, self._config, is_weighed=self._is_weighed(), lanes=self.lanes
+        )
         self.poses = PoseHistory()
         self._antennas.restart()
         if self.judge:

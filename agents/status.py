@@ -163,6 +163,8 @@ def _of_sensors(report: Mapping[str, Any]) -> Iterator[Hindrance]:
         yield Hindrance(problem)
     for name, fault in report["pipeline"]["faults"].items():
         yield Hindrance(f"{name} {fault}")
+    if problem := (report.get("lanes") or {}).get("problem"):
+        yield Hindrance(problem, is_problem=False)
     beside = ((report[name] or {}).get("problem") for name in ("corrections", "record"))
     for problem in filter(None, (report["clocks"], *beside, report["calibration_problem"])):
         yield Hindrance(problem)

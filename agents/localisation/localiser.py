@@ -20,6 +20,7 @@ from agents.localisation.filters.state import YAW
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.fix import Fix
 from agents.localisation.imu_steps import FilterStep, Sensed, StepGatherer
+from agents.localisation.lanes.aid import LaneAid
 from agents.localisation.place_watch import PlaceWatch
 from agents.localisation.repeats import Repeats
 from agents.localisation.tracker import Event, Tracker, TrackerConfig, gps_velocity
@@ -37,6 +38,7 @@ UNSIGNED_M = 60.0  # way over ground after which its first motion is taken for o
 REFUTED_SIGMA = 3.0  # a proven heading is refuted if refused fixes show one that is further off
 FILTERS: dict[str, Filter] = {"ekf": Ekf(), "ukf": Ukf()}
 PROFILES = ("default", "paper")
+MAP_AIDS = ("auto", "off")
 MAX_LAG_S = 3600.0  # each second of it is a node to smooth
 
 
@@ -49,7 +51,8 @@ class LocalisationConfig:
     start: x, y [m] and heading [rad] in `map`, where they are known: no alignment is needed then, nor GPS. It counts
     once: after a pause or a jump of the clock the machine may be anywhere. slip, slip_soft: wheel slip per traction on
     firm ground, and how much it rises with the rolling resistance; of the tyres. lag_s: how long places of the past are
-    smoothed by what comes after them, 0 for not at all; "paper" never smooths.
+    smoothed by what comes after them, 0 for not at all; "paper" never smooths. map_aid: "auto" finds the machine's lane
+    on the map that all machines draw, once there is one; "off" never does, nor does "paper".
     """
 
     filter: str = "ukf"
@@ -58,12 +61,15 @@ class LocalisationConfig:
     slip: float = 0.1
     slip_soft: float = 0.9
     lag_s: float = 90.0
+    map_aid: str = "auto"
 
     def __post_init__(self) -> None:
         if self.filter not in FILTERS:
             raise ValueError(f"filter: {self.filter!r} is neither {' nor '.join(FILTERS)}")
         if self.profile not in PROFILES:
             raise ValueError(f"profile: {self.profile!r} is neither {' nor '.join(PROFILES)}")
+        if self.map_aid not in MAP_AIDS:
+            raise ValueError(f"map_aid: {self.map_aid!r} is neither {' nor '.join(MAP_AIDS)}")
         if not (0 <= self.slip < 1 and 0 <= self.slip_soft < math.inf):
             raise ValueError("slip: must be from 0 to below 1, slip_soft not negative")
         if not 0 <= self.lag_s <= MAX_LAG_S:
@@ -75,6 +81,11 @@ class LocalisationConfig:
     def smoothing_s(self) -> float:
         """The lag of the smoother; 0 for the profile `paper`, whose method has none."""
         return self.lag_s if self.profile == "default" else 0.0
+
+    @property
+    def uses_lanes(self) -> bool:
+        """Whether the lanes of all machines are used."""
+        return self.map_aid == "auto" and self.profile == "default"
 
 
 class HeadingRefutedError(ArithmeticError):
@@ -100,7 +111,9 @@ class Localiser:
         step_s: float = STEP_S,
         *,
         is_weighed: bool = True,
+        lanes: LaneAid | None = None,
     ) -> None:
+        """lanes: those of all machines, as this one uses them."""
         self.engine = _engine(config)
         self.is_proven = False
         self.watch = PlaceWatch()
@@ -109,7 +122,7 @@ class Localiser:
         self._tracker_config = TrackerConfig(
             machine, projection, config.profile, tyres, step_s, config.smoothing_s, is_started, is_weighed
         )
-        self._tracker = Tracker(self._tracker_config)
+        self._tracker, self._lanes = Tracker(self._tracker_config), lanes
         self._gatherer = StepGatherer(machine, step_s)
         self._repeats = Repeats()
         self._accelerometers = [s.name for s in machine.sensors if s.kind == "imu" and s.use and s.provides("force")]
@@ -259,6 +272,7 @@ class Localiser:
         """Beliefs that an event changed; a fix may prove the heading, or take it back."""
         if not self.is_proven:
             self._remember(event)
+        self._tracker.lanes = self._lanes if self.is_proven else None
         beliefs = self._tracker.filter(event)
         if isinstance(event, Fix) and event.is_absolute and self._config.profile == "default":
             if shown := self._contradiction(event):

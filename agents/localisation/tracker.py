@@ -2,10 +2,11 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from agents.dead_reckoning import turn_source
+from agents.dead_reckoning import DeadReckonedPose, turn_source
 from agents.ground_speed import velocity_variances
 from agents.localisation import measurements
 from agents.localisation.alignment import Alignment, start_belief
@@ -18,6 +19,7 @@ from agents.localisation.fix import GPS_GATE_SIGMA, Fix
 from agents.localisation.gps import Receivers, drifting
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep
+from agents.localisation.lanes.aid import LANES, LaneAid
 from agents.localisation.measurements import PLACE
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
@@ -61,6 +63,7 @@ class Tracker:
     """Filters events into beliefs. fusion: None until `start`.
 
     has_relocked: whether the newest fix of a receiver made the filter accept it again, after too many refusals.
+    lanes: those of all machines, as this one uses them; None for not at all.
     """
 
     def __init__(self, config: TrackerConfig) -> None:
@@ -69,6 +72,7 @@ class Tracker:
         share, projection = machine.machine_share, config.projection
         self.fusion: Fusion | None = None
         self.has_relocked = False
+        self.lanes: LaneAid | None = None
         self.receivers = Receivers(machine.sensors, projection, layout, slow=slow, machine_share=share)
         self._config = config
         self._references = References(machine.sensors, layout, slow=slow)
@@ -170,7 +174,22 @@ class Tracker:
         shown = [*inertial, *absolute, *turn, *wheels]
         if self._doubt and shown:
             shown[0], self._doubt = replace(shown[0], change=self._doubt), None
-        return beliefs + (fusion.add(shown) if shown else [])
+        beliefs += fusion.add(shown) if shown else []
+        return beliefs + self._follow_lanes(fusion, event.reckoned)
+
+    def _follow_lanes(self, fusion: Fusion, reckoned: DeadReckonedPose) -> list[Belief]:
+        """Beliefs that the lanes of all machines changed, where a window of them has ended."""
+        aid = self.lanes
+        if aid is None or not aid.is_due(reckoned):
+            return []
+        if aid.lanes and not fusion.model.layout.lanes:
+            layout = replace(fusion.model.layout, lanes=True)
+            fusion.extend(replace(fusion.model, layout=layout), aid.variances_m2(reckoned.stamp_ns))
+        measurement, layout = aid.measurement(fusion.belief), fusion.model.layout
+        beliefs = fusion.add([measurement]) if measurement else []
+        if beliefs and not aid.judge(fusion.belief, fusion.last[LANES].nis, layout):
+            self._doubt = partial(aid.forgotten, layout=layout)
+        return beliefs
 
     def _place(self, fusion: Fusion, event: Fix | Measurement) -> list[Belief]:
         """Beliefs that a fix or a velocity by GPS changed."""

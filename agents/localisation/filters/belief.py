@@ -136,6 +136,15 @@ def pose_of(belief: Belief, wheels_mps: float | None) -> PoseBelief:
 # --- changes ---------------------------------------------------------------------------------------------------------
 
 
+def extended(belief: Belief, variance: Floats) -> Belief:
+    """The belief with more states at its end, zero, of variances (k,), and correlated with nothing."""
+    n, more = len(belief.x), len(variance)
+    P = np.diag(np.concatenate([np.zeros(n), variance]))
+    P[:n, :n] = belief.P
+    past = belief.past and belief.past.extended(more)
+    return Belief(belief.stamp_ns, np.pad(belief.x, (0, more)), P, past=past)
+
+
 def reset_states(belief: Belief, states: slice, variance: float) -> Belief:
     """The belief with these states at zero, of this variance and correlated with nothing."""
     x, P, M = belief.x.copy(), belief.P.copy(), np.eye(len(belief.x))

@@ -13,7 +13,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, open_states
+from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, extended, open_states
 from agents.localisation.filters.motion import MotionModel, motion
 from agents.localisation.filters.smoother import SmoothedPose
 from protocol.arrays import Floats
@@ -84,6 +84,12 @@ class Fusion:
             return []
         left = [pose for belief in beliefs if belief.past for pose in belief.past.final]
         return left + newest.past.poses(newest.stamp_ns, newest.x, newest.P)
+
+    def extend(self, model: MotionModel, variance: Floats) -> None:
+        """Estimate more states from here on, those that a model has beyond the others, with variances (k,)."""
+        self.model = model
+        for node in self._nodes:
+            node.belief = node.belief and extended(node.belief, variance)
 
     def add(self, measurements: Sequence[Measurement]) -> list[Belief]:
         """Filter measurements of one stamp; returns the beliefs that they changed, oldest first, none if refused."""

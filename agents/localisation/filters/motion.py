@@ -5,7 +5,7 @@ Over a step dt, with R = map_from_base and E the matrix from body rates to the r
 
     position += R (velocity dt + acceleration dt^2 / 2)        attitude += E rate dt
     velocity += acceleration dt                                rate, acceleration, biases, scale stay
-    error of an absolute heading *= exp(-dt / tau)
+    error of an absolute heading, and how far beside the fleet's lanes it drives *= exp(-dt / tau)
     GPS error *= exp(-dt / tau), of its own tau; what several receivers see, such as one sky, moves all their errors
 
 `velocity` is that of base_link's origin in its own axes and `acceleration` its rate of change; what an accelerometer
@@ -54,6 +54,8 @@ GYRO_BIAS_WALK = 5e-5  # [rad/s/sqrt(s)]
 WHEEL_SCALE_WALK = 2e-4  # [1/sqrt(s)]
 SLIP_STD = 0.08  # of the wheels' slip per traction, which the speed is corrected by
 SLIP_TIME_S = 5.0  # how long a ground's slip stays the same
+OFFSET_WALK = 1e-3  # offset of the map [m/sqrt(s)]: one that is drawn of many days stays where it is
+BESIDE_STD_M, BESIDE_S = 2.0, 300.0  # how far beside the fleet's lanes a machine keeps, and for how long so
 TURN_S = 3.0  # how long a turn lasts that no sensor shows
 CURVATURE, MAX_TURN_RADPS, LEAST_TURN_RADPS = 0.1, 0.3, 0.005  # it: standard deviation per metre driven, and its limits
 BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a wrong scale makes another in every bend
@@ -143,6 +145,10 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     for state, error in enumerate(model.heading_errors, layout.heading_errors.start):
         scale[state] = math.exp(-dt_s / error.time_s)
         Q[state, state] = error.std_rad**2 * -math.expm1(-2 * dt_s / error.time_s)
+    if layout.lanes:
+        beside = layout.beside_lane
+        scale[beside] = math.exp(-dt_s / BESIDE_S)
+        Q[beside, beside] = BESIDE_STD_M**2 * -math.expm1(-2 * dt_s / BESIDE_S)
     of_position = Q[POSITION, POSITION]
     slip_mps = model.slip_std * model.traction * float(belief.x[SPEED])
     # The integral of a Gauss-Markov error of SLIP_TIME_S grows by 2 std^2 time per second.
@@ -314,6 +320,7 @@ def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats]:
     deviation[layout.gyro_biases] = GYRO_BIAS_WALK
     deviation[layout.wheel_scales] = WHEEL_SCALE_WALK
     deviation[layout.heading_errors] = HEADING_WALK
+    deviation[layout.map_offset] = OFFSET_WALK
     walks = np.diag(deviation**2)
     for shared in (keep, walks):
         shared.setflags(write=False)

@@ -89,6 +89,15 @@ class Past:
         """After a change that maps the state's error by M (n, n)."""
         return replace(self, transition=M.dot(self.transition))
 
+    def extended(self, more: int) -> "Past":
+        """With so many more states, of which the past knows nothing yet."""
+        square, n = (0, more), len(self.adjoint)
+        nodes = self.nodes._replace(cross=np.pad(self.nodes.cross, ((0, 0), (0, 0), square)))
+        transition = np.eye(n + more)
+        transition[:n, :n] = self.transition
+        information = np.pad(self.information, (square, square))
+        return Past(self.lag_ns, nodes, self.final, transition, np.pad(self.adjoint, square), information)
+
     def informed(self, shown: Floats, weighted: Floats, y: Floats, K: Floats) -> "Past":
         """After a measurement: shown: H Phi (k, n), weighted: its transpose times S^-1 (n, k); y: (k,), K: (n, k)."""
         return Past(

@@ -1,4 +1,4 @@
-"""The state: the 15 of robot_localization, followed by the slow errors of sensors that are estimated with it.
+"""The state: the 15 of robot_localization, followed by the slow errors of sensors and of the map estimated with it.
 
 Frames as in REP-103 and REP-105: `map` is east, north, up; `base_link` is forward, left, up.
 map_from_base = Rz(yaw) Ry(pitch) Rx(roll).
@@ -26,13 +26,16 @@ class Layout:
 
     imus: with a yaw gyro bias each [rad/s], and one more where another sensor shows the turn. wheel_scale: whether
     there is one [-]: wheels turn by 1 + scale times the distance. receivers: GPS receivers with an error east and north
-    each [m]. references: of attitude, with an error of the heading each [rad]. Without any, the 15 states of the paper.
+    each [m]. references: of attitude, with an error of the heading each [rad]. lanes: whether those of all machines are
+    compared with, of which the map's offset and this machine's own habit are states. Without any, the 15 states of the
+    paper.
     """
 
     imus: int = 0
     wheel_scale: bool = False
     receivers: int = 0
     references: int = 0
+    lanes: bool = False
 
     def __post_init__(self) -> None:
         if min(self.imus, self.receivers, self.references) < 0:
@@ -41,7 +44,7 @@ class Layout:
     @cached_property
     def n(self) -> int:
         """Number of states."""
-        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references
+        return BASE_STATES + self.imus + self.wheel_scale + 2 * self.receivers + self.references + 3 * self.lanes
 
     @cached_property
     def gyro_biases(self) -> slice:
@@ -65,6 +68,18 @@ class Layout:
         """One per reference [rad]."""
         first = self.gps_errors.stop
         return slice(first, first + self.references)
+
+    @cached_property
+    def map_offset(self) -> slice:
+        """Offset of the map, east and north [m]; none without lanes."""
+        first = self.heading_errors.stop
+        return slice(first, first + 2 * self.lanes)
+
+    @cached_property
+    def beside_lane(self) -> slice:
+        """How far to the left of the fleet's lanes the machine keeps [m]; none without lanes."""
+        first = self.map_offset.stop
+        return slice(first, first + self.lanes)
 
     def gyro_bias(self, imu: int) -> int:
         """State of the bias of one yaw gyro."""

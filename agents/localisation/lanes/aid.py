@@ -1,0 +1,89 @@
+"""Lanes as one machine uses them: each window that it has driven becomes a measurement of its place."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from agents.dead_reckoning import DeadReckonedPose
+from agents.localisation.filters.belief import Belief, Measurement, reset_states
+from agents.localisation.filters.state import YAW, Layout, X, Y
+from agents.localisation.lanes.guards import ALARMS, Guards, prior_m2, shown
+from agents.localisation.lanes.lane_map import LaneMap
+from agents.localisation.lanes.matching import Match, match
+from agents.localisation.lanes.window import Window
+from protocol.arrays import Floats
+
+LANES = "lanes"  # the name that its measurements count under
+
+
+class LaneAid:
+    """The lanes that a machine has, and what it makes of them. lanes: the newest, None before there are any."""
+
+    def __init__(self, load_centre_m: float) -> None:
+        self.lanes: LaneMap | None = None
+        self.counters: Counter[str] = Counter()
+        self._load_centre_m = load_centre_m
+        self._is_used, self._std_m = False, math.nan
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew, as localisation does."""
+        self._window, self._guards, self._prior_m2 = Window(self._load_centre_m), Guards(), prior_m2(young=False)
+
+    def is_due(self, reckoned: DeadReckonedPose) -> bool:
+        """Note where dead reckoning is; returns whether a window has ended there."""
+        return self._window.add(reckoned)
+
+    def variances_m2(self, stamp_ns: int) -> Floats:
+        """Of the states that the layout has with lanes (3,), before anything is known of them."""
+        self._prior_m2 = prior_m2(young=self.lanes is None or self.lanes.is_young(stamp_ns))
+        return self._prior_m2
+
+    def measurement(self, belief: Belief) -> Measurement | None:
+        """What the window that ended shows, of a belief with lanes; None where that is nothing."""
+        heading_rad = float(belief.x[YAW])
+        back_m, headings_rad = self._window.end(heading_rad)
+        self._is_used = False
+        if self.lanes is None or not self._guards.is_open(belief.stamp_ns):
+            return None
+        H = shown(len(belief.x), heading_rad)
+        matched = match(self.lanes, H.dot(belief.x), H.dot(belief.P).dot(H.T), back_m, headings_rad)
+        if not isinstance(matched, Match):
+            self.counters[f"{LANES}_{matched}"] += 1
+            return None
+        z, R = matched.place_m, matched.covariance_m2
+        return Measurement(LANES, belief.stamp_ns, z, R, lambda x: x @ H.T, lambda _: H, relocks=False)
+
+    def judge(self, belief: Belief, nis: float, layout: Layout) -> bool:
+        """Look at the belief after a measurement; returns whether lanes fit. Where not they are off for a while."""
+        guards = slice(layout.map_offset.start, layout.beside_lane.stop)
+        self._std_m = math.sqrt(float(np.linalg.eigvalsh(belief.P[X : Y + 1, X : Y + 1])[-1]))
+        alarm = self._guards.judge(belief.stamp_ns, belief.x[guards], self._prior_m2, nis)
+        self.counters[f"{LANES}_{alarm}"] += bool(alarm)
+        self._is_used = not alarm
+        return not alarm
+
+    def forgotten(self, belief: Belief, layout: Layout) -> Belief:
+        """The belief with nothing known of the map's offset and of the machine's habit."""
+        offset_m2, _, beside_m2 = self._prior_m2.tolist()
+        return reset_states(reset_states(belief, layout.map_offset, offset_m2), layout.beside_lane, beside_m2)
+
+    def report(self) -> dict[str, Any]:
+        """Whether lanes are used, in plain values and a sentence."""
+        squares = len(self.lanes.tiles) if self.lanes else 0
+        return {"squares": squares, "used": self._is_used, "sentence": self._sentence(), "problem": self._problem()}
+
+    def _problem(self) -> str:
+        alarm = self._guards.alarm
+        return f"{ALARMS[alarm]}: they are not used for some minutes" if alarm else ""
+
+    def _sentence(self) -> str:
+        if self.lanes is None:
+            return "no lanes yet"
+        if problem := self._problem():
+            return problem
+        return f"on the fleet's lanes, {self._std_m:.1f} m" if self._is_used else "no lane of the fleet's here"

@@ -1,0 +1,149 @@
+"""Laws of lanes: ground without any tells nothing, a covariance stays one, no place counts twice, a shift shows."""
+
+import math
+
+import numpy as np
+import pytest
+
+from agents.dead_reckoning import DeadReckonedPose
+from agents.localisation.filters.belief import Belief, extended
+from agents.localisation.filters.ekf import Ekf
+from agents.localisation.filters.late_measurements import Fusion
+from agents.localisation.filters.motion import BESIDE_STD_M, MotionModel
+from agents.localisation.filters.smoother import nothing_past
+from agents.localisation.filters.state import YAW, Layout
+from agents.localisation.filters.ukf import Ukf
+from agents.localisation.lanes.aid import LANES, LaneAid
+from agents.localisation.lanes.guards import AFTER_NS, OFF_NS, Guards, prior_m2
+from agents.localisation.lanes.lane_map import LaneMap
+from agents.localisation.lanes.matching import Match, match
+from agents.localisation.lanes.window import WINDOW_M, Window
+from protocol.queries.lanes import SCALE_M, LaneTile
+
+LAYOUT = Layout(imus=1, lanes=True)
+SQUARE = [(0.0, 0.0, 0.0), (40.0, 0.0, math.pi / 2), (40.0, 40.0, math.pi), (0.0, 40.0, -math.pi / 2)]
+
+
+def lane_map(metres):
+    """Lanes of 8 x 8 squares around the origin; metres (16, rows, columns)."""
+    planes = SCALE_M.quantised(np.where(metres > 0, metres, np.nan))
+    tiles = {
+        (x, y): LaneTile(x, y, 1, 9, 2, 3, planes[:, 16 * y + 64 :, 16 * x + 64 :][:, :16, :16].reshape(16, 256))
+        for x in range(-4, 4)
+        for y in range(-4, 4)
+    }
+    return LaneMap(1.0, tiles)
+
+
+def flat(value=5.0):
+    return lane_map(np.full((16, 128, 128), value))
+
+
+def lane_north(column):
+    """One lane northwards, two cells wide, whose middle is the west edge of a column."""
+    metres = np.zeros((16, 128, 128))
+    metres[4, :, column + 63 : column + 65] = 10.0
+    return lane_map(metres)
+
+
+def straight(count=20):
+    """Way back along a straight drive northwards."""
+    return np.stack([np.zeros(count), -np.arange(count, dtype=float)], axis=1), np.full(count, math.pi / 2)
+
+
+def belief_at(x_m=0.0, stamp_ns=0, states=LAYOUT):
+    x = np.zeros(states.n)
+    x[0], x[YAW] = x_m, math.pi / 2
+    P = np.diag(np.full(states.n, 0.01))
+    P[:2, :2] = [[1.5, 0.3], [0.3, 1.0]]
+    P[-3:, -3:] = np.diag(prior_m2(young=False))
+    return Belief(stamp_ns, x, P, past=nothing_past(states.n, 90.0))
+
+
+def test_ground_without_lanes_tells_nothing():
+    back_m, heading = straight()
+    for lanes in (flat(), LaneMap(1.0), flat(50.0)):
+        assert match(lanes, np.zeros(2), np.diag([4.0, 9.0]), back_m, heading) == "flat"
+
+
+@pytest.mark.parametrize("off_m", [-3.0, -1.0, 0.0, 2.0])
+def test_a_lane_shows_how_far_beside_it_the_machine_seems_to_be(off_m):
+    back_m, heading = straight()
+    matched = match(lane_north(0), np.array([off_m, 0.0]), np.diag([4.0, 4.0]), back_m, heading)
+    assert isinstance(matched, Match)
+    assert matched.place_m[0] == pytest.approx(0.0, abs=0.25)
+    assert 1.0 < matched.covariance_m2[0, 0] < 2.0
+    assert matched.covariance_m2[1, 1] > 1000  # along a straight nothing shows
+
+
+def test_lanes_of_another_direction_tell_nothing():
+    back_m, heading = straight()
+    assert match(lane_north(0), np.zeros(2), np.diag([4.0, 4.0]), back_m, heading + math.pi / 2) == "flat"
+
+
+def test_every_place_is_in_one_window():
+    window, seen, ends = Window(2.0), [], 0
+    for step in range(2000):
+        angle = 0.01 * step
+        at = DeadReckonedPose(step * 10**8, 0.0, angle, 20 * math.cos(angle), 20 * math.sin(angle))
+        if window.add(at):
+            back_m, heading = window.end(angle)
+            seen += [tuple(place) for place in np.round(back_m + np.array([at.x_m, at.y_m]), 6)]
+            assert len(heading) == len(back_m) <= WINDOW_M + 1
+            ends += 1
+    assert ends == 19  # the chords of 400 m of arc are a little shorter
+    assert len(set(seen)) == len(seen)
+
+
+@pytest.mark.parametrize("engine", [Ekf(), Ukf()])
+@pytest.mark.parametrize("tells", [False, True])
+def test_a_thousand_windows(engine, tells):
+    """Of flat ground they change nothing, bit for bit; of lanes they leave a covariance, and the place as it is."""
+    aid, model = LaneAid(0.0), MotionModel(LAYOUT)
+    aid.lanes = lane_north(0) if tells else flat()
+    start = belief_at(stamp_ns=10**9)
+    fusion = Fusion(engine, model, start)
+    for step in range(1000):
+        for place in range(22):
+            aid.is_due(DeadReckonedPose(10**9 + step, 0.0, 0.0, step * 20.0 + place, 0.0))
+        belief = fusion.belief
+        measurement = aid.measurement(Belief(belief.stamp_ns + AFTER_NS * bool(step), belief.x, belief.P))
+        if measurement:
+            conditioned = engine.condition(belief, measurement)
+            assert conditioned.accepted
+            fusion = Fusion(engine, model, conditioned.belief)
+            assert np.linalg.eigvalsh(conditioned.belief.P)[0] > 0
+    if not tells:
+        assert fusion.belief is start
+        assert aid.counters == {f"{LANES}_flat": 999}
+    assert np.abs(fusion.belief.x - start.x).max() < 0.2
+
+
+def test_states_that_come_later_leave_the_others_as_they_are():
+    small = Layout(imus=1)
+    belief = belief_at(states=Layout(imus=1, lanes=True))
+    bare = Belief(0, belief.x[: small.n], belief.P[: small.n, : small.n], past=nothing_past(small.n, 90.0))
+    fusion = Fusion(Ukf(), MotionModel(small), bare)
+    fusion.extend(MotionModel(LAYOUT), prior_m2(young=True))
+    moved, alone = fusion.at(2 * 10**9), Fusion(Ukf(), MotionModel(small), bare).at(2 * 10**9)
+    assert np.allclose(moved.x[: small.n], alone.x, atol=1e-12)
+    assert np.allclose(moved.P[: small.n, : small.n], alone.P, atol=1e-12)
+    assert moved.P[LAYOUT.beside_lane, LAYOUT.beside_lane][0, 0] == pytest.approx(BESIDE_STD_M**2)
+    assert not moved.P[: small.n, small.n :].any()
+    assert extended(bare, prior_m2(young=False)).past is not None
+
+
+def test_alarms_turn_lanes_off_for_a_while():
+    for mean, nis, why in (
+        ([2.1, 0.0, 0.0], 1.0, "map_moved"),
+        ([0.0, 0.0, -4.1], 1.0, "beside_lanes"),
+        ([0.0, 0.0, 0.0], 30.0, "contradicted"),
+    ):
+        guards = Guards()
+        assert not guards.is_open(1)
+        assert guards.is_open(1 + AFTER_NS)
+        alarms = [guards.judge(2 + AFTER_NS, np.array(mean), prior_m2(young=False), nis) for _ in range(8)]
+        assert alarms[-1] == guards.alarm == why
+        assert not guards.is_open(1 + AFTER_NS + OFF_NS)
+        assert guards.is_open(2 + AFTER_NS + OFF_NS)
+        assert guards.alarm == ""
