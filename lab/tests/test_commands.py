@@ -18,6 +18,7 @@ from sitegrid.options.values import count, positive, seed
 WORK = {
     "calibration": "lab.calibration.experiment",
     "cooperation": "lab.cooperation.experiment",
+    "fedback": "lab.fedback.experiment",
     "ground": "lab.ground.experiment",
     "maps": "lab.maps.experiment",
     "paper": "lab.paper.experiment",

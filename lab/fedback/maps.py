@@ -1,0 +1,156 @@
+"""Lane maps by the map server's own fold and layer, and maps that may harm: lanes elsewhere, and none that repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from agents.localisation.lanes.lane_map import LaneMap
+from lab.fedback.days import free_ways
+from lab.fedback.rerun import Maps
+from mapserver.config import ServerConfig
+from mapserver.evidence.fold_config import FoldConfig
+from mapserver.evidence.grid import Grid
+from mapserver.query.views import read_lanes, view_of
+from protocol.arrays import Floats, Table
+from protocol.machine.samples import empty
+from protocol.site.geometry import CellWindow
+from sim.operators.routes import tour
+
+Rows = Sequence[tuple[str, Table]]  # samples by machine
+MapsOf = Callable[[str], Maps]  # of a machine
+
+
+def lane_map(rows: Iterable[tuple[str, Table]]) -> LaneMap:
+    """Lanes as the server makes them of samples."""
+    grid, config = Grid(1.0, FoldConfig()), ServerConfig()
+    for name, table in rows:
+        grid.fold(table, name)
+    west, south, east, north = grid.bounds() or (0, 0, 1, 1)
+    view = view_of(grid, CellWindow(west, south, east - west, north - south), config)
+    answer = read_lanes(view, None, None, 1.0, config)
+    return LaneMap(1.0, {(tile.x, tile.y): tile for tile in answer.tiles})
+
+
+def moved(rows: Rows, left_m: float = 0.0, east_m: float = 0.0, from_x_m: float = -1e9) -> Rows:
+    """Samples moved to the left of where machines drove, and east; left: beyond a place east, over 10 m less."""
+    out = []
+    for name, table in rows:
+        table, heading = table.copy(), table["heading_rad"].astype(float)
+        share = np.clip((table["x_m"] - from_x_m) / 10, 0, 1) * left_m
+        table["x_m"], table["y_m"] = (
+            table["x_m"] - share * np.sin(heading) + east_m,
+            table["y_m"] + share * np.cos(heading),
+        )
+        out.append((name, table))
+    return out
+
+
+def turned(rows: Rows) -> Rows:
+    """The same ways, driven in the opposite direction by others."""
+    out = []
+    for name, table in rows:
+        table = table.copy()
+        table["heading_rad"] = (table["heading_rad"] + 2 * np.pi) % (2 * np.pi) - np.pi
+        out.append((f"{name}-back", table))
+    return out
+
+
+def renamed(rows: Rows, ending: str) -> Rows:
+    """The same by other machines."""
+    return [(f"{name}{ending}", table) for name, table in rows]
+
+
+def along(lines: Iterable[Floats], stamp_ns: int, draw: np.random.Generator, spacing_m: float = 0.5) -> Rows:
+    """Samples along lines (k, 2) of points spacing_m apart, each by a machine that errs by a metre, slowly."""
+    out = []
+    for number, line in enumerate(lines):
+        rows = empty(len(line))
+        step = np.gradient(line, axis=0)
+        rows["heading_rad"], rows["distance_m"] = np.arctan2(step[:, 1], step[:, 0]), spacing_m
+        rows["stamp_ns"] = stamp_ns + np.arange(len(line)) * 125_000_000
+        error = np.cumsum(draw.normal(0, 0.05, (len(line), 2)), axis=0) + draw.normal(0, 0.8, 2)
+        rows["x_m"], rows["y_m"] = (line + error).T
+        rows["cov_xx_m2"] = rows["cov_yy_m2"] = 1.0
+        for name in ("c_rr", "c_rr_var", "grade_e", "grade_n", "grade_var"):
+            rows[name] = np.nan
+        out.append((f"other-{number}", rows))
+    return out
+
+
+def crossing(count: int, draw: np.random.Generator) -> list[Floats]:
+    """Straight lines across the site in any direction."""
+    lines = []
+    for _ in range(count):
+        middle, angle = draw.uniform((40, 30), (160, 120)), draw.uniform(0, 2 * np.pi)
+        lines.append(middle + np.arange(-60, 60, 0.5)[:, None] * (np.cos(angle), np.sin(angle)))
+    return lines
+
+
+def free(seed: int, laps: int = 2) -> list[Floats]:
+    """Ways of a day of free driving."""
+    ways = (tour(corners, 8.0).legs[0] for corners in free_ways(seed).values())
+    return [np.tile(leg.points, (laps, 1)) for leg in ways]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What maps are made of. rows: of another day; own: of the day that is judged, both by machine. begin_ns: of it."""
+
+    rows: Rows
+    own: Rows
+    begin_ns: int
+    seconds: float
+
+    def still(self, rows: Rows) -> MapsOf:
+        """One map for all."""
+        lanes = lane_map(rows)
+        return lambda _: lambda __: lanes
+
+    def moves(self, left_m: float) -> MapsOf:
+        """Roads of the eastern half lie elsewhere from half time on, seen from the map: as if they had been moved."""
+        before, after = lane_map(self.rows), lane_map(moved(self.rows, left_m, from_x_m=EAST_M))
+        half_ns = self.begin_ns + round(self.seconds / 2 * 1e9)
+        return lambda _: lambda stamp_ns: before if stamp_ns < half_ns else after
+
+    def grows(self, names: Callable[[str], Sequence[str]]) -> MapsOf:
+        """The map of the same day from nothing, of the machines that a machine's name gives, read now and then."""
+        kept: dict[tuple[Sequence[str], int], LaneMap | None] = {}
+
+        def maps_of(name: str) -> Maps:
+            def at(stamp_ns: int) -> LaneMap | None:
+                turn = int((stamp_ns - self.begin_ns) * 1e-9 // READ_S)
+                key = tuple(names(name)), turn
+                if key not in kept:
+                    until_ns = self.begin_ns + round((turn * READ_S - LATE_S) * 1e9)
+                    some = [(n, rows[rows["stamp_ns"] < until_ns]) for n, rows in self.own if n in key[0]]
+                    kept[key] = lane_map(some) if any(len(rows) for _, rows in some) else None
+                return kept[key]
+
+            return at
+
+        return maps_of
+
+
+EAST_M = 100.0
+READ_S, LATE_S = 180.0, 95.0  # how often lanes are asked for, and how much later samples are final
+GROWING = ("young", "alone")  # maps of the same day
+_draw = partial(np.random.default_rng, 7)
+MAPS: dict[str, Callable[[Scene], MapsOf]] = {
+    "mature": lambda scene: scene.still(scene.rows),
+    "young": lambda scene: scene.grows(lambda _: [name for name, _ in scene.own]),
+    "alone": lambda scene: scene.grows(lambda name: [name]),
+    "east2": lambda scene: scene.still(moved(scene.rows, east_m=2.0)),
+    "left3": lambda scene: scene.still(moved(scene.rows, 3.0)),
+    "moved3": lambda scene: scene.moves(3.0),
+    "moved5": lambda scene: scene.moves(5.0),
+    "moved8": lambda scene: scene.moves(8.0),
+    "two6": lambda scene: scene.still([*scene.rows, *renamed(moved(scene.rows, 6.0), "-two")]),
+    "only6": lambda scene: scene.still(moved(scene.rows, 6.0)),
+    "both": lambda scene: scene.still([*scene.rows, *turned(moved(scene.rows, 1.0))]),
+    "crossed": lambda scene: scene.still([*scene.rows, *along(crossing(60, _draw()), scene.begin_ns, _draw())]),
+    "free": lambda scene: scene.still(along(free(5) + free(6), scene.begin_ns, _draw())),
+}

@@ -1,0 +1,142 @@
+"""The filter run again from its nodes, with windows of lanes as measurements; live, and smoothed with a lag."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.dead_reckoning import DeadReckonedPose
+from agents.localisation.filters.motion import BESIDE_S, BESIDE_STD_M, OFFSET_WALK
+from agents.localisation.filters.smoother import KEPT
+from agents.localisation.filters.state import YAW
+from agents.localisation.lanes.guards import Guards, prior_m2, shown
+from agents.localisation.lanes.lane_map import LaneMap
+from agents.localisation.lanes.matching import Match, match
+from agents.localisation.lanes.window import Window
+from lab.fedback.nodes import Nodes
+from protocol.arrays import Floats
+
+LAG = 90  # nodes
+Maps = Callable[[int], LaneMap | None]  # the map that an agent has at a stamp
+
+
+@dataclass(frozen=True)
+class Course:
+    """Errors (n, 2) and covariances (n, 2, 2) at the nodes, live and smoothed; counts: what became of windows."""
+
+    live_m: Floats
+    live_m2: Floats
+    smoothed_m: Floats
+    smoothed_m2: Floats
+    counts: Counter[str]
+    guards: Floats  # m, l (k, 3) after each window
+
+
+class _Smoother:
+    """Nodes of the lag, jointly with the state: mean (q, 3), covariance (q, 3, 3), cross-covariance (q, 3, s)."""
+
+    def __init__(self, states: int) -> None:
+        self.mean, self.P, self.C = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, states))
+        self.final: list[tuple[Floats, Floats]] = []
+
+    def add(self, mean: Floats, P: Floats) -> None:
+        if len(self.mean) == LAG:
+            self.final.append((self.mean[0], self.P[0]))
+        keep = slice(len(self.mean) == LAG, None)
+        self.mean = np.concatenate([self.mean[keep], mean[None, KEPT]])
+        self.P = np.concatenate([self.P[keep], P[None][:, KEPT][:, :, KEPT]])
+        self.C = np.concatenate([self.C[keep], P[None, KEPT]])
+
+    def inform(self, vector: Floats, information: Floats, moved: Floats) -> None:
+        """By a vector (s,) and information (s, s) on the state, which moves (s, s) then."""
+        self.mean = self.mean + self.C @ vector
+        self.P = self.P - self.C @ information @ self.C.transpose(0, 2, 1)
+        self.C = self.C @ moved.T
+
+    def all(self) -> tuple[Floats, Floats]:
+        """Places (n, 2) and covariances (n, 2, 2) of all nodes so far."""
+        pairs = [*self.final, *zip(self.mean, self.P, strict=True)]
+        return np.array([mean[:2] for mean, _ in pairs]), np.array([P[:2, :2] for _, P in pairs])
+
+
+def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -> Course:
+    """The filter again. aids: False for the filter as it was."""
+    n = nodes.x.shape[1]
+    states = n + 3 * aids
+    window, guards, counts = Window(nodes.ahead_m), Guards(), Counter[str]()
+    d, P = np.zeros(states), np.zeros((states, states))
+    P[:n, :n] = nodes.P[0]
+    if aids:
+        P[n:, n:] = np.diag(prior_m2(young=young))
+    smoother, live, live_m2, seen, at = _Smoother(states), [], [], [], 0
+    for k, stamp_ns in enumerate(nodes.stamp_ns.tolist()):
+        if k:
+            d, P = _moved(nodes, k - 1, d, P, smoother)
+        full = False
+        while aids and at < len(nodes.way_ns) and nodes.way_ns[at] <= stamp_ns:
+            full = window.add(_reckoned(nodes, int(nodes.way_ns[at])))
+            at += 1
+        if full:
+            x = np.concatenate([nodes.x[k], np.zeros(3)]) + d
+            heading = float(x[YAW])
+            H = shown(states, heading)
+            window.add(_reckoned(nodes, stamp_ns))
+            back_m, headings = window.end(heading)
+            lanes = maps(stamp_ns) if guards.is_open(stamp_ns) else None
+            matched = match(lanes, H @ x, H @ P @ H.T, back_m, headings) if lanes else "closed"
+            counts[matched if isinstance(matched, str) else "used"] += 1
+            if isinstance(matched, Match):
+                d, P, nis = _matched(matched, x, d, P, H, smoother)
+                seen.append(d[n:].copy())
+                if why := guards.judge(stamp_ns, d[n:], prior_m2(young=young), nis):
+                    counts[why] += 1
+                    d[n:], P[n:, :], P[:, n:] = 0.0, 0.0, 0.0
+                    P[n:, n:] = np.diag(prior_m2(young=young))
+                    smoother.C[:, :, n:] = 0.0
+        x = nodes.x[k] + d[:n]
+        live.append(x[:2])
+        live_m2.append(P[:2, :2].copy())
+        smoother.add(x, P)
+    places, smoothed_m2 = smoother.all()
+    return Course(
+        np.array(live) - nodes.true_m, np.array(live_m2), places - nodes.true_m, smoothed_m2, counts, np.array(seen)
+    )
+
+
+def _reckoned(nodes: Nodes, stamp_ns: int) -> DeadReckonedPose:
+    """Where dead reckoning was at a stamp."""
+    x_m, y_m, angle_rad = (float(np.interp(stamp_ns, nodes.way_ns, nodes.way[:, i])) for i in range(3))
+    return DeadReckonedPose(stamp_ns, 0.0, angle_rad, x_m, y_m)
+
+
+def _matched(
+    matched: Match, x: Floats, d: Floats, P: Floats, H: Floats, smoother: _Smoother
+) -> tuple[Floats, Floats, float]:
+    """After a match, and its normalised innovation squared."""
+    y, S, R = matched.place_m - H @ x, H @ P @ H.T + matched.covariance_m2, matched.covariance_m2
+    gain = np.linalg.solve(S, H)
+    K = P @ gain.T
+    kept = np.eye(len(d)) - K @ H
+    smoother.inform(gain.T @ y, H.T @ gain, kept)
+    return d + K @ y, kept @ P @ kept.T + K @ R @ K.T, float(y @ np.linalg.solve(S, y))
+
+
+def _moved(nodes: Nodes, k: int, d: Floats, P: Floats, smoother: _Smoother) -> tuple[Floats, Floats]:
+    """From node k to the next."""
+    n, states = nodes.x.shape[1], len(d)
+    A, W, J, j, shift = np.eye(states), np.zeros_like(P), np.zeros_like(P), np.zeros(states), np.zeros(states)
+    A[:n, :n], W[:n, :n], J[:n, :n] = nodes.A[k], nodes.W[k], nodes.J[k]
+    j[:n], shift[:n] = nodes.j[k], nodes.shift[k]
+    if states > n:
+        dt_s = float(nodes.stamp_ns[k + 1] - nodes.stamp_ns[k]) * 1e-9
+        kept, walked_m2 = np.exp(-dt_s / BESIDE_S), OFFSET_WALK**2 * dt_s
+        A[-1, -1], W[-1, -1] = kept, BESIDE_STD_M**2 * (1 - kept**2)
+        W[n, n] = W[n + 1, n + 1] = walked_m2
+    M = J @ np.linalg.inv(np.eye(states) + P @ J)
+    vector = j - J @ d
+    vector = vector - M @ (P @ vector)
+    smoother.inform(vector, M, A @ (np.eye(states) - P @ M))
+    return A @ (d + P @ vector - shift), A @ (P - P @ M @ P) @ A.T + W

@@ -1,0 +1,55 @@
+"""Filtered again from its nodes a drive is what the filter made of it; a map of another day is of use."""
+
+import numpy as np
+import pytest
+
+from lab.campaign.recordings import make
+from lab.fedback import maps
+from lab.fedback.days import day
+from lab.fedback.maps import MAPS, Scene, free, moved
+from lab.fedback.nodes import watch
+from lab.fedback.rerun import rerun
+
+SECONDS = 130.0
+
+
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory):
+    drive = day("driven", 3, SECONDS)
+    return watch(make(drive, tmp_path_factory.mktemp("fedback")), drive.names[0])
+
+
+@pytest.mark.slow
+def test_a_drive_filtered_again_is_the_same(nodes):
+    again = rerun(nodes, lambda _: None, aids=False)
+    assert np.abs(again.live_m + nodes.true_m - nodes.x[:, :2]).max() < 1e-6
+    assert np.abs(again.live_m2 - nodes.P[:, :2, :2]).max() < 1e-6
+    known_ns = nodes.stamp_ns[:-91]  # of the others the smoother knows the end of the drive, after the last node
+    _, at, of_rows = np.intersect1d(known_ns, nodes.rows["stamp_ns"], return_indices=True)
+    rows, heading = nodes.rows[of_rows], nodes.rows["heading_rad"][of_rows].astype(float)
+    places = again.smoothed_m[at] + nodes.true_m[at] + nodes.ahead_m * np.stack([np.cos(heading), np.sin(heading)], 1)
+    assert len(at) > 3
+    assert np.abs(places - np.stack([rows["x_m"], rows["y_m"]], 1)).max() < 1e-4
+
+
+@pytest.mark.slow
+def test_guards_without_lanes_change_nothing(nodes):
+    again, guarded = rerun(nodes, lambda _: None, aids=False), rerun(nodes, lambda _: None)
+    assert np.allclose(again.live_m, guarded.live_m, atol=1e-9)
+    assert np.allclose(again.smoothed_m2, guarded.smoothed_m2, atol=1e-9)
+    assert set(guarded.counts) == {"closed"}
+
+
+@pytest.mark.slow
+def test_maps_are_what_their_names_say(nodes):
+    rows = [("machine-1", nodes.rows)]
+    scene = Scene(rows, rows, int(nodes.stamp_ns[0]), SECONDS)
+    assert np.allclose(np.hypot(*(moved(rows, 3.0)[0][1][n] - nodes.rows[n] for n in ("x_m", "y_m"))), 3.0)
+    first, last = nodes.stamp_ns[0], nodes.stamp_ns[-1]
+    for name, make_maps in MAPS.items():
+        maps_of = make_maps(scene)("machine-1")
+        if name in maps.GROWING:
+            assert maps_of(first) is None
+        else:
+            assert maps_of(last).tiles
+    assert len(free(5)) == 4
