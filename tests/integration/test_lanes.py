@@ -1,0 +1,65 @@
+"""The map fed back, through real processes: machines draw it, find their lanes on it, and go on without a server."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from protocol.queries.lanes import LanesQuery
+from protocol.wire import keys
+from protocol.wire.codec import decode_health
+from protocol.wire.session import free_endpoint
+from sim.config import SimConfig
+from sitegrid.process.children import Children
+from tests.integration.site_run import SiteRun, kill  # beside this file
+from tests.patience import until
+
+pytestmark = [pytest.mark.processes, pytest.mark.nightly]
+DRIVEN = SimConfig(scenario="paper_site_driven", machines=4, seconds=0, speed=3, seed=3, world="fast")
+
+
+class Driving(SiteRun):
+    """The same, of another scenario."""
+
+    def start_sim(self, *options: str | Path):
+        return super().start_sim("--scenario", self.sim.scenario, *options)
+
+
+def test_machines_follow_the_lanes_that_they_drew_also_while_the_server_is_down(tmp_path: Path):
+    with Children(tmp_path) as children:
+        run = Driving(tmp_path, children, free_endpoint(), DRIVEN)
+        _, server, driving = run.start()
+        with run.connect() as client:
+            used: dict[str, int] = {}
+
+            def note(sample: zenoh.Sample) -> None:
+                health = decode_health(sample.payload.to_bytes())
+                if (health.values["lanes"] or {}).get("used"):
+                    used[health.machine] = health.stamp_ns
+
+            def follow_for(seconds: float) -> None:
+                """Until all machines are on lanes so much later, in their own time."""
+                before = dict(used)
+                until(
+                    lambda: len(used) == 4 and all(used[m] > before.get(m, 0) + seconds * 1e9 for m in used),
+                    "machines on lanes",
+                )
+
+            subscriber = client.session.declare_subscriber(keys.health_all(run.site), note)
+            follow_for(0)
+            assert client.ask(LanesQuery()).tiles
+            kill(server)
+            follow_for(120)
+            run.start_server()
+            follow_for(10)
+            subscriber.undeclare()
+            driving.send(signal.SIGTERM)
+            reports = run.delivered()
+        assert all(report["lanes"]["squares"] > 20 for report in reports.values())
+        assert all(report["lanes"]["counters"]["lanes_bytes"] < 40_000 for report in reports.values())
+        assert run.server.stop() == 0
+        audit = run.audit()
+        assert (audit.lost, audit.double, audit.unrecorded) == (0, 0, 0)
