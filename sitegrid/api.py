@@ -21,6 +21,7 @@ from protocol.queries.answers import (
 )
 from protocol.queries.calibration import CalibrationAnswer, CorrectedSpan, MachineCalibration
 from protocol.queries.coverage import Coverage, CoverageQuery
+from protocol.queries.lanes import LanesAnswer, LanesQuery
 from protocol.queries.map_tiles import MapTile, TilesAnswer, TilesQuery
 from protocol.queries.origin import Origin
 from protocol.queries.reasons import CellReasons, Votes
@@ -66,5 +67,6 @@ __all__ += ["Bounds", "KnownGround", "SampleCounts", "ServerAlive", "SiteInfo"]
 __all__ += ["QUERIES", "CalibrationQuery", "ChangesQuery", "HistoryQuery", "InfoQuery", "MachinesQuery"]
 __all__ += ["PointQuery", "PointsQuery", "RegionQuery", "RouteQuery", "SegmentsQuery", "TilesQuery", "WayQuery"]
 __all__ += ["WhyQuery", "WorklistQuery"]
-__all__ += ["ChangesAnswer", "Coverage", "CoverageQuery", "HistoryAnswer", "MachinesAnswer", "MapRegion"]
+__all__ += ["ChangesAnswer", "Coverage", "CoverageQuery", "HistoryAnswer", "LanesAnswer", "LanesQuery"]
+__all__ += ["MachinesAnswer", "MapRegion"]
 __version__ = package_version()

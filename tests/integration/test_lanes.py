@@ -22,7 +22,12 @@ DRIVEN = SimConfig(scenario="paper_site_driven", machines=4, seconds=0, speed=3,
 
 
 class Driving(SiteRun):
-    """The same, of another scenario."""
+    """The same, of another scenario, whose agents use the map."""
+
+    def start_agent(self, config: Path):
+        with config.open("a", encoding="utf-8") as file:
+            file.write('\n[pipeline.localisation]\nmap_aid = "auto"\n')
+        return super().start_agent(config)
 
     def start_sim(self, *options: str | Path):
         return super().start_sim("--scenario", self.sim.scenario, *options)
