@@ -25,8 +25,8 @@ class Driving(SiteRun):
     """The same, of another scenario, whose agents use the map."""
 
     def start_agent(self, config: Path):
-        with config.open("a", encoding="utf-8") as file:
-            file.write('\n[pipeline.localisation]\nmap_aid = "auto"\n')
+        table = "[pipeline.localisation]\n"
+        config.write_text(config.read_text("utf-8").replace(table, f'{table}map_aid = "auto"\n'), "utf-8")
         return super().start_agent(config)
 
     def start_sim(self, *options: str | Path):
