@@ -112,5 +112,4 @@ def _made(name: str, config: SignalConfig, database: Any, error: type[Exception]
         raise ValueError(f"signals.{name}: the DBC has no {config.dbc!r}")
     group = group_of(message.frame_id, is_extended=message.is_extended_frame)
     plain = Signal(name, group, 0, signal.length, signal.scale, signal.offset, signal.is_signed)
-    own = {"factor": config.scale, "shift": config.offset}
-    return DbcSignal(**vars(plain), message=message, error=error, label=label, **own)
+    return DbcSignal(**vars(plain), message=message, error=error, label=label, factor=config.scale, shift=config.offset)
