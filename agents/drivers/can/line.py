@@ -58,19 +58,19 @@ class CanLine:
         group = group_of(identifier, is_extended=is_extended)
         if (signals := self._by_group.get(group)) is None:
             return []
-        found = {signal.name: value for signal in signals if (value := signal.value(data)) is not None}
-        if not found:
+        values = {signal.name: value for signal in signals if (value := signal.value(data)) is not None}
+        if not values:
             self.counters["frames_without_value"] += 1
             return []
         sender = identifier & 0xFF if is_extended else 0
         counts = self._counts(group, sender, host_ns)
         if counts:
-            self._held |= {name: (value, host_ns) for name, value in found.items()}
+            self._held |= {name: (value, host_ns) for name, value in values.items()}
         taken_from = (ANY, sender) if counts else (sender,)
-        begun = {feed for name in found for feed in self._begun_by.get(name, ()) if feed.sender in taken_from}
+        begun = {feed for name in values for feed in self._begun_by.get(name, ()) if feed.sender in taken_from}
         if not begun:
             return []
-        held = {name: value for name, (value, ns) in self._held.items() if host_ns - ns <= HELD_NS} | found
+        held = {name: value for name, (value, ns) in self._held.items() if host_ns - ns <= HELD_NS} | values
         made = [self._observed(feed, held, host_ns) for feed in self._feeds if feed in begun]
         return [observed for observed in made if observed]
 

@@ -56,8 +56,8 @@ class CanSource:
 
     def problems(self) -> Sequence[str]:
         """What hinders it: the link first, then what comes over it."""
-        found = [self._problem] if self._problem else self._line.problems(self._clock_ns())
-        return [f"{self._address}: {problem}" for problem in found]
+        sentences = [self._problem] if self._problem else self._line.problems(self._clock_ns())
+        return [f"{self._address}: {problem}" for problem in sentences]
 
     def close(self) -> None:
         """Let go of the bus."""
@@ -128,8 +128,8 @@ class RecordingSource:
 
     def problems(self) -> Sequence[str]:
         """What hinders it: the file first, then what is in it."""
-        found = [self._problem] if self._problem else self._line.problems(self._newest_ns)
-        return [f"{self._address}: {problem}" for problem in found]
+        sentences = [self._problem] if self._problem else self._line.problems(self._newest_ns)
+        return [f"{self._address}: {problem}" for problem in sentences]
 
     def close(self) -> None:
         """Nothing is held open once it was read."""
