@@ -14,7 +14,6 @@ from agents.drivers.time_base import ClockTie
 from protocol.machine.machine_config import QUANTITIES, SensorConfig
 from protocol.machine.readings import columns
 
-COLUMNS = {stream: columns(kind) for stream, kind in STREAMS.items()}
 DECODERS: dict[str, Callable[[Collection[str]], Decoder]] = {NMEA: NmeaDecoder, UBX: UbxDecoder, GPSD: GpsdDecoder}
 
 
@@ -82,7 +81,7 @@ class Line:
         if sensor is None:
             return None
         values = message.values
-        if any(map(math.isnan, values)) and any(map(math.isnan, values := _stated(message, sensor))):
+        if any(map(math.isnan, values)) and any(map(math.isnan, values := stated(values, sensor))):
             self._counters["without_value"] += 1
             return None
         return Observed(sensor.name, STREAMS[message.stream], values, host_ns, message.utc_ns)
@@ -96,10 +95,10 @@ class Line:
         return host_ns if tie.offset_ns is None else tag_ns - tie.offset_ns
 
 
-def _stated(message: Message, sensor: SensorConfig) -> tuple[float, ...]:
-    """Values of a message, with the sensor's own variance where the sender states none."""
-    std = sensor.std.get(QUANTITIES[STREAMS[message.stream]][-1], math.nan)
-    named = zip(message.values, COLUMNS[message.stream], strict=True)
+def stated(values: tuple[float, ...], sensor: SensorConfig) -> tuple[float, ...]:
+    """Values of a sensor's kind, with its own variance where the sender states none."""
+    std = sensor.std.get(QUANTITIES.get(sensor.kind, ("",))[-1], math.nan)
+    named = zip(values, columns(sensor.kind), strict=True)
     return tuple(std * std if math.isnan(value) and name.startswith("var_") else value for value, name in named)
 
 

@@ -5,6 +5,10 @@ from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 
 from agents.drivers import Driver, Source
+from agents.drivers.can.buses import is_recording, split_bus
+from agents.drivers.can.config import SignalConfig, all_signals, misfit
+from agents.drivers.can.line import CanLine
+from agents.drivers.can.source import CanSource, RecordingSource
 from agents.drivers.formats import STREAMS
 from agents.drivers.formats.framing import GPSD
 from agents.drivers.line import DECODERS, Line, split_stream
@@ -16,6 +20,7 @@ from agents.drivers.zenoh import ZENOH, BundleSource
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import QUANTITIES, MachineConfig, SensorConfig
 
+CAN = "can"  # kind of a machine's own bus
 PLUG_INS = "sitegrid.drivers"  # group of entry points
 
 
@@ -23,10 +28,12 @@ PLUG_INS = "sitegrid.drivers"  # group of entry points
 class DriverConfig:
     """One [[driver]]: a port that is listened to.
 
-    kind: `nmea`, `ubx`, `gpsd`, `zenoh`, or the name of a plug-in. address: a serial port (`/dev/ttyACM0`),
-    `tcp://HOST:PORT`, `udp://[HOST]:PORT`, or a file of recorded bytes; of `zenoh` none. baud: of a serial port; 0
-    finds it. feeds: the sensor that takes each stream, one of STREAMS; `gp:fix` is that of one NMEA talker, or gpsd
-    device, among several; of `zenoh` a stream is a sensor's name in the bundles. options: of a plug-in.
+    kind: `nmea`, `ubx`, `gpsd`, `can`, `zenoh`, or the name of a plug-in. address: a serial port (`/dev/ttyACM0`),
+    `tcp://HOST:PORT`, `udp://[HOST]:PORT`, or a file of recorded bytes; of `zenoh` none; of `can` as `split_bus` has
+    it. baud: of a serial port; 0 finds it. feeds: the sensor that takes each stream, one of STREAMS; `gp:fix` is that
+    of one NMEA talker, gpsd device, or address on a bus (`0x0f:retarder`) among several; of `zenoh` a stream is a
+    sensor's name in the bundles. dbc, signals: of `can`, signals beside the built-in ones, and a file that describes
+    them. options: of a plug-in.
     """
 
     kind: str
@@ -34,6 +41,8 @@ class DriverConfig:
     baud: int = 0
     feeds: Mapping[str, str] = field(default_factory=dict, hash=False)
     options: Mapping[str, str] = field(default_factory=dict, hash=False)
+    dbc: str = ""
+    signals: Mapping[str, SignalConfig] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if self.kind not in (known := known_kinds()):
@@ -44,6 +53,10 @@ class DriverConfig:
             self._check_address()
         if self.kind in DECODERS:
             self._check_feeds()
+        if self.kind == CAN:
+            self._check_bus()
+        elif self.dbc or self.signals:
+            raise ValueError(f"dbc, signals: of can alone, {self.kind} has none")
 
     def _check_address(self) -> None:
         if not self.address or not self.address.isprintable():
@@ -60,6 +73,25 @@ class DriverConfig:
             if split_stream(key)[1] not in STREAMS:
                 raise ValueError(f"feeds: {key!r} is no stream; there are {', '.join(STREAMS)}")
 
+    def _check_bus(self) -> None:
+        if self.baud or self.options:
+            raise ValueError("baud, options: can has none; a bus has its bit rate from the host (`ip link set`)")
+        if not is_recording(self.address):
+            split_bus(self.address)
+        for key in self.feeds:
+            sender, _ = split_stream(key)
+            try:
+                is_address = not sender or 0 <= int(sender, 16) <= 0xFF
+            except ValueError:
+                is_address = False
+            if not is_address:
+                raise ValueError(f'feeds: {key!r}: {sender!r} is no address on a bus, as "0x0f:retarder"')
+
+    @property
+    def states_utc(self) -> bool:
+        """Whether what it reads states UTC: receivers do, and recordings of a bus."""
+        return self.kind in DECODERS or (self.kind == CAN and is_recording(self.address))
+
     @property
     def name(self) -> str:
         """Its address, or its kind where it has none."""
@@ -72,7 +104,7 @@ Factory = Callable[[DriverConfig, MachineConfig], Source]
 
 def known_kinds() -> list[str]:
     """Ours, then plug-ins that are installed."""
-    return [*DECODERS, ZENOH, *(plug_in.name for plug_in in entry_points(group=PLUG_INS))]
+    return [*DECODERS, CAN, ZENOH, *(plug_in.name for plug_in in entry_points(group=PLUG_INS))]
 
 
 def check_drivers(drivers: Sequence[DriverConfig], machine: MachineConfig, where: str) -> None:
@@ -92,6 +124,8 @@ def check_drivers(drivers: Sequence[DriverConfig], machine: MachineConfig, where
 
 def _misfit(driver: DriverConfig, stream: str, sensor: SensorConfig) -> str:
     """Why a stream cannot feed a sensor; empty where it can."""
+    if driver.kind == CAN:
+        return misfit(stream, sensor, driver.signals)
     if driver.kind not in DECODERS:
         return ""
     if sensor.kind != (kind := STREAMS[stream]):
@@ -116,7 +150,7 @@ def open_sources(
     machine's key `sensors`.
     """
     time_base = TimeBase()
-    if not any(driver.kind in DECODERS for driver in drivers):
+    if not any(driver.states_utc for driver in drivers):
         time_base.take("host", *host_utc())
     return Sources({driver.name: _open(driver, machine, bundles) for driver in drivers}, time_base)
 
@@ -127,9 +161,19 @@ def _open(driver: DriverConfig, machine: MachineConfig, bundles: Callable[[], Dr
         return BundleSource(bundles(), feeds)
     if driver.kind in DECODERS:
         return ReceiverSource(driver.address, driver.baud, driver.kind, Line(driver.kind, feeds))
+    if driver.kind == CAN:
+        return _open_bus(driver, feeds)
     plug_in = next(iter(entry_points(group=PLUG_INS, name=driver.kind)))
     try:
         factory: Factory = plug_in.load()
         return factory(driver, machine)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"[[driver]] {driver.kind}", str(error)) from None
+
+
+def _open_bus(driver: DriverConfig, feeds: Mapping[str, SensorConfig]) -> Source:
+    try:
+        line = CanLine(feeds, all_signals(driver.signals, driver.dbc))
+    except ValueError as error:
+        raise ConfigError(f"[[driver]] {driver.address}", str(error)) from None
+    return RecordingSource(driver.address, line) if is_recording(driver.address) else CanSource(driver.address, line)

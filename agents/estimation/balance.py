@@ -5,8 +5,8 @@ payload, m_0 the one without, and lambda the rotating mass factor, which is stat
 
     F / (m g) - (f - g squat) / g - (lambda - 1) (m_0 / m) a / g  =  direction c_rr cos(slope)
 
-F is what the torque sensor states, less what it does not see: friction between it and the wheels, brakes whose force is
-read, and the drag of the air, rho c_d A v^2 / 2.
+F is what wheels, engine or motor state (`powertrain`), less what they do not see: friction between them and the wheels,
+brakes whose force is read, and the drag of the air, rho c_d A v^2 / 2.
 
 The accelerometer measures gravity's share of the slope as well, so the grade cancels.
 
@@ -21,10 +21,11 @@ from operator import add
 
 from agents.dead_reckoning import DeadReckoning
 from agents.estimation.attitude import SlopeFilter
+from agents.estimation.powertrain import DriveReadings
 from agents.ground_speed import GroundSpeed
 from protocol.arrays import Floats
 from protocol.machine.machine_config import BASE, MachineConfig, Mount, SensorConfig
-from protocol.machine.readings import Articulation, Brake, BrakeForce, Imu, Payload, Reading, Torque
+from protocol.machine.readings import Articulation, Brake, BrakeForce, Imu, Payload, Reading
 from protocol.units import GRAVITY_MPS2
 
 STEP_NS = 50_000_000  # of the balance: short enough to date a border of two grounds, long enough to average vibration
@@ -48,7 +49,8 @@ class Balance:
     pitch_radps: rate of the pitch, nose up positive. yaw_radps: of the turn to the left. norm_mps2: of the specific
     force. on_front: share of the load on the front axle, 0 if not known. body_mps2: acceleration ahead by the
     accelerometer. torque_s, wheels_s: age of their newest reading. mass_kg: with payload. brake: how much of a brake is
-    applied whose force nobody reads, 0 to 1; NaN of a machine without any reading of its brakes.
+    applied whose force nobody reads, 0 to 1; NaN of a machine without any reading of its brakes. share_var: of share,
+    by the torque's steps. unknown: why the drive force is not known, "" where it is.
     """
 
     stamp_ns: int
@@ -72,6 +74,8 @@ class Balance:
     wheels_s: float
     mass_kg: float
     brake: float
+    share_var: float = 0.0
+    unknown: str = ""
 
     @property
     def direction(self) -> float:
@@ -86,7 +90,7 @@ class BalanceStep:
     stamp_ns: of its end; dt_s; distance_m: driven since the last usable step. raw: with the calibration applied [-].
     regressor: direction cos(slope) [-]. share: drive force over weight, signed ahead [-]. lead_share: share of the load
     that the leading axle carries; wheelbase_m: how far the trailing axle is behind it; lead_m: how far the load centre
-    is. Without a wheelbase, all wheels stand on the same ground.
+    is. Without a wheelbase, all wheels stand on the same ground. share_var: of share, by the torque's steps.
     """
 
     stamp_ns: int
@@ -98,6 +102,7 @@ class BalanceStep:
     lead_share: float = 1.0
     wheelbase_m: float = 0.0
     lead_m: float = 0.0
+    share_var: float = 0.0
 
 
 class Balancer:
@@ -114,11 +119,11 @@ class Balancer:
         self._bend_rad = 0.0
         self._rotation: dict[str, Floats] = {}
         self._sensor: str | None = None
-        self._imu_ns = self._begin_ns = self._torque_ns = self._wheels_ns = self._ground_ns = 0
+        self._imu_ns = self._begin_ns = self._wheels_ns = self._ground_ns = 0
         # Count; force ahead at base_link, norm; rates about x, y, z; forces ahead and left that change the speed.
         self._imu_sums = NO_SUMS
         self._rolls = False  # whether wheels said something in this step
-        self._torque_nm, self._torque_sums = 0.0, (0, 0.0)
+        self._drive = DriveReadings(machine)
         self._brakes: dict[str, Brake] = {}
         self._brake_forces: dict[str, BrakeForce] = {}
 
@@ -129,11 +134,9 @@ class Balancer:
 
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> Balance | None:
         """Add a reading, after dead reckoning did; returns the balance of the step that it ends."""
-        if isinstance(reading, Torque):
-            self._torque_ns, self._torque_nm = reading.stamp_ns, reading.torque_nm
-            count, total = self._torque_sums
-            self._torque_sums = count + 1, total + reading.torque_nm
-        elif isinstance(reading, Brake):
+        if self._drive.add(reading):
+            return None
+        if isinstance(reading, Brake):
             self._brakes[reading.sensor] = reading
         elif isinstance(reading, BrakeForce):
             self._brake_forces[reading.sensor] = reading
@@ -156,7 +159,8 @@ class Balancer:
             return None
         dt_s, self._imu_ns = (imu.stamp_ns - self._imu_ns) * 1e-9, imu.stamp_ns
         if not 0 < dt_s < MAX_PAUSE_S:  # start from here
-            self._begin_ns, self._imu_sums, self._torque_sums = imu.stamp_ns, NO_SUMS, (0, 0.0)
+            self._begin_ns, self._imu_sums = imu.stamp_ns, NO_SUMS
+            self._drive.restart()
             self._slope.restart()
             return None
         rotation, wheels, (x_m, y_m, z_m) = self._rotation[imu.sensor], dead_reckoning.wheels, sensor.mount.xyz_m
@@ -179,11 +183,11 @@ class Balancer:
         self, dead_reckoning: DeadReckoning, mount: Mount, speed: float, accel: float, ground: GroundSpeed | None
     ) -> Balance:
         machine, g = self._machine, GRAVITY_MPS2
-        (n, *sums), (torques, torque_nm) = self._imu_sums, self._torque_sums
+        n, *sums = self._imu_sums
         force, norm, about_x, about_y, about_z, *turned = (value / n for value in sums)
         rate = -about_y  # the nose rises
         dt_s, self._begin_ns = (self._imu_ns - self._begin_ns) * 1e-9, self._imu_ns
-        self._imu_sums, self._torque_sums = NO_SUMS, (0, 0.0)
+        self._imu_sums, drive = NO_SUMS, self._drive.take(speed)
         # At the sensor, with mean rates: those of one reading shake. None sideways, with wheels or without.
         x_m, y_m, z_m = mount.xyz_m
         ahead = speed + about_z * (dead_reckoning.wheels.offset_m - y_m) + about_y * z_m
@@ -192,8 +196,7 @@ class Balancer:
         variance = self._ground_variance(ground, turned[0]) if ground else None
         self._slope.update(dt_s, (about_x, about_y, about_z), turned, at_sensor, variance)
         self._ground_ns = ground.stamp_ns if ground else 0
-        drive_n = (torque_nm / torques if torques else self._torque_nm) / machine.wheel_radius_m
-        share = drive_n / (self.mass_kg * g)
+        share = drive.force_n / (self.mass_kg * g)
         on_front = front_share(machine, self.payload_kg, force)
         squat = squat_rad(machine, self.payload_kg, force)
         bend = self._climb_of_bend(on_front, squat)
@@ -219,10 +222,12 @@ class Balancer:
             norm_mps2=norm,
             on_front=on_front,
             body_mps2=force - g * self._slope.shown_ahead,
-            torque_s=(self._imu_ns - self._torque_ns) * 1e-9 if self._torque_ns else math.inf,
+            torque_s=(self._imu_ns - self._drive.stamp_ns) * 1e-9 if self._drive.stamp_ns else math.inf,
             wheels_s=self._wheels_s() if dead_reckoning.wheels.is_known else math.inf,
             mass_kg=self.mass_kg,
             brake=self._brake(),
+            share_var=drive.variance_n2 / (self.mass_kg * g) ** 2,
+            unknown=drive.unknown,
         )
 
     def _unseen_n(self, speed_mps: float) -> float:

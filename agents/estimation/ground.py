@@ -271,7 +271,8 @@ class GroundEstimator:
             lead_share = balance.on_front if forwards else 1 - balance.on_front
             lead_m = machine.wheelbase_m - machine.load_centre_m if forwards else machine.load_centre_m
             axles = (lead_share, machine.wheelbase_m, lead_m)
-        return BalanceStep(balance.stamp_ns, balance.dt_s, distance_m, raw, regressor, balance.share, *axles)
+        step = BalanceStep(balance.stamp_ns, balance.dt_s, distance_m, raw, regressor, balance.share, *axles)
+        return replace(step, share_var=balance.share_var) if balance.share_var else step
 
     def _stand(self, balance: Balance) -> None:
         """What stretches show takes effect while the machine stands: it comes in small steps, each half a metre."""

@@ -1,8 +1,8 @@
 """Whether a balance may be believed; if not, the reason in a word that health and counters carry.
 
-A machine that stands, brakes, digs or spins its wheels shows nothing of the ground's resistance; on a change of slope
-its axles stand on two slopes; and sensors fail: they fall silent, freeze (stuck, or at the end of their range), or come
-in the wrong unit.
+A machine that stands, brakes, digs, spins its wheels or slips in its driveline shows nothing of the ground's
+resistance; on a change of slope its axles stand on two slopes; and sensors fail: they fall silent, freeze (stuck, or at
+the end of their range), or come in the wrong unit.
 
 Brakes that neither the torque sensor nor a reading shows make the ground seem rough: downhill at constant speed and
 without torque, c_rr would be just the grade. So a machine that rolls without torque on ground that seems rougher than
@@ -96,6 +96,9 @@ class Plausibility:
             return fault
         if not _rolls(balance):
             return "standstill"
+        if balance.unknown:  # engine and driveline settle for as long after it
+            self._hold = balance.unknown, HOLD_S
+            return balance.unknown
         pitch_radps = self._pitch_radps if self._pitching.variance else balance.pitch_radps
         curve = max(MAX_CURVE_RADPM, MAX_DIFFERENCE_RAD / self._axles_m)
         if abs(pitch_radps) > curve * max(abs(balance.speed_mps), SLOW_MPS):
@@ -116,8 +119,10 @@ class Plausibility:
             return "no_wheels"
         if balance.torque_s > STALE_S:
             return "no_torque"
-        drives = _rolls(balance)
-        frozen_share = FROZEN_SHARE + 2 * self._shaking.margin(MEAN_S) / GRAVITY_MPS2  # its top and its bottom shake
+        drives = _rolls(balance) and not balance.unknown
+        # Its top and its bottom shake; torque in steps stays the same within one, sqrt(12) standard deviations wide.
+        steps = 2 * math.sqrt(12 * balance.share_var)
+        frozen_share = FROZEN_SHARE + steps + 2 * self._shaking.margin(MEAN_S) / GRAVITY_MPS2
         is_frozen = self._frozen.update(balance, drives=drives) >= frozen_share and self._frozen.same_s >= FROZEN_S
         if is_frozen and abs(balance.share) > ROLLS_SHARE:  # none at all is that of a machine that rolls or brakes
             return "torque_frozen"

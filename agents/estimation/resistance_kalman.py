@@ -38,6 +38,7 @@ LEAD, TRAIL, SCALE = 0, 1, 2
 KEPT = 100  # steps: 5 s, more than a sample waits for what comes after it
 NEAR_NS = 150_000_000  # a stamp this far from a usable step has no estimate
 PAUSE_S = 0.1  # steps further apart do not follow one another
+STEADY_S = 1.0  # for so long torque in steps has the same error, and counts as one measurement
 
 IDENTITY = np.eye(3)
 TRAIL_IS_LEAD = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -109,7 +110,8 @@ class KalmanResistance:
         h = np.array([step.regressor * lead, step.regressor * (1 - lead), share])
         before = self._before(len(self._steps))
         distance_m = before.measured.distance_m + step.distance_m
-        measured = _Measured(step, distance_m, h, self._noise.density / step.dt_s, scale_var)
+        density = self._noise.density + step.share_var * STEADY_S
+        measured = _Measured(step, distance_m, h, density / step.dt_s, scale_var)
         self._steps.append(_filtered(before, measured, self._tuning, border=False))
         self._count += 1
         raw = step.raw - share * float(before.x[SCALE])

@@ -37,6 +37,7 @@ from protocol.machine.machine_config import (
     SensorConfig,
     parse_machine,
     plain_lines,
+    powertrain_lines,
     sensor_lines,
 )
 from protocol.machine.readings import MAX_STAMP_NS, Reading, columns, parse_reading
@@ -274,7 +275,7 @@ def manifest_toml(
     """The manifest of what `log_files` has written. notes: comments, by sensor; those by "" stand at the top."""
     comments = {sensor: [f"# {one_line(line)}" for line in some] for sensor, some in (notes or {}).items()}
     lines = [*comments.get("", ()), "[log]", *toml_lines({"name": name}), "", "[site]", site_toml(site)]
-    lines += ["[machine]", *plain_lines(machine)]
+    lines += ["[machine]", *plain_lines(machine), *powertrain_lines(machine)]
     for sensor in machine.sensors:
         lines += ["", *comments.get(sensor.name, ()), "[[sensor]]", *sensor_lines(sensor)]
         lines += [f'file = "{sensor.name}.csv"', "[sensor.columns]"]

@@ -3,14 +3,15 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
 from protocol.arrays import Floats
-from protocol.config import from_table, require_between
+from protocol.config import from_table, require_between, toml_lines
 from protocol.errors import ConfigError
+from protocol.machine.powertrain_config import PowertrainConfig
 from protocol.machine.readings import KINDS
 from protocol.rotations import matrix_from_rpy
 from protocol.site.site_config import NAME
@@ -32,6 +33,7 @@ QUANTITIES = {
 MODES = ABSOLUTE, DIFFERENTIAL, RELATIVE = ("absolute", "differential", "relative")
 WITH_MODE = ("gps", "attitude")
 MAX_DELAY_S = 0.4  # what is 0.5 s behind the newest reading is refused as late; readings do not arrive in perfect order
+BEFORE_THE_WHEELS = frozenset({"engine", "motor", "motor_power"})  # kinds whose readings need a powertrain
 NOT_NEGATIVE = (
     "wheelbase_m",
     "axle_stiffness_npm",
@@ -150,7 +152,8 @@ class MachineConfig:
     vertical, of the two tyres of one axle together. cog_height_m: of the empty machine's centre of mass above the
     ground. payload_x_m, payload_z_m: where the centre of what it carries lies, ahead of `base_link` when it stands
     straight, and above the ground. drag_area_m2: frontal area times drag coefficient. drive_friction_n: of what the
-    torque sensor drives before the wheels, at the wheels, whatever the speed.
+    torque sensor drives before the wheels, at the wheels, whatever the speed. powertrain: None where torque is read at
+    the wheels.
     """
 
     name: str
@@ -167,6 +170,7 @@ class MachineConfig:
     payload_z_m: float = 0.0
     drag_area_m2: float = 0.0
     drive_friction_n: float = 0.0
+    powertrain: PowertrainConfig | None = None
     sensors: tuple[SensorConfig, ...] = ()
 
     def __post_init__(self) -> None:
@@ -185,9 +189,15 @@ class MachineConfig:
                 raise ValueError(f"{name}: {getattr(self, name)!r} is not a positive number, nor 0 for not known")
         if not self.wheelbase_m and (blind := [s.name for s in self.sensors if s.kind == "steering" and s.use]):
             raise ValueError(f"wheelbase_m: {blind[0]}: steering is of no use without it, so give it or `use = false`")
+        self._check_powertrain()
         names = [s.name for s in self.sensors]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise ValueError(f"sensors: two are named {twice[0]!r}")
+
+    def _check_powertrain(self) -> None:
+        kinds = {s.kind for s in self.sensors if s.use} & BEFORE_THE_WHEELS
+        if kinds and (lacks := self.powertrain.lacks(kinds) if self.powertrain else "of no use without this table"):
+            raise ValueError(f"powertrain: {min(kinds)}: {lacks}")
 
     def _check_mass(self) -> None:
         require_between(self, 1, MOST_KG, "mass_kg")
@@ -221,10 +231,16 @@ def machine_toml(machine: MachineConfig) -> str:
     """A machine and its sensors as TOML, as an agent's configuration has them; drag and friction where known."""
     unknown = {name for name in ("drag_area_m2", "drive_friction_n") if not getattr(machine, name)}
     known = [line for line in plain_lines(machine) if line.partition(" ")[0] not in unknown]
-    lines = ["[machine]", *known]
+    lines = ["[machine]", *known, *powertrain_lines(machine)]
     for sensor in machine.sensors:
         lines += ["", "[[sensor]]", *sensor_lines(sensor)]
     return "\n".join(lines) + "\n"
+
+
+def powertrain_lines(machine: MachineConfig) -> list[str]:
+    """The powertrain of a machine as a key of its table, where it has one."""
+    values = asdict(machine.powertrain) if machine.powertrain else {}
+    return [f"powertrain = {{ {', '.join(toml_lines(values))} }}"] if values else []
 
 
 def plain_lines(config: Any) -> list[str]:

@@ -137,6 +137,69 @@ class Torque(Reading):
 
 
 @dataclass(frozen=True, slots=True)
+class Engine(Reading):
+    """Indicated torque of an engine, friction included, as a share of its reference torque, and its speed."""
+
+    kind: ClassVar[str] = "engine"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"torque": (-1.25, 1.5), "speed_radps": (0, 1000)}
+
+    torque: float
+    speed_radps: float
+
+
+@dataclass(frozen=True, slots=True)
+class EngineLosses(Reading):
+    """Friction of an engine and its auxiliary drives, as a share of its reference torque."""
+
+    kind: ClassVar[str] = "engine_losses"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"friction": (-1.25, 1.5)}
+
+    friction: float
+
+
+@dataclass(frozen=True, slots=True)
+class Driveline(Reading):
+    """Whether the clutch is closed, the converter locked, and a gear being changed: 0 or 1 each."""
+
+    kind: ClassVar[str] = "driveline"
+    limits: ClassVar[dict[str, tuple[float, float]]] = dict.fromkeys(("engaged", "locked", "shifting"), (0.0, 1.0))
+
+    engaged: float
+    locked: float
+    shifting: float
+
+
+@dataclass(frozen=True, slots=True)
+class Motor(Reading):
+    """Torque of an electric or hydraulic motor at its shaft, summed over all, positive when it drives forwards."""
+
+    kind: ClassVar[str] = "motor"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"torque_nm": (-1e6, 1e6)}
+
+    torque_nm: float
+
+
+@dataclass(frozen=True, slots=True)
+class MotorPower(Reading):
+    """Mechanical power of the motors that drive, negative when they brake."""
+
+    kind: ClassVar[str] = "motor_power"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"power_w": (-1e7, 1e7)}
+
+    power_w: float
+
+
+@dataclass(frozen=True, slots=True)
+class HydraulicPressure(Reading):
+    """Pressure of the hydraulics that the engine drives beside the wheels."""
+
+    kind: ClassVar[str] = "hydraulic_pressure"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"pressure_pa": (-1e6, 2e8)}
+
+    pressure_pa: float
+
+
+@dataclass(frozen=True, slots=True)
 class Brake(Reading):
     """How much of a brake or retarder is applied, which the torque does not see; of a switch 0 or 1."""
 
@@ -196,6 +259,12 @@ KINDS: dict[str, type[Reading]] = {
         Odometry,
         Encoder,
         Torque,
+        Engine,
+        EngineLosses,
+        Driveline,
+        Motor,
+        MotorPower,
+        HydraulicPressure,
         Brake,
         BrakeForce,
         Articulation,

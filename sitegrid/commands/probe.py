@@ -13,7 +13,7 @@ EXTRA = "receivers"
 
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
-    ports = "serial port, tcp://HOST:PORT, udp://[HOST]:PORT, gpsd, or a file (default: all serial ports)"
+    ports = "serial port, tcp://HOST:PORT, udp://[HOST]:PORT, gpsd, CAN bus, or a file (default: all serial ports)"
     parser.add_argument("ports", nargs="*", metavar="PORT", help=ports)
     parser.add_argument("--seconds", type=positive, default=5.0, help="how long to listen (default %(default)s)")
 

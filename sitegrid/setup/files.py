@@ -16,6 +16,7 @@ from agents.config import AgentConfig, load_agent, require_place
 from agents.drivers.formats import FIX, HEADING, IMU, STREAMS, VELOCITY, WHEELS
 from agents.drivers.formats.framing import GPSD
 from agents.drivers.receiver import BAUDS
+from agents.drivers.tables import CAN
 from protocol.config import toml_lines
 from protocol.errors import ConfigError, SitegridError
 from protocol.machine.machine_config import MachineConfig
@@ -90,7 +91,9 @@ def agent_text(name: str, model: str, every: Sequence[HeardLine]) -> str:
     template = models()[model]
     lines = [f"# A machine, made by `sitegrid init` as a {model}: measure, and correct, what has a comment."]
     lines += ["", "[machine]", *toml_lines({"name": name}), *_explained(template["machine"])]
-    for i, heard in enumerate((heard for heard in every if heard.kind), 1):
+    for heard in (heard for heard in every if heard.kind == CAN):
+        lines += ["", f"# {heard.address} is a bus with {', '.join(heard.streams)}: docs/can.md has its tables."]
+    for i, heard in enumerate((heard for heard in every if heard.kind not in ("", CAN)), 1):
         feeds = {stream: f"{NAMES[stream]}-{i}" for stream in heard.streams}
         for stream, sensor in feeds.items():
             lines += ["", "[[sensor]]", *toml_lines({"name": sensor, "kind": STREAMS[stream]})]

@@ -28,6 +28,7 @@ PROMISED = {
 }
 # Formats that no driver reads, by how their messages begin.
 FOREIGN = {b"$@": "SBF (Septentrio)", b"\xaaD\x12": "NovAtel's binary", b"\xa0\xa2": "SiRF's binary"}
+ENGINE = "engine"  # stream of a bus
 MANY, MOST_BETWEEN = 3, 2000  # such beginnings, and bytes from one to the next, are no chance
 NO_PORT = "no serial port is there: plug a receiver in, or name an address (tcp://HOST:PORT, udp://:PORT, gpsd, a file)"
 
@@ -190,4 +191,6 @@ def missing(every: Sequence[HeardLine]) -> dict[str, str]:
     if IMU not in streams:
         lacks["slope"] = "no IMU: no slope (of a u-blox with one: switch on ESF-MEAS or ESF-RAW)"
     rest = "slope only" if IMU in streams else "no rolling resistance"
-    return lacks | {"resistance": f"no torque: {rest} (no receiver carries it: a driver of your own, or a log)"}
+    if ENGINE in streams:
+        return lacks
+    return lacks | {"resistance": f"no torque: {rest} (the machine's bus has it, or a driver of your own, or a log)"}

@@ -9,18 +9,22 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+from agents.drivers.can.buses import buses
 from agents.drivers.formats.framing import GPSD
 from agents.drivers.formats.gpsd import GPSD_PORT, GREETING
 from agents.drivers.receiver import BAUDS, TRY_S
 from agents.drivers.transports import Transport, open_transport, split_address, why_closed
 from protocol.errors import ConfigError
 from sitegrid.setup.hearing import Ear, HeardLine
+from sitegrid.setup.hearing_bus import is_bus, listen_to_bus
 
 MOST_FILE_BYTES = 1 << 22  # of a recording: an hour of a receiver
 
 
 def address_of(text: str) -> str:
     """An address as [[driver]] has it, `gpsd` for that of this host; ConfigError where it is none."""
+    if text in buses() or (is_bus(text) and "://" in text):
+        return text
     address = f"tcp://127.0.0.1:{GPSD_PORT}" if text == GPSD else text
     if "://" in address:
         try:
@@ -41,6 +45,8 @@ def listen_to(addresses: Sequence[str], seconds: float, bauds: Sequence[int] = B
 
 def listen(address: str, seconds: float, bauds: Sequence[int] = BAUDS) -> HeardLine:
     """What talks at one address; on a serial port at the first baud with frames."""
+    if is_bus(address):
+        return listen_to_bus(address, seconds)
     ear, is_serial = Ear(), "://" not in address
     for baud in bauds if is_serial else bauds[:1]:
         ear = Ear()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.fuzz import can_frames
 from tests.fuzz.frames import MAKERS, run
 
 
@@ -14,3 +15,9 @@ def test_no_frame_raises_and_no_whole_one_is_lost(name: str):
     assert outcome.read > 100
     assert outcome.malformed > 0
     assert outcome.broken_bytes > 0
+
+
+def test_no_frame_of_a_bus_raises_and_no_whole_one_is_lost():
+    outcome = can_frames.run(3000)
+    assert outcome.lost == 0
+    assert outcome.values > 300

@@ -10,11 +10,13 @@ from agents.config import MOST_LAG_S, AgentConfig, load_agent
 from agents.drivers.tables import DriverConfig
 from agents.estimation.ground import NOTHING_KNOWN
 from agents.estimation.plausibility import FAULTS
+from agents.estimation.powertrain import REASONS
 from agents.localisation.localiser import LocalisationConfig
 from agents.positioning import PipelineConfig
 from mapserver.trust.judgement import CLOCK_LIMIT_S
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.powertrain_config import PowertrainConfig
 from protocol.site.site_config import SiteConfig
 from protocol.site.site_file import load_site
 from sim.scenario.file import load_scenario
@@ -51,9 +53,10 @@ def test_files_name_every_option() -> None:
     assert all(f"\n# {f.name} = " in text for f in fields(DriverConfig))
     assert {f.name for f in fields(SiteConfig)} == set(table("site.toml"))
     estimated = "machine_share", "skid_steers"  # without it; so it is in a comment
-    assert {f.name for f in fields(MachineConfig)} - {"sensors", *estimated} == set(named["machine"])
-    for name in estimated:
+    assert {f.name for f in fields(MachineConfig)} - {"sensors", "powertrain", *estimated} == set(named["machine"])
+    for name in (*estimated, *(f.name for f in fields(PowertrainConfig))):
         assert f"\n# {name} = " in text
+    assert "\n# [machine.powertrain]" in text
     assert {f.name for f in fields(SensorConfig)} == {key for sensor in named["sensor"] for key in sensor}
     assert {f.name for f in fields(Mount)} == set(named["sensor"][0]["mount"])
 
@@ -132,4 +135,4 @@ def test_page_of_ground_estimation_names_every_reason_and_none_else() -> None:
     assert not {reason for reason in reasons if f'"{reason}"' not in source}
     judged = (CONFIG.parent / "agents" / "estimation" / "plausibility.py").read_text(encoding="utf-8")
     given = set(re.findall(r'return "(\w+)"', judged)) | set(re.findall(r'_hold = "(\w+)"', judged))
-    assert given | FAULTS | {NOTHING_KNOWN.reason, "settling"} == reasons
+    assert given | FAULTS | REASONS | {NOTHING_KNOWN.reason, "settling"} == reasons

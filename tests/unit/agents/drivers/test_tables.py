@@ -26,7 +26,7 @@ kind = "attitude"
 @pytest.mark.parametrize(
     ("keys", "problem"),
     [
-        ({"kind": "nme"}, "kind: 'nme' is none of nmea, ubx, gpsd, zenoh"),
+        ({"kind": "nme"}, "kind: 'nme' is none of nmea, ubx, gpsd, can, zenoh"),
         ({"address": "tcp://10.0.0.7"}, "address: 'tcp://10.0.0.7' is neither tcp://HOST:PORT nor"),
         ({"address": ""}, "address: '' is neither a port"),
         ({"baud": -3}, "baud: -3 is no baud; 0 finds it"),

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.log_folder import open_log, write_log
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
+from protocol.machine.powertrain_config import PowertrainConfig
 from protocol.machine.readings import KINDS, Articulation
 from protocol.site.site_config import SiteConfig
 
@@ -147,7 +148,8 @@ def test_files_below_the_data_folder_are_read_also_through_links(tmp_path):
 SITE = SiteConfig("paper", 49.1, 8.4, 110.5)
 MOUNT = Mount((0.1, -0.2, 3.0), (0.0, 90.0, -90.0))
 SENSORS = tuple(SensorConfig(f"{kind}-1", kind, MOUNT, drift_time_s=60.0) for kind in KINDS)
-MACHINE = MachineConfig("loader-1", mass_kg=17_000.5, wheelbase_m=2.5, sensors=SENSORS)
+TRAIN = PowertrainConfig(reference_torque_nm=1900.0, reverse_gears=(13.0, 11.0), final_drive=5.1)
+MACHINE = MachineConfig("loader-1", mass_kg=17_000.5, wheelbase_m=2.5, powertrain=TRAIN, sensors=SENSORS)
 
 
 @st.composite

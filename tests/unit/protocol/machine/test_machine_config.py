@@ -6,6 +6,7 @@ import pytest
 
 from protocol.config import from_table
 from protocol.machine.machine_config import QUANTITIES, MachineConfig, Mount, SensorConfig, machine_toml, parse_machine
+from protocol.machine.powertrain_config import PowertrainConfig
 from protocol.machine.readings import KINDS
 
 GPS = SensorConfig("gps-1", "gps", Mount((1.5, -0.5, 3.25), (0.0, 0.0, 180.0)), drift_share=0.5, use=False)
@@ -75,8 +76,9 @@ def test_every_option_of_a_machine_is_written_and_read_back():
     body = {
         f.name: 1.25 + i / 16
         for i, f in enumerate(dataclasses.fields(MachineConfig))
-        if f.name not in ("name", "sensors")
+        if f.name not in ("name", "sensors", "powertrain")
     }
+    body |= {"powertrain": PowertrainConfig(1900.0, 0.1, (9.0, 4.0), (8.0,), 5.1, 0.9, 3e6)}
     machine = MachineConfig("a", **{**body, "mass_kg": 2500.0, "machine_share": 0.5, "skid_steers": True})
     assert parse_machine(tomllib.loads(machine_toml(machine))["machine"], (), "x") == machine
 

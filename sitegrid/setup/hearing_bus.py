@@ -1,0 +1,72 @@
+"""What talks on a CAN bus: which parameter groups come with values, and what an agent misses among them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+
+from agents.drivers.can.buses import Bus, CanFrame, buses, is_recording, read_recording, split_bus, why_shut
+from agents.drivers.can.line import CanLine
+from agents.drivers.can.pgns import SIGNALS, group_name
+from agents.drivers.can.signals import group_of
+from agents.drivers.can.source import SILENT, take
+from agents.drivers.can.streams import STREAMS
+from agents.drivers.tables import CAN
+from protocol.machine.machine_config import SensorConfig
+from sitegrid.setup.hearing import HeardLine
+
+NEEDED = {"engine": "engine torque (EEC1)", "speed": "wheel speed (CCVS1)", "gearbox": "clutch and shifts (ETC1)"}
+PLACES = {"fix", "velocity"}  # a bus of NMEA 2000 has no engine to drive by
+POLL_S = 0.1
+
+
+def is_bus(address: str) -> bool:
+    """Whether an address is that of a bus, or of a recording of one."""
+    if is_recording(address) or address in buses():
+        return True
+    try:
+        return "://" in address and bool(split_bus(address))
+    except ValueError:
+        return False
+
+
+def listen_to_bus(address: str, seconds: float) -> HeardLine:
+    """What comes on a bus within some seconds, or is in a recording."""
+    try:
+        if is_recording(address):
+            return heard_bus(address, read_recording(address))
+        with closing(Bus(address)) as bus:
+            return heard_bus(address, _live(bus, time.monotonic() + seconds))
+    except OSError as error:
+        return HeardLine(address, problem=why_shut(address, error))
+
+
+def heard_bus(address: str, frames: Iterable[CanFrame]) -> HeardLine:
+    """Which groups of these frames have values, what they can feed, and what is missing."""
+    line = CanLine({name: SensorConfig(name, stream.kind) for name, stream in STREAMS.items()}, SIGNALS)
+    stamps: dict[str, list[float]] = {}
+    streams: set[str] = set()
+    for frame in frames:
+        group = group_of(frame.identifier, is_extended=frame.is_extended)
+        streams.update(value.sensor for value in take(line, frame, round(frame.utc_s * 1e9)))
+        if any(signal.group == group and signal.value(frame.data) is not None for signal in SIGNALS.values()):
+            stamps.setdefault(group_name(group), []).append(frame.utc_s)
+    rates = {name: _hz(every) for name, every in sorted(stamps.items())}
+    if not streams:
+        n = line.counters["frames_can"]
+        foreign = f"{n} frames, and none that the built-in table knows: say its `signals`, or a DBC"
+        return HeardLine(address, messages=rates, problem=foreign if n else SILENT)
+    lacks = [what for name, what in NEEDED.items() if name not in streams]
+    problem = f"no value of {', '.join(lacks)}" if lacks and not streams & PLACES else ""
+    return HeardLine(address, CAN, 0, rates, tuple(name for name in STREAMS if name in streams), problem=problem)
+
+
+def _live(bus: Bus, end_s: float) -> Iterator[CanFrame]:
+    while (left_s := end_s - time.monotonic()) > 0:
+        yield from bus.read(min(left_s, POLL_S))
+
+
+def _hz(stamps: list[float]) -> float:
+    """0 where one alone came."""
+    return round((len(stamps) - 1) / (stamps[-1] - stamps[0]), 2) if stamps[-1] > stamps[0] else 0.0
