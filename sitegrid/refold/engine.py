@@ -134,7 +134,8 @@ class Cluster:
 
     def _started(self) -> Any:
         """A client of a scheduler in this process, with workers that die with it."""
-        options = {"memory_limit": 0, "dashboard_address": None, "silence_logs": logging.CRITICAL, "security": True}
+        options: dict[str, Any] = {"memory_limit": 0, "silence_logs": logging.CRITICAL, "security": True}
+        options["dashboard_address"] = "127.0.0.1:0"  # there is no way without one; its usual port may be taken
         known = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which what starts here inherits: Ctrl-C is for us alone
         try:
             self._local = self._dask.LocalCluster(n_workers=self._jobs, threads_per_worker=1, **options)
