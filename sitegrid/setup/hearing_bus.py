@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import closing
@@ -19,11 +20,12 @@ from sitegrid.setup.hearing import HeardLine
 NEEDED = {"engine": "engine torque (EEC1)", "speed": "wheel speed (CCVS1)", "gearbox": "clutch and shifts (ETC1)"}
 PLACES = {"fix", "velocity"}  # a bus of NMEA 2000 has no engine to drive by
 POLL_S = 0.1
+USUAL = re.compile(r"v?can\d+")  # names of buses, which a host may lack
 
 
 def is_bus(address: str) -> bool:
     """Whether an address is that of a bus, or of a recording of one."""
-    if is_recording(address) or address in buses():
+    if is_recording(address) or address in buses() or USUAL.fullmatch(address):
         return True
     try:
         return "://" in address and bool(split_bus(address))

@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from agents.drivers.can.buses import buses
+from agents.drivers.can.buses import is_recording
 from agents.drivers.formats.framing import GPSD
 from agents.drivers.formats.gpsd import GPSD_PORT, GREETING
 from agents.drivers.receiver import BAUDS, TRY_S
@@ -23,7 +23,7 @@ MOST_FILE_BYTES = 1 << 22  # of a recording: an hour of a receiver
 
 def address_of(text: str) -> str:
     """An address as [[driver]] has it, `gpsd` for that of this host; ConfigError where it is none."""
-    if text in buses() or (is_bus(text) and "://" in text):
+    if is_bus(text) and not is_recording(text):
         return text
     address = f"tcp://127.0.0.1:{GPSD_PORT}" if text == GPSD else text
     if "://" in address:

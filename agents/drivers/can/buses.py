@@ -100,6 +100,8 @@ def why_shut(address: str, error: OSError) -> str:
     """Why a bus cannot be opened and what to do, in one sentence."""
     if error.errno == errno.ENODEV or "No such device" in str(error):
         return f"no such bus: plug the adapter in, then `ip link set {address} up type can bitrate 250000`"
+    if error.errno == errno.EAFNOSUPPORT:
+        return "this host's kernel has no SocketCAN: load its modules (`modprobe can_raw`), or use another host"
     return error.strerror or str(error)
 
 

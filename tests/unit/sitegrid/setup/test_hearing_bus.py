@@ -8,7 +8,7 @@ from agents.drivers.can.buses import CanFrame
 from sitegrid.setup.files import agent_text
 from sitegrid.setup.hearing import missing
 from sitegrid.setup.hearing_bus import heard_bus
-from sitegrid.setup.listening import address_of
+from sitegrid.setup.listening import address_of, listen
 from tests.unit.agents.drivers.test_can import EEC1, frame
 
 STATED = [
@@ -46,4 +46,7 @@ def test_what_is_missing_is_named() -> None:
 
 def test_addresses_of_buses_are_taken_as_they_are() -> None:
     assert address_of("virtual://a") == "virtual://a"
+    assert address_of("can7") == "can7"  # also where this host lacks it
+    problem = listen("can7", 0.1).problem
+    assert problem.startswith(("no such bus: plug the adapter in", "this host's kernel has no SocketCAN: load"))
     assert address_of("udp_multicast://239.0.0.1:5000") == "udp_multicast://239.0.0.1:5000"
