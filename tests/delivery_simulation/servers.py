@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mapserver.config import ServerConfig
-from mapserver.ingest.admission import GapError, admit, check_store, judge
+from mapserver.ingest.admission import GapError, admit, check_store, judge_batch
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.journal.rows import Admission, StoreIdentity
@@ -95,7 +95,7 @@ class ModelServer:
     def _take_one(self, disk: _Disk, incoming: Incoming) -> Ack | Refused:
         try:
             batch = decode_batch(incoming.payload, self._site.extent_m)
-            judge(batch, incoming.machine, self._site, self._now_ns)
+            judge_batch(batch, incoming.machine, self._site, self._now_ns)
             check_store(batch, STORE, ())
             seq, lost = disk.marks.get((batch.machine, batch.spool_id), (0, 0))
             admission = admit(batch, seq)

@@ -42,7 +42,7 @@ def test_every_command_in_the_readme_is_one_that_the_parser_takes(root: Path, mo
     blocks = re.findall(r"```sh\n(.*?)```", (root / "README.md").read_text(), re.DOTALL)
     lines = [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
     commands = [[word for word in words[1:] if word != "&"] for words in lines if words[:1] == ["sitegrid"]]
-    assert {"router", "server", "agent", "web", "sim", "query", "plot", "export", "demo", "log"} == {
+    assert {"router", "server", "agent", "web", "sim", "query", "plot", "export", "record", "demo", "log"} == {
         words[0] for words in commands
     }
     for words in commands:

@@ -48,7 +48,7 @@ def session() -> Iterator[Any]:
     session.close()
 
 
-class ReceiverSource:
+class Receiver:
     """A receiver's port of TCP, which may be unplugged."""
 
     def __init__(self, port: int = 0) -> None:
@@ -77,7 +77,7 @@ def test_frames_of_a_base_reach_a_serial_port_and_one_of_tcp(session: Any) -> No
     wire, device = pty.openpty()
     tty.setraw(wire)
     heard = bytearray()
-    receiver = ReceiverSource()
+    receiver = Receiver()
     relayed = threading.Event()
     with Caster(sends(b"noise" + SAID.frames), asks=False) as base, receiver.caster:
         config = RelayConfig("base-1", f"tcp://127.0.0.1:{base.port}")
@@ -101,7 +101,7 @@ def test_frames_of_a_base_reach_a_serial_port_and_one_of_tcp(session: Any) -> No
 
 
 def test_a_receiver_that_is_unplugged_is_named_and_gets_the_next_ones_when_it_is_back(session: Any) -> None:
-    receiver = ReceiverSource()
+    receiver = Receiver()
     key, said = keys.corrections(SITE.name, "base-1"), encode_corrections(SAID)
     with delivering(session, receiver.address) as delivery:
         session.put(key, said)
@@ -113,14 +113,14 @@ def test_a_receiver_that_is_unplugged_is_named_and_gets_the_next_ones_when_it_is
             return "corrections do not reach tcp://" in delivery.report()["problem"]
 
         until(is_noticed, "the receiver missed")
-        again = ReceiverSource(receiver.caster.port)
+        again = Receiver(receiver.caster.port)
         with again.caster:
             until(lambda: session.put(key, said) or again.heard, "frames again")
             until(lambda: not delivery.report()["problem"], "no problem any more")
 
 
 def test_the_port_that_a_driver_reads_takes_corrections_too(session: Any) -> None:
-    receiver = ReceiverSource()
+    receiver = Receiver()
     source = DriverReceiver(receiver.address, 0, "ubx", Line("ubx", {}))
     key, said = keys.corrections(SITE.name, "base-1"), encode_corrections(SAID)
     with receiver.caster, delivering(session, receiver.address, ports={receiver.address: source}) as delivery:
@@ -144,7 +144,7 @@ def test_the_port_that_a_driver_reads_takes_corrections_too(session: Any) -> Non
     ],
 )
 def test_nothing_but_whole_frames_of_its_base_reaches_a_receiver(session: Any, payload: bytes, reason: str) -> None:
-    receiver = ReceiverSource()
+    receiver = Receiver()
     with receiver.caster, delivering(session, receiver.address) as delivery:
         session.put(keys.corrections(SITE.name, "base-1"), payload)
         until(lambda: delivery.report()["counters"], "refused")
@@ -156,7 +156,7 @@ def test_nothing_but_whole_frames_of_its_base_reaches_a_receiver(session: Any, p
 
 def test_a_port_that_takes_little_at_a_time_gets_all_and_one_that_takes_nothing_is_named(session: Any) -> None:
     frames = b"".join(FRAMES) * 5000  # more than any buffer holds
-    receiver = ReceiverSource()
+    receiver = Receiver()
     with receiver.caster:
         port = OwnPort(receiver.address, 9600)
         port.write(frames)

@@ -302,7 +302,7 @@ def may(name: str, message: str, key: str, flow: str = "ingress", register: Regi
         ("delete", keys.pose(SITE, "loader-1"), set()),
         ("declare_subscriber", keys.sensors(SITE, "loader-1"), {"loader-1"}),
         ("declare_subscriber", keys.poses_all(SITE), {"guest", "boss", "server"}),
-        ("declare_subscriber", keys.health_all(SITE), {"guest", "boss", "server"}),
+        ("declare_subscriber", keys.health_all(SITE), {"guest", "boss", "server", "sim"}),
         ("declare_subscriber", keys.changed(SITE), {"loader-1", "loader-2", "guest", "boss"}),
         ("declare_subscriber", keys.corrections(SITE, "b1"), {"loader-1", "loader-2"}),
         ("put", keys.corrections(SITE, "b1"), {"b1"}),
