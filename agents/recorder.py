@@ -95,7 +95,7 @@ class ReadingsRecorder:
 
     def _open(self, log_ns: int) -> Recording:
         """The next file, once there is room for it."""
-        kept_bytes = FILES * self._file_bytes - self._file_bytes
+        kept_bytes = (FILES - 1) * self._file_bytes
         for path in sorted(self._folder.glob(f"{self._machine}.*.mcap*"), reverse=True):
             kept_bytes -= path.stat().st_size
             if kept_bytes < 0:

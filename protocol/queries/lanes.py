@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.errors import MessageError, Refusal
+from protocol.errors import Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries.answers import MapVersion
 from protocol.queries.map_tiles import Scale
@@ -16,7 +16,7 @@ from protocol.queries.parameters import RECTANGLE, STAMP
 from protocol.queries.request import Codec, MapQuery, Size, asked
 from protocol.site.geometry import BLOCK_CELLS, Bounds
 from protocol.wire.codec import MAX_SEQ
-from protocol.wire.fields import pack, take, take_int, take_store, unpack
+from protocol.wire.fields import check, inflated, pack, take, take_int, take_store, unpack
 
 SECTORS = 16  # of heading, the first one centred on east
 SHAPE = (SECTORS, BLOCK_CELLS * BLOCK_CELLS)
@@ -74,9 +74,10 @@ def decode_lanes(data: bytes) -> LanesAnswer:
     """Undo `encode_lanes`; a MessageError says what is wrong."""
     table = unpack(data, MAX_LANES_BYTES)
     n, cell_m, cols = take_int(table, "n", 0, MOST_TILES), take(table, "cell_m", float), take(table, "cols", dict)
-    _check(0.01 <= cell_m <= 100, "cell_m", f"{cell_m} is not between 0.01 and 100")
+    check(0.01 <= cell_m <= 100, "cell_m", f"{cell_m} is not between 0.01 and 100")
     columns = [_column(cols, name, n, low, high) for name, low, high in HEAD]
-    metres = _inflated(take(table, "metres", bytes), n * SHAPE[0] * SHAPE[1]).reshape(n, *SHAPE)
+    plain = inflated(take(table, "metres", bytes), n * SHAPE[0] * SHAPE[1], "metres")
+    metres = np.frombuffer(plain, np.uint8).reshape(n, *SHAPE)
     x, y, newest_ns, passes, days, machines = columns
     tiles = tuple(map(LaneTile, x, y, newest_ns, passes, days, machines, metres))
     version = MapVersion(take_store(table), take_int(table, "row", 0, MAX_SEQ), take_int(table, "fact", 0, MAX_SEQ))
@@ -85,27 +86,11 @@ def decode_lanes(data: bytes) -> LanesAnswer:
 
 def _column(cols: dict[str, object], name: str, n: int, low: int, high: int) -> list[int]:
     data: bytes = take(cols, name, bytes)
-    _check(len(data) == 8 * n, f"cols.{name}", f"{len(data)} bytes for {n} squares", Refusal.COLUMN_LENGTH)
+    check(len(data) == 8 * n, f"cols.{name}", f"{len(data)} bytes for {n} squares", Refusal.COLUMN_LENGTH)
     values = np.frombuffer(data, "<i8")
-    _check(bool(((values >= low) & (values <= high)).all()), f"cols.{name}", f"not between {low} and {high}")
+    check(bool(((values >= low) & (values <= high)).all()), f"cols.{name}", f"not between {low} and {high}")
     whole: list[int] = values.tolist()
     return whole
-
-
-def _inflated(data: bytes, size: int) -> NDArray[np.uint8]:
-    stream = zlib.decompressobj()
-    try:
-        plain = stream.decompress(data, size + 1)
-    except zlib.error as error:
-        raise MessageError(Refusal.WRONG_TYPE, f"not deflated: {error}", field="metres") from None
-    problem = f"{len(plain)} bytes, the squares take {size}"
-    _check(len(plain) == size and stream.eof, "metres", problem, Refusal.COLUMN_LENGTH)
-    return np.frombuffer(plain, np.uint8)
-
-
-def _check(holds: bool, field: str, problem: str, reason: Refusal = Refusal.OUT_OF_RANGE) -> None:  # noqa: FBT001
-    if not holds:
-        raise MessageError(reason, problem, field=field)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from protocol.queries.answers import MapVersion
 from protocol.queries.parameters import METRES, ValueForm, ValueKind, count, name_of
 from protocol.queries.request import AsOf, Codec, Group, Parameter, Size, asked, grouped
 from protocol.wire.codec import MAX_SEQ
-from protocol.wire.fields import pack, take, unpack
+from protocol.wire.fields import inflated, pack, take, unpack
 
 TILE_CELLS = 64
 AREA = TILE_CELLS * TILE_CELLS
@@ -147,14 +147,7 @@ def _tile(row: Any, index: int) -> MapTile:
     x, y, version_row, fact, newest_ns, planes = row
     if any(abs(number) > MAX_SEQ for number in row[:-1]):
         raise MessageError(Refusal.OUT_OF_RANGE, f"{row[:-1]}", field="tiles", row=index)
-    stream = zlib.decompressobj()
-    try:
-        length = len(stream.decompress(planes, len(PLANES) * AREA + 1))
-    except zlib.error as error:
-        raise MessageError(Refusal.WRONG_TYPE, f"not deflated: {error}", field="tiles", row=index) from None
-    if length != len(PLANES) * AREA or not stream.eof:
-        problem = f"{length} bytes of planes, {len(PLANES)} take {len(PLANES) * AREA}"
-        raise MessageError(Refusal.COLUMN_LENGTH, problem, field="tiles", row=index)
+    inflated(planes, len(PLANES) * AREA, "tiles", index)
     return MapTile(x, y, version_row, fact, newest_ns, planes)
 
 

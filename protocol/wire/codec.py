@@ -13,6 +13,7 @@ from protocol.site.site_config import MAX_EXTENT_M
 from protocol.wire.fields import (
     MAX_INT,
     MAX_SMALL_BYTES,
+    check,
     pack,
     take,
     take_int,
@@ -273,14 +274,9 @@ def decode_offer(table: Any) -> CalibrationOffer:
     values = {name: take(table, name, float) for name in names}
     for name in ("zero", "scale"):
         low, high = LIMITS[f"applied_{name}"]
-        _check(low <= values[name] <= high, name, f"{values[name]} is not between {low} and {high}")
+        check(low <= values[name] <= high, name, f"{values[name]} is not between {low} and {high}")
         variance = values[f"{name}_var"]
-        _check(0 < variance <= MOST_VAR, f"{name}_var", f"{variance} is not above 0, up to {MOST_VAR}")
+        check(0 < variance <= MOST_VAR, f"{name}_var", f"{variance} is not above 0, up to {MOST_VAR}")
     product = values["zero_var"] * values["scale_var"]
-    _check(values["covariance"] ** 2 < product, "covariance", "not positive definite")
+    check(values["covariance"] ** 2 < product, "covariance", "not positive definite")
     return CalibrationOffer(take_name(table), take_stamp(table), **values)
-
-
-def _check(holds: bool, field: str, problem: str) -> None:  # noqa: FBT001
-    if not holds:
-        raise MessageError(Refusal.OUT_OF_RANGE, problem, field=field)

@@ -5,6 +5,7 @@ A MessageError names the field that is wrong.
 
 import math
 import re
+import zlib
 from typing import Any
 
 import msgpack
@@ -113,3 +114,22 @@ def take_store(table: dict[str, Any], name: str = "store", *, optional: bool = F
 def take_stamp(table: dict[str, Any]) -> int:
     """Take `stamp_ns`."""
     return take_int(table, "stamp_ns", 1, MAX_STAMP_NS)
+
+
+def check(holds: bool, field: str, problem: str, reason: Refusal = Refusal.OUT_OF_RANGE) -> None:  # noqa: FBT001
+    """Refuse a field about which something does not hold."""
+    if not holds:
+        raise MessageError(reason, problem, field=field)
+
+
+def inflated(data: bytes, size: int, field: str, row: int | None = None) -> bytes:
+    """Inflate bytes (zlib) of a field, which are `size` then; more are never made."""
+    stream = zlib.decompressobj()
+    try:
+        plain = stream.decompress(data, size + 1)
+    except zlib.error as error:
+        raise MessageError(Refusal.WRONG_TYPE, f"not deflated: {error}", field=field, row=row) from None
+    if len(plain) != size or not stream.eof:
+        problem = f"{len(plain)} bytes deflated, {size} are expected"
+        raise MessageError(Refusal.COLUMN_LENGTH, problem, field=field, row=row)
+    return plain

@@ -54,8 +54,8 @@ PROPERTIES: dict[str, dict[str, Any]] = {
 }
 
 
-class Said(NamedTuple):
-    """What was said, before it is a message. stamp_ns: when it was true."""
+class SiteMessage(NamedTuple):
+    """One message of a site, before it is recorded. stamp_ns: when it was true."""
 
     topic: str
     schema: str
@@ -71,7 +71,7 @@ class Said(NamedTuple):
         recording.write(Message(self.topic, self.schema, log_ns, stamp_ns, data), properties)
 
 
-def transform_of(pose: Pose) -> Said:
+def transform_of(pose: Pose) -> SiteMessage:
     """A pose as a transform from the machine's frame, and its speed."""
     half = pose.heading_rad / 2
     values = {
@@ -81,39 +81,39 @@ def transform_of(pose: Pose) -> Said:
         "rotation": {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)},
         "speed_mps": pose.speed_mps,
     }
-    return Said(f"/machine/{pose.machine}/poses", TRANSFORM, pose.stamp_ns, values)
+    return SiteMessage(f"/machine/{pose.machine}/poses", TRANSFORM, pose.stamp_ns, values)
 
 
-def place_of(pose: Pose, projection: Projection) -> Said:
+def place_of(pose: Pose, projection: Projection) -> SiteMessage:
     """A pose as a place on Earth, with its covariance."""
     xx, xy, yy = pose.cov_xx_m2, pose.cov_xy_m2, pose.cov_yy_m2
     covariance = (xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, 0.0)
     fix = fix_of(pose.machine, projection.to_geodetic(pose.x_m, pose.y_m), covariance, COVARIANCE_KNOWN)
-    return Said(f"/machine/{pose.machine}/places", LOCATION_FIX, pose.stamp_ns, fix)
+    return SiteMessage(f"/machine/{pose.machine}/places", LOCATION_FIX, pose.stamp_ns, fix)
 
 
-def health_of(health: Health) -> Said:
+def health_of(health: Health) -> SiteMessage:
     """What an agent says of itself, as a line of a log, and all of it as `values`."""
     level = WARNING if problems_of(health.values) else INFO
     line = _line(level, status_of(health.values), health.machine)
-    return Said(f"/machine/{health.machine}/health", LOG, health.stamp_ns, line | {"values": health.values})
+    return SiteMessage(f"/machine/{health.machine}/health", LOG, health.stamp_ns, line | {"values": health.values})
 
 
-def change_of(change: GroundChange) -> Said:
+def change_of(change: GroundChange) -> SiteMessage:
     """A change of the ground, as a line of a log, and its fields as `change`."""
     before, after = (
         "unknown" if value is None else f"{value:.3g}" for value in (change.resistance_before, change.resistance_after)
     )
     line = _line(INFO, f"the ground changed in {change.cells} cells: resistance {before} -> {after}", "map")
-    return Said("/map/changes", LOG, change.last_ns, line | {"change": asdict(change)})
+    return SiteMessage("/map/changes", LOG, change.last_ns, line | {"change": asdict(change)})
 
 
-def gap_of(stamp_ns: int, problem: str) -> Said:
+def gap_of(stamp_ns: int, problem: str) -> SiteMessage:
     """What the recording lacks, as a line of a log."""
-    return Said("/recording/gaps", LOG, stamp_ns, _line(WARNING, problem, "recording"))
+    return SiteMessage("/recording/gaps", LOG, stamp_ns, _line(WARNING, problem, "recording"))
 
 
-def tile_of(tile: MapTile, cell_m: float) -> Said:
+def tile_of(tile: MapTile, cell_m: float) -> SiteMessage:
     """A tile as a grid of LAYERS, float32 with NaN for unknown; each on a topic of its own, so that all are shown."""
     planes = tile.unpacked()
     cells = np.stack([PLANES[name].values()[planes[name]] for name in LAYERS], axis=-1).astype("<f4")
@@ -129,7 +129,7 @@ def tile_of(tile: MapTile, cell_m: float) -> Said:
         "fields": [{"name": name, "offset": width * i, "type": FLOAT32} for i, name in enumerate(LAYERS)],
         "data": base64.b64encode(cells.tobytes()).decode(),
     }
-    return Said(f"/map/tiles/{tile.x}_{tile.y}", GRID, tile.newest_ns, values)
+    return SiteMessage(f"/map/tiles/{tile.x}_{tile.y}", GRID, tile.newest_ns, values)
 
 
 def kind_of(topic: str) -> str:

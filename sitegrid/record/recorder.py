@@ -30,7 +30,7 @@ from sitegrid.client import Client
 from sitegrid.features.feature import projection_of
 from sitegrid.record.messages import (
     LAYERS,
-    Said,
+    SiteMessage,
     change_of,
     gap_of,
     health_of,
@@ -131,7 +131,7 @@ class SiteRecorder:
         return dict(counts)
 
     def _tend(self) -> None:
-        self._mind("router", "" if self._client.session.info.routers_zid() else "no router")
+        self._note_gap("router", "" if self._client.session.info.routers_zid() else "no router")
         if self._samples:
             problem = ""
             try:
@@ -140,7 +140,7 @@ class SiteRecorder:
                     self._recording.write(Message(topic, MSGPACK, now_ns, now_ns, batch), {})
             except StoreError as error:
                 problem = str(error)
-            self._mind("store", problem)
+            self._note_gap("store", problem)
         self._recording.tend()
 
     def _subscribe(self, key: str, take: Callable[[str, bytes, int], None]) -> Callable[[], None]:
@@ -192,28 +192,28 @@ class SiteRecorder:
                 answer = self._client.ask(TilesQuery(version))
                 if "tiles" in self._what:
                     for tile in answer.tiles:
-                        self._hand_on(partial(tile_of, tile, answer.cell_m), TILE_BYTES)
+                        self._enqueue(partial(tile_of, tile, answer.cell_m), TILE_BYTES)
                 if "changes" in self._what and answer.version != version:
                     for change in self._client.changes():
                         if known.get(change.id) != change:
                             known[change.id] = change
-                            self._hand_on(partial(change_of, change), 1000)
+                            self._enqueue(partial(change_of, change), 1000)
                 version = answer.version
             except (LinkError, MessageError, QueryError) as error:
                 problem = str(error)
-            self._waiting.put(partial(self._mind, "map", problem), 0)
+            self._waiting.put(partial(self._note_gap, "map", problem), 0)
             self._stop.wait(LOOK_S)
 
-    def _hand_on(self, said: Callable[[], Said], size: int) -> None:
-        """Have it written, once there is room."""
-        work = partial(self._record, said, time.time_ns())
+    def _enqueue(self, message: Callable[[], SiteMessage], size: int) -> None:
+        """Have a message written, once there is room."""
+        work = partial(self._record, message, time.time_ns())
         while not self._stop.is_set() and not self._waiting.put(work, size, SECOND_S):
             pass
 
-    def _record(self, said: Callable[[], Said], log_ns: int) -> None:
-        said().record(self._recording, log_ns)
+    def _record(self, message: Callable[[], SiteMessage], log_ns: int) -> None:
+        message().record(self._recording, log_ns)
 
-    def _mind(self, what: str, problem: str) -> None:
+    def _note_gap(self, what: str, problem: str) -> None:
         """Tell, and record, that a gap begins or ends."""
         if bool(problem) == (what in self._gaps):
             return

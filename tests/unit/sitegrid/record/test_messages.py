@@ -22,7 +22,7 @@ from sitegrid.record.messages import (
     LAYERS,
     PROPERTIES,
     WARNING,
-    Said,
+    SiteMessage,
     change_of,
     health_of,
     place_of,
@@ -35,7 +35,7 @@ SITE = SiteConfig("paper", 49.01, 8.4)
 POSE = Pose("loader-1", 1_700_000_000_123_456_789, 120.5, -30.25, 2.5, 3.5, 0.04, 0.01, 0.09)
 
 
-def recorded(path: Path, said: Said) -> dict:
+def recorded(path: Path, said: SiteMessage) -> dict:
     """The message as a reader finds it, fit for its schema."""
     recording = Recording(path, {})
     said.record(recording, 1)
