@@ -39,6 +39,7 @@ SPEED = (
     "query --hours 0.5 --queries 20",
     "restart --samples 200000 --hours 0.5",
     "export --hours 0.5 --runs 1",
+    "walks",
     "filter --runs 1 --steps 300",
     "sim --runs 1 --seconds 5",
     "archive --samples 200000",

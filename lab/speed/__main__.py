@@ -54,6 +54,7 @@ LOADS = {
     "filter": "steps of the filters, the smoother, a whole agent",
     "sim": "simulated time of small and large fleets, sensors on",
     "archive": "an archive folded by threads, processes and a cluster (minutes)",
+    "walks": "modules that a fix and an answer pass through",
     "export": "the map of 1 km2 as a GeoTIFF, and what memory that takes",
     "followers": "how soon followers show a sample, and what readers cost with them and without",
 }
