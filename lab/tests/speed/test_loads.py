@@ -34,6 +34,7 @@ SMALLEST = {
     "filter": ("--steps 3 --runs 1", ["stock ukf, predict", "ekf, update rate", "ukf and smoother", "agent"]),
     "sim": ("--seconds 0.5 --runs 2", ["pybullet, 1", "fast, 3"]),
     "archive": ("--samples 20000 --runs 1", ["thread", "threads", "jobs"]),
+    "walks": ("--hours 0.01", ["fix", "worklist"]),
     "export": ("--hours 0.05 --runs 1", ["command", "map"]),
     "followers": ("--machines 4 --seconds 2 --hours 0.02 --runs 1", ["alone", "readers", "readers and followers"]),
 }
