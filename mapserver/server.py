@@ -11,6 +11,8 @@ from contextlib import ExitStack
 
 import zenoh
 
+from mapserver.calibration import ledger
+from mapserver.change import change_log
 from mapserver.claim import WriterClaim
 from mapserver.config import ServerConfig
 from mapserver.evidence import grid
@@ -171,5 +173,7 @@ def warm_up(config: ServerConfig) -> None:
     batches.warm_up()
     block_credit.warm_up(config.fold)
     records.warm_up()
+    change_log.warm_up(config.fold)
+    ledger.warm_up()
     road_maps.warm_up(config.fold)
     routes.warm_up()

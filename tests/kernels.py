@@ -11,8 +11,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mapserver.calibration import stays
-from mapserver.change import detection
+from mapserver.calibration import ledger
+from mapserver.change import change_log
 from mapserver.config import ServerConfig
 from mapserver.evidence import fold_kernels, grid
 from mapserver.ingest import batches, block_credit
@@ -32,15 +32,6 @@ def pages() -> Any:
     return folded_pages
 
 
-def changes() -> None:
-    detection.cuts(pages(), detection.ChangeConfig())
-    detection.known(pages())
-
-
-def corrections() -> None:
-    stays.stays(samples(2, applied_zero=0.01), 1.0)
-
-
 def world() -> None:
     with placed(fast.FastWorld, plane(0), LOADER) as placed_world:
         idle(placed_world, 0.01)
@@ -51,8 +42,8 @@ PARTS: tuple[tuple[ModuleType, bool, Callable[[], object]], ...] = (
     (road_maps, True, lambda: road_maps.warm_up(FOLD)),
     (grid, True, lambda: grid.warm_up(FOLD)),
     (block_credit, True, lambda: block_credit.warm_up(FOLD)),
-    (detection, True, changes),
-    (stays, False, corrections),
+    (change_log, True, lambda: change_log.warm_up(FOLD)),
+    (ledger, False, ledger.warm_up),
     (batches, False, batches.warm_up),
     (records, False, records.warm_up),
     (routes, False, routes.warm_up),

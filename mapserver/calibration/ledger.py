@@ -13,7 +13,7 @@ import numpy as np
 from mapserver.calibration.correction import LAST_NS
 from mapserver.calibration.stays import SLOT_NS, SLOT_SHIFT, STAY, VALUE_UNITS, merged, stays
 from protocol.arrays import Ints, Table
-from protocol.machine.samples import APPLIED
+from protocol.machine.samples import APPLIED, SAMPLE_DTYPE
 
 CELL_M = 2.0  # about one standard deviation of a position
 EPOCH_SLOTS = 30  # 300 s, the length of the map's time buckets
@@ -110,3 +110,10 @@ def stated(table: Table) -> Mapping[int, Stated]:
         spreads.append(np.sqrt(np.bincount(which, (each - means[-1][which]) ** 2 * table["n"]) / n))
     values = np.stack([*means, *spreads], axis=1).tolist()
     return {number: Stated(*row) for number, row in zip(numbers.tolist(), values, strict=True)}
+
+
+def warm_up() -> None:
+    """Compile the kernels of ledgers and corrections, or read them from their cache."""
+    rows = np.zeros(1, SAMPLE_DTYPE)
+    rows["applied_zero"] = 0.01
+    StayLedger().add(rows)

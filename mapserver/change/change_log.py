@@ -16,15 +16,19 @@ import numpy as np
 from mapserver.change.detection import ChangeConfig, cuts
 from mapserver.change.validity import image_of, valid_pages
 from mapserver.evidence import cells as ev
+from mapserver.evidence.fold_config import FoldConfig
+from mapserver.evidence.grid import Grid
 from mapserver.evidence.timeline import Block, TimedPage, evidence
 from mapserver.layers import cell_layers
 from protocol.arrays import Bools, Floats32, Ints
+from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.queries.answers import GroundChange
 from protocol.site.geometry import BLOCK_CELLS
+from protocol.units import HOUR_NS
 
 KIND = "change"  # of the journal's events
-SAME_NS = 6 * 3600 * 10**9  # changes next to each other within this time are one
-SETTLES_NS = 2 * 3600 * 10**9  # the time of a change moves by the length of its pages as these are summed, and by this
+SAME_NS = 6 * HOUR_NS  # changes next to each other within this time are one
+SETTLES_NS = 2 * HOUR_NS  # the time of a change moves by the length of its pages as these are summed, and by this
 NEAR_CELLS = 8.0
 _BEFORE_AFTER = ("resistance", "grade")
 
@@ -149,3 +153,16 @@ def _before_and_after(old: ev.Evidence, now: ev.Evidence, config: cell_layers.Re
 def _median(values: Floats32) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None
+
+
+def warm_up(config: FoldConfig) -> None:
+    """Compile the kernels of changes, or read them from their cache: ground of one kind, then of another."""
+    log, grid, n = ChangeLog(1.0, ChangeConfig(), cell_layers.ReadConfig()), Grid(1.0, config), BLOCK_CELLS
+    rows = np.zeros(n * n, SAMPLE_DTYPE)
+    rows["x_m"], rows["y_m"] = np.arange(n * n) % n + 0.5, np.arange(n * n) // n + 0.5
+    rows["cov_xx_m2"] = rows["cov_yy_m2"] = 0.04
+    rows["distance_m"], rows["c_rr_var"] = 1.0, 1e-6
+    for hour, c_rr in enumerate((0.02, 0.02, 0.2)):
+        rows["stamp_ns"], rows["c_rr"] = (hour + 1) * HOUR_NS, c_rr
+        grid.fold(rows, "")
+    log.look([(0, 0)], {(0, 0): grid.pages([(0, 0)])[0]})

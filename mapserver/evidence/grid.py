@@ -282,6 +282,8 @@ def warm_up(config: FoldConfig) -> None:
         row["stamp_ns"], row["distance_m"] = stamp_ns, 1.0
         grid.fold(row, "")
         grid.state()
+    Grid(1.0, config).merge(grid)
+    assert all(pages.is_sound for *_, pages in grid.state().blocks)
 
 
 def chunks(blocks: list[Block]) -> Iterator[list[Block]]:

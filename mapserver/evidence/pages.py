@@ -25,7 +25,6 @@ TIERS = 4  # of a timeline: buckets, hours, days, all before
 NARROW = np.dtype([("place", "<u2"), ("count", "<u2")])
 WIDE = np.dtype([("place", "<u2"), ("count", "<u4")])
 CELL = np.dtype([("cell", "u1"), ("visits", "<u8"), ("machines", "<u8"), ("newest_ns", "<i8")])
-NO_HIGH = np.empty(0, np.uint16)
 RAW_CELL = np.dtype((np.void, CELL.itemsize))  # numpy copies records field by field, and these at once
 
 
@@ -98,7 +97,7 @@ class CompactPages:
             np.concatenate([getattr(part, name) for part in parts])
             for name in ("runs", "cells", "counts", "marks", "words")
         )
-        high = NO_HIGH
+        high = np.empty(0, np.uint16)
         if any(len(part.high) for part in parts):
             high = np.concatenate([part.high if len(part.high) else np.zeros_like(part.counts) for part in parts])
         return cls(table, runs, cells, counts, high, marks, words)
@@ -144,6 +143,9 @@ def copied(part: AnyArray) -> AnyArray:
     return np.frombuffer(part.tobytes(), part.dtype).reshape(part.shape)
 
 
+NO_HIGH = copied(np.empty(0, np.uint16))  # not to be written either: kernels are compiled for either kind of array
+
+
 def compact(ends: Ints, table: Ints, votes: NDArray[np.uint64], cells: Table, buffers: Buffers) -> list[CompactPages]:
     """Pages of several blocks, each whole and by itself.
 
@@ -151,7 +153,7 @@ def compact(ends: Ints, table: Ints, votes: NDArray[np.uint64], cells: Table, bu
     """
     n, array = len(votes), buffers.array
     runs, of_cells, counts = array("runs", n, np.uint8, 2), array("places", n, np.uint8), array("counts", n, np.uint16)
-    high = NO_HIGH if int(votes.max(initial=0)) < 2**32 else np.empty(n, np.uint16)
+    high = np.empty(n if int(votes.max(initial=0)) >= 2**32 else 0, np.uint16)
     marks, words = array("marks", len(cells), np.uint8, 4), array("words", len(table) + 3 * len(cells), np.uint64)
     word_ends = np.empty(len(table), np.int64)
     table = table.copy()

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 
 from mapserver.evidence.grid_state import GridState
-from mapserver.evidence.pages import EMPTY, CompactPages
+from mapserver.evidence.pages import EMPTY, CompactPages, copied
 from protocol.arrays import Ints, Table
 from protocol.errors import StoreError
 from protocol.files import PRIVATE, whole_file
@@ -139,7 +139,7 @@ class Checkpoint:
         ends = np.cumsum(self.index["lengths"][numbers] * _WIDTHS, axis=1).tolist()
         for (x, y), record, ends_of_parts in zip(places, self.records(numbers), ends, strict=True):
             parts = zip(PARTS, _EMPTY, [0, *ends_of_parts], ends_of_parts, strict=False)
-            data = np.frombuffer(record, np.uint8).copy()  # alone: a block that grows gives its memory back
+            data = copied(np.frombuffer(record, np.uint8))  # alone: a block that grows gives its memory back
             pages = CompactPages(
                 **{name: data[i:j].view(empty.dtype).reshape(-1, *empty.shape[1:]) for name, empty, i, j in parts}
             )
