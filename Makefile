@@ -8,7 +8,7 @@ SIZE_dev := 670 MB to load, 2.4 GB on disk
 
 # make quick: unit tests that are not slow, in about a minute. make test: the proof. make nightly, make weekly: what
 # takes longer (CONTRIBUTING.md).
-.PHONY: venv demo quick test nightly weekly check lint-page chaos fuzz soak bench
+.PHONY: venv demo quick test nightly weekly check lint-page chaos fuzz soak bench bundle
 
 venv: $(VENV)/.dev
 
@@ -67,6 +67,11 @@ fuzz: venv
 
 soak: venv
 	$(BIN)/python -m tests.soak
+
+# A folder of wheels for hosts without a network (docs/operation.md): of this computer's kind and version of Python.
+bundle:
+	"$(PYTHON)" -m pip wheel --quiet --disable-pip-version-check --constraint constraints.txt --wheel-dir wheels \
+		'.[agent,can,postgres,receivers,security,server,web]'
 
 bench: venv
 	$(BIN)/python -m lab speed merge

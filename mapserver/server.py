@@ -104,6 +104,17 @@ class Server:
             readers.declare_queryable(keys.admin_all(site.name), self._on_command),
         ]
 
+    def lives(self) -> bool:
+        """Whether the writer takes batches: not where it has ended or hangs."""
+        try:
+            return bool(self._writer.alive())
+        except QueryError:
+            return False
+
+    def changes(self) -> list[GroundChange]:
+        """Changes of the ground so far."""
+        return self._upkeep.changes()
+
     @property
     def failed(self) -> bool:
         """Whether the writer's thread has died; the process should end."""

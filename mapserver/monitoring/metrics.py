@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +20,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoM
 from prometheus_client.registry import Collector
 
 from protocol.errors import ConfigError, MessageError
+from protocol.queries.answers import GroundChange
 from protocol.wire import keys
 from protocol.wire.codec import decode_health
 from protocol.wire.fields import MAX_SMALL_BYTES
@@ -74,16 +76,18 @@ class ServerCollector(Collector):
     """All metrics of a server, except those of its process.
 
     info: answers as `map/info` does, and asks the thread that owns the store. agents: their health by machine.
+    changes: of the ground, all so far.
     """
 
     def __init__(
         self,
         info: Callable[[], Mapping[str, Any]],
         agents: Callable[[], Mapping[str, ReceivedHealth]],
+        changes: Callable[[], Iterable[GroundChange]],
         store: Path,
         version: str,
     ) -> None:
-        self._info, self._agents, self._store, self._version = info, agents, store, version
+        self._info, self._agents, self._changes, self._store, self._version = info, agents, changes, store, version
 
     def describe(self) -> Iterable[Metric]:
         """Nothing: a registry need not ask the server for the names when this is registered."""
@@ -99,6 +103,9 @@ class ServerCollector(Collector):
         yield from _server(info)
         yield from _machines(info)
         yield from _agent_health(self._agents())
+        became = Counter(dict.fromkeys(("better", "worse", "unclear"), 0))
+        became.update(map(_became, self._changes()))
+        yield _counter("sitegrid_ground_changes_total", "Changes of the ground.", became, "became")
         yield _gauge("sitegrid_turn_seconds", "Time that a reader just waited for the store.", turn_s)
         yield _gauge("sitegrid_store_bytes", "Size of the files of the store.", size_of(self._store))
         free_bytes = shutil.disk_usage(self._store).free
@@ -152,6 +159,12 @@ def _server(info: Mapping[str, Any]) -> Iterable[Metric]:
         _counter("sitegrid_commits_total", "Commits of the journal.", writer["commits"]),
         _counter("sitegrid_commit_seconds_total", "Time spent on commits.", writer["commit_s"]),
     ]
+
+
+def _became(change: GroundChange) -> str:
+    """Whether a machine rolls with less or more resistance there than before."""
+    before, after = change.resistance_before, change.resistance_after
+    return "unclear" if before is None or after is None else "better" if after < before else "worse"
 
 
 def _ahead_s(info: Mapping[str, Any]) -> float:

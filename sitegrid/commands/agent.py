@@ -26,6 +26,7 @@ from sitegrid.options.groups import add_network
 from sitegrid.options.values import OutputFile, not_negative
 from sitegrid.process.lifetime import note, plain, say, stop_flag
 from sitegrid.process.status_line import Due, status_line
+from sitegrid.process.supervisor import say_ready, until
 from sitegrid.security.join import join, reply_check, signer
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def run(arguments: Namespace) -> int:
         agent = _agent(arguments, joined, corrections)
         opened.callback(agent.close)
         show = opened.enter_context(_shown(machine.name, site.name, stop.is_set, is_json=arguments.json))
-        report = agent.run(driver, stop.is_set, wait=stop.wait, show=show)
+        report = agent.run(driver, until(stop), wait=stop.wait, show=show)
     say({"ended": plain(report)}) if arguments.json else note(summary_of(machine.name, report))
     return 0 if report.get("delivered", True) or stop.is_set() else 1
 
@@ -178,14 +179,14 @@ def _driver(arguments: Namespace, log: LogFolder | None, joined: _Joined) -> Dri
 def _shown(machine: str, site: str, is_stopped: Callable[[], bool], *, is_json: bool) -> Iterator[Show]:
     """Say that it is ready, and how it does: on a terminal for people, else for programs."""
     if is_json or not sys.stderr.isatty():
-        say({"ready": "agent", "machine": machine, "site": site})
+        say_ready({"ready": "agent", "machine": machine, "site": site})
         due = Due()
         yield lambda report: _log(machine, report) if due.is_due(report["status"]) else None
         return
     if sys.stdout.isatty():
         note(f"{machine} draws the map of {site}; Ctrl-C ends it")
     else:
-        say({"ready": "agent", "machine": machine, "site": site})
+        say_ready({"ready": "agent", "machine": machine, "site": site})
     with status_line() as line:
         yield lambda report: line.show("" if is_stopped() else line_of(machine, report))
 

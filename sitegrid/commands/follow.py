@@ -16,8 +16,9 @@ from protocol.site.site_file import load_site
 from protocol.wire.keys import check_name
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
-from sitegrid.process.lifetime import return_large_blocks, say, stop_flag
+from sitegrid.process.lifetime import return_large_blocks, stop_flag
 from sitegrid.process.progress import compilation_reported
+from sitegrid.process.supervisor import say_ready, turns
 from sitegrid.security.join import join
 
 HELP = "follow a site's journal and answer queries of its map, so that the server need not"
@@ -58,13 +59,13 @@ def run(arguments: Namespace) -> int:
         journal = JournalLocation(arguments.store, arguments.journal)
         follower = opened.enter_context(closing(Follower(session, name, journal, site, config, time.time_ns)))
         is_ready = False
-        while not stop.wait(0.5):
+        for _ in turns(stop):
             if follower.ended:
                 raise LinkError(f"follower {name}", f"{follower.ended}; this one ends")
             follower.tend()
             if follower.is_shown and not is_ready:
                 is_ready = True
-                say({"ready": "follow", "site": site.name, "name": name, "store": str(arguments.store)})
+                say_ready({"ready": "follow", "site": site.name, "name": name, "store": str(arguments.store)})
     return 0
 
 

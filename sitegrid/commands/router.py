@@ -11,7 +11,8 @@ from pathlib import Path
 from protocol.errors import ConfigError
 from protocol.wire.credentials import check_valid, load_credentials
 from protocol.wire.session import DEFAULT_ENDPOINT, SessionConfig, open_session, use_many_threads
-from sitegrid.process.lifetime import say, stop_flag, wait
+from sitegrid.process.lifetime import say, stop_flag
+from sitegrid.process.supervisor import say_ready, turns
 from sitegrid.security.access import router_settings
 from sitegrid.security.join import is_loopback, with_keys
 from sitegrid.security.register import REGISTER_FILE, ROUTER, Register, load_register
@@ -48,8 +49,9 @@ def _route_open(endpoint: str, stop: threading.Event, *, insecure: bool) -> None
         raise ConfigError(endpoint, f"anyone on the network could read and write the map: {advice}")
     session = open_session(SessionConfig(endpoint, mode="router"))
     reach = "this host only" if on_this_host else "open to everyone who gets here"
-    say({"ready": "router", "endpoint": endpoint, "security": f"none: {reach}"})
-    wait(stop)
+    say_ready({"ready": "router", "endpoint": endpoint, "security": f"none: {reach}"})
+    for _ in turns(stop):
+        pass
     session.close()  # type: ignore[no-untyped-call]
 
 
@@ -61,8 +63,8 @@ def _route_guarded(folder: Path, endpoint: str, stop: threading.Event) -> None:
     """
     text, register = _text(folder), load_register(folder)
     session = open_session(_guarded(folder, endpoint, register))
-    say({"ready": "router", "endpoint": endpoint, "security": "mutual TLS", "names": len(register.admitted())})
-    while not stop.wait(0.5):
+    say_ready({"ready": "router", "endpoint": endpoint, "security": "mutual TLS", "names": len(register.admitted())})
+    for _ in turns(stop):
         if (newer := _text(folder)) == text:
             continue
         text = newer

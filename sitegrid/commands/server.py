@@ -18,8 +18,9 @@ from protocol.version import package_version
 from protocol.wire.session import open_session, use_many_threads
 from sitegrid.options.groups import add_network
 from sitegrid.options.values import FOLDER, address
-from sitegrid.process.lifetime import end_in_time, return_large_blocks, say, stop_flag, tell
+from sitegrid.process.lifetime import end_in_time, return_large_blocks, stop_flag, tell
 from sitegrid.process.progress import compilation_reported
+from sitegrid.process.supervisor import say_ready, turns, until
 from sitegrid.security.join import join, signer
 from sitegrid.security.register import load_register
 
@@ -79,11 +80,13 @@ def run(arguments: Namespace) -> int:
         sign = key.sign_reply if key else None
         said: list[str] = []
 
+        is_stopped = until(stop)
+
         def standing_by(warm: bool) -> None:  # noqa: FBT001
             if warm and not said:
                 said.append("standby")
-                say({"standby": "server", "site": site.name, "store": str(arguments.store)})
-            if stop.is_set():
+                say_ready({"standby": "server", "site": site.name, "store": str(arguments.store)})
+            if is_stopped():
                 raise _StoppedError
 
         more = {"sign": sign, "take_over": take_over, "standing_by": standing_by}
@@ -95,8 +98,8 @@ def run(arguments: Namespace) -> int:
         ready = {"ready": "server", "site": site.name, "store": str(arguments.store)}
         if arguments.metrics:
             ready["metrics"] = _export(opened, readers, server, site.name, arguments)
-        say(ready)
-        while not stop.wait(0.5):
+        say_ready(ready)
+        for _ in turns(stop, lives=server.lives):
             if server.failed:
                 break
             if server.ended:
@@ -123,5 +126,7 @@ def _export(opened: ExitStack, session: zenoh.Session, server: Server, site: str
     from mapserver.monitoring.metrics import HealthListener, ServerCollector
 
     health = opened.enter_context(closing(HealthListener(session, site)))
-    collector = ServerCollector(server.answers.info, health.received, arguments.store, package_version())
+    collector = ServerCollector(
+        server.answers.info, health.received, server.changes, arguments.store, package_version()
+    )
     return opened.enter_context(closing(Exporter(arguments.metrics, collector))).url

@@ -22,7 +22,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from protocol.errors import ConfigError, LinkError
 from protocol.wire.credentials import CERTIFICATE_FILE, KEY_FILE
 from sitegrid.client import Client, connect
-from sitegrid.process.lifetime import say
+from sitegrid.process.supervisor import say_ready, until
 from sitegrid.security.tokens import TokenFile
 from sitegrid.web.app import WebApp
 from sitegrid.web.site import SiteFeed
@@ -83,7 +83,7 @@ def serve(
         watch = asyncio.create_task(_stop_with(server, stop))
         scheme, (host, port) = "https" if arguments.tls else "http", listening.getsockname()[:2]
         url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
-        say({"ready": "web", "url": url, "sites": [client.site for client in clients]})
+        say_ready({"ready": "web", "url": url, "sites": [client.site for client in clients]})
         await server._serve([listening])  # noqa: SLF001 - `serve` would take the signals that stop_flag has
         stop.set()
         await watch
@@ -114,7 +114,8 @@ def _without_traceback(record: logging.LogRecord) -> bool:
 
 
 async def _stop_with(server: uvicorn.Server, stop: threading.Event) -> None:
-    while not stop.is_set():
+    is_stopped = until(stop)
+    while not is_stopped():
         await asyncio.sleep(0.2)
     server.should_exit = True
 

@@ -17,10 +17,12 @@ import pytest
 from prometheus_client import CollectorRegistry, Metric, ProcessCollector, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
+from ruamel.yaml import YAML
 
 from mapserver.monitoring.exporter import Exporter
 from mapserver.monitoring.metrics import HealthListener, ReceivedHealth, ServerCollector
 from protocol.errors import LinkError
+from protocol.queries.answers import GroundChange
 from protocol.wire import keys
 from protocol.wire.codec import encode_health
 from protocol.wire.fields import MAX_SMALL_BYTES
@@ -58,6 +60,10 @@ INFO: dict[str, Any] = {
     },
     "writer": {"waiting": 3, "waiting_bytes": 4096, "commits": 20, "commit_s": 0.5},
 }
+CHANGES = [
+    GroundChange(i, 1, 2, (0.0, 0.0, 1.0, 1.0), 4, before, after, None, None)
+    for i, (before, after) in enumerate([(0.03, 0.02), (0.03, 0.05), (0.02, 0.03)], start=1)
+]
 HEALTH = {
     "spool": {"depth": 40, "pending": 30, "unsaved": 1, "recorded": 90, "dropped": 2, "put_aside": 1, "gone": 6},
     "uplink": {"problem": "no answer"},
@@ -69,7 +75,7 @@ def exposition(folder: Path, info: Mapping[str, Any] = INFO, **health: Mapping[s
     """The text for a server with this state; health by machine, with `_` for `-`."""
     received = {name.replace("_", "-"): ReceivedHealth(values, 1e9 + 0.25) for name, values in health.items()}
     registry = CollectorRegistry()
-    registry.register(ServerCollector(lambda: info, lambda: received, folder, "1.2"))
+    registry.register(ServerCollector(lambda: info, lambda: received, lambda: CHANGES, folder, "1.2"))
     ProcessCollector(registry=registry)
     return generate_latest(registry).decode()
 
@@ -124,6 +130,10 @@ def test_the_state_of_the_server_is_exposed(tmp_path: Path):
         ("sitegrid_batches_refused_total", frozenset({("reason", "gap")})): 2,
         ("sitegrid_queries_refused_total", frozenset({("reason", "unknown_layer")})): 1,
     }
+    changes = {
+        word: at(values, "sitegrid_ground_changes_total", became=word) for word in ("better", "worse", "unclear")
+    }
+    assert changes == {"better": 1, "worse": 2, "unclear": 0}
     assert at(values, "sitegrid_machine_samples_total", machine="loader-2") == 104
     assert at(values, "sitegrid_machine_samples_lost_total", machine="loader-1") == 3
     assert at(values, "sitegrid_machine_samples_missing", machine="loader-1") == 5
@@ -165,6 +175,25 @@ def test_the_operators_page_names_every_metric_with_its_labels(tmp_path: Path):
     page = (ROOT / "docs" / "operation.md").read_text().split("## Metrics")[1].split("\nCounters")[0]
     named = re.findall(r"`((?:sitegrid|process)_\w+)(?:\{(.*?)\})?`", page)
     assert {(name, frozenset(filter(None, labels.split(",")))) for name, labels in named} == exposed
+
+
+@pytest.mark.parametrize("file", ["prometheus/rules.yml", "grafana/site.json"])
+def test_alarms_and_dashboard_use_metrics_and_labels_that_exist(tmp_path: Path, file: str):
+    exposed: dict[str, set[str]] = {
+        name: {label for label, _ in labels} for name, labels in read(exposition(tmp_path, loader_1=HEALTH))
+    }
+    exposed |= {"sitegrid_web_server_away": {"site"}}
+    text = (ROOT / "config" / file).read_text().replace('\\"', '"')
+    used = re.findall(r"\b((?:sitegrid|process)_\w+)(?:\{(\w+)=)?", text)
+    assert len(used) > 10
+    assert not [name for name, label in used if name not in exposed or label not in {"", *exposed[name]}]
+
+
+def test_every_alarm_has_its_row_in_the_operators_page():
+    rules = YAML(typ="safe").load(ROOT / "config/prometheus/rules.yml")
+    page = (ROOT / "docs/operation.md").read_text().split("## When an alarm goes off")[1]
+    named = {rule["annotations"]["runbook"] for group in rules["groups"] for rule in group["rules"]}
+    assert not {name for name in named if f"| `{name}` |" not in page}
 
 
 class One(Collector):
