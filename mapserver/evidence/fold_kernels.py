@@ -119,12 +119,12 @@ def _vote(counts: Any, lines: Any, top: int, end: int, part: Any, bins: Any, bin
                 counts[upper + i] += above
             lines[plane] |= touched
             lines[plane + _ONE] |= touched
-    for plane, share in ((_DOUBT, bin_shares[k, 3] if bins[k, 0] >= 0 else _NONE), (_AIDED, bin_shares[k, 4])):
+    for line, share in ((_DOUBT, bin_shares[k, 3] if bins[k, 0] >= 0 else _NONE), (_AIDED, bin_shares[k, 4])):
         if share:
-            at = np.uint64(plane) * _PLANE + first
+            at = np.uint64(line) * _PLANE + first
             for i in range(n):
                 counts[at + i] += np.uint32(np.uint32(part[i] * share + _HALF_SHARE) >> np.uint32(8))
-            lines[plane] |= touched
+            lines[line] |= touched
     sector = np.uint64(_HEADING + bins[k, 3])
     at = sector * _PLANE + first
     for i in range(n):

@@ -57,5 +57,5 @@ def _by_sector(timed: TimedPage, first: Ints, index: int) -> Floats:
     counts = np.zeros((ev.COUNTS, ev.CELLS))
     counts.reshape(-1)[timed.page.votes["place"]] = timed.page.votes["count"]
     metres = counts[ev.HEADING] * ((first <= index) / ev.WEIGHT_UNITS_PER_M)
-    own = 1 - counts[ev.AIDED] / np.maximum(counts[ev.HEADING].sum(axis=0), 1)
-    return metres * np.clip(own, 0, 1)
+    own: Floats = np.clip(1 - counts[ev.AIDED] / np.maximum(counts[ev.HEADING].sum(axis=0), 1), 0, 1)
+    return metres * own

@@ -27,7 +27,8 @@ class Votes:
 
     place: (n, 2) position; inverse: (n, 3) inverse covariance xx, 2 xy, yy; reach: (n,) half the stencil's edge, in
     cells around the one that the sample lies in; weight: (n,); bins, shares: (n, 3) for resistance, grade east, grade
-    north; doubt (n,) in 1/256 of DOUBT_MOST, aided (n,) in 1/256; sector, stamp_ns, bucket: (n,); bits: (n, 2) one bit set in each.
+    north; doubt (n,) in 1/256 of DOUBT_MOST; aided (n,) in 1/256; sector, stamp_ns, bucket: (n,); bits: (n, 2) one bit
+    set in each.
     """
 
     place: Floats
