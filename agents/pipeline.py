@@ -276,5 +276,6 @@ def corrected(pose: PoseBelief, nodes: Sequence[SmoothedPose]) -> PoseBelief:
     share = (pose.stamp_ns - before.stamp_ns) / span_ns if span_ns else 1.0
     dx, dy, turn = (before.correction + share * (after.correction - before.correction)).tolist()
     covariance_m2 = before.covariance_m2 + share * (after.covariance_m2 - before.covariance_m2)
+    aided = before.aid_share + share * (after.aid_share - before.aid_share)
     heading_rad = wrap_angle(pose.heading_rad + turn)
-    return PoseBelief(pose.stamp_ns, pose.x_m + dx, pose.y_m + dy, heading_rad, pose.speed_mps, covariance_m2)
+    return PoseBelief(pose.stamp_ns, pose.x_m + dx, pose.y_m + dy, heading_rad, pose.speed_mps, covariance_m2, aided)

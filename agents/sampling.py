@@ -195,7 +195,7 @@ class Sampler:
         x, y = pose.x_m + c * self._load_centre_m, pose.y_m + s * self._load_centre_m
         grade = (c * e.slope_x - s * e.slope_y, s * e.slope_x + c * e.slope_y, e.slope_var)
         at = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)
-        return (*at, e.c_rr, e.c_rr_var, *grade, e.zero, e.scale, e.mass_kg)
+        return (*at, e.c_rr, e.c_rr_var, *grade, e.zero, e.scale, e.mass_kg, pose.aid_share)
 
 
 def joined(made: Sequence[Samples]) -> Samples:
@@ -208,4 +208,5 @@ def _interpolate(a: PoseBelief, b: PoseBelief, stamp_ns: int) -> PoseBelief:
     heading = wrap_angle(a.heading_rad + share * wrap_angle(b.heading_rad - a.heading_rad))
     x, y = a.x_m + share * (b.x_m - a.x_m), a.y_m + share * (b.y_m - a.y_m)
     speed = a.speed_mps + share * (b.speed_mps - a.speed_mps)
-    return PoseBelief(stamp_ns, x, y, heading, speed, a.covariance_m2 + share * (b.covariance_m2 - a.covariance_m2))
+    covariance_m2 = a.covariance_m2 + share * (b.covariance_m2 - a.covariance_m2)
+    return PoseBelief(stamp_ns, x, y, heading, speed, covariance_m2, a.aid_share + share * (b.aid_share - a.aid_share))

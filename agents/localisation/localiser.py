@@ -8,7 +8,7 @@ heading back: what came before its refusals counts no longer, and the rest is al
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from agents.dead_reckoning import DeadReckoning
 from agents.localisation.alignment import DISTANCE_M, Alignment, align_fixes, align_start
@@ -189,7 +189,7 @@ class Localiser:
     def take_smoothed(self) -> list[SmoothedPose]:
         """Smoothed poses that became final since the last call, oldest first; none of an unproven heading."""
         if self._tracker.fusion:
-            self._smoothed += self._tracker.fusion.take_smoothed()
+            self._smoothed += self._aided(self._tracker.fusion.take_smoothed())
         if not self.is_proven:
             return []
         taken, self._smoothed = self._smoothed, []
@@ -198,7 +198,11 @@ class Localiser:
     def remaining(self) -> list[SmoothedPose]:
         """Smoothed poses that are not final, as known by now; the last is the newest belief's. They stay."""
         fusion = self._tracker.fusion
-        return self._smoothed + fusion.remaining() if fusion else []
+        return self._smoothed + self._aided(fusion.remaining()) if fusion else []
+
+    def _aided(self, poses: list[SmoothedPose]) -> list[SmoothedPose]:
+        """The poses with what came from lanes of each."""
+        return [replace(pose, aid_share=self._tracker.aid_share(pose.cross)) for pose in poses]
 
     def doubt(self, off_m: float, off_mps: float) -> float:
         """Be less sure of place and speed, as wheels that count no longer have led both astray; returns the heading."""
@@ -219,7 +223,7 @@ class Localiser:
         if was_proven and not beliefs:  # as mostly
             return []
         wheels_mps = None if dead_reckoning.is_silent(readings[0][0].stamp_ns) else dead_reckoning.wheels.speed_mps
-        poses = [pose_of(belief, wheels_mps) for belief in beliefs]
+        poses = [pose_of(belief, wheels_mps, self._tracker.aid_share(belief.P)) for belief in beliefs]
         if was_proven:
             return poses
         self._keep(poses)

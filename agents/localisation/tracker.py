@@ -110,6 +110,11 @@ class Tracker:
         states = self.receivers.error_states(receiver)
         return self.belief.x[states] if self.belief and states else np.zeros(2)
 
+    def aid_share(self, cross: Floats) -> float:
+        """How much of a place came from lanes, 0 to 1. cross (2 or more, n): its covariance with the state."""
+        layout = self.fusion.model.layout if self.fusion else self._model.layout
+        return self.lanes.share(cross[:2, layout.map_offset]) if layout.lanes and self.lanes else 0.0
+
     def doubt(self, off_m: float, off_mps: float) -> float:
         """Be less sure of place and speed, from the next step on; returns the heading [rad].
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from lab.campaign.experiment import Experiment, Runner, Task, replay_task
+from lab.campaign.experiment import Experiment, Runner, replay_task
 from lab.fedback.days import day
-from lab.fedback.maps import GROWING, MAPS, Scene
-from lab.fedback.nodes import Nodes, watch
-from lab.fedback.rerun import Course, rerun
+from lab.fedback.maps import GROWING, MAPS, READ_S, Rows, Scene, days_ago, lane_map
+from lab.fedback.nodes import Machine, Nodes, solve
+from lab.fedback.rerun import Course, Maps, placed_again, rerun
 from protocol.arrays import Floats
 from protocol.errors import ConfigError
 from sitegrid.proof.figures import Report, Row, rounded
@@ -26,34 +27,27 @@ REPEATED = ("loading", "haul", "two", "both", "crossings", "free")
 
 @dataclass(frozen=True)
 class FedbackCase:
-    """A site of `days`, and a map of `maps`."""
+    """A site of `days`, a map of `maps`, or `row` for each day on those before it, and how many receivers count."""
 
     site: str
     map: str
+    receivers: int = 2
 
     @property
     def name(self) -> str:
         """For people."""
-        return f"{self.site}-{self.map}"
+        return f"{self.site}-{self.map}" + "-1gps" * (self.receivers == 1)
 
 
-CASES = (*(FedbackCase("driven", name) for name in MAPS), *(FedbackCase(site, "mature") for site in REPEATED))
-
-
-@dataclass(frozen=True)
-class Machine:
-    """One machine of a day."""
-
-    name: str
-
-
-def solve(task: Task[Machine], cache: Path) -> Nodes:
-    """The nodes of one machine's drive."""
-    assert task.drive
-    return watch(task.drive.folder(cache), task.variant.name)
-
-
+CASES = (
+    *(FedbackCase("driven", name) for name in MAPS),
+    FedbackCase("driven", "mature", receivers=1),
+    *(FedbackCase(site, "mature") for site in REPEATED),
+    FedbackCase("driven", "row"),
+)
 EXPERIMENT = Experiment("fedback", Nodes, solve)
+Drives = Mapping[str, Nodes]  # of one day, by machine
+Figures = Mapping[str, Floats]  # by machine
 
 
 def run(
@@ -63,35 +57,86 @@ def run(
     pairs = list(pairwise(seeds))[::2]
     if not pairs:
         raise ConfigError("--seeds", "two days are compared: give 2 or more")
-    days = {(case.site, seed): day(case.site, seed, seconds) for case in cases for pair in pairs for seed in pair}
-    tasks = {(key, name): replay_task(Machine(name), drive) for key, drive in days.items() for name in drive.names}
-    nodes = dict(zip(tasks, runner.run(EXPERIMENT, list(tasks.values())), strict=True))
-    of_day = {key: {name: nodes[key, name] for name in drive.names} for key, drive in days.items()}
+    turns = [turn for a, b in pairs for turn in ((a, b), (b, a))]
+    days = _days(runner, cases, [seed for pair in pairs for seed in pair], seconds)
     rows = []
     for case in cases:
-        turns = [turn for a, b in pairs for turn in ((a, b), (b, a))]
-        judged = [_day(case, of_day[case.site, first], of_day[case.site, second], seconds) for first, second in turns]
+        of_day = days[case.site, case.receivers]
+        if case.map == "row":
+            rows += _row_of_days(list(of_day.values()))
+            continue
+        judged = [_day(case, of_day[first], of_day[second], seconds) for first, second in turns]
         rows.append(_row(case, [figures for figures, _ in judged], [counts for _, counts in judged]))
     return {"seeds": list(seeds), "seconds": seconds, "rows": rows}, None
 
 
-Figures = Mapping[str, Floats]  # by machine
+def _days(
+    runner: Runner, cases: Sequence[FedbackCase], seeds: Sequence[int], seconds: float
+) -> Mapping[tuple[str, int], Mapping[int, Drives]]:
+    """The drives of each site and number of receivers, by seed."""
+    drives = {(case.site, case.receivers, seed): day(case.site, seed, seconds) for case in cases for seed in seeds}
+    keys = [(*key, name) for key, drive in drives.items() for name in drive.names]
+    tasks = [replay_task(Machine(name, count), drives[site, count, seed]) for site, count, seed, name in keys]
+    nodes: dict[tuple[str, int], dict[int, dict[str, Nodes]]] = {}
+    for (site, count, seed, name), of_machine in zip(keys, runner.run(EXPERIMENT, tasks), strict=True):
+        nodes.setdefault((site, count), {}).setdefault(seed, {})[name] = of_machine
+    return nodes
 
 
-def _day(
-    case: FedbackCase, first: Mapping[str, Nodes], second: Mapping[str, Nodes], seconds: float
-) -> tuple[Figures, Counter[str]]:
-    """Figures of the machines of the second day, with the map and without, and what became of windows."""
-    rows, own = ([(name, nodes.rows) for name, nodes in machines.items()] for machines in (first, second))
-    scene = Scene(rows, own, int(min(nodes.stamp_ns[0] for nodes in second.values())), seconds)
-    maps_of, young = MAPS[case.map](scene), case.map in GROWING
-    columns, counts = [], Counter[str]()
-    for name, nodes in second.items():
-        without = rerun(nodes, lambda _: None, aids=False)
-        aided = rerun(nodes, maps_of(name), young=young)
-        columns.append({**_figures(nodes, without, "without_"), **_figures(nodes, aided)})
-        counts += aided.counts
-    return {key: np.array([column[key] for column in columns]) for key in columns[0]}, counts
+def _rows(drives: Drives) -> Rows:
+    return [(name, nodes.rows) for name, nodes in drives.items()]
+
+
+def _day(case: FedbackCase, first: Drives, second: Drives, seconds: float) -> tuple[Figures, Counter[str]]:
+    """Figures of the machines of the second day, with the map and without, and what became of windows.
+
+    A map that grows is of places that it aided itself: filtered again as often as it is read, these are all there.
+    """
+    rows, own, young = days_ago(_rows(first), 1), _rows(second), case.map in GROWING
+    begin_ns = int(min(nodes.stamp_ns[0] for nodes in second.values()))
+    without = {name: rerun(nodes, lambda _: None, aids=False) for name, nodes in second.items()}
+    for _ in range(math.ceil(seconds / READ_S) if young else 1):
+        maps_of = MAPS[case.map](Scene(rows, own, begin_ns, seconds))
+        aided = {name: rerun(nodes, maps_of(name), young=young) for name, nodes in second.items()}
+        own = [(name, placed_again(nodes, without[name], aided[name])) for name, nodes in second.items()]
+    figures = _compared(second, without, aided)
+    return figures, sum((course.counts for course in aided.values()), Counter[str]())
+
+
+def _compared(drives: Drives, without: Mapping[str, Course], aided: Mapping[str, Course]) -> Figures:
+    columns = [
+        {**_figures(nodes, without[name], "without_"), **_figures(nodes, aided[name])} for name, nodes in drives.items()
+    ]
+    return {key: np.array([column[key] for column in columns]) for key in columns[0]}
+
+
+def _row_of_days(days: Sequence[Drives]) -> list[Row]:
+    """Each day on the map of all days before it, whose places lanes aided too; a row per day from the second on.
+
+    offset_m: how far the samples of all machines of a day are off together, which is what a map could run away by.
+    """
+    known: list[tuple[str, Any]] = []
+    out: list[Row] = []
+    for number, drives in enumerate(days):
+        lanes = lane_map(known) if known else None
+        maps: Maps = lambda _, lanes=lanes: lanes  # type: ignore[misc] # noqa: E731
+        without = {name: rerun(nodes, lambda _: None, aids=False) for name, nodes in drives.items()}
+        aided = {name: rerun(nodes, maps, young=False) for name, nodes in drives.items()} if known else without
+        figures = _compared(drives, without, aided)
+        ratios = {
+            f"{what}_ratio": float(np.sqrt(figures[f"{what}_m2"].mean() / figures[f"without_{what}_m2"].mean()))
+            for what in ("live", "smoothed")
+        }
+        offsets = {
+            name: float(np.hypot(*np.concatenate([course.smoothed_m for course in of_all.values()]).mean(axis=0)))
+            for name, of_all in (("offset_m", aided), ("offset_without_m", without))
+        }
+        share = float(np.mean([course.shares.mean() for course in aided.values()]))
+        if known:
+            out.append(rounded({"case": f"day {number + 1}", **ratios, **offsets, "aid_share": share}, 2))
+        rows = [(name, placed_again(nodes, without[name], aided[name])) for name, nodes in drives.items()]
+        known += days_ago(rows, len(days) - number)
+    return out
 
 
 def _figures(nodes: Nodes, course: Course, named: str = "") -> dict[str, float]:

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from agents.localisation.lanes.lane_map import LaneMap
+from agents.localisation.lanes.lane_map import DAY_NS, LaneMap
 from lab.fedback.days import free_ways
 from lab.fedback.rerun import Maps
 from mapserver.config import ServerConfig
@@ -56,6 +56,16 @@ def turned(rows: Rows) -> Rows:
         table = table.copy()
         table["heading_rad"] = (table["heading_rad"] + 2 * np.pi) % (2 * np.pi) - np.pi
         out.append((f"{name}-back", table))
+    return out
+
+
+def days_ago(rows: Rows, days: int) -> Rows:
+    """The same, so many days earlier: recordings of all days begin at one stamp."""
+    out = []
+    for name, table in rows:
+        table = table.copy()
+        table["stamp_ns"] -= days * DAY_NS
+        out.append((name, table))
     return out
 
 

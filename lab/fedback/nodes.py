@@ -12,7 +12,7 @@ hold without GPS, where the filter's gains are not optimal on purpose (`consider
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +21,10 @@ from agents.localisation.filters.belief import Belief, Conditioned, Filter, Meas
 from agents.localisation.filters.smoother import NODE_NS, SmoothedPose
 from agents.pipeline import corrected
 from agents.positioning import PipelineConfig, Positioning
+from lab.campaign.experiment import Task
 from protocol.arrays import Floats, Ints, Table
 from protocol.machine.log_folder import open_log
+from protocol.machine.machine_config import MachineConfig
 from protocol.machine.samples import empty
 from sim.recorder import TRACKS_FOLDER
 from sitegrid.proof.tracks import read_track
@@ -58,6 +60,25 @@ class Nodes:
     ahead_m: float
 
 
+@dataclass(frozen=True)
+class Machine:
+    """One machine of a day, and how many of its receivers count."""
+
+    machine: str
+    receivers: int = 2
+
+    @property
+    def name(self) -> str:
+        """For people and for files."""
+        return f"{self.machine}-{self.receivers}gps"
+
+
+def solve(task: Task[Machine], cache: Path) -> Nodes:
+    """The nodes of one machine's drive."""
+    assert task.drive
+    return watch(task.drive.folder(cache), task.variant)
+
+
 class _Watched:
     """A filter that notes the belief at the end of each second."""
 
@@ -74,10 +95,18 @@ class _Watched:
         return self.engine.condition(belief, measurement)
 
 
-def watch(folder: Path, name: str) -> Nodes:
+def with_receivers(machine: MachineConfig, count: int) -> MachineConfig:
+    """The machine, of whose GPS receivers only the first count."""
+    gps = [sensor.name for sensor in machine.sensors if sensor.kind == "gps"]
+    sensors = (replace(s, use=s.use and s.name not in gps[count:]) for s in machine.sensors)
+    return replace(machine, sensors=tuple(sensors))
+
+
+def watch(folder: Path, who: Machine) -> Nodes:
     """Localise one machine of a recording, and note the filter's nodes."""
+    name = who.machine
     log = open_log(folder / "logs" / name)
-    core = Positioning(log.site, log.machine, PipelineConfig())
+    core = Positioning(log.site, with_receivers(log.machine, who.receivers), PipelineConfig())
     watched = core.localiser.engine = _Watched(core.localiser.engine)
     readings = list(log.readings())
     way: list[tuple[int, float, float, float, float]] = []

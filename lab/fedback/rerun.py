@@ -12,12 +12,12 @@ from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation.filters.motion import BESIDE_S, BESIDE_STD_M, OFFSET_WALK
 from agents.localisation.filters.smoother import KEPT
 from agents.localisation.filters.state import YAW
-from agents.localisation.lanes.guards import Guards, prior_m2, shown
+from agents.localisation.lanes.guards import OFF_NS, Guards, prior_m2, share_of, shown
 from agents.localisation.lanes.lane_map import LaneMap
 from agents.localisation.lanes.matching import Match, match
 from agents.localisation.lanes.window import Window
 from lab.fedback.nodes import Nodes
-from protocol.arrays import Floats
+from protocol.arrays import Floats, Table
 
 LAG = 90  # nodes
 Maps = Callable[[int], LaneMap | None]  # the map that an agent has at a stamp
@@ -25,12 +25,16 @@ Maps = Callable[[int], LaneMap | None]  # the map that an agent has at a stamp
 
 @dataclass(frozen=True)
 class Course:
-    """Errors (n, 2) and covariances (n, 2, 2) at the nodes, live and smoothed; counts: what became of windows."""
+    """Errors (n, 2) and covariances (n, 2, 2) at the nodes, live and smoothed; counts: what became of windows.
+
+    shares (n,): how much of the smoothed places came from lanes.
+    """
 
     live_m: Floats
     live_m2: Floats
     smoothed_m: Floats
     smoothed_m2: Floats
+    shares: Floats
     counts: Counter[str]
     guards: Floats  # m, l (k, 3) after each window
 
@@ -38,13 +42,15 @@ class Course:
 class _Smoother:
     """Nodes of the lag, jointly with the state: mean (q, 3), covariance (q, 3, 3), cross-covariance (q, 3, s)."""
 
-    def __init__(self, states: int) -> None:
+    def __init__(self, states: int, offset_m2: float) -> None:
+        """offset_m2: prior variance of the map's offset, 0 where that is no state; held: least share of places."""
         self.mean, self.P, self.C = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, states))
-        self.final: list[tuple[Floats, Floats]] = []
+        self.final: list[tuple[Floats, Floats, float]] = []
+        self.offset_m2, self.held = offset_m2, 0.0
 
     def add(self, mean: Floats, P: Floats) -> None:
         if len(self.mean) == LAG:
-            self.final.append((self.mean[0], self.P[0]))
+            self.final.append((self.mean[0], self.P[0], self._share(self.C[0])))
         keep = slice(len(self.mean) == LAG, None)
         self.mean = np.concatenate([self.mean[keep], mean[None, KEPT]])
         self.P = np.concatenate([self.P[keep], P[None][:, KEPT][:, :, KEPT]])
@@ -56,10 +62,14 @@ class _Smoother:
         self.P = self.P - self.C @ information @ self.C.transpose(0, 2, 1)
         self.C = self.C @ moved.T
 
-    def all(self) -> tuple[Floats, Floats]:
-        """Places (n, 2) and covariances (n, 2, 2) of all nodes so far."""
-        pairs = [*self.final, *zip(self.mean, self.P, strict=True)]
-        return np.array([mean[:2] for mean, _ in pairs]), np.array([P[:2, :2] for _, P in pairs])
+    def all(self) -> tuple[Floats, Floats, Floats]:
+        """Places (n, 2), covariances (n, 2, 2) and shares (n,) of all nodes so far."""
+        shares = map(self._share, self.C)
+        means, covariances, aided = zip(*self.final, *zip(self.mean, self.P, shares, strict=True), strict=True)
+        return np.array(means)[:, :2], np.array(covariances)[:, :2, :2], np.array(aided)
+
+    def _share(self, cross: Floats) -> float:
+        return max(share_of(cross[:2, -3:-1], self.offset_m2), self.held) if self.offset_m2 else 0.0
 
 
 def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -> Course:
@@ -71,7 +81,9 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -
     P[:n, :n] = nodes.P[0]
     if aids:
         P[n:, n:] = np.diag(prior_m2(young=young))
-    smoother, live, live_m2, seen, at = _Smoother(states), [], [], [], 0
+    offset_m2 = float(prior_m2(young=young)[0]) * aids
+    smoother, live, live_m2, seen, at = _Smoother(states, offset_m2), [], [], [], 0
+    holds_ns = 0
     for k, stamp_ns in enumerate(nodes.stamp_ns.tolist()):
         if k:
             d, P = _moved(nodes, k - 1, d, P, smoother)
@@ -93,17 +105,30 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -
                 seen.append(d[n:].copy())
                 if why := guards.judge(stamp_ns, d[n:], prior_m2(young=young), nis):
                     counts[why] += 1
+                    smoother.held, holds_ns = share_of(P[:2, n : n + 2], offset_m2), stamp_ns + OFF_NS
                     d[n:], P[n:, :], P[:, n:] = 0.0, 0.0, 0.0
                     P[n:, n:] = np.diag(prior_m2(young=young))
                     smoother.C[:, :, n:] = 0.0
+        smoother.held *= stamp_ns < holds_ns
         x = nodes.x[k] + d[:n]
         live.append(x[:2])
         live_m2.append(P[:2, :2].copy())
         smoother.add(x, P)
-    places, smoothed_m2 = smoother.all()
-    return Course(
-        np.array(live) - nodes.true_m, np.array(live_m2), places - nodes.true_m, smoothed_m2, counts, np.array(seen)
-    )
+    places, smoothed_m2, shares = smoother.all()
+    courses = np.array(live) - nodes.true_m, np.array(live_m2), places - nodes.true_m, smoothed_m2
+    return Course(*courses, shares, counts, np.array(seen))
+
+
+def placed_again(nodes: Nodes, without: Course, aided: Course) -> Table:
+    """The samples of a drive, where lanes put them, with what came from lanes; without: the same drive without."""
+    rows, moved_m = nodes.rows.copy(), aided.smoothed_m - without.smoothed_m
+    for axis, name in enumerate(("x_m", "y_m")):
+        rows[name] += np.interp(rows["stamp_ns"], nodes.stamp_ns, moved_m[:, axis])
+    P = aided.smoothed_m2
+    values_of = {"cov_xx_m2": P[:, 0, 0], "cov_xy_m2": P[:, 0, 1], "cov_yy_m2": P[:, 1, 1], "aid_share": aided.shares}
+    for name, values in values_of.items():
+        rows[name] = np.interp(rows["stamp_ns"], nodes.stamp_ns, values)
+    return rows
 
 
 def _reckoned(nodes: Nodes, stamp_ns: int) -> DeadReckonedPose:

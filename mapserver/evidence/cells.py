@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-SCHEMA = 5  # of everything below; a snapshot of another schema is folded again from the journal
+SCHEMA = 6  # of everything below; a snapshot of another schema is folded again from the journal
 
 CELLS = BLOCK_CELLS * BLOCK_CELLS  # of a block
 WEIGHT_UNITS_PER_M = 4096
@@ -36,7 +36,8 @@ HEADING = slice(GRADE_NORTH.stop, GRADE_NORTH.stop + SECTORS)
 # One count: metres of the c_rr votes, times the standard deviation that their samples state as a share of DOUBT_MOST.
 DOUBT = HEADING.stop
 DOUBT_MOST = 0.032  # larger deviations count as this one [-]: three of it are half of what tells sand from concrete
-COUNTS = DOUBT + 1
+AIDED = DOUBT + 1  # metres, times the share of their place that came from lanes
+COUNTS = AIDED + 1
 
 VISITS, MACHINES = 0, 1  # the two bitmaps
 SHARE_ONE = 256  # a vote is split between two neighbouring bins in 1/256

@@ -19,7 +19,7 @@ from protocol.arrays import AnyArray, Bools, Ints, Table
 MOST_SHARES = 1 << 24  # of stencils that are weighed at once, 64 MB
 MOST_VOTES = 1 << 20  # that are packed at once, 8 MB
 MOST_PAGES = 1 << 14  # likewise
-_VOTES_OF_CELL = 8  # two bins of each of three values, one sector, and the doubt
+_VOTES_OF_CELL = 9  # two bins of each of three values, one sector, the doubt, and what is aided
 
 
 class Scratch(Buffers):
@@ -65,7 +65,7 @@ def fold(
         keys[:pairs] = keys[:pairs] >> BUCKET_BITS << BUCKET_BITS | spans[touching[:pairs]]
     starts, shares = array("starts", n, np.int64), array("shares", area, np.uint32)
     weigh(rows, places, stencils, starts, shares)
-    bins, bin_shares = array("bins", n, np.int64, 4), array("bin_shares", n, np.uint32, 4)
+    bins, bin_shares = array("bins", n, np.int64, 4), array("bin_shares", n, np.uint32, 5)
     bits, stamps = array("bits", n, np.uint64, 2), array("stamps", n, np.int64)
     split(rows, names, bins, bin_shares, bits, stamps)
     order = np.argsort(keys[:pairs], kind="stable")

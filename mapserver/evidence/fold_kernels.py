@@ -17,8 +17,9 @@ import numpy as np
 from mapserver.evidence import cells as ev
 
 _RESISTANCE, _EAST, _NORTH = ev.RESISTANCE.start, ev.GRADE_EAST.start, ev.GRADE_NORTH.start
-_HEADING, _DOUBT, _COUNTS, _CELLS = ev.HEADING.start, ev.DOUBT, ev.COUNTS, ev.CELLS
+_HEADING, _DOUBT, _AIDED, _COUNTS, _CELLS = ev.HEADING.start, ev.DOUBT, ev.AIDED, ev.COUNTS, ev.CELLS
 _ONE, _PLANE, _HALF_SHARE = np.uint64(1), np.uint64(ev.CELLS), np.uint32(ev.SHARE_ONE // 2)
+_NONE = np.uint32(0)
 
 # Keys sort by block column, block row and bucket: 18, 18 and 27 bits, enough for 5 cm cells 100 km away, and for
 # minutes until the year 2100.
@@ -118,11 +119,12 @@ def _vote(counts: Any, lines: Any, top: int, end: int, part: Any, bins: Any, bin
                 counts[upper + i] += above
             lines[plane] |= touched
             lines[plane + _ONE] |= touched
-    if bins[k, 0] >= 0:
-        at = np.uint64(_DOUBT) * _PLANE + first
-        for i in range(n):
-            counts[at + i] += np.uint32(np.uint32(part[i] * bin_shares[k, 3] + _HALF_SHARE) >> np.uint32(8))
-        lines[_DOUBT] |= touched
+    for line, share in ((_DOUBT, bin_shares[k, 3] if bins[k, 0] >= 0 else _NONE), (_AIDED, bin_shares[k, 4])):
+        if share:
+            at = np.uint64(line) * _PLANE + first
+            for i in range(n):
+                counts[at + i] += np.uint32(np.uint32(part[i] * share + _HALF_SHARE) >> np.uint32(8))
+            lines[line] |= touched
     sector = np.uint64(_HEADING + bins[k, 3])
     at = sector * _PLANE + first
     for i in range(n):

@@ -219,9 +219,9 @@ def split(rows: Any, names: Any, bins: Any, shares: Any, bits: Any, stamps: Any)
     """What rows vote for.
 
     names (n,): hashes of machines. Fills bins (n, 4): of resistance, grade east and grade north, -1 for no vote, and
-    sector of the heading; shares (n, 4): of the bin above, in 1/256, and the stated standard deviation of c_rr in 1/256
-    of DOUBT_MOST; bits (n, 2): one of the visit and one of the machine (a multiplicative hash takes the top six bits);
-    stamps (n,).
+    sector of the heading; shares (n, 5): of the bin above, in 1/256, the stated standard deviation of c_rr in 1/256 of
+    DOUBT_MOST, and the share of the place that came from lanes, in 1/256, rounded up; bits (n, 2): one of the visit and
+    one of the machine (a multiplicative hash takes the top six bits); stamps (n,).
     """
     for k in range(len(rows)):
         row = rows[k]
@@ -229,6 +229,7 @@ def split(rows: Any, names: Any, bins: Any, shares: Any, bits: Any, stamps: Any)
         bins[k, 1], shares[k, 1] = _split_grade(np.float64(row.grade_e))
         bins[k, 2], shares[k, 2] = _split_grade(np.float64(row.grade_n))
         shares[k, 3] = _doubt(np.float64(row.c_rr_var))
+        shares[k, 4] = np.uint32(np.ceil(np.float64(row.aid_share) * _ONE))
         bins[k, 3] = np.int64(np.floor(np.float64(row.heading_rad) / _SECTOR_RAD + 0.5)) % _SECTORS
         visit = (names[k] + np.uint64(row.stamp_ns // VISIT_NS)) * _HASH
         bits[k, 0], bits[k, 1] = np.uint64(1) << (visit >> np.uint64(58)), np.uint64(1) << (names[k] >> np.uint64(58))

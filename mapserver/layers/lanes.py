@@ -3,7 +3,9 @@
 A road that is moved, a face that is dug away: nobody says so, but machines drive elsewhere from then on. So in a square
 of 16 x 16 cells a pass counts by what was driven there later, in the same direction or nearly so, and by its age:
 
-    metres = sum of passes exp(-later metres / FADES_M) 2^(-age / FADES_DAYS)
+    metres = sum of passes (1 - aid_share) exp(-later metres / FADES_M) 2^(-age / FADES_DAYS)
+
+A pass whose place came from lanes in part counts by what is left, so that lanes do not confirm themselves.
 """
 
 from __future__ import annotations
@@ -51,10 +53,9 @@ def lane_tile(block: Block, pages: Sequence[TimedPage], first: Ints, stamp_ns: i
 
 
 def _by_sector(timed: TimedPage, first: Ints, index: int) -> Floats:
-    """Metres (16, 256) of a page in each sector of heading, of the cells in which it counts."""
-    plane, cell = np.divmod(timed.page.votes["place"].astype(np.int64), ev.CELLS)
-    heading = (plane >= ev.HEADING.start) & (plane < ev.HEADING.stop) & (first[cell] <= index)
-    place = (plane[heading] - ev.HEADING.start) * ev.CELLS + cell[heading]
-    weight = timed.page.votes["count"][heading] / ev.WEIGHT_UNITS_PER_M
-    metres: Floats = np.bincount(place, weight, ev.SECTORS * ev.CELLS)  # type: ignore[assignment] # weights are floats
-    return metres.reshape(ev.SECTORS, ev.CELLS)
+    """Metres (16, 256) of a page in each sector of heading, of the cells in which it counts, less what was aided."""
+    counts = np.zeros((ev.COUNTS, ev.CELLS))
+    counts.reshape(-1)[timed.page.votes["place"]] = timed.page.votes["count"]
+    metres = counts[ev.HEADING] * ((first <= index) / ev.WEIGHT_UNITS_PER_M)
+    own: Floats = np.clip(1 - counts[ev.AIDED] / np.maximum(counts[ev.HEADING].sum(axis=0), 1), 0, 1)
+    return metres * own

@@ -29,6 +29,7 @@ SAMPLE_DTYPE = np.dtype(
         ("applied_zero", "<f4"),
         ("applied_scale", "<f4"),
         ("mass_kg", "<f4"),
+        ("aid_share", "<f4"),
     ]
 )
 COLUMNS: tuple[str, ...] = SAMPLE_DTYPE.names or ()
@@ -39,8 +40,9 @@ RESISTANCE = ("c_rr", "c_rr_var")  # may both be NaN
 GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
 APPLIED = ("applied_zero", "applied_scale")  # what the machine's own calibration has taken off its balance already
 MASS = "mass_kg"  # of machine and load; may be NaN
-# Columns that a batch may lack, and what stands for them: nothing was taken off; the mass is not known.
-OPTIONAL = {**dict.fromkeys(APPLIED, 0.0), MASS: np.nan}
+AIDED = "aid_share"  # how much of the place came from lanes of the map [-]
+# Columns that a batch may lack, and what stands for them: nothing was taken off; the mass is not known; no lanes.
+OPTIONAL = {**dict.fromkeys(APPLIED, 0.0), MASS: np.nan, AIDED: 0.0}
 NAN_ALLOWED = (RESISTANCE, GRADE, (MASS,))  # groups of columns: NaN together, or not at all
 
 # Plausible range of each column.
@@ -62,6 +64,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "applied_zero": (-0.2, 0.2),
     "applied_scale": (-0.5, 0.5),
     "mass_kg": (1.0, 1e6),
+    "aid_share": (0.0, 1.0),
 }
 # What machines differ by before any calibration, by data sheets, as machines and map server assume: standard deviations
 # of an accelerometer's zero over gravity (0.044 m/s2) and of the scale of drive force over weight; random walk of the

@@ -73,13 +73,19 @@ def rows() -> np.ndarray:
     calibration = (0.00390625, -0.0625)
     return np.array(
         [
-            (*whole, *calibration, 17_500.0),
-            (*level, *calibration, 44_000.5),
-            (*ahead, 0.0, 0.0, NAN),
-            (*place, *calibration, 17_500.0),
+            (*whole, *calibration, 17_500.0, 0.0),
+            (*level, *calibration, 44_000.5, 0.0),
+            (*ahead, 0.0, 0.0, NAN, 0.0),
+            (*place, *calibration, 17_500.0, 0.0),
         ],
         SAMPLE_DTYPE,
     )
+
+
+def aided(rows: np.ndarray) -> np.ndarray:
+    """Return the samples of a machine that found its place on lanes."""
+    rows["aid_share"] = 0.0, 0.25, 0.5, 1.0
+    return rows
 
 
 def readings() -> tuple[Any, ...]:
@@ -131,6 +137,7 @@ def decode_info_table(data: bytes) -> dict[str, Any]:
 
 
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
+AIDED = replace(BATCH, rows=aided(rows()))
 LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60, store=STORE)
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 OFFER = CalibrationOffer("loader-1", T0, 0.00390625, -0.0625, 2.0**-22, 2.0**-16, 2.0**-20)
@@ -264,6 +271,7 @@ ROUTE = RouteAnswer(
 
 GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
+    "batch_aided.bin": Golden(AIDED, codec.encode_batch, decode_batch),
     "batch_lost.bin": Golden(LOST, codec.encode_batch, decode_batch),
     "batch_empty.bin": Golden(ASK, codec.encode_batch, decode_batch),
     "ack.bin": Golden(Ack(43, 17, 2, STORE), codec.encode_reply, codec.decode_reply),

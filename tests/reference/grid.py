@@ -59,8 +59,9 @@ def folded(batches: Iterable[tuple[str, Table]], cell_m: float, config: FoldConf
                     one.counts[plane] += np.uint64(share - above)
                     if part >= 0 and plane < ev.HEADING.start:
                         one.counts[plane + 1] += np.uint64(above)
-                if votes.bins[k, 0] >= 0:
-                    one.counts[ev.DOUBT] += np.uint64((share * int(votes.doubt[k]) + ev.SHARE_ONE // 2) >> 8)
+                doubt = int(votes.doubt[k]) if votes.bins[k, 0] >= 0 else 0
+                for plane, part in ((ev.DOUBT, doubt), (ev.AIDED, int(votes.aided[k]))):
+                    one.counts[plane] += np.uint64((share * part + ev.SHARE_ONE // 2) >> 8)
                 evidence[cell][0, int(votes.bucket[k])].add(one)
     return evidence
 

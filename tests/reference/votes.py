@@ -27,7 +27,8 @@ class Votes:
 
     place: (n, 2) position; inverse: (n, 3) inverse covariance xx, 2 xy, yy; reach: (n,) half the stencil's edge, in
     cells around the one that the sample lies in; weight: (n,); bins, shares: (n, 3) for resistance, grade east, grade
-    north; doubt (n,) in 1/256 of DOUBT_MOST; sector, stamp_ns, bucket: (n,); bits: (n, 2) one bit set in each.
+    north; doubt (n,) in 1/256 of DOUBT_MOST; aided (n,) in 1/256; sector, stamp_ns, bucket: (n,); bits: (n, 2) one bit
+    set in each.
     """
 
     place: Floats
@@ -37,6 +38,7 @@ class Votes:
     bins: Ints
     shares: Ints
     doubt: Ints
+    aided: Ints
     sector: Ints
     stamp_ns: Ints
     bucket: Ints
@@ -64,6 +66,7 @@ def prepare(rows: Table, machine: str, cell_m: float, config: FoldConfig) -> Vot
         bins=np.stack([lower for lower, _ in pairs], axis=1),
         shares=np.stack([share for _, share in pairs], axis=1),
         doubt=_doubt(rows["c_rr_var"].astype(np.float64)),
+        aided=np.ceil(rows["aid_share"].astype(np.float64) * ev.SHARE_ONE).astype(np.int64),
         sector=sector % ev.SECTORS,
         stamp_ns=rows["stamp_ns"].copy(),
         bucket=rows["stamp_ns"] // config.bucket_ns,

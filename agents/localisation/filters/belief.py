@@ -102,7 +102,10 @@ class Conditioned:
 
 @dataclass(frozen=True)
 class PoseBelief:
-    """Pose in `map` at a stamp: position [m], heading [rad, in +-pi], speed [m/s], covariance (2, 2) [m2]."""
+    """Pose in `map` at a stamp: position [m], heading [rad, in +-pi], speed [m/s], covariance (2, 2) [m2].
+
+    aid_share: how much of the position came from lanes, 0 to 1.
+    """
 
     stamp_ns: int
     x_m: float
@@ -110,6 +113,7 @@ class PoseBelief:
     heading_rad: float
     speed_mps: float
     covariance_m2: Floats
+    aid_share: float = 0.0
 
 
 class DivergedError(ArithmeticError):
@@ -126,11 +130,11 @@ class Filter(Protocol):
         """Condition the belief on a measurement of its stamp."""
 
 
-def pose_of(belief: Belief, wheels_mps: float | None) -> PoseBelief:
+def pose_of(belief: Belief, wheels_mps: float | None, aid_share: float = 0.0) -> PoseBelief:
     """The pose that a belief holds, with the wheels' speed; None: with its own."""
     speed_mps = float(belief.x[SPEED]) if wheels_mps is None else wheels_mps
     x, y, heading = float(belief.x[X]), float(belief.x[Y]), wrap_angle(float(belief.x[YAW]))
-    return PoseBelief(belief.stamp_ns, x, y, heading, speed_mps, belief.P[:2, :2].copy())
+    return PoseBelief(belief.stamp_ns, x, y, heading, speed_mps, belief.P[:2, :2].copy(), aid_share)
 
 
 # --- changes ---------------------------------------------------------------------------------------------------------

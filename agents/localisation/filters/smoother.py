@@ -36,7 +36,8 @@ MIN_VARIANCE = 1e-8  # along any axis [m2, rad2]: a tenth of a millimetre; round
 class SmoothedPose:
     """Where the machine was, as known after what came since: position [m], heading [rad, in +-pi], covariance (2, 2).
 
-    correction: x, y [m] and heading [rad] (3,) less what the filter believed at that stamp.
+    correction: x, y [m] and heading [rad] (3,) less what the filter believed at that stamp. cross: (3, n), with the
+    state as it was known last. aid_share: how much of the position came from lanes, 0 to 1.
     """
 
     stamp_ns: int
@@ -45,6 +46,8 @@ class SmoothedPose:
     heading_rad: float
     covariance_m2: Floats
     correction: Floats
+    cross: Floats
+    aid_share: float = 0.0
 
 
 class Nodes(NamedTuple):
@@ -138,13 +141,13 @@ def nothing_past(n: int, lag_s: float) -> Past | None:
 
 def _poses(nodes: Nodes, end: int | None = None) -> list[SmoothedPose]:
     """Poses of the nodes, or of the oldest up to one."""
-    rows = zip(*(values[:end] for values in nodes[:4]), strict=True)
-    return [_pose(int(stamp_ns), filtered, mean, covariance) for stamp_ns, filtered, mean, covariance in rows]
+    rows = zip(*(values[:end] for values in nodes), strict=True)
+    return [_pose(int(stamp_ns), *values) for stamp_ns, *values in rows]
 
 
-def _pose(stamp_ns: int, filtered: Floats, mean: Floats, covariance: Floats) -> SmoothedPose:
+def _pose(stamp_ns: int, filtered: Floats, mean: Floats, covariance: Floats, cross: Floats) -> SmoothedPose:
     x, y, heading = mean.tolist()
-    return SmoothedPose(stamp_ns, x, y, wrap_angle(heading), _floored(covariance[:2, :2]), mean - filtered)
+    return SmoothedPose(stamp_ns, x, y, wrap_angle(heading), _floored(covariance[:2, :2]), mean - filtered, cross)
 
 
 def _floored(covariance: Floats) -> Floats:

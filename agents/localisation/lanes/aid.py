@@ -11,7 +11,7 @@ import numpy as np
 from agents.dead_reckoning import DeadReckonedPose
 from agents.localisation.filters.belief import Belief, Measurement, reset_states
 from agents.localisation.filters.state import YAW, Layout, X, Y
-from agents.localisation.lanes.guards import ALARMS, Guards, prior_m2, shown
+from agents.localisation.lanes.guards import ALARMS, Guards, prior_m2, share_of, shown
 from agents.localisation.lanes.lane_map import LaneMap
 from agents.localisation.lanes.matching import Match, match
 from agents.localisation.lanes.window import Window
@@ -33,6 +33,7 @@ class LaneAid:
     def restart(self) -> None:
         """Begin anew, as localisation does."""
         self._window, self._guards, self._prior_m2 = Window(self._load_centre_m), Guards(), prior_m2(young=False)
+        self._held = 0.0  # share of places that holds since an alarm, when what is known of m is forgotten
 
     def is_due(self, reckoned: DeadReckonedPose) -> bool:
         """Note where dead reckoning is; returns whether a window has ended there."""
@@ -50,6 +51,7 @@ class LaneAid:
         self._is_used = False
         if self.lanes is None or not self._guards.is_open(belief.stamp_ns):
             return None
+        self._held = 0.0
         H = shown(len(belief.x), heading_rad)
         matched = match(self.lanes, H.dot(belief.x), H.dot(belief.P).dot(H.T), back_m, headings_rad)
         if not isinstance(matched, Match):
@@ -65,7 +67,12 @@ class LaneAid:
         alarm = self._guards.judge(belief.stamp_ns, belief.x[guards], self._prior_m2, nis)
         self.counters[f"{LANES}_{alarm}"] += bool(alarm)
         self._is_used = not alarm
+        self._held = self.share(belief.P[:2, layout.map_offset]) if alarm else 0.0
         return not alarm
+
+    def share(self, cross_m2: Floats) -> float:
+        """How much of a place came from lanes, by its covariance with the map's offset (2, 2)."""
+        return max(share_of(cross_m2, float(self._prior_m2[0])), self._held)
 
     def forgotten(self, belief: Belief, layout: Layout) -> Belief:
         """The belief with nothing known of the map's offset and of the machine's habit."""

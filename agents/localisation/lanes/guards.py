@@ -41,6 +41,15 @@ def shown(states: int, heading_rad: float) -> Floats:
     return H
 
 
+def share_of(cross_m2: Floats, offset_m2: float) -> float:
+    """How much of a place came from lanes, 0 to 1: how far it would move if the whole map were moved by a metre.
+
+    cross_m2 (2, 2): covariance of the place with m now, of a prior variance offset_m2. A map that is moved is a prior
+    of m with another mean, and the mean of the place follows that by cov(p, m) / var(m).
+    """
+    return min(float(np.linalg.norm(cross_m2, 2)) / offset_m2, 1.0)
+
+
 class Guards:
     """Decides whether lanes are used now. alarm: of ALARMS, why they are not; empty where that is not it."""
 

@@ -7,7 +7,7 @@ from lab.campaign.recordings import make
 from lab.fedback import maps
 from lab.fedback.days import day
 from lab.fedback.maps import MAPS, Scene, free, moved
-from lab.fedback.nodes import watch
+from lab.fedback.nodes import Machine, watch
 from lab.fedback.rerun import rerun
 
 SECONDS = 130.0
@@ -16,7 +16,7 @@ SECONDS = 130.0
 @pytest.fixture(scope="module")
 def nodes(tmp_path_factory):
     drive = day("driven", 3, SECONDS)
-    return watch(make(drive, tmp_path_factory.mktemp("fedback")), drive.names[0])
+    return watch(make(drive, tmp_path_factory.mktemp("fedback")), Machine(drive.names[0]))
 
 
 @pytest.mark.slow

@@ -462,7 +462,7 @@ def test_a_receiver_that_counts_from_its_first_fix_may_be_anywhere() -> None:
 
 def node(second: int, correction: tuple[float, float, float], variance_m2: float = 0.5) -> SmoothedPose:
     covariance_m2 = np.diag([variance_m2, 2 * variance_m2])
-    return SmoothedPose(second * SECOND, 0.0, 0.0, 0.0, covariance_m2, np.array(correction))
+    return SmoothedPose(second * SECOND, 0.0, 0.0, 0.0, covariance_m2, np.array(correction), np.zeros((3, 15)))
 
 
 def filtered(at_s: float, heading_rad: float = 0.0) -> PoseBelief:

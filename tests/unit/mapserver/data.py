@@ -81,6 +81,7 @@ def random_samples(n: int, seed: int, half_m: float = 60.0, std_m: float = 1.5) 
         c_rr=draw.uniform(0.0, 0.5, n),
         grade_e=draw.uniform(-0.6, 0.6, n),
         grade_n=draw.uniform(-0.6, 0.6, n),
+        aid_share=draw.uniform(0.0, 1.0, n) * (draw.random(n) < 0.5),
     )
     for names, hit in ((("c_rr", "c_rr_var"), 7), (("grade_e", "grade_n", "grade_var"), 5)):
         for name in names:

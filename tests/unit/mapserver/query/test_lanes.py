@@ -10,7 +10,8 @@ from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.query.views import read_lanes, view_of
+from mapserver.layers.cell_layers import LAYERS
+from mapserver.query.views import read_cells, read_lanes, view_of
 from protocol.errors import MessageError
 from protocol.machine.samples import empty
 from protocol.queries.lanes import SCALE_M, LanesQuery, decode_lanes, encode_lanes
@@ -64,6 +65,22 @@ def test_a_lane_fades_as_machines_drive_beside_it_and_with_its_age():
     assert metres(answer, 0, 1, 4) < 0.1 * metres(lanes_of(old), 0, 1, 4)
     far = passes(80.5, 1, BEGIN_NS + 7 * DAY_NS)  # the site's now is a week later
     assert metres(lanes_of(old, far), 0, 1, 4) == pytest.approx(0.5 * metres(lanes_of(old), 0, 1, 4), rel=0.05)
+
+
+def test_lanes_weigh_passes_by_what_is_left_of_them_and_no_other_layer_does():
+    own, aided = passes(8.5, 3, BEGIN_NS), passes(8.5, 3, BEGIN_NS)
+    aided["aid_share"] = np.repeat([0.0, 0.75, 1.0], 128)
+    alone = metres(lanes_of(passes(8.5, 1, BEGIN_NS)), 0, 1, 8)
+    assert metres(lanes_of(own), 0, 1, 8) == pytest.approx(3 * alone, rel=0.03)
+    assert metres(lanes_of(aided), 0, 1, 8) == pytest.approx(1.25 * alone, rel=0.03)
+    window, grids = CellWindow(0, 0, 32, 64), []
+    for rows in (own, aided):
+        grids.append(Grid(1.0, FoldConfig()))
+        grids[-1].fold(rows, "loader")
+    views = (view_of(grid, window, ServerConfig()) for grid in grids)
+    plain, marked = (read_cells(view, window, tuple(LAYERS), 1.0, ServerConfig()) for view in views)
+    for name in LAYERS:
+        np.testing.assert_array_equal(plain[name], marked[name], name)
 
 
 def test_lanes_are_asked_for_whole_by_place_and_by_news(tmp_path):

@@ -28,7 +28,7 @@ T0 = 1_750_000_000_000_000_000
 
 
 def rows(n: int = 5) -> np.ndarray:
-    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4, 1e-3, 0.01, 17_500.0)
+    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4, 1e-3, 0.01, 17_500.0, 0.25)
     return np.array([one] * n, SAMPLE_DTYPE)
 
 
@@ -159,6 +159,7 @@ def tables(draw):
         "applied_zero": st.floats(-0.03125, 0.03125, width=32),
         "applied_scale": st.floats(-0.5, 0.5, width=32),
         "mass_kg": st.floats(1, 1e6, width=32),
+        "aid_share": st.floats(0, 1, width=32),
     }
     table = empty(draw(st.integers(0, 4)))
     for row in table:

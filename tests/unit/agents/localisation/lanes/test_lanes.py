@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.dead_reckoning import DeadReckonedPose
-from agents.localisation.filters.belief import Belief, extended
+from agents.localisation.filters.belief import Belief, Measurement, extended
 from agents.localisation.filters.ekf import Ekf
 from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import BESIDE_STD_M, MotionModel
@@ -14,7 +14,7 @@ from agents.localisation.filters.smoother import nothing_past
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.lanes.aid import LANES, LaneAid
-from agents.localisation.lanes.guards import AFTER_NS, OFF_NS, Guards, prior_m2
+from agents.localisation.lanes.guards import AFTER_NS, OFF_NS, Guards, prior_m2, share_of, shown
 from agents.localisation.lanes.lane_map import LaneMap
 from agents.localisation.lanes.matching import Match, match
 from agents.localisation.lanes.window import WINDOW_M, Window
@@ -131,6 +131,44 @@ def test_states_that_come_later_leave_the_others_as_they_are():
     assert moved.P[LAYOUT.beside_lane, LAYOUT.beside_lane][0, 0] == pytest.approx(BESIDE_STD_M**2)
     assert not moved.P[: small.n, small.n :].any()
     assert extended(bare, prior_m2(young=False)).past is not None
+
+
+@pytest.mark.parametrize("engine", [Ekf(), Ukf()])
+def test_the_share_of_lanes_is_how_far_places_go_with_the_map(engine):
+    """Live, and of each place of the past, of a map that is moved east or north by a centimetre."""
+
+    def driven(moved_m):
+        fusion = Fusion(engine, MotionModel(LAYOUT), belief_at())
+        for second in range(1, 40):
+            place, rest = shown(LAYOUT.n, math.pi / 2), np.eye(LAYOUT.n)[3:15]
+            place[:, -3:] *= second % 3 > 0  # every third one is a fix
+            z, variance = (moved_m, 1.0) if second % 3 else (np.zeros(2), 4.0)
+            still = np.where(np.arange(12) == 2, math.pi / 2, 0.0)
+            shown_now = (("place", place, z, np.eye(2) * variance), ("rest", rest, still, np.eye(12) * 1e-4))
+            stamp_ns = second * 10**9
+            fusion.add(
+                [Measurement(n, stamp_ns, z, R, lambda x, H=H: x @ H.T, lambda _, H=H: H) for n, H, z, R in shown_now]
+            )
+        places = [(pose.x_m, pose.y_m) for pose in fusion.remaining()]
+        return np.array(places), [share_of(pose.cross[:2, -3:-1], 1.0) for pose in fusion.remaining()]
+
+    still, shares = driven(np.zeros(2))
+    went = [(driven(0.01 * axis)[0] - still) / 0.01 for axis in np.eye(2)]
+    assert 0.05 < min(shares) < max(shares) < 0.9
+    np.testing.assert_allclose(np.linalg.norm(np.stack(went, axis=2), 2, axis=(1, 2)), shares, atol=2e-3)
+
+
+def test_after_an_alarm_places_keep_the_share_that_they_had():
+    aid, belief = LaneAid(0.0), belief_at()
+    belief.P[0, -3] = belief.P[-3, 0] = -0.4
+    assert aid.share(belief.P[:2, LAYOUT.map_offset]) == pytest.approx(0.4)
+    x = belief.x.copy()
+    x[-3] = 2.1
+    assert not aid.judge(Belief(10**9, x, belief.P), 1.0, LAYOUT)
+    forgotten = aid.forgotten(belief, LAYOUT)
+    assert aid.share(forgotten.P[:2, LAYOUT.map_offset]) == pytest.approx(0.4)
+    aid.restart()
+    assert aid.share(forgotten.P[:2, LAYOUT.map_offset]) == 0.0
 
 
 def test_alarms_turn_lanes_off_for_a_while():
