@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from lab.speed import filter as filters
-from lab.speed import fleet, ingest, merge, query, restart, scaling, sim, site
+from lab import sums
+from lab.speed import fleet, ingest, merge, query, restart, sim, site
 from lab.speed.__main__ import LOADS, OPTIONS, load_of, main
 from lab.speed.measure import in_turn, scattered, track
 from protocol.errors import Refusal
@@ -190,7 +191,7 @@ def test_work_is_a_function_of_its_seed_and_a_second_has_what_ten_machines_drive
 
 def test_the_page_of_many_sites_has_the_tables_that_follow_from_what_was_measured():
     page = (ROOT / "lab" / "results" / "sums.md").read_text()
-    assert [table.splitlines()[0] for table in scaling.tables() if table not in page] == []
-    small, large = scaling.Needs(10, 10), scaling.Needs(1000, 500)
+    assert [table.splitlines()[0] for table in sums.tables() if table not in page] == []
+    small, large = sums.Needs(10, 10), sums.Needs(1000, 500)
     assert (large.sites, large.samples) == (2, pytest.approx(100 * small.samples))
-    assert scaling.carried(0.5) == scaling.carried(1.0) // 2
+    assert sums.carried(0.5) == sums.carried(1.0) // 2

@@ -1,4 +1,4 @@
-"""What a number of machines needs, as sums of what was measured of one: `python -m lab.speed.scaling`.
+"""What a number of machines needs, as sums of what was measured of one: `python -m lab.sums`.
 
 It prints the tables of lab/results/sums.md, in Markdown. Measured figures stand on lab/results/speed.md and
 calibration.md; assumed ones are nobody's: put in your own.
