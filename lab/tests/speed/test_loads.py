@@ -10,8 +10,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from lab.speed import filter as filters
 from lab import sums
+from lab.speed import filter as filters
 from lab.speed import fleet, ingest, merge, query, restart, sim, site
 from lab.speed.__main__ import LOADS, OPTIONS, load_of, main
 from lab.speed.measure import in_turn, scattered, track
