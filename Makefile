@@ -17,9 +17,9 @@ demo: $(VENV)/.demo
 
 # An extra of this project and all that it needs. pip is silent while it unpacks: a terminal shows how far it is.
 $(VENV)/.%: pyproject.toml constraints.txt
-	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
-		echo "Python 3.11 is needed, since PyBullet has wheels for no other, and '$(PYTHON)' is" \
-		"$$("$(PYTHON)" --version 2>&1 | grep -x 'Python [0-9.]*' || echo none): say make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null || { \
+		echo "Python 3.11, 3.12 or 3.13 is needed, and '$(PYTHON)' is" \
+		"$$("$(PYTHON)" --version 2>&1 | grep -x 'Python [0-9.]*' || echo none): say make PYTHON=/path/to/python3" >&2; exit 1; }
 	@echo "Installing into $(VENV): $(SIZE_$*)"
 	@began=$$(date +%s); \
 	{ [ ! -t 1 ] || while kill -0 $$$$ && sleep 1; do \

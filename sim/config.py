@@ -5,7 +5,9 @@ Also the files that agents of its machines are given.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,6 +22,7 @@ from sim.scenario.file import check, load_scenario
 from sim.scenario.tables import MAX_MACHINES, FleetConfig, Scenario
 
 T = TypeVar("T", FleetConfig, Scenario)
+log = logging.getLogger("sim.config")
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ def resolve(config: SimConfig) -> Scenario:
     if config.names is not None and len(config.names) != count:
         raise ConfigError(where, f"names: {len(config.names)} names for {count} machines")
     site = scenario.site if config.site is None else replace(scenario.site, name=config.site)
-    options = _given(config, "world", "seed", "seconds", "names")
+    options = _given(config, "seed", "seconds", "names") | {"world": _world(config.world, scenario)}
     scenario = _replace(scenario, where, fleet=fleets, site=site, **options)
     check(scenario, where)
     return scenario
@@ -100,6 +103,14 @@ def write_configs(config: SimConfig, folder: Path, ports: Path | None = None) ->
         path.write_text(text + (driver_toml(ports, wirings, rig.machine) if ports else ""), encoding="utf-8")
         paths.append(path)
     return paths
+
+
+def _world(asked: str | None, scenario: Scenario) -> str:
+    """What moves the machines: the fast world where PyBullet is not installed, unless that is asked for."""
+    if asked or scenario.world == "fast" or find_spec("pybullet"):
+        return asked or scenario.world
+    log.warning("the fast world takes its place problem='PyBullet has wheels for Python 3.11 alone'")
+    return "fast"
 
 
 def _given(config: SimConfig, *names: str) -> dict[str, Any]:

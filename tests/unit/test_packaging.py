@@ -35,14 +35,14 @@ def test_it_is_never_uploaded_and_the_readme_names_its_extras(root: Path):
 
 def test_make_refuses_another_python_in_one_sentence_and_installs_nothing(root: Path, tmp_path: Path):
     python, venv = tmp_path / "python", tmp_path / "venv"
-    python.write_text('#!/bin/sh\n[ "$1" = --version ] && echo Python 3.12.1\nexit 1\n')
+    python.write_text('#!/bin/sh\n[ "$1" = --version ] && echo Python 3.14.0\nexit 1\n')
     python.chmod(0o755)
     command = ["make", "--silent", "demo", f"PYTHON={python}", f"VENV={venv}"]
     made = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert made.returncode == 2
     sentence, _ = made.stderr.splitlines()  # and what make says of its own
     assert sentence.startswith(
-        f"Python 3.11 is needed, since PyBullet has wheels for no other, and '{python}' is Python 3.12.1"
+        f"Python 3.11, 3.12 or 3.13 is needed, and '{python}' is Python 3.14.0"
     )
     assert (made.stdout, venv.exists()) == ("", False)
 

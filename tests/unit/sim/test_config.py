@@ -1,4 +1,5 @@
 import dataclasses
+import sys
 import tomllib
 
 import pytest
@@ -59,3 +60,12 @@ def test_options_go_over_the_scenario() -> None:
     assert {speed for _, speed, _ in scenario.journeys()} == {2.0}
     names = {s.name for s in scenario.rigs()[0].machine.sensors}
     assert names == {"gps-3", "imu-1", "imu-4", "attitude-4", "torque", "wheels", "articulation", "payload"}
+
+
+def test_without_pybullet_the_fast_world_takes_its_place_and_says_so(monkeypatch, caplog) -> None:
+    assert resolve(SimConfig("haul_road")).world == "pybullet"
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    assert resolve(SimConfig("haul_road", world="pybullet")).world == "pybullet"  # fails later, in one line
+    assert not caplog.records
+    assert resolve(SimConfig("haul_road")).world == "fast"
+    assert "the fast world takes its place" in caplog.text
