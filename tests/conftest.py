@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy starts them: small matrices, and tests side by side
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each process that a test starts compiles all sources
@@ -135,12 +136,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
                 f"{report.nodeid} took {taken_s:.1f} s of processor time: mark it slow, unless kernels compiled"
             )
     times = os.times()
-    of_children_s = max(times.children_user + times.children_system, config.stash.get(OF_WORKERS, 0.0))
-    minutes, seconds = divmod(round(times.user + times.system + of_children_s), 60)
+    of_workers_s = times.user + times.system + config.stash.get(OF_WORKERS, 0.0)
+    minutes, seconds = divmod(round(max(_cpu_s(), of_workers_s)), 60)
     terminalreporter.line(f"processor time {minutes}:{seconds:02}")
 
 
 def _cpu_s() -> float:
-    """Processor time of this process and of the children that it waited for."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    """Processor time of this process, of the children that it waited for, and of forks."""
+    times, forks = os.times(), sys.modules.get("tests.integration.forks")
+    of_children_s = times.children_user + times.children_system + (forks.cpu_s() if forks else 0.0)
+    return times.user + times.system + of_children_s

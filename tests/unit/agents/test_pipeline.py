@@ -178,6 +178,7 @@ def test_a_machine_that_lacks_sensors_gives_samples_without_resistance_or_slope(
     assert np.isfinite(rows["grade_e"]).all() if has_slope else np.isnan(rows["grade_e"]).all()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_machine_that_aligns_late_loses_nothing_of_its_drive() -> None:
     """GPS comes up two minutes into the drive, longer than poses are remembered."""
@@ -393,6 +394,7 @@ def test_no_reading_carries_truth() -> None:
 # --- options of sensors that the pipeline itself sees to ----------------------------------------------------------
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_sensor_that_is_not_used_is_as_if_it_were_not_there(vehicle: MachineConfig, recorded: list[Reading]) -> None:
     unused = run(changed_sensor(vehicle, "gps-2", use=False), recorded)
