@@ -8,6 +8,7 @@ import sys
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy starts them: small matrices, and tests side by side
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each process that a test starts compiles all sources
 
+import gc
 import signal
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -19,6 +20,8 @@ from hypothesis import settings
 from sitegrid.process.lifetime import SIGNALS
 from tests import postgres_server as postgres
 from tests.paths import ROOT, SHARED_DATA
+
+gc.set_threshold(50_000, 50, 100)  # recorded drives are millions of objects: usual steps take a sixth of all time
 
 # A shell starts what it runs in the background with SIGINT ignored, nohup with SIGHUP, and so would be all processes of
 # the tests.
