@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import sys
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy starts them: small matrices, and tests side by side
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or each process that a test starts compiles all sources
 
+import gc
 import signal
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -18,6 +20,8 @@ from hypothesis import settings
 from sitegrid.process.lifetime import SIGNALS
 from tests import postgres_server as postgres
 from tests.paths import ROOT, SHARED_DATA
+
+gc.set_threshold(50_000, 50, 100)  # recorded drives are millions of objects: usual steps take a sixth of all time
 
 # A shell starts what it runs in the background with SIGINT ignored, nohup with SIGHUP, and so would be all processes of
 # the tests.
@@ -135,12 +139,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
                 f"{report.nodeid} took {taken_s:.1f} s of processor time: mark it slow, unless kernels compiled"
             )
     times = os.times()
-    of_children_s = max(times.children_user + times.children_system, config.stash.get(OF_WORKERS, 0.0))
-    minutes, seconds = divmod(round(times.user + times.system + of_children_s), 60)
+    of_workers_s = times.user + times.system + config.stash.get(OF_WORKERS, 0.0)
+    minutes, seconds = divmod(round(max(_cpu_s(), of_workers_s)), 60)
     terminalreporter.line(f"processor time {minutes}:{seconds:02}")
 
 
 def _cpu_s() -> float:
-    """Processor time of this process and of the children that it waited for."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    """Processor time of this process, of the children that it waited for, and of forks."""
+    times, forks = os.times(), sys.modules.get("tests.integration.forks")
+    of_children_s = times.children_user + times.children_system + (forks.cpu_s() if forks else 0.0)
+    return times.user + times.system + of_children_s

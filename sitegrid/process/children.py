@@ -37,7 +37,14 @@ class Child:
     ) -> None:
         self.name, self._meanwhile = name, meanwhile
         self._errors = errors.open("ab") if errors else None
-        self._process = subprocess.Popen(  # noqa: S603 - our own command, no shell
+        self._process = self._started(words)
+        self.pid = self._process.pid
+        self._lines: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _started(self, words: list[str]) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(  # noqa: S603 - our own command, no shell
             [sys.executable, "-m", "sitegrid.cli", *words],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -45,10 +52,6 @@ class Child:
             start_new_session=True,  # Ctrl-C reaches the parent alone, which ends its children in order
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
         )
-        self.pid = self._process.pid
-        self._lines: queue.Queue[dict[str, Any]] = queue.Queue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
 
     @property
     def code(self) -> int | None:
@@ -135,6 +138,8 @@ class Children(ExitStack):
     meanwhile: is called ten times a second while a line is waited for, with another one that came in or with nothing.
     """
 
+    child: type[Child] = Child
+
     def __init__(self, log_folder: Path | None = None, meanwhile: Meanwhile = lambda _: None) -> None:
         super().__init__()
         self._log_folder, self._meanwhile = log_folder, meanwhile
@@ -142,7 +147,7 @@ class Children(ExitStack):
     def start(self, name: str, *words: str | Path | float) -> Child:
         """Start `sitegrid <words>`."""
         errors = self._log_folder / f"{name}.log" if self._log_folder else None
-        child = Child(name, [str(word) for word in words], errors, self._meanwhile)
+        child = self.child(name, [str(word) for word in words], errors, self._meanwhile)
         self.callback(child.stop)
         return child
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import subprocess
 import sys
 from collections.abc import Iterator
 
 import pytest
 
-from tests.delivery_simulation.__main__ import run_one, run_seeds
+from tests.delivery_simulation.__main__ import main, run_one, run_seeds
 from tests.delivery_simulation.bugs import BUGS
 
 
@@ -24,9 +23,9 @@ def _quiet() -> Iterator[None]:
 @pytest.mark.slow
 def test_nothing_is_lost_or_double_in_any_world() -> None:
     lines: list[str] = []
-    sums = run_seeds(0, 100, say=lines.append)
+    sums = run_seeds(0, 60, say=lines.append)
     assert not lines, lines[0]
-    assert sums["recorded"] > 2000
+    assert sums["recorded"] > 1200
     assert sums["journalled"] > 0.6 * sums["recorded"]
     events = sums["events"]
     for name in ("agent_kills", "server_kills", "disk_full", "late", "clones", "spool_restores", "server_restores"):
@@ -41,7 +40,7 @@ def test_nothing_is_lost_or_double_with_the_real_store() -> None:
     assert sums["recorded"] > 500
 
 
-SHOWN_FROM = {"failed_commit_stays_open": 90, "final_values_are_given_up": 70}  # the first worlds that do are later
+SHOWN_FROM = {"failed_commit_stays_open": 100, "final_values_are_given_up": 79}  # the first worlds that do
 
 
 @pytest.mark.slow
@@ -62,8 +61,8 @@ def test_same_seed_is_the_same_world() -> None:
     assert len(traces[0]) > 20
 
 
-def test_command_prints_one_object_last() -> None:
-    command = [sys.executable, "-m", "tests.delivery_simulation", "--seeds", "3", "--json"]
-    ended = subprocess.run(command, capture_output=True, text=True, check=True)
-    table = json.loads(ended.stdout.splitlines()[-1])
+def test_command_prints_one_object_last(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["delivery_simulation", "--seeds", "3", "--json"])
+    assert main() == 0
+    table = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (table["seeds"], table["lost"], table["double"], table["failed"]) == (3, 0, 0, 0)

@@ -10,14 +10,14 @@ import pytest
 
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
-from sitegrid.process.children import Children
 from tests.integration.browser_tab import launched
+from tests.integration.forks import Forks
 from tests.integration.hauling_site import hauling_site
 from tests.integration.site_run import NOBODY_DRIVES, SiteRun  # beside this file
 from tests.integration.web_site import WebSite
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     yield from launched()
 
@@ -26,7 +26,7 @@ def browser() -> Iterator[Any]:
 def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
     """A site on the web where machines drove for a minute: for tests that read, and leave it as it was or driven on."""
     folder = tmp_path_factory.mktemp("web")
-    with Children(folder) as started:
+    with Forks(folder) as started:
         site = WebSite(folder, started, "--host", "map.example")
         site.drive(60)
         yield site
@@ -36,24 +36,24 @@ def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
 def hauling(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
     """A site on the web whose roads haulers drove for four days; tests leave it as it was."""
     folder = tmp_path_factory.mktemp("hauling")
-    with Children(folder) as started:
+    with Forks(folder) as started:
         yield hauling_site(folder, started)
 
 
 @pytest.fixture
-def children(tmp_path: Path) -> Iterator[Children]:
-    with Children(tmp_path) as started:
+def children(tmp_path: Path) -> Iterator[Forks]:
+    with Forks(tmp_path) as started:
         yield started
 
 
 @pytest.fixture
-def site(tmp_path: Path, children: Children) -> SiteRun:
+def site(tmp_path: Path, children: Forks) -> SiteRun:
     """A site where nobody drives; nothing of it runs yet."""
     return SiteRun(tmp_path, children, free_endpoint(), NOBODY_DRIVES)
 
 
 @pytest.fixture
-def site_run(tmp_path: Path, children: Children) -> SiteRun:
+def site_run(tmp_path: Path, children: Forks) -> SiteRun:
     return SiteRun(
         tmp_path, children, free_endpoint(), SimConfig(machines=3, seconds=40, speed=8, seed=3, world="pybullet")
     )

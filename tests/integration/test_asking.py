@@ -16,7 +16,7 @@ from protocol.queries.answers import MapInfo
 from protocol.wire import keys
 from protocol.wire.session import free_endpoint
 from sitegrid import Client, connect
-from sitegrid.process.children import Children
+from tests.integration.forks import Forks
 from tests.integration.site_run import NOBODY_DRIVES, SiteRun, kill  # beside this file
 from tests.patience import PATIENCE_S, until
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.processes
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SiteRun]:
     """Router and server, which each test leaves as it found them."""
     folder, sim = tmp_path_factory.mktemp("asked"), NOBODY_DRIVES
-    with Children(folder) as children:
+    with Forks(folder) as children:
         run = SiteRun(folder, children, free_endpoint(), sim)
         run.start_router()
         run.start_server()

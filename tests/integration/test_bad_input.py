@@ -20,7 +20,7 @@ from protocol.wire.codec import MAX_BATCH_BYTES, decode_health, decode_reply, en
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig
-from sitegrid.process.children import Children
+from tests.integration.forks import Forks
 from tests.integration.site_run import NOBODY_DRIVES, SiteRun  # beside this file
 from tests.patience import PATIENCE_S, until
 
@@ -71,7 +71,7 @@ class Probe:
 @pytest.fixture(scope="module")
 def probe(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Probe]:
     folder = tmp_path_factory.mktemp("bad-input")
-    with Children(folder) as children:
+    with Forks(folder) as children:
         sim = NOBODY_DRIVES
         opened = Probe(SiteRun(folder, children, free_endpoint(), sim))
         opened.takes_a_good_one()
@@ -171,7 +171,7 @@ def test_a_bad_query_is_refused_counted_and_named(probe: Probe, selector: str):
 
 
 @pytest.mark.nightly
-def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children: Children, tmp_path):
+def test_a_sample_that_is_never_taken_is_put_aside_reported_and_passed(children: Forks, tmp_path):
     """The server's site is smaller than the agent's: what lies beyond it is refused, the way back in arrives."""
     sim = SimConfig(machines=1, seconds=60, speed=10, seed=3, world="fast")
     run = SiteRun(tmp_path, children, free_endpoint(), sim)

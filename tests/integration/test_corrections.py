@@ -11,7 +11,7 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_health
 from protocol.wire.session import free_endpoint
 from sitegrid import connect
-from sitegrid.process.children import Children
+from tests.integration.forks import Forks
 from tests.integration.site_run import NOBODY_DRIVES, SiteRun
 from tests.patience import PATIENCE_S, until
 from tests.unit.agents.corrections.caster import Caster, sends
@@ -27,7 +27,7 @@ def test_a_caster_s_frames_reach_a_receiver_and_its_refusal_the_health(tmp_path:
         health.update(decode_health(sample.payload.to_bytes()).values)
 
     refusing = Caster(sends(b"HTTP/1.1 401 Unauthorized\r\n\r\n"))
-    with Children(tmp_path) as children, receiver.caster:
+    with Forks(tmp_path) as children, receiver.caster:
         site = SiteRun(tmp_path, children, free_endpoint(), NOBODY_DRIVES)
         table = f'\n[corrections]\nbase = "base-1"\nports = ["{receiver.address}"]\n'
         (config,) = site.configs

@@ -25,8 +25,9 @@ from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid import Client
-from sitegrid.process.children import Child, Children
+from sitegrid.process.children import Child
 from tests.command_lines import said
+from tests.integration.forks import Forks
 from tests.integration.site_run import NOBODY_DRIVES, SiteRun, kill
 from tests.patience import PATIENCE_S, until
 from tests.unit.mapserver.data import random_samples
@@ -85,7 +86,7 @@ class Sender:
 
 
 @pytest.fixture
-def run(tmp_path: Path, children: Children) -> Followed:
+def run(tmp_path: Path, children: Forks) -> Followed:
     site = Followed(tmp_path, children, free_endpoint(), SIM)
     site.start_router()
     return site
@@ -263,7 +264,7 @@ class Quiet:
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Quiet]:
     folder = tmp_path_factory.mktemp("quiet")
-    with Children(folder) as children:
+    with Forks(folder) as children:
         run = Followed(folder, children, free_endpoint(), SIM)
         run.start_router()
         run.serve()

@@ -13,7 +13,7 @@ from protocol.wire import keys
 from protocol.wire.codec import decode_health
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
-from sitegrid.process.children import Children
+from tests.integration.forks import Forks
 from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.patience import until
 
@@ -34,7 +34,7 @@ class Driving(SiteRun):
 
 
 def test_machines_follow_the_lanes_that_they_drew_also_while_the_server_is_down(tmp_path: Path):
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         run = Driving(tmp_path, children, free_endpoint(), DRIVEN)
         _, server, driving = run.start()
         with run.connect() as client:

@@ -15,8 +15,8 @@ from protocol.queries.requests import WhyQuery
 from protocol.wire import keys
 from protocol.wire.codec import encode_batch, encode_health, encode_pose
 from protocol.wire.messages import Health, Pose, SampleBatch
-from sitegrid.process.children import Children
 from tests.integration.browser_tab import WAIT_MS, Tab, axe_script, needs_browser, watched
+from tests.integration.forks import Forks
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, START_NS, WebSite
 from tests.patience import PATIENCE_S, until
@@ -234,7 +234,7 @@ def seen(tab: Tab, *places: tuple[float, float]) -> bool:
 
 @pytest.mark.nightly
 def test_an_empty_map_says_what_to_do_and_what_comes_is_in_sight_until_the_view_is_moved(browser, tmp_path: Path):
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         web = WebSite(tmp_path, children)
         kill(web.server)
         tab = Tab(browser, web.url)
@@ -272,7 +272,7 @@ def test_an_empty_map_says_what_to_do_and_what_comes_is_in_sight_until_the_view_
 
 def test_without_a_token_nobody_sees_the_map(browser, tmp_path: Path):
     keys = tmp_path / "keys"
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         children.start("init", "keys", "init", "--site", "soak", "--dir", keys).wait(PATIENCE_S)
         token = children.start("token", "keys", "token", "anna", "--dir", keys, "--json").expect("token", PATIENCE_S)[
             "token"
@@ -347,7 +347,7 @@ class Sweeper:
 
 @pytest.mark.nightly
 def test_the_page_opens_with_the_layer_that_the_map_knows(browser, tmp_path: Path):
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         web = WebSite(tmp_path, children)
         web.machines = [Sweeper(blind_hours=2)]
         web.drive(2 * BATCH_S)
@@ -371,7 +371,7 @@ def test_the_page_opens_with_the_layer_that_the_map_knows(browser, tmp_path: Pat
 
 @pytest.mark.nightly
 def test_changed_ground_is_outlined_and_says_what_it_was(browser, tmp_path: Path):
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         web = WebSite(tmp_path, children)
         web.machines = [Sweeper()]
         web.drive(5 * BATCH_S)

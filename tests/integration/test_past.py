@@ -25,7 +25,8 @@ from protocol.wire.messages import SampleBatch
 from protocol.wire.session import free_endpoint
 from sitegrid import connect
 from sitegrid.client import Client
-from sitegrid.process.children import Child, Children
+from sitegrid.process.children import Child
+from tests.integration.forks import Forks
 from tests.integration.site_run import kill
 from tests.patience import PATIENCE_S, until
 from tests.site_work import BATCH, START_NS, batches, samples_of
@@ -77,7 +78,7 @@ def test_the_past_of_a_server_killed_in_mid_checkpoint_and_after_a_distrust(tmp_
     folder, endpoint = tmp_path / "store" / "checkpoints", free_endpoint()
     late_ns, between_ns = START_NS + 2 * HOUR_NS + HOUR_NS // 10, START_NS + HOUR_NS + HOUR_NS // 2
 
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         children.start("router", "router", "--listen", endpoint).expect("ready", PATIENCE_S)
 
         def serve() -> Child:

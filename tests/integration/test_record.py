@@ -20,7 +20,8 @@ from protocol.site.geometry import Bounds
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.cli import main
-from sitegrid.process.children import Child, Children
+from sitegrid.process.children import Child
+from tests.integration.forks import Forks
 from tests.integration.site_run import SiteRun
 from tests.patience import PATIENCE_S, until
 
@@ -32,7 +33,7 @@ SIDE_M = 256.0
 class Recorded:
     """A site that was recorded while two machines drove: by `sitegrid record`, and by their agents."""
 
-    def __init__(self, folder: Path, children: Children) -> None:
+    def __init__(self, folder: Path, children: Forks) -> None:
         self.children, self.endpoint = children, free_endpoint()
         self.site = self.run(folder)
         self.readings = folder / "readings"
@@ -79,7 +80,7 @@ class Recorded:
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
     folder = tmp_path_factory.mktemp("recorded")
-    with Children(folder) as children:
+    with Forks(folder) as children:
         yield Recorded(folder, children)
 
 
@@ -104,7 +105,7 @@ def test_samples_that_are_replayed_give_the_same_map(recorded: Recorded, tmp_pat
     assert recorded.end(site) == (recorded.samples, recorded.map)
 
 
-def test_a_lost_router_is_a_gap_and_a_killed_recording_can_be_read(site: SiteRun, children: Children):
+def test_a_lost_router_is_a_gap_and_a_killed_recording_can_be_read(site: SiteRun, children: Forks):
     site.start_router()
     site.start_server()
     file, log = site.folder / "a.mcap", site.folder / "record.log"

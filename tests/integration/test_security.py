@@ -33,10 +33,11 @@ from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sim.config import SimConfig, write_configs
 from sitegrid import connect
 from sitegrid.cli import main
-from sitegrid.process.children import Child, Children
+from sitegrid.process.children import Child
 from sitegrid.security.access import SPARE_BYTES
 from sitegrid.security.join import reply_check
 from sitegrid.security.signing import Signer
+from tests.integration.forks import Forks
 from tests.patience import PATIENCE_S, until
 
 certificates = pytest.importorskip("sitegrid.security.key_folder", reason="cryptography is not installed")
@@ -58,7 +59,7 @@ DAY = timedelta(days=1)
 class Guarded:
     """Router and map server of a site with keys."""
 
-    def __init__(self, folder: Path, children: Children, *, signed: bool = False) -> None:
+    def __init__(self, folder: Path, children: Forks, *, signed: bool = False) -> None:
         self.keys, self.children = folder / "keys", children
         self.make_keys("init", "--site", SITE)
         for name, role in ROLES.items():
@@ -109,7 +110,7 @@ class Guarded:
 @pytest.fixture(scope="module")
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
     folder = tmp_path_factory.mktemp("guarded")
-    with Children(folder) as children:
+    with Forks(folder) as children:
         yield Guarded(folder, children)
 
 
@@ -176,7 +177,7 @@ def test_a_follower_with_keys_answers_under_its_own_name_alone(guarded: Guarded)
     follower.stop()
 
 
-def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_path: Path, children: Children):
+def test_a_server_that_asks_for_signatures_takes_those_of_the_machine_alone(tmp_path: Path, children: Forks):
     site = Guarded(tmp_path, children, signed=True)
     key, batch = keys.ingest(SITE, "loader-1"), site.batch("loader-1")
     mine, others = (
@@ -452,7 +453,7 @@ def test_a_flood_of_poses_is_thinned_out(guarded: Guarded):
 
 
 @pytest.mark.nightly
-def test_connections_that_say_nothing_delay_no_link(guarded: Guarded, children: Children):
+def test_connections_that_say_nothing_delay_no_link(guarded: Guarded, children: Forks):
     """At a router of their own: as they end, each pauses its listener for 0.1 s, so 150 keep everybody out for 15 s."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     router = children.start("router", "router", "--keys", guarded.keys, "--listen", endpoint)
@@ -471,7 +472,7 @@ def test_connections_that_say_nothing_delay_no_link(guarded: Guarded, children: 
 # --- revoked ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, children: Children):
+def test_a_revoked_machine_is_shut_out_at_once_and_for_good(tmp_path: Path, children: Forks):
     site = Guarded(tmp_path, children)
     stolen = tmp_path / "stolen"
     shutil.copytree(site.keys / "loader-1", stolen)
@@ -512,7 +513,7 @@ def answers_again(guarded: Guarded) -> bool:
 # --- without keys ----------------------------------------------------------------------------------------------------
 
 
-def test_without_keys_the_router_stays_on_this_host(children: Children):
+def test_without_keys_the_router_stays_on_this_host(children: Forks):
     port = free_endpoint().rpartition(":")[2]
     words = ["router", "--listen", f"tcp/0.0.0.0:{port}"]
     command = [sys.executable, "-m", "sitegrid.cli", *words]

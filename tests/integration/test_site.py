@@ -18,9 +18,10 @@ from protocol.wire.codec import decode_pose
 from protocol.wire.session import free_endpoint
 from sim.config import SimConfig
 from sitegrid.client import Client
-from sitegrid.process.children import Child, Children
+from sitegrid.process.children import Child
 from sitegrid.proof.delivery import AuditResult
 from tests.command_lines import said
+from tests.integration.forks import Forks
 from tests.integration.site_run import SiteRun, kill  # beside this file
 from tests.patience import PATIENCE_S, until
 
@@ -50,7 +51,7 @@ class Shift:
 @pytest.fixture(scope="module")
 def shift(tmp_path_factory: pytest.TempPathFactory) -> Shift:
     folder = tmp_path_factory.mktemp("shift")
-    with Children(folder) as children:
+    with Forks(folder) as children:
         sim = SimConfig(machines=3, seconds=0, speed=8, seed=3, world="fast")
         run = SiteRun(folder, children, free_endpoint(), sim)
         router, server, driving = run.start()
@@ -126,7 +127,7 @@ def test_a_process_killed_in_mid_run_loses_nothing(shift: Shift, victim: str):
 
 
 @pytest.mark.nightly
-def test_an_agent_runs_on_without_a_router_and_catches_up(site_run: SiteRun, children: Children, tmp_path):
+def test_an_agent_runs_on_without_a_router_and_catches_up(site_run: SiteRun, children: Forks, tmp_path):
     recording = ("--record", tmp_path / "logs", "--seconds", 60, "--machines", 1, "--world", "fast")
     assert said("sim", *recording).code == 0
     log, spool = tmp_path / "logs" / "loader-1", tmp_path / "loader-1.db"

@@ -12,7 +12,8 @@ import pytest
 from protocol.queries.answers import Region
 from protocol.site.geometry import Bounds
 from sitegrid import connect
-from sitegrid.process.children import Child, Children
+from sitegrid.process.children import Child
+from tests.integration.forks import Forks
 from tests.integration.web_site import NAME, WebSite
 from tests.patience import PATIENCE_S, until
 
@@ -24,7 +25,7 @@ TEN_MINUTES_S = 600
 class Watched:
     """What a program has seen, kept by a thread of its own."""
 
-    def __init__(self, site: WebSite, children: Children) -> None:
+    def __init__(self, site: WebSite, children: Forks) -> None:
         self.bounds = Bounds(-SIDE_M, -SIDE_M, SIDE_M, SIDE_M)
         self.client = children.enter_context(connect(site.endpoint, NAME, timeout_s=2.0))
         size = round(2 * SIDE_M)
@@ -58,7 +59,7 @@ def killed(child: Child) -> None:
 @pytest.mark.nightly
 @pytest.mark.processes
 def test_a_watched_map_is_the_map_after_server_and_router_were_killed(tmp_path: Path):
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         site = WebSite(tmp_path, children)
         watched = Watched(site, children)
         for step in range(TEN_MINUTES_S // 20):

@@ -25,9 +25,9 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_pose
 from protocol.wire.messages import Pose
 from protocol.wire.session import free_endpoint
-from sitegrid.process.children import Children
 from sitegrid.security.key_folder import issue, make_authority
 from sitegrid.web import values
+from tests.integration.forks import Forks
 from tests.integration.site_run import kill
 from tests.integration.web_site import NAME, Frame, WebSite
 from tests.patience import PATIENCE_S, until
@@ -283,7 +283,7 @@ def test_slow_headers_and_handshakes_do_not_hold_a_place(web: WebSite, tmp_path:
 
 
 def test_it_waits_for_a_router(tmp_path: Path):
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         endpoint = free_endpoint()
         web = children.start("web", "web", "--endpoint", endpoint, "--listen", "0")
         until(lambda: "waiting for the router" in (tmp_path / "web.log").read_text(), "that it says so")
@@ -293,7 +293,7 @@ def test_it_waits_for_a_router(tmp_path: Path):
 
 @pytest.mark.nightly
 def test_two_sites_stand_behind_one_address(tmp_path: Path):
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         web = WebSite(tmp_path, children, "--site", "pit")
         (tmp_path / "pit.toml").write_text(SITE_TOML.replace('"soak"', '"pit"'))
         words = ("--site-file", tmp_path / "pit.toml", "--store", tmp_path / "pit")
@@ -369,7 +369,7 @@ def test_pages_that_are_fast_slow_or_asleep_end_with_the_map_as_it_is(web: WebSi
 
 @pytest.mark.nightly
 def test_a_page_goes_on_after_web_server_map_server_and_trust_were_others(tmp_path: Path):
-    with Children(tmp_path) as children:
+    with Forks(tmp_path) as children:
         web = WebSite(tmp_path, children)
         web.drive(24)
         page = Page(web)

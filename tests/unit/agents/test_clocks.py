@@ -16,6 +16,7 @@ from agents.sampling import Samples, joined
 from agents.status import Status
 from protocol.machine.machine_config import SensorConfig
 from protocol.machine.readings import Reading
+from tests.tiers import by_night
 from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, drive, thinned
 from tests.unit.agents.test_status import report
 
@@ -151,7 +152,7 @@ def leaping(rng: random.Random) -> list[Reading]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", by_night(range(10), day=range(3)))
 def test_clocks_that_leap_never_end_an_agent(seed: int) -> None:
     """Each reading counts or is counted as refused; what is sampled has a place and a covariance."""
     readings, pipeline = leaping(random.Random(seed)), WatchedPipeline(SITE, VEHICLE, EKF)
@@ -167,7 +168,7 @@ def test_clocks_that_leap_never_end_an_agent(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("leap_s", [-3600.0, 3600.0, -DAY])
+@pytest.mark.parametrize("leap_s", by_night([-3600.0, 3600.0, -DAY], day=[-3600.0]))
 def test_a_clock_that_was_set_is_a_start_anew(leap_s: float) -> None:
     """Nothing timed from before counts: samples are those of an agent that starts there, bit for bit."""
     before, after = READINGS[:1500], iter(shifted(READINGS[1500:], leap_s, *SENSORS))

@@ -160,7 +160,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "doppler": with_doppler,
 }
 ROWS, DIGITS = 6, 8
-AT_NIGHT = ("loader, paper ekf", "modes, paper")  # the profile has another drive by day, and modes have one
+AT_NIGHT = ("loader, paper ekf", "modes", "modes, paper")  # the profile has another drive by day, modes have tests
 
 
 def figures(case: Case) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from protocol.machine.samples import check_samples
 from protocol.site.site_config import KnownGround
 from sim.config import SimConfig
 from sim.recorder import record
+from tests.tiers import by_night
 from tests.unit.agents.drives import (
     PROJECTION,
     S_BEND,
@@ -178,6 +179,7 @@ def test_a_machine_that_lacks_sensors_gives_samples_without_resistance_or_slope(
     assert np.isfinite(rows["grade_e"]).all() if has_slope else np.isnan(rows["grade_e"]).all()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_machine_that_aligns_late_loses_nothing_of_its_drive() -> None:
     """GPS comes up two minutes into the drive, longer than poses are remembered."""
@@ -242,7 +244,7 @@ def test_samples_are_final_once_the_lag_is_over_at_the_smoothed_place(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", by_night(range(2), day=[0]))
 def test_every_sample_becomes_final_whatever_happens(
     vehicle: MachineConfig, recorded: list[Reading], seed: int
 ) -> None:
@@ -393,6 +395,7 @@ def test_no_reading_carries_truth() -> None:
 # --- options of sensors that the pipeline itself sees to ----------------------------------------------------------
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_sensor_that_is_not_used_is_as_if_it_were_not_there(vehicle: MachineConfig, recorded: list[Reading]) -> None:
     unused = run(changed_sensor(vehicle, "gps-2", use=False), recorded)
@@ -401,7 +404,7 @@ def test_sensor_that_is_not_used_is_as_if_it_were_not_there(vehicle: MachineConf
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("delay_s", "sensors"), [(0.02, ""), (-3.0, "gps-1")])
+@pytest.mark.parametrize(("delay_s", "sensors"), by_night([(0.02, ""), (-3.0, "gps-1")], day=[(-3.0, "gps-1")]))
 def test_sensors_whose_stamps_are_off_by_their_delay_are_as_ones_in_time(
     vehicle: MachineConfig, recorded: list[Reading], base: Base, delay_s: float, sensors: str
 ) -> None:

@@ -17,6 +17,7 @@ from agents.sampling import joined
 from protocol.arrays import Bools, Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Gps, Reading
+from tests.tiers import by_night
 from tests.unit.agents.drives import SITE, START_NS, Leg, drive, machine, noisy, seconds, thinned
 from tests.unit.agents.test_receiver_faults import SLOW_S, SLOW_SHARE, STD_M, shifted
 
@@ -67,7 +68,8 @@ def false(metres: float, lasts_s: float, creeps_s: float = 1e-9) -> Off:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("metres", "lasts_s", "creeps_s", "receivers"), [(30, 5, 0, 1), (100, 30, 2, 1), (500, 30, 0, 2)]
+    ("metres", "lasts_s", "creeps_s", "receivers"),
+    by_night([(30, 5, 0, 1), (100, 30, 2, 1), (500, 30, 0, 2)], day=[(30, 5, 0, 1)]),
 )
 def test_of_a_jump_that_comes_back_only_what_lies_between_is_withheld(
     metres: float, lasts_s: float, creeps_s: float, receivers: int
@@ -82,7 +84,13 @@ def test_of_a_jump_that_comes_back_only_what_lies_between_is_withheld(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("off", [false(30.0, math.inf, 2.0), lambda s: 500.0 * (s < AT_S)], ids=["false", "true"])
+@pytest.mark.parametrize(
+    "off",
+    [
+        pytest.param(false(30.0, math.inf, 2.0), id="false"),
+        pytest.param(lambda s: 500.0 * (s < AT_S), id="true", marks=pytest.mark.nightly),
+    ],
+)
 def test_of_a_jump_that_lasts_nothing_is_sure_before_it_has_stood_for_longer(off: Off) -> None:
     _, lies, health, _ = replayed(off)
     assert lies.sum() <= 1
@@ -91,6 +99,7 @@ def test_of_a_jump_that_lasts_nothing_is_sure_before_it_has_stood_for_longer(off
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_receiver_that_jumps_beside_one_that_does_not_withholds_nothing() -> None:
     _, lies, health, _ = replayed(false(30.0, math.inf), 2, ("gps-1",))
     assert lies.sum() <= 1

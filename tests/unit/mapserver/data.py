@@ -32,22 +32,17 @@ from protocol.site.site_config import SiteConfig
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from tests.patience import PATIENCE_S, until
 from tests.reference.grid import by_definition, of_grid, plain
 
 SITE = SiteConfig("pit", 48.0, 11.0)
 CONFIG = ServerConfig()
 NOW_NS = 1_767_225_600_000_000_000
-WAIT_S = 20.0
 
 
 def wait_for(fact: Callable[[], Any]) -> None:
     """Wait on a condition that has no event of its own."""
-    never = Event()
-    for _ in range(int(WAIT_S / 0.005)):
-        if fact():
-            return
-        never.wait(0.005)
-    raise AssertionError("did not come true")
+    until(fact, "a test's condition")
 
 
 def now_ns() -> int:
@@ -234,7 +229,7 @@ class Replies:
 
     def wait(self, n: int) -> list[Ack | Refused]:
         while len(self.all) < n:
-            assert self._more.wait(WAIT_S), f"{len(self.all)} of {n} answers after {WAIT_S} s"
+            assert self._more.wait(PATIENCE_S), f"{len(self.all)} of {n} answers after {PATIENCE_S} s"
             self._more.clear()
         return [answer for _, answer in self.all]
 
@@ -246,11 +241,11 @@ def held(writer: Writer) -> Iterator[None]:
 
     def hold(_: Store) -> None:
         entered.set()
-        release.wait(WAIT_S)
+        release.wait(PATIENCE_S)
 
     reader = Thread(target=writer.run, args=(hold,))
     reader.start()
-    assert entered.wait(WAIT_S)
+    assert entered.wait(PATIENCE_S)
     try:
         yield
     finally:

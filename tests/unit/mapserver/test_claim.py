@@ -10,8 +10,9 @@ from mapserver.claim import BETWEEN_S, WriterClaim
 from protocol.errors import LinkError
 from protocol.wire import keys
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from tests.patience import PATIENCE_S
 from tests.tcp_proxy import FAIR, Proxy, Weather
-from tests.unit.mapserver.data import WAIT_S, wait_for
+from tests.unit.mapserver.data import wait_for
 
 FIRST, SECOND = "a" * 16, "b" * 16
 
@@ -62,7 +63,7 @@ def test_a_server_that_takes_over_waits_until_the_other_one_has_ended(network: N
             assert (first.held, second.held) == (False, False)
             with pytest.raises(TimeoutError):
                 taking.result(4 * BETWEEN_S)
-        taking.result(WAIT_S)
+        taking.result(PATIENCE_S)
         assert (second.held, second.ended) == (True, "")
 
 
@@ -71,7 +72,7 @@ def test_of_two_servers_that_start_at_once_one_goes_on(network: Network):
         claims = [network.claim(store) for store in (FIRST, SECOND)]
         with ThreadPoolExecutor() as threads:
             runs = [threads.submit(claim.acquire) for claim in claims]
-            errors = [run.exception(WAIT_S) for run in runs]
+            errors = [run.exception(PATIENCE_S) for run in runs]
         assert sum(isinstance(error, LinkError) for error in errors) == 1
         assert sorted(claim.held for claim in claims) == [False, True]
         for claim in claims:
@@ -111,7 +112,7 @@ def test_of_two_that_write_since_neither_answered_in_time_the_earlier_one_goes_o
 def test_whatever_is_asked_is_answered(network: Network):
     with network.writer(FIRST) as claim:
         for payload in (b"", b"\xc1", b"\x80"):
-            (reply,) = network.session().get(keys.writer("pit"), payload=payload, timeout=WAIT_S)
+            (reply,) = network.session().get(keys.writer("pit"), payload=payload, timeout=PATIENCE_S)
             assert reply.ok is not None
         with suppress(LinkError):
             network.claim(SECOND).acquire()
@@ -182,5 +183,5 @@ def test_a_take_over_for_another_store_ends_also_who_waits(network: Network):
             other = opened.enter_context(closing(network.claim(SECOND)))
             taking = threads.submit(other.acquire, take_over=True)
             wait_for(lambda: writer.ended and standby.ended)
-        taking.result(WAIT_S)
+        taking.result(PATIENCE_S)
         assert other.held

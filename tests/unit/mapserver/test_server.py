@@ -23,7 +23,8 @@ from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack
-from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, WAIT_S, batch, held, now_ns, routed, samples, wait_for
+from tests.patience import PATIENCE_S
+from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, held, now_ns, routed, samples, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def served(sessions, tmp_path):
 
 def get(client: zenoh.Session, key: str, parameters: dict[str, str] | None = None, payload: bytes | None = None):
     selector = f"{key}?{selector_of(parameters)}" if parameters else key
-    (reply,) = client.get(selector, payload=payload, timeout=WAIT_S)
+    (reply,) = client.get(selector, payload=payload, timeout=PATIENCE_S)
     return reply
 
 
@@ -83,7 +84,7 @@ def test_a_probe_is_answered_while_the_writer_is_busy(served):
     with held(server._writer):
         alive = codec.decode_alive(ask(client, AliveQuery()))
         assert (alive.journalled, alive.merged, alive.store) == (1, 1, server._writer.store_id)
-        assert 0 < alive.busy_s < WAIT_S
+        assert 0 < alive.busy_s < PATIENCE_S
     error = refusal(client, "alive", {"after": "1"})
     assert error.reason == Refusal.UNKNOWN_PARAMETER
 
@@ -132,7 +133,7 @@ def test_so_many_queries_are_answered_at_once(sessions, tmp_path, monkeypatch, q
 
     def meet() -> dict[str, object]:
         with suppress(threading.BrokenBarrierError):
-            both.wait(WAIT_S if together else 0.2)
+            both.wait(PATIENCE_S if together else 0.2)
             met.append(True)
         return {}
 
@@ -149,7 +150,7 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
     deliver(client, batch(samples(5)))
     server.close()
     assert not server.failed
-    assert list(client.get(keys.ingest("pit", "a"), payload=b"", timeout=WAIT_S)) == []  # nobody listens
+    assert list(client.get(keys.ingest("pit", "a"), payload=b"", timeout=PATIENCE_S)) == []  # nobody listens
     server = Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)
     ack = deliver(client, batch(samples(0)))
     assert ack == Ack(5, 1, store=ack.store)
@@ -158,7 +159,7 @@ def test_a_server_that_closes_keeps_what_it_acknowledged(sessions, tmp_path):
 
 
 def begun(client: zenoh.Session, key: str, parameters: dict[str, str], n: int) -> list[zenoh.Handler]:
-    return [client.get(f"{key}?{selector_of(parameters)}", timeout=WAIT_S) for _ in range(n)]
+    return [client.get(f"{key}?{selector_of(parameters)}", timeout=PATIENCE_S) for _ in range(n)]
 
 
 def test_waiting_queries_keep_no_other_from_an_answer_and_get_theirs(served):
@@ -187,7 +188,7 @@ def test_queries_beyond_a_budget_have_to_come_again(sessions, tmp_path, monkeypa
         release = threading.Event()
 
         def hold(*_):
-            assert release.wait(WAIT_S)
+            assert release.wait(PATIENCE_S)
             raise QueryError(Refusal.STORE, "held")
 
         monkeypatch.setattr(server._commands, "_trust", hold)
@@ -245,7 +246,7 @@ def test_the_map_as_it_is_does_not_wait_for_what_is_slow(served, monkeypatch, sl
 
     def hold(*_):
         entered.set()
-        assert release.wait(WAIT_S)
+        assert release.wait(PATIENCE_S)
         raise QueryError(Refusal.STORE, "held")
 
     monkeypatch.setitem(server.answers._answers, HistoryQuery, hold)
@@ -257,7 +258,7 @@ def test_the_map_as_it_is_does_not_wait_for_what_is_slow(served, monkeypatch, sl
     askers = [threading.Thread(target=get, args=(client, key, asked)) for _ in range(3)]
     for asker in askers:
         asker.start()
-    assert entered.wait(WAIT_S)
+    assert entered.wait(PATIENCE_S)
     for _ in range(3):
         ask(client, InfoQuery())
     release.set()

@@ -31,10 +31,11 @@ from protocol.wire.messages import Ack, SampleBatch
 from sitegrid.backup import _making
 from sitegrid.cli import main
 from sitegrid.process.children import wait_until
+from tests.patience import PATIENCE_S
 from tests.unit.sitegrid.refold.archives import SITE, T0, samples
 
 pytest.importorskip("pyarrow.parquet")
-KILLS, WAIT_S = 4, 60.0
+KILLS = 4
 
 
 def rows_of(number: int) -> Table:
@@ -211,6 +212,7 @@ for number in range(10, 1_000_000):
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.processes
 def test_backups_that_are_killed_leave_no_backup_and_the_one_that_ends_has_all_that_was_acknowledged_before(
@@ -222,7 +224,7 @@ def test_backups_that_are_killed_leave_no_backup_and_the_one_that_ends_has_all_t
     with ExitStack() as ending:
         live = ending.enter_context(subprocess.Popen([sys.executable, "-c", SERVE, str(store), str(noted)]))
         ending.callback(live.kill)
-        wait_until(lambda: noted.exists() and noted.read_text() != "", WAIT_S, "the first batch")
+        wait_until(lambda: noted.exists() and noted.read_text() != "", PATIENCE_S, "the first batch")
         words = ("backup", str(store), "--out", str(tmp_path / "copy"), "--json")
         command = [sys.executable, "-m", "sitegrid.cli", *words]
         killed = 0
@@ -236,7 +238,7 @@ def test_backups_that_are_killed_leave_no_backup_and_the_one_that_ends_has_all_t
             if (tmp_path / "copy").exists():  # whole, though it may have been killed after that
                 assert run("verify", tmp_path / "copy") == 0
                 (tmp_path / "copy").rename(tmp_path / f"copy-{copier.pid}")
-        wait_until(lambda: noted.read_text() != "", WAIT_S, "a whole note")
+        wait_until(lambda: noted.read_text() != "", PATIENCE_S, "a whole note")
         acknowledged = int(noted.read_text() or 10)
         assert run("backup", store, "--out", tmp_path / "copy") == 0
         assert live.poll() is None, "it went on all the time"

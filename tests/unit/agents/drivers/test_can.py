@@ -6,7 +6,6 @@ import math
 import random
 import socket
 import time
-from collections.abc import Callable
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +26,7 @@ from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.powertrain_config import PowertrainConfig
 from protocol.machine.readings import Engine
 from tests.paths import SHARED_DATA
+from tests.patience import until
 from tests.unit.agents.drivers.frames import no_bundles
 
 TEN_NS = 1_795_688_127 * 10**9
@@ -237,13 +237,6 @@ def test_a_dbc_that_is_none_is_refused_in_a_sentence(tmp_path: Path) -> None:
 # --- buses -----------------------------------------------------------------------------------------------------------
 
 
-def until(read: Callable[[], object], seconds: float = 60.0) -> None:
-    """Read until it returns something true; a deadline stops a hang."""
-    deadline_s = time.monotonic() + seconds
-    while not read():
-        assert time.monotonic() < deadline_s
-
-
 @pytest.mark.parametrize(
     ("address", "options"),
     [
@@ -272,7 +265,7 @@ def test_frames_on_a_bus_become_readings(address: str, options: dict[str, object
             return len(observed) >= 3
 
         source.read(0.01)  # opens it
-        until(exchanged)
+        until(exchanged, "readings of both buses")
     assert {o.values for o in observed} == {observed[0].values}
     assert observed[0].values == pytest.approx((0.37, 157.0), abs=0.01)
     assert 0 <= time.monotonic_ns() - observed[-1].host_ns < 60 * 10**9

@@ -1,4 +1,3 @@
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from protocol.wire import keys
 from protocol.wire.codec import encode_bundle
 from protocol.wire.messages import SensorBundle
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
+from tests.patience import until
 from tests.unit.agents.drivers.frames import Script
 from tests.unit.agents.drives import SITE, START_NS, VEHICLE, Leg, changed_sensor, drive, thinned
 
@@ -147,9 +147,7 @@ class Stream:
         self._publisher.undeclare()
 
     def _wait(self, known: bool) -> None:
-        deadline_s = time.monotonic() + 10
-        while self._publisher.matching_status.matching != known:
-            assert time.monotonic() < deadline_s, f"the router does not know of the subscriber's {known=}"
+        until(lambda: self._publisher.matching_status.matching == known, f"the router knows of it, {known=}")
 
 
 @pytest.fixture

@@ -207,6 +207,7 @@ def test_each_estimate_states_the_calibration_that_it_was_made_with() -> None:
             assert (plain.zero, plain.scale) == (0.0, 0.0)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_jolt_on_the_way_does_not_hide_the_zero() -> None:
     """Three steps of the balance at the end of what is plausible, as at the foot of a ramp."""

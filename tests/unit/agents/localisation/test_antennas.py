@@ -49,7 +49,9 @@ def mounted(first: Mount, second: Mount) -> MachineConfig:
     return changed_sensor(changed_sensor(TRUE, "gps-1", mount=first), "gps-2", mount=second)
 
 
-@pytest.mark.parametrize("legs", [S_BEND, BACK_AND_FORTH], ids=["ahead", "in reverse too"])
+@pytest.mark.parametrize(
+    "legs", [pytest.param(S_BEND, marks=pytest.mark.nightly), BACK_AND_FORTH], ids=["ahead", "in reverse too"]
+)
 @pytest.mark.parametrize(
     ("believed", "sentence"),
     [

@@ -325,6 +325,7 @@ def test_a_stated_error_has_a_least_value_and_a_configured_one_counts_as_it_is()
     assert gps_velocity(reading, replace(DOPPLER, gate_sigma=9.0)).gate_sigma == 9.0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_it_holds_the_position_while_fixes_are_away_and_the_wheels_are_wrong() -> None:
     """A scale that is wrong by a tenth is outside of what the filter takes wheels for before it has seen them."""

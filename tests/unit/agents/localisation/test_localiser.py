@@ -51,7 +51,7 @@ def test_noiseless_readings_give_a_small_error(receivers: int, profile: str, eng
     vehicle = machine(receivers=receivers)
     made = drive(S_BEND, vehicle)
     located = localiser(vehicle, filter=engine, profile=profile)
-    beliefs = located.run(made.readings)
+    beliefs = located.run(thinned(made.readings, 20))
     assert located.is_aligned
     assert not [name for name in located.counters if not name.endswith("_used")]
     assert max(map(made.off_m, beliefs)) < 0.3
@@ -169,7 +169,7 @@ def test_without_gps_an_unsure_heading_does_not_shorten_the_distance() -> None:
     vehicle = machine(receivers=0)
     made = drive([Leg(4, 1.0), Leg(116)], vehicle)
     located = localiser(vehicle, start=START, filter="ukf")
-    last = located.run(thinned(made.readings))[-1]
+    last = located.run(thinned(made.readings, 200))[-1]
     assert located.belief.P[YAW, YAW] > 0.4**2
     x, y, _ = made.at(last.stamp_ns)
     driven_m = math.dist(START[:2], (x, y))
@@ -183,7 +183,7 @@ def test_paper_has_15_states_and_follows_orientations_whose_error_the_default_le
     off, states, used = {}, {}, {}
     for profile in ("paper", "default"):
         located = localiser(vehicle, profile=profile)
-        located.run(with_ahrs(made, 0.1))
+        located.run(thinned(with_ahrs(made, 0.1), 20))
         states[profile] = len(state(located))
         used[profile] = located.counters["ahrs_used"]
         off[profile] = math.remainder(state(located)[YAW] - made.heading_rad[-1], math.tau)

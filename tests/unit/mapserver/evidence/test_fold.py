@@ -51,7 +51,7 @@ def admitted(drawn: list[dict[str, float]], shrunk: float = 1.0):
     return rows
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.lists(sample, min_size=1, max_size=10), st.sampled_from([0.5, 1.0, 7.3, 100.0]), st.integers(1, 8))
 def test_the_grid_is_what_the_definition_says(drawn, cell_m, waiting_rows):
     rows = admitted(drawn)

@@ -183,7 +183,7 @@ def unpacked(one: Page) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return counts, bitmaps, newest_ns
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.lists(drawn, max_size=5))
 def test_compact_pages_come_back_to_the_bit(drawn_pages):
     before = packed(drawn_pages)

@@ -33,11 +33,11 @@ from protocol.errors import QueryError, Refusal, StoreError
 from protocol.queries.answers import GroundChange, MapVersion
 from protocol.units import HOUR_NS
 from tests import postgres_server as server
+from tests.patience import PATIENCE_S
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
     SITE,
-    WAIT_S,
     incoming,
     now_ns,
     open_writer,
@@ -122,7 +122,7 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
     def held(past, reader, facts, stopped):
         folds.append(facts.number)
         if facts.number == 1:
-            assert may_go_on.wait(WAIT_S)
+            assert may_go_on.wait(PATIENCE_S)
         return fold_anew(past, reader, facts, stopped)
 
     with closing(open_writer(tmp_path)) as writer, following(tmp_path) as one:
@@ -166,7 +166,7 @@ class Served:
         if what == "decides":
             trusted = self.writer.run(lambda store: machine in store.facts.excluded)
             decision = TrustDecision(machine, trusted, PERSON, "drawn", NOW_NS)
-            self._refolding.wait(self._refolding.decide(decision), WAIT_S)
+            self._refolding.wait(self._refolding.decide(decision), PATIENCE_S)
         elif what == "archives":
             archive_all(self._folder, self.writer)
         elif what == "starts again":
@@ -181,7 +181,7 @@ class Served:
 WHAT = st.sampled_from(["nothing more", "decides", "archives", "starts again"])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     st.lists(st.tuples(WHAT, st.sampled_from("abc"), st.integers(1, 60)), min_size=1, max_size=12), st.integers(0, 12)
 )
@@ -194,7 +194,7 @@ def test_any_course_of_rows_decisions_and_starts_makes_the_same_map(tmp_path_fac
             served.does(what, machine, number, n)
         catches_up(one, served.writer)
         rows, seconds = one.behind()
-        assert (rows, 0 <= seconds < WAIT_S) == (0, True)
+        assert (rows, 0 <= seconds < PATIENCE_S) == (0, True)
 
 
 @dataclass(frozen=True)
@@ -362,7 +362,7 @@ def test_a_follower_that_cannot_keep_up_is_hidden_until_it_has_caught_up(tmp_pat
 
     def slowly(*words):
         for rows in read(*words):
-            assert may_read.wait(WAIT_S)
+            assert may_read.wait(PATIENCE_S)
             yield rows
 
     monkeypatch.setattr(edge, "SHOWN_S", 1.5)  # for ten seconds

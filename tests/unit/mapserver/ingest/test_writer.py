@@ -26,10 +26,10 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import ServerAlive
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
 from protocol.wire.messages import Ack
+from tests.patience import PATIENCE_S
 from tests.unit.mapserver.data import (
     NOW_NS,
     SITE,
-    WAIT_S,
     Incoming,
     Replies,
     batch,
@@ -91,7 +91,7 @@ def test_acknowledged_only_after_the_commit(start, monkeypatch):
             writer.submit(incoming(samples(2), 1 + 2 * i), lambda _: events.append("ack"))
         assert events == []
     writer.submit(incoming(samples(2), 7), lambda _: (events.append("ack"), done.set()))
-    assert done.wait(WAIT_S)
+    assert done.wait(PATIENCE_S)
     assert events[:4] == ["commit", "ack", "ack", "ack"]
     assert events.count("commit") <= 2
 
@@ -148,7 +148,7 @@ def test_closing_finishes_what_is_waiting(start, tmp_path):
             writer.submit(incoming(samples(1), i + 1), replies[i])
         closing = threading.Thread(target=writer.close)
         closing.start()
-    closing.join(WAIT_S)
+    closing.join(PATIENCE_S)
     assert [a.watermark for a in replies.wait(7)] == [1, 2, 3, 4, 5, 6, 7]
     assert max(snapshot_rows(tmp_path)) == 7
     again = start()
@@ -181,7 +181,7 @@ def test_nobody_looks_while_the_owner_commits(start, monkeypatch):
         send(writer, [incoming(samples(2), first_seq=1 + 2 * number)])
     ended.set()
     for asker in askers:
-        asker.join(WAIT_S)
+        asker.join(PATIENCE_S)
     assert both
     assert all(folded == 2 * merged for merged, folded in both)
 
@@ -217,14 +217,14 @@ def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start
 
     def slow(*args):
         entered.set()
-        assert release.wait(WAIT_S)
+        assert release.wait(PATIENCE_S)
         return real(*args)
 
     monkeypatch.setattr(store_module, "save_snapshot", slow)
     writer = start(restart_samples=2, clock=clock)
     for row in range(1, 7):
         assert send(writer, [incoming(samples(1), row)]) == [Ack(row, row, store=writer.store_id)]
-    assert entered.wait(WAIT_S)
+    assert entered.wait(PATIENCE_S)
     assert snapshot_rows(tmp_path) == []
     clock.now_s += 3.0
     release.set()
@@ -428,7 +428,7 @@ def waits():
         yield made
 
 
-def added(waits: MergeWaits, row: int, wait_s: float = WAIT_S) -> Future:
+def added(waits: MergeWaits, row: int, wait_s: float = PATIENCE_S) -> Future:
     called: Future[QueryError | None] = Future()
     waits.add(row, wait_s, called.set_result)
     return called
@@ -438,10 +438,10 @@ def test_rows_call_back_as_they_are_merged_in_any_order(waits):
     later, sooner = added(waits, 9), added(waits, 7)
     waits.advance(6)
     waits.advance(7)
-    assert sooner.result(WAIT_S) is None
+    assert sooner.result(PATIENCE_S) is None
     assert not later.done()
     waits.advance(12)
-    assert later.result(WAIT_S) is None
+    assert later.result(PATIENCE_S) is None
 
 
 def test_waits_are_bounded_and_room_comes_back(waits, monkeypatch):
@@ -453,5 +453,5 @@ def test_waits_are_bounded_and_room_comes_back(waits, monkeypatch):
     assert caught.value.retry_after_s > 0
     assert added(waits, 5).done(), "which waits for nothing"
     waits.advance(6)
-    assert [one.result(WAIT_S) for one in first] == [None, None]
+    assert [one.result(PATIENCE_S) for one in first] == [None, None]
     assert not added(waits, 7).done()

@@ -190,7 +190,7 @@ ACTIONS = st.one_of(
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(actions=st.lists(ACTIONS, min_size=3, max_size=14), ask=st.integers(-1, HOURS * 3600), fine=st.booleans())
 def test_whatever_came_late_was_excluded_or_archived_the_past_is_a_fold_from_the_start(actions, ask, fine):
     to_ns = NOW_NS + ask * S - fine

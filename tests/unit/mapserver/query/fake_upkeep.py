@@ -10,7 +10,8 @@ from mapserver.query.server_source import ServerSource
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import GroundChange
 from protocol.queries.requests import parse_query
-from tests.unit.mapserver.data import WAIT_S, past_of
+from tests.patience import PATIENCE_S
+from tests.unit.mapserver.data import past_of
 from tests.unit.records import machine_state
 
 
@@ -57,6 +58,6 @@ def answered(answers: AnswersOf, name: str, parameters: dict[str, str]) -> bytes
         parameters = {"after": str(newest), **parameters}
     query, waited = parse_query(name, parameters), Future()
     answers.source.waits.add(query.after, query.wait_s, waited.set_result)
-    if error := waited.result(WAIT_S):
+    if error := waited.result(PATIENCE_S):
         raise error
     return answers.answer(query)

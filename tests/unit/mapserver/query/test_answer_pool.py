@@ -5,7 +5,8 @@ import pytest
 
 from mapserver.query.queryable import MIN_RETRY_S, AnswerPool
 from protocol.errors import QueryError, Refusal
-from tests.unit.mapserver.data import WAIT_S, wait_for
+from tests.patience import PATIENCE_S
+from tests.unit.mapserver.data import wait_for
 
 
 class Held:
@@ -19,13 +20,13 @@ class Held:
     def work(self, name: str):
         def do() -> None:
             self._begun.release()
-            assert self._go.acquire(timeout=WAIT_S)
+            assert self._go.acquire(timeout=PATIENCE_S)
             self.done.append(name)
 
         return do
 
     def begun(self) -> None:
-        assert self._begun.acquire(timeout=WAIT_S)
+        assert self._begun.acquire(timeout=PATIENCE_S)
 
     def let_go(self, n: int) -> None:
         self._go.release(n)
@@ -54,7 +55,7 @@ def test_small_answers_without_end_do_not_keep_a_large_one_waiting():
         for _ in range(4):
             pool.submit(1, small)
         pool.submit(500, done.set)
-        assert done.wait(WAIT_S)
+        assert done.wait(PATIENCE_S)
 
 
 def test_answers_beyond_the_budget_are_refused_until_some_are_done():

@@ -154,7 +154,7 @@ def rows_of(what: str, seed: int, more: object, turn: int) -> Table:
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(st.lists(some | passing | asked, min_size=2, max_size=14))
 def test_an_answer_is_that_of_a_server_that_begins_now(course):
     with tempfile.TemporaryDirectory() as folder, closing(open_writer(Path(folder))) as writer:

@@ -23,7 +23,8 @@ from protocol.queries.roads import MAX_LIMIT, SegmentsQuery, WorklistQuery, deco
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import decode_answer
 from protocol.site.geometry import Bounds
-from tests.unit.mapserver.data import WAIT_S, incoming, open_writer, refused, send, wait_for
+from tests.patience import PATIENCE_S
+from tests.unit.mapserver.data import incoming, open_writer, refused, send, wait_for
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of, source_of
 from tests.unit.mapserver.roads.drives import START_NS, along, passes
 
@@ -362,7 +363,7 @@ def slow(repaired, monkeypatch):
 
     def slowly(skeleton):
         began.set()
-        assert may_end.wait(WAIT_S)
+        assert may_end.wait(PATIENCE_S)
         return whole(skeleton)
 
     monkeypatch.setattr(road_maps, "network", slowly)
@@ -370,7 +371,7 @@ def slow(repaired, monkeypatch):
     come(opened)
     with ThreadPoolExecutor(4) as pool:
         waiting = [pool.submit(row_of, answers, replace(WHOLE, after=5)) for _ in range(4)]
-        assert began.wait(WAIT_S)
+        assert began.wait(PATIENCE_S)
         yield answers, may_end, waiting
         may_end.set()
 
@@ -383,7 +384,7 @@ def test_roads_in_the_making_hold_up_nobody_and_who_waits_for_them_takes_them(sl
         patched.setattr(road_maps, "FRESH_S", -1.0)  # too old at once
         assert answers.tiles(TilesQuery()).version.row == 5, "a picture goes without them"
     may_end.set()
-    assert [one.result(WAIT_S) for one in waiting] == [5] * 4
+    assert [one.result(PATIENCE_S) for one in waiting] == [5] * 4
     assert row_of(answers, WHOLE) == 5
 
 

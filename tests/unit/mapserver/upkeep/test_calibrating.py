@@ -27,8 +27,9 @@ from mapserver.upkeep.upkeep import Upkeep
 from protocol.arrays import Table
 from protocol.errors import Refusal
 from protocol.queries.commands import CalibrateCommand
+from tests.patience import PATIENCE_S
 from tests.unit.mapserver.calibration.drives import LOW, RAMP, RAMP_AGAIN, START_NS, Errors, drive
-from tests.unit.mapserver.data import SITE, WAIT_S, grid_copy, incoming, open_writer, past_of, refused, same, send
+from tests.unit.mapserver.data import SITE, grid_copy, incoming, open_writer, past_of, refused, same, send
 
 DRIVES = {
     "a": drive(LOW, Errors(zero=0.008), seed=1, seconds=300),
@@ -138,7 +139,7 @@ def test_asked_for_the_map_has_what_is_known_at_once(writer):
     before = writer.run(grid_copy)
     with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
         assert site.calibration().machines[0].spans == ()
-        site.calibrate(WAIT_S)
+        site.calibrate(PATIENCE_S)
         answer = site.calibration()
         a, b, c = answer.machines
         assert (a.by, a.zero_by != (), answer.fact, answer.merged) == (
@@ -151,14 +152,14 @@ def test_asked_for_the_map_has_what_is_known_at_once(writer):
         assert b.spans[-1].scale - c.spans[-1].scale == pytest.approx(0.09, abs=0.02)
         assert same(writer.run(grid_copy), folded(site, writer))
         assert not same(writer.run(grid_copy), before)
-        site.calibrate(WAIT_S)
+        site.calibrate(PATIENCE_S)
         assert site.calibration().fact == 3, "nothing new is known"
 
 
 def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
     deliver(writer)
     with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
-        site.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=WAIT_S))
+        site.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=PATIENCE_S))
         state = site.calibration().machines[0]
         assert (state.by, state.reason, state.spans[0].zero, state.spans[0].from_ns) == (
             "person",
@@ -166,13 +167,13 @@ def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
             0.00812,
             0,
         )
-        site.calibrate(WAIT_S)
+        site.calibrate(PATIENCE_S)
         assert site.calibration().machines[0].spans == state.spans, "a person is not overruled"
         assert site.calibration().machines[1].by == "solver"
         assert same(writer.run(grid_copy), folded(site, writer))
-        site.correct(CalibrateCommand("a", auto=True, wait_s=WAIT_S))
+        site.correct(CalibrateCommand("a", auto=True, wait_s=PATIENCE_S))
         assert site.calibration().machines[0].spans == ()
-        site.calibrate(WAIT_S)
+        site.calibrate(PATIENCE_S)
         assert site.calibration().machines[0].by == "solver"
         with refused(Refusal.UNKNOWN_MACHINE, "`z` has sent nothing; known: a, b, c"):
             site.correct(CalibrateCommand("z", auto=True))
@@ -189,7 +190,7 @@ def test_by_itself_it_corrects_machines_unless_it_must_not(tmp_path, automatic, 
                 deliver(writer, share / 4, (share + 1) / 4)
                 site._calibrating._due_s = 0.0
                 site._calibrating.run()
-            site._refolding.wait(site._refolding._decided, WAIT_S)
+            site._refolding.wait(site._refolding._decided, PATIENCE_S)
             assert site.calibration().solved_ns > 0
             assert sum(bool(each.spans) for each in site.calibration().machines) == machines
             assert same(writer.run(grid_copy), folded(site, writer))

@@ -36,13 +36,13 @@ from mapserver.upkeep.refolding import Refolding
 from protocol.arrays import Table
 from protocol.errors import QueryError, Refusal
 from protocol.units import HOUR_NS
+from tests.patience import PATIENCE_S
 from tests.reference.correction import in_numpy
 from tests.reference.grid import by_definition, of_grid, plain
 from tests.unit.mapserver.data import (
     CONFIG,
     NOW_NS,
     SITE,
-    WAIT_S,
     grid_copy,
     held,
     incoming,
@@ -75,7 +75,7 @@ class HeldFold:
     def __call__(self, grid: Grid, history: Any, after: int, until: int, selection: Any, stopped: Any) -> bool:
         self.without.append(set(selection.without))
         self.rows.append((after, until))
-        assert self.may_go_on.wait(WAIT_S)
+        assert self.may_go_on.wait(PATIENCE_S)
         self.came_to_an_end.append(self._fold(grid, history, after, until, selection, stopped))
         return self.came_to_an_end[-1]
 
@@ -123,7 +123,7 @@ def test_batches_are_acknowledged_during_a_fold_and_are_in_the_map_afterwards(wr
         deliver(writer, range(5, 10))
         assert same(writer.run(grid_copy), map_without("", 10)), "the map answers as it was, with what came in"
         fold.may_go_on.set()
-        refolds.wait(number, WAIT_S)
+        refolds.wait(number, PATIENCE_S)
         assert same(writer.run(grid_copy), map_without("b", 10))
         assert fold.rows == [(0, 20), (20, 40)], "what came in was folded beside the writer, too"
         deliver(writer, range(10, 12))
@@ -139,7 +139,7 @@ def test_decisions_during_a_fold_are_folded_together_and_the_old_fold_is_given_u
         assert refolds.decision("d") == decision("d"), "it counts at once"
         fold.may_go_on.set()
         for number in (first, last):
-            refolds.wait(number, WAIT_S)
+            refolds.wait(number, PATIENCE_S)
         assert fold.without == [{"b"}, {"b", "c", "d"}]
         assert fold.came_to_an_end == [False, True]
         assert same(writer.run(grid_copy), map_without("bcd", 5))
@@ -158,10 +158,10 @@ def test_the_solver_decides_nothing_new_until_the_map_follows_unless_it_is_asked
             assert refolds.calibrate(solved(0.002), NOW_NS + due * EVERY_NS) == 1
         assert refolds.calibrate(solved(0.003), NOW_NS, asked=True) == 2
         fold.may_go_on.set()
-        refolds.wait(2, WAIT_S)
+        refolds.wait(2, PATIENCE_S)
         for due in (10, 11):
             number = refolds.calibrate(solved(0.004), NOW_NS + due * EVERY_NS)
-        refolds.wait(number, WAIT_S)
+        refolds.wait(number, PATIENCE_S)
         newest = refolds.facts().corrections.newest("a")
         assert (number, newest and newest.zero) == (3, 0.004)
 
@@ -177,7 +177,7 @@ def test_decisions_that_come_faster_than_folds_do_not_keep_the_map_from_followin
     refolding_fold = past.fold_history
     monkeypatch.setattr(past, "fold_history", fold)
     with closing(Refolding(writer, past_of(writer))) as refolds:
-        refolds.wait(refolds.decide(decision("b")), WAIT_S)
+        refolds.wait(refolds.decide(decision("b")), PATIENCE_S)
         wait_for(lambda: len(folds) >= 6)
         assert folds[:6] == [False, True] * 3
         assert refolds.facts().excluded == {"b"}
@@ -190,7 +190,7 @@ def test_a_decision_that_is_taken_back_during_its_fold_leaves_the_map(writer, fo
         fold.wait(1)
         number = refolds.decide(decision("b", trusted=True))
         fold.may_go_on.set()
-        refolds.wait(number, WAIT_S)
+        refolds.wait(number, PATIENCE_S)
         assert fold.came_to_an_end == [False]
         assert writer.run(lambda store: store.grid) is before
 
@@ -210,7 +210,7 @@ def test_a_decision_that_cannot_be_written_does_not_count_and_is_said_so(writer,
         assert (refolds.decision("b"), refolds.facts().excluded, reader.events(KIND)) == (None, frozenset(), [])
         assert writer.run(lambda store: store.grid) is before
         writer.run(lambda store: room(store, full=False))
-        refolds.wait(refolds.decide(long), WAIT_S)
+        refolds.wait(refolds.decide(long), PATIENCE_S)
         assert refolds.facts().excluded == {"b"}
         assert [event.body["machine"] for event in reader.events(KIND)] == ["b"]
         deliver(writer, range(5, 6))
@@ -228,7 +228,7 @@ def test_a_person_is_not_overruled_by_an_audit_that_judged_at_the_same_time(writ
             person.start()
             judge.start()
         for thread in (person, judge):
-            thread.join(WAIT_S)
+            thread.join(PATIENCE_S)
         assert refolds.decision("b") == decision("b", trusted=True)
         wait_for(lambda: refolds.facts().excluded == frozenset())
 
@@ -306,12 +306,12 @@ def test_any_batching_any_order_and_any_time_of_the_decision_give_one_map(empty_
     fleet = Fleet(1)
     with closing(Refolding(empty_writer, past_of(empty_writer))) as refolds:
         fleet.send(empty_writer, int(fleet.draw.integers(1, 20)))
-        refolds.wait(refolds.decide(correction_of("a")), WAIT_S)
+        refolds.wait(refolds.decide(correction_of("a")), PATIENCE_S)
         assert same(empty_writer.run(grid_copy), fleet.folded(correction_of("a").corrections))
         fleet.send(empty_writer, 6)
         number = refolds.decide(correction_of("b"))
         fleet.send(empty_writer, 6)
-        refolds.wait(number, WAIT_S)
+        refolds.wait(number, PATIENCE_S)
         live = empty_writer.run(grid_copy)
         assert same(live, fleet.folded(MADE))
         assert empty_writer.run(lambda store: store.version.fact) == 2
@@ -329,12 +329,12 @@ def test_a_correction_of_a_machine_that_is_left_out_folds_nothing_and_counts_whe
     fleet = Fleet(8)
     fleet.send(empty_writer, 12)
     with closing(Refolding(empty_writer, past_of(empty_writer))) as refolds:
-        refolds.wait(refolds.decide(TrustDecision("b", False, PERSON, "why", NOW_NS)), WAIT_S)
+        refolds.wait(refolds.decide(TrustDecision("b", False, PERSON, "why", NOW_NS)), PATIENCE_S)
         grid = empty_writer.run(lambda store: store.grid)
-        refolds.wait(refolds.decide(correction_of("b")), WAIT_S)
+        refolds.wait(refolds.decide(correction_of("b")), PATIENCE_S)
         assert empty_writer.run(lambda store: store.grid) is grid
         assert empty_writer.run(lambda store: store.fact) == 2
-        refolds.wait(refolds.decide(TrustDecision("b", True, PERSON, "mended", NOW_NS)), WAIT_S)
+        refolds.wait(refolds.decide(TrustDecision("b", True, PERSON, "mended", NOW_NS)), PATIENCE_S)
         assert same(empty_writer.run(grid_copy), fleet.folded(correction_of("b").corrections))
 
 
@@ -352,7 +352,7 @@ def test_maps_of_the_past_have_the_facts_of_now_and_a_checkpoint_that_lacks_them
         for hour in (1, 2, 3):
             assert list(make(past, reader, NOW_NS + hour * HOUR_NS, empty_writer.run(lambda store: store.facts)))
         for name in "ab":
-            refolds.wait(refolds.decide(correction_of(name, later)), WAIT_S)
+            refolds.wait(refolds.decide(correction_of(name, later)), PATIENCE_S)
         facts = empty_writer.run(lambda store: store.facts)
         entries = past.checkpoints.entries(past.depends_on(reader, facts), reader.last_row)
         assert [entry.usable for entry in entries] == [True, False, False], "an hour that they do not touch stays"
@@ -416,10 +416,10 @@ def test_a_correction_is_never_taken_for_a_change_of_the_ground_and_hides_none(w
     assert writer.run(lambda store: looked(log, store.grid)) == []
     with closing(Refolding(writer, past_of(writer))) as refolds:
         fact = CalibrationDecision("a", SOLVER, "", NOW_NS, (Correction("a", 0, END_NS, zero, 0.0, 0.0, ()),))
-        refolds.wait(refolds.decide(fact), WAIT_S)
+        refolds.wait(refolds.decide(fact), PATIENCE_S)
         assert writer.run(lambda store: looked(log, store.grid)) == [], "all was folded again, and nothing changed"
         send(writer, [incoming(paved[: len(paved) // 2], 1 + len(gravel))])
-        refolds.wait(refolds.decide(replace(fact, corrections=(replace(fact.corrections[0], zero=0.119),))), WAIT_S)
+        refolds.wait(refolds.decide(replace(fact, corrections=(replace(fact.corrections[0], zero=0.119),))), PATIENCE_S)
         send(writer, [incoming(paved[len(paved) // 2 :], 1 + len(gravel) + len(paved) // 2)])
         found_changes = writer.run(lambda store: looked(log, store.grid))
     assert found_changes

@@ -26,9 +26,9 @@ from sitegrid.cli import main
 from sitegrid.client import Client, connect
 from sitegrid.commands import query
 from sitegrid.process.lifetime import plain
+from tests.patience import PATIENCE_S
 from tests.unit.records import STORE, machine_state, version
 
-WAIT_S = 20.0
 T0 = 1_750_000_000_000_000_000
 FOUND = {"trusted": False, "by": "audit", "since_ns": T0 + 60 * 10**9, "contradicts": True, "reasons": ("gain",)}
 MACHINES = [
@@ -144,7 +144,7 @@ class Callback:
 
     def wait(self, n: int) -> list[GroundChange]:
         with self._more:
-            assert self._more.wait_for(lambda: len(self.events) >= n, WAIT_S)
+            assert self._more.wait_for(lambda: len(self.events) >= n, PATIENCE_S)
             return list(self.events)
 
 
@@ -170,14 +170,14 @@ def test_a_slow_callback_stalls_nothing(server: FakeServer, client: Client):
 
     def slow(_: object) -> None:
         entered.set()
-        release.wait(WAIT_S)
+        release.wait(PATIENCE_S)
 
     client.on_change(slow)
     client.on_change(quick)
     client.changes()
     for i in range(600):  # more than Zenoh holds for a callback
         server.publish(encode_change(replace(CHANGE, id=i)))
-    assert entered.wait(WAIT_S)
+    assert entered.wait(PATIENCE_S)
     assert [event.id for event in quick.wait(600)] == list(range(600))
     assert client.changes() == [CHANGE]
     release.set()
@@ -193,7 +193,7 @@ def test_a_callback_may_close_its_own_listener(server: FakeServer, client: Clien
     listener = client.on_change(once)
     client.changes()
     server.publish(encode_change(CHANGE))
-    assert closed.wait(WAIT_S)
+    assert closed.wait(PATIENCE_S)
 
 
 # --- from the command line -------------------------------------------------------------------------------------------
@@ -303,7 +303,7 @@ def test_changes_are_followed_until_stopped(server: FakeServer, monkeypatch, cap
 
     monkeypatch.setattr(query, "say", show)
     monkeypatch.setattr(query, "tell", show)
-    watchdog = threading.Timer(WAIT_S, stop.set)
+    watchdog = threading.Timer(PATIENCE_S, stop.set)
     watchdog.start()
     assert sitegrid(server, "query", "changes", "--follow", *(["--json"] if as_json else [])) == 0
     watchdog.cancel()

@@ -336,6 +336,7 @@ def test_real_recordings_are_read_whole(tmp_path: Path, name: str, takes: Any, c
     assert not log.refused
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_raw_bag_is_the_held_log_of_its_drive_but_for_the_digits_that_the_log_was_cut_to(tmp_path: Path) -> None:
     """The held log was written with 0.1 ms, nine decimals of degrees, and six digits of the rest."""

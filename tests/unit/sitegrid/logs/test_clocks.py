@@ -16,6 +16,7 @@ from protocol.machine.readings import Gps, Reading
 from sitegrid.logs.check import examine
 from sitegrid.logs.run import read_recording, run
 from sitegrid.proof.figures import Row
+from tests.tiers import by_night
 from tests.unit.agents.drives import SITE, Leg, drive, machine, noisy, thinned
 
 VEHICLE = machine(receivers=2)
@@ -105,9 +106,10 @@ APART = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ahead_s", APART.values(), ids=APART)
-def test_an_offset_is_proposed_and_mends_the_log(tmp_path: Path, ahead_s: dict[str, float]) -> None:
+@pytest.mark.parametrize("case", by_night(APART, day=("leap seconds", "a slow gyro", "early wheels")))
+def test_an_offset_is_proposed_and_mends_the_log(tmp_path: Path, case: str) -> None:
     """Of most sensors against the least: where wheels and gyro are as many, the receiver is set to them."""
+    ahead_s = APART[case]
     log_of(tmp_path, without("gps-2", legs=work(1)), **ahead_s)
     expected = ahead_s if len(ahead_s) < 3 else {"gps_1": 1.7e9}
     delays_s = proposed(tmp_path)
@@ -125,7 +127,7 @@ def test_one_of_two_receivers_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", by_night(range(3), day=[0]))
 def test_a_sound_log_has_no_proposal(tmp_path: Path, seed: int) -> None:
     log_of(tmp_path, recorded(work(seed), seed), gps_1=0.1, wheels=-0.1)
     assert proposed(tmp_path) == {}
@@ -142,7 +144,7 @@ def test_a_steady_drive_tells_no_offset(tmp_path: Path, ahead_s: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ahead_s", "is_located"), [(18.0, True), (1.7e9, False)])
+@pytest.mark.parametrize(("ahead_s", "is_located"), by_night([(18.0, True), (1.7e9, False)], day=[(1.7e9, False)]))
 def test_with_what_is_proposed_positions_are_as_good_as_ever(tmp_path: Path, ahead_s: float, is_located: bool) -> None:
     """Before, they are far off, or there are none; either way the replay says why."""
 

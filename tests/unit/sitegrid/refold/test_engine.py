@@ -14,10 +14,10 @@ from protocol.errors import SitegridError
 from sitegrid.process.children import wait_until
 from sitegrid.refold import engine
 from sitegrid.refold.engine import Cluster, EngineError, Here
+from tests.patience import PATIENCE_S
 from tests.unit.sitegrid.refold.tasks import die, die_once, fail, hang, square
 
 pytestmark = [pytest.mark.processes, pytest.mark.nightly]
-WAIT_S = 60.0
 
 
 def running() -> list[int]:
@@ -80,7 +80,7 @@ def test_processes_end_with_who_started_them() -> None:
         pids = [int(word) for word in parent.stdout.readline().split()]
         parent.kill()
     assert pids
-    wait_until(lambda: not any(_runs(pid) for pid in pids), WAIT_S, "the end of the processes")
+    wait_until(lambda: not any(_runs(pid) for pid in pids), PATIENCE_S, "the end of the processes")
 
 
 def _runs(pid: int) -> bool:
