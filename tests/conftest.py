@@ -30,7 +30,9 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
         signal.signal(number, handler)
 
 # Repeatable on every machine, and no complaint about a slow one.
-settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, print_blob=True)
+settings.register_profile(
+    "repeatable", max_examples=50, derandomize=True, deadline=None, database=None, print_blob=True
+)
 settings.load_profile("repeatable")
 
 

@@ -13,7 +13,7 @@ from tests.fuzz.mutations import files
 from tests.fuzz.verdict import Decoder, FaultError, judge, watched
 
 NAMES = [decoder.name for decoder in decoders()]
-INPUTS = 6
+INPUTS = 3
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -115,6 +115,7 @@ def site() -> Driven:
     return drive(SimConfig(scenario="paper_site_driven", world="fast", seed=3), 400.0)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_machines_stand_where_and_as_long_as_their_drivers_stop() -> None:
     driven = site()
