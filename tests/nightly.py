@@ -72,12 +72,12 @@ def loads(*lines: str) -> tuple[tuple[str, ...], ...]:
 
 
 PARTS = (
-    Part("tests", 330, ((*TESTS, "-m", "nightly", "tests", *OTHERS),)),
+    Part("tests", 400, ((*TESTS, "-m", "nightly", "tests", *OTHERS),)),
     Part("chaos", 330, (("tests.chaos", "--json", "--seconds", "240"),)),
     Part("worlds", 90, (("tests.delivery_simulation", "--seeds", "1000"), ("tests.fuzz", "--seconds", "30"))),
     Part("takeover", 180, ((*TESTS, *TAKEOVER), ("tests.takeover", "--count", "12"))),
     Part("compose", 180, ((*TESTS, *COMPOSE),)),
-    Part("fold", 210, ((*TESTS, "-m", "nightly", *FOLD),)),
+    Part("fold", 140, ((*TESTS, "-m", "nightly", *FOLD),)),
     Part("followers", 120, ((*TESTS, *FOLLOWERS), *loads("followers --machines 20 --seconds 5 --hours 0.2 --runs 1"))),
     Part("lab", 300, ((*TESTS, "lab/tests"),)),
     Part("speed", 180, loads(*SPEED)),

@@ -64,6 +64,10 @@ class Tab:
             self.page.wait_for_timeout(50)
         raise AssertionError(f"did not come true: {expression}; {self.complaints}")
 
+    def drawn(self) -> None:
+        """Wait for two frames of the browser: what was asked for before is done."""
+        self.js("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
     def loaded(self) -> Tab:
         ready = "sitegrid.site.state === 'live' && sitegrid.times.step_ns"
         self.until(f"window.sitegrid && !sitegrid.site.isEmpty && {ready}")
@@ -75,7 +79,7 @@ class Tab:
 
     def serious_faults(self, axe: str) -> list[Any]:
         """What axe finds of a page that came without its own rules for scripts."""
-        self.page.wait_for_timeout(400)  # its transitions
+        self.until("document.getAnimations().every((one) => one.playState !== 'running')")
         self.page.evaluate(axe)
         script = "axe.run().then((r) => r.violations.map((v) => [v.id, v.impact, v.nodes.map((n) => n.html)]))"
         return [fault for fault in self.page.evaluate(script) if fault[1] in ("serious", "critical")]

@@ -130,14 +130,6 @@ def test_a_key_with_a_wildcard_names_no_machine(probe: Probe):
     assert probe.client.info().journalled == before.journalled
 
 
-def test_a_sequence_that_goes_back_is_acknowledged_and_changes_nothing(probe: Probe):
-    before = probe.client.info()
-    reply = probe.send(encode_batch(probe.batch(first_seq=1)))
-    assert reply == Ack(probe.seq, before.journalled, 3, before.store), probe.where
-    after = probe.client.info()
-    assert (after.journalled, after.samples_merged) == (before.journalled, before.samples_merged)
-
-
 BAD_QUERIES = {
     "map/point?x=nan;y=1": Refusal.NOT_FINITE,
     "map/point?x=1;y=1;z=1": Refusal.UNKNOWN_PARAMETER,

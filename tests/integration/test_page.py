@@ -53,14 +53,10 @@ def test_the_colours_on_the_map_are_those_of_its_cells(tab: Tab, web: WebSite):
     x_m, y_m = known_place(web)
     tab.js("(sitegrid.choices.setShow('unsure', false), sitegrid.choices.setShow('machines', false))")
     left, top = tab.pixel_of(x_m, y_m)
-    tab.page.wait_for_timeout(300)
-    red, green, blue, _ = tab.js(
-        f"[...document.getElementById('map').getContext('2d').getImageData({left:.0f}, {top:.0f}, 1, 1).data]"
-    )
     resistance = web.client.point(x_m, y_m, ["resistance"]).values["resistance"]
     expected = tab.js(f"sitegrid.choices.layer.colour({resistance})")
-    shown = (red << 16) | (green << 8) | blue
-    assert all(abs((shown >> s & 255) - (expected >> s & 255)) <= 6 for s in (0, 8, 16))
+    shown = f"document.getElementById('map').getContext('2d').getImageData({left:.0f}, {top:.0f}, 1, 1).data"
+    tab.until(f"[16, 8, 0].every((s, i) => Math.abs({shown}[i] - ({expected} >> s & 255)) <= 6)")
 
 
 def test_a_click_says_why(tab: Tab, web: WebSite):
@@ -265,7 +261,7 @@ def test_an_empty_map_says_what_to_do_and_what_comes_is_in_sight_until_the_view_
         tab.until("sitegrid.view.moved")
         moved = tab.js("[sitegrid.view.x, sitegrid.view.y, sitegrid.view.scale]")
         machine_at(3000.0, 900.0)
-        tab.page.wait_for_timeout(300)
+        tab.drawn()
         assert tab.js("[sitegrid.view.x, sitegrid.view.y, sitegrid.view.scale]") == moved
         tab.close()
 

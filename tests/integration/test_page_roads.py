@@ -238,7 +238,7 @@ def test_a_link_opens_the_same_drive(tab: Tab, browser, cheapest: bool):
     tab.page.locator("#machine").select_option("empty_truck")
     set_places(tab, (20, 10), (120, 10))
     tab.until("location.search.includes('line=')")
-    tab.page.wait_for_timeout(300)
+    tab.drawn()
     other = Tab(browser, tab.page.url).loaded()
     other.until(f"sitegrid.panel.name === 'route' && {QUIET} && sitegrid.route.answer !== null")
     assert other.page.locator("#panel .totals").inner_text() == panel.locator(".totals").inner_text()
@@ -310,7 +310,7 @@ def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
     for place in ((20, 10), (90, 10)):
         tab.page.mouse.click(*tab.pixel_of(*place))
     tab.until("sitegrid.route.places.length === 2")
-    tab.page.wait_for_timeout(1000)
+    tab.until("document.querySelector('#panel .asking') !== null")
     frames, x = tab.js("[sitegrid.drawn.frames, sitegrid.view.x]")
     tab.page.locator("#map").focus()
     tab.page.keyboard.press("ArrowRight")
@@ -321,5 +321,5 @@ def test_a_slow_answer_holds_nothing_up_and_a_late_one_is_dropped(tab: Tab):
     assert held
     with contextlib.suppress(Exception):  # the page has dropped the question already
         held[0].continue_()
-    tab.page.wait_for_timeout(500)
+    tab.drawn()
     assert tab.js("sitegrid.route.answer.line.length") == 3

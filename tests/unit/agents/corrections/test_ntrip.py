@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.corrections.ntrip import CONNECT_S, Chunks, NtripStream, gga, parse_caster
+from agents.corrections.ntrip import CONNECT_S, NtripStream, gga, parse_caster
 from agents.corrections.relay import Relay, RelayConfig
 from agents.corrections.rtcm import whole_frames
 from protocol.errors import ConfigError, LinkError
@@ -230,15 +230,6 @@ def test_what_is_no_address_of_a_caster_is_refused(address: str) -> None:
 def test_a_relay_that_cannot_be_is_refused(options: dict[str, str], problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
         RelayConfig(**{"name": "base-1", "source": "tcp://host:1", **options})  # type: ignore[arg-type]
-
-
-def test_chunks_are_joined_however_they_are_cut() -> None:
-    for size in (1, 2, 3, 5, 4096):
-        chunks, body = Chunks(), b""
-        for data in (chunked(DATA, 255)[at : at + size] for at in range(0, 8000, size)):
-            body += chunks.feed(data)
-        assert DATA.startswith(body)
-        assert len(body) > 3900
 
 
 def _certificate(folder: Path) -> Path:

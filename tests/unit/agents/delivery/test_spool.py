@@ -62,20 +62,6 @@ def test_commits_are_full_and_logged_ahead(spool: Spool) -> None:
     assert spool._db.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
 
 
-def test_acknowledged_samples_are_deleted_and_stay_so(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
-    spool.record(ROWS[:10])
-    spool.acknowledge(spool.spool_id, 6)
-    assert (spool.acknowledged, spool.counters()["depth"]) == (6, 4)
-    earlier = spool.spool_id
-    spool.close()
-    again = opened(tmp_path)
-    head = again.head(99)
-    assert (head.spool_id, head.first_seq, len(head.rows), head.lost_before) == (earlier, 7, 4, 0)
-    assert again.counters()["depth"] == 4
-    again.close()
-
-
 def test_runs_that_are_closed_are_declared_again_at_each_opening_and_forgotten_in_the_end(tmp_path: Path) -> None:
     for _ in range(KEPT_RUNS + 2):
         spool = opened(tmp_path)
@@ -165,43 +151,12 @@ def better(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-def test_pending_samples_wait_until_they_are_final(spool: Spool) -> None:
-    assert spool.record(ROWS[:3], pending=3) == 1
-    assert spool.head(99) is None
-    assert spool.counters()["pending"] == 3
-    assert spool.record(ROWS[3:5], pending=2, finals=better(ROWS[:2])) == 4
-    head = spool.head(99)
-    assert hashes(head.rows) == hashes(better(ROWS[:2]))
-    assert (head.first_seq, head.newest) == (1, 5)
-    assert spool.counters()["pending"] == 3
-    spool.acknowledge(spool.spool_id, 2)
-    assert spool.head(99) is None
-    assert not spool.is_settled()
-    spool.record(ROWS[:0], finals=better(ROWS[2:5]))
-    assert hashes(spool.head(99).rows) == hashes(better(ROWS[2:5]))
-    spool.acknowledge(spool.spool_id, 5)
-    assert spool.is_settled()
-
-
 @pytest.mark.parametrize(("n", "pending", "finals"), [(1, 0, 1), (0, 0, 3), (1, 2, 0), (2, 1, 0), (0, -1, 0)])
 def test_no_sample_is_final_before_an_earlier_one(spool: Spool, n: int, pending: int, finals: int) -> None:
     spool.record(ROWS[:2], pending=2)
     with pytest.raises(ValueError, match="pending samples"):
         spool.record(ROWS[:n], pending=pending, finals=ROWS[:finals])
     assert spool.counters() == {**EMPTY, "depth": 2, "pending": 2, "recorded": 2}
-
-
-def test_pending_samples_are_final_after_a_crash(tmp_path: Path) -> None:
-    spool = opened(tmp_path)
-    spool.record(ROWS[:3], pending=3)
-    spool.record(ROWS[3:5], pending=2, finals=better(ROWS[:1]))
-    kill(spool)
-    again = opened(tmp_path)
-    assert again.counters()["pending"] == 0
-    head = again.head(99)
-    assert hashes(head.rows) == hashes(np.concatenate([better(ROWS[:1]), ROWS[1:5]]))
-    assert head.newest is None, "it is an earlier run now"
-    again.close()
 
 
 def test_pending_samples_that_a_copy_of_the_file_has_delivered_are_passed_over(tmp_path: Path) -> None:

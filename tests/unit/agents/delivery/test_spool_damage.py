@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from agents.delivery.spool import Spool, SpoolConfig
-from protocol.disk.high_water_mark import mark_path
 from protocol.errors import StoreError
 from protocol.machine.samples import content_hash
 from tests.unit.agents.drives import made_up_samples
@@ -134,23 +133,6 @@ def test_what_was_acknowledged_is_not_gone(tmp_path):
     cut_short(left, 0.1)
     with closing(opened(left)) as spool:
         assert spool.counters()["gone"] == 3
-
-
-@pytest.mark.parametrize("kept", [0.0, 0.9])
-def test_a_mark_that_is_torn_or_behind_is_no_alarm(folder, kept):
-    mark = mark_path(folder / "spool.db")
-    mark.write_bytes(mark.read_bytes()[: int(mark.stat().st_size * kept)])
-    with closing(opened(folder)) as spool:
-        assert (spool.damage, spool.counters()["gone"]) == ("", 0)
-
-
-def test_without_a_mark_damage_before_the_last_commit_is_named(folder):
-    mark_path(folder / "spool.db").unlink()
-    content = bytearray((folder / "spool.db-wal").read_bytes())
-    content[len(content) // 2] ^= 1
-    (folder / "spool.db-wal").write_bytes(content)
-    with closing(opened(folder)) as spool:
-        assert "spool.db-wal is damaged at byte" in spool.damage
 
 
 def test_a_copy_in_place_of_the_file_is_named_and_declares_nothing(tmp_path):

@@ -77,18 +77,6 @@ def test_a_group_is_answered_in_order(store):
     assert (store.merged, store.journalled, store.grid.folded) == (3, 3, 10)
 
 
-def test_sent_at_least_once_is_merged_exactly_once(store):
-    rows, draw = random_samples(120, 1), np.random.default_rng(1)
-    watermark = 0
-    while watermark < len(rows):
-        first = max(1, watermark + 1 - int(draw.integers(0, 15)))
-        group = [incoming(rows[first - 1 : first - 1 + n], first) for n in draw.integers(1, 30, 3).tolist()]
-        answers = store.commit(group)
-        watermark = max([watermark, *(a.watermark for a in answers if isinstance(a, Ack))])
-    assert same(store.grid, folded(rows))
-    assert store.counters["samples_trimmed"] > 0
-
-
 def test_a_failed_commit_refuses_all_and_folds_nothing(store, monkeypatch):
     store.commit([incoming(samples(2))])
 

@@ -7,19 +7,16 @@ import pytest
 
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
-from mapserver.layers.cell_layers import LAYERS
-from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.answering import Answers
 from mapserver.query.block_layers import BlockLayers
 from protocol.errors import QueryError, Refusal
-from protocol.queries.answer_codec import decode_info, decode_point, decode_region
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.requests import HistoryQuery, PointQuery, PointsQuery, RegionQuery, WhyQuery
 from protocol.queries.roads import SegmentsQuery, WorklistQuery
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.site.geometry import Bounds
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, incoming, open_writer, refused, samples, send
-from tests.unit.mapserver.query.fake_upkeep import answered, answers_of
+from tests.unit.mapserver.query.fake_upkeep import answers_of
 
 # One sample in each cell of two diagonals, the value tells the cell.
 STEPS = np.arange(-40, 40)
@@ -138,16 +135,6 @@ def test_numbers_of_another_frame_are_refused_with_where_the_map_lies(answers, q
     with pytest.raises(QueryError, match=f"parameter `{name}`: .* is off the site.*: {where}") as caught:
         answers.answer(query)
     assert caught.value.reason == Refusal.OUTSIDE_SITE
-
-
-def test_answers_travel_as_bytes(answers):
-    point = decode_point(answered(answers, "point", {"x": "0.5", "y": "-0.5", "layers": "grade_east,visits"}))
-    assert set(point.values) == {"grade_east", "visits"}
-    here = decode_region(answered(answers, "region", {"bounds": "0,-2,2,0", "layers": "grade_east"}))
-    np.testing.assert_allclose(here["grade_east"], [[np.nan, 0.01], [0.0, np.nan]], atol=1e-3)
-    info = decode_info(answered(answers, "info", {"after": "1"}))
-    assert info.layers == (*LAYERS, *AREA_LAYERS)
-    assert info.samples_merged == 80
 
 
 def driven(

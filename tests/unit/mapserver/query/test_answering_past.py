@@ -105,14 +105,6 @@ def test_what_changed_later_has_not_changed_yet(served):
     assert now["resistance"] == after["resistance"]
 
 
-def test_excluded_machines_are_excluded_from_the_past(answers, served):
-    without = served(excluded="b")
-    only_a = served({"a": ROWS["a"]})
-    here, there = (asked.region(RegionQuery(BOX, ("resistance",), as_of_ns=NEWEST_NS)) for asked in (without, only_a))
-    assert equal(here, there, ["resistance"])
-    assert not equal(here, answers.region(RegionQuery(BOX, ("resistance",), as_of_ns=NEWEST_NS)), ["resistance"])
-
-
 def test_a_difference_is_value_by_value_and_unknown_where_either_is(answers):
     names = ("resistance", "visits", "resistance_filled")
     middle_ns = NOW_NS + 900 * S

@@ -130,18 +130,6 @@ def test_turns_of_a_large_fleet_leave_most_of_the_time_to_others(worked_s, pause
     assert upkeep.pause_s(worked_s) == pytest.approx(pause_s)
 
 
-def test_an_excluded_machine_is_folded_out_and_in_again_to_the_bit(opened):
-    sent = fleet({}, size=16)
-    with opened() as site:
-        deliver(site, sent)
-        row = site.upkeep.trust("b", False, "its scale is broken", 20.0)
-        assert (row["trusted"], row["by"], row["reason"]) == (False, "person", "its scale is broken")
-        assert same(site.grid, fold_of(sent, site.config, without="b"))
-        assert site.writer.run(lambda store: store.facts).excluded == {"b"}
-        assert site.upkeep.trust("b", True, "repaired", 20.0)["trusted"]
-        assert same(site.grid, fold_of(sent, site.config))
-
-
 def test_a_machine_that_contradicts_all_others_is_excluded(opened):
     sent = fleet({"c": 1.6})
     with opened(judge_s=JUDGE_S, calibrates=False) as site:  # its evidence is of what it sent

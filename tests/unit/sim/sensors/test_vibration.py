@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sim.sensors.presets import load_preset
-from tests.unit.sim.sensor_rigs import SEED, check_deviation, errors, noisy, perfect, rig, sampled, still, values
+from tests.unit.sim.sensor_rigs import SEED, check_deviation, errors, noisy, perfect, rig, values
 
 N = 40
 
@@ -52,11 +52,3 @@ def test_imus_of_one_machine_shake_alike_and_its_other_errors_stay_as_they_are()
         for mps2 in (0.0, 1.0)
     )
     np.testing.assert_array_equal(quiet, shaking)  # it stands
-
-
-def test_vibration_does_not_depend_on_how_many_steps_are_sampled_at_a_time() -> None:
-    one = rig(load_preset("shaking_2"), only="imu")
-    whole = sampled([one], still(50, 1, speed_mps=4.0)).groups[0].values
-    again = sampled([one], still(50, 1, speed_mps=4.0)).groups[0].values
-    np.testing.assert_array_equal(whole, again)
-    assert not np.array_equal(whole, sampled([one], still(50, 1, speed_mps=4.0), seed=SEED + 1).groups[0].values)
