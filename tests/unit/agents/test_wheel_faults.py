@@ -23,6 +23,7 @@ from agents.stream_order import by_stamp
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, GpsVelocity, Imu, Odometry, Reading
+from tests.tiers import by_night
 from tests.unit.agents.drives import LEVER_M, PROJECTION, SITE, Drive, Leg, drive, noisy, seconds, simulated, thinned
 from tests.unit.agents.test_receiver_faults import FAULTS as RECEIVER_FAULTS
 from tests.unit.agents.test_receiver_faults import RECEIVER, SLOW_S, SLOW_SHARE, STD_M, shifted
@@ -185,7 +186,7 @@ def passing(wheels: tuple[SensorConfig, ...]) -> Outcome:
     return located(case, shown(case))
 
 
-@pytest.mark.parametrize("name", [*LOCATED, *(pytest.param(name, marks=pytest.mark.nightly) for name in AT_NIGHT)])
+@pytest.mark.parametrize("name", [*LOCATED, *by_night(AT_NIGHT)])
 def test_positions_are_nearly_as_good_as_without_the_fault(name: str) -> None:
     case = CASES[name]
     outcome, without = located(case, shown(case)), passing(case.wheels)

@@ -14,6 +14,7 @@ from agents.localisation.localiser import LocalisationConfig, Localiser
 from agents.positioning import PipelineConfig, Positioning
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Imu, Odometry, Reading
+from tests.tiers import by_night
 from tests.unit.agents.drives import LEVER_M, PROJECTION, SITE, START_NS, Drive, Leg, drive, fix
 
 TOUR = (Leg(6, 1.0), Leg(6), *[Leg(12, 0, 0.2), Leg(5), Leg(12, 0, -0.2), Leg(5)] * 2)  # 6 m/s in bends of 30 m
@@ -99,7 +100,7 @@ def test_a_log_that_begins_in_motion_gates_no_wheels_and_bends_no_scale(
     assert abs(scale) < max(2 * std, 0.02)
 
 
-@pytest.mark.parametrize("wheels", [ENCODER, ODOMETRY])
+@pytest.mark.parametrize("wheels", by_night([ENCODER, ODOMETRY], day=[ENCODER]))
 def test_wheels_that_pause_while_the_machine_brakes_come_back_with_their_new_speed(wheels: SensorConfig) -> None:
     legs = (Leg(6, 1.0), Leg(20), Leg(4, -1.2), Leg(20))
     vehicle = cart(SensorConfig("imu", "imu"), wheels, GPS)

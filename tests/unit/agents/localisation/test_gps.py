@@ -21,6 +21,7 @@ from agents.localisation.tracker import gps_velocity, layout_of
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, GpsVelocity, Reading
+from tests.tiers import by_night
 from tests.unit.agents.drives import (
     LEVER_M,
     PROJECTION,
@@ -100,7 +101,7 @@ def test_the_more_is_shared_the_less_is_known_and_all_shared_is_one_receiver() -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("share", "off_m"), [(0.95, 5.0), (None, 40.0)])
+@pytest.mark.parametrize(("share", "off_m"), by_night([(0.95, 5.0), (None, 40.0)], day=[(None, 40.0)]))
 def test_a_receiver_that_goes_off_for_long_does_not_take_the_place_with_it(share: float | None, off_m: float) -> None:
     """It is accepted again, as its own error, and once more when it comes back; the others say where the machine is."""
     vehicle = sharing(3, share)

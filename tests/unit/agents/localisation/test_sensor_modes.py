@@ -166,8 +166,9 @@ def turned(readings: list[Reading], by_rad: float, from_s: float) -> list[Readin
     ]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong_deg", [pytest.param(8.0, marks=pytest.mark.nightly), -25.0])
+@pytest.mark.parametrize("wrong_deg", [8.0, -25.0])
 def test_an_error_larger_than_stated_is_learnt_and_does_no_harm(wrong_deg: float) -> None:
     """While fixes show the heading, and in the time without them that follows."""
     vehicle = of_ahrs()

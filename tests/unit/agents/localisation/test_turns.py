@@ -139,7 +139,7 @@ def test_old_steering_angle_turns_nothing() -> None:
     ("sensors", "wrong", "gps_hz", "engine"),
     [
         ((ENCODER, STEERING), Wrong(steering_rad=math.radians(1)), 1, "ekf"),
-        ((ODOMETRY,), Wrong(rate_radps=0.01), 5, "ukf"),
+        pytest.param((ODOMETRY,), Wrong(rate_radps=0.01), 5, "ukf", marks=pytest.mark.nightly),
     ],
 )
 def test_a_machine_without_imu_is_located_and_holds_through_ten_seconds_without_gps(
