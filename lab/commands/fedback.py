@@ -1,10 +1,37 @@
 """`python -m lab fedback`: what lanes are worth that are fed back, and where they may harm."""
 
-from functools import partial
+from argparse import ArgumentParser, Namespace
+from typing import Any
 
-from lab.campaign.command import add_runs, seeded
+from lab.campaign.command import add_runs, perform, seeds_of
+from lab.campaign.experiment import Runner
+from lab.campaign.summary import chosen
+from sitegrid.options.values import OutputFile
+from sitegrid.proof.figures import Report
 
 HELP = "filter drives again with the lanes of another day, at a thirtieth of the cost"
 EXTRA = "lab"
-add_options = partial(add_runs, seconds=420.0, cases=True)
-run = seeded("lab.fedback.experiment", "machines drive two days, the second on the lanes of the first")
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Options of a run."""
+    add_runs(parser, seconds=420.0, cases=True)
+    picture = "file to draw a bend into, in which lanes tell a machine its place"
+    parser.add_argument("--picture", type=OutputFile((".png",)), metavar="FILE", help=picture)
+
+
+def run(arguments: Namespace) -> int:
+    """Run it, and draw."""
+    from lab.fedback import experiment
+
+    seeds, cases = seeds_of(arguments), chosen(experiment.CASES, arguments.cases)
+
+    def work(runner: Runner) -> tuple[Report, Any]:
+        report, days = experiment.run(runner, seeds, arguments.seconds, cases)
+        if arguments.picture:
+            from lab.fedback.picture import draw  # imported here: only pictures need matplotlib
+
+            draw(*list(days.values())[:2], arguments.picture)
+        return report, days
+
+    return perform(arguments, "machines drive two days, the second on the lanes of the first", work)

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from lab.campaign.experiment import Experiment, Runner, replay_task
+from lab.campaign.experiment import Runner, replay_task
+from lab.fedback.blackout import compare
 from lab.fedback.days import day
 from lab.fedback.maps import GROWING, MAPS, READ_S, Rows, Scene, days_ago, lane_map
-from lab.fedback.nodes import Machine, Nodes, solve
+from lab.fedback.nodes import EXPERIMENT, Machine, Nodes
 from lab.fedback.rerun import Course, Maps, placed_again, rerun
 from protocol.arrays import Floats
 from protocol.errors import ConfigError
@@ -27,7 +28,10 @@ REPEATED = ("loading", "haul", "two", "both", "crossings", "free")
 
 @dataclass(frozen=True)
 class FedbackCase:
-    """A site of `days`, a map of `maps`, or `row` for each day on those before it, and how many receivers count."""
+    """A site of `days`, a map of `maps`, and how many receivers count.
+
+    map: also `row`, each day on those before it; or `lost`, machines that lose GPS.
+    """
 
     site: str
     map: str
@@ -44,16 +48,19 @@ CASES = (
     FedbackCase("driven", "mature", receivers=1),
     *(FedbackCase(site, "mature") for site in REPEATED),
     FedbackCase("driven", "row"),
+    FedbackCase("driven", "lost"),
 )
-EXPERIMENT = Experiment("fedback", Nodes, solve)
 Drives = Mapping[str, Nodes]  # of one day, by machine
 Figures = Mapping[str, Floats]  # by machine
 
 
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[FedbackCase] = CASES
-) -> tuple[Report, None]:
-    """Record, localise once, and filter again with each map; a row per case. Seeds count in pairs."""
+) -> tuple[Report, Mapping[int, Drives]]:
+    """Record, localise once, and filter again with each map; a row per case, and the first one's drives.
+
+    Seeds count in pairs.
+    """
     pairs = list(pairwise(seeds))[::2]
     if not pairs:
         raise ConfigError("--seeds", "two days are compared: give 2 or more")
@@ -62,12 +69,16 @@ def run(
     rows = []
     for case in cases:
         of_day = days[case.site, case.receivers]
+        if case.map == "lost":
+            rows += compare(runner, turns, seconds)
+            continue
         if case.map == "row":
             rows += _row_of_days(list(of_day.values()))
             continue
         judged = [_day(case, of_day[first], of_day[second], seconds) for first, second in turns]
         rows.append(_row(case, [figures for figures, _ in judged], [counts for _, counts in judged]))
-    return {"seeds": list(seeds), "seconds": seconds, "rows": rows}, None
+    first = days[cases[0].site, cases[0].receivers]
+    return {"seeds": list(seeds), "seconds": seconds, "rows": rows}, first
 
 
 def _days(
