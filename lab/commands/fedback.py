@@ -6,6 +6,7 @@ from typing import Any
 from lab.campaign.command import add_runs, perform, seeds_of
 from lab.campaign.experiment import Runner
 from lab.campaign.summary import chosen
+from protocol.errors import ConfigError
 from sitegrid.options.values import OutputFile
 from sitegrid.proof.figures import Report
 
@@ -16,22 +17,26 @@ EXTRA = "lab"
 def add_options(parser: ArgumentParser) -> None:
     """Options of a run."""
     add_runs(parser, seconds=420.0, cases=True)
-    picture = "file to draw a bend into, in which lanes tell a machine its place"
+    picture = "file to draw a machine into that loses GPS, the first of the case driven-lost"
     parser.add_argument("--picture", type=OutputFile((".png",)), metavar="FILE", help=picture)
 
 
 def run(arguments: Namespace) -> int:
     """Run it, and draw."""
     from lab.fedback import experiment
+    from lab.fedback.blackout import lanes_of
 
     seeds, cases = seeds_of(arguments), chosen(experiment.CASES, arguments.cases)
+    if arguments.picture and not any(case.map == "lost" for case in cases):
+        raise ConfigError("--picture", "is of the case driven-lost: add it to --cases")
 
     def work(runner: Runner) -> tuple[Report, Any]:
-        report, days = experiment.run(runner, seeds, arguments.seconds, cases)
+        report, courses = experiment.run(runner, seeds, arguments.seconds, cases)
         if arguments.picture:
             from lab.fedback.picture import draw  # imported here: only pictures need matplotlib
 
-            draw(*list(days.values())[:2], arguments.picture)
-        return report, days
+            lanes = lanes_of(seeds[0], arguments.seconds, runner.cache)
+            draw(lanes, courses[True][0], courses[False][0], arguments.picture)
+        return report, courses
 
     return perform(arguments, "machines drive two days, the second on the lanes of the first", work)

@@ -43,26 +43,31 @@ class Lost:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors (n, 2) and covariances (n, 2, 2) of the live pose, a second apart; after_s (n,): since GPS was lost."""
+    """Errors (n, 2) and covariances (n, 2, 2) of the live pose, a second apart.
+
+    after_s (n,): since GPS was lost. true_m (n, 2): where the machine was.
+    """
 
     after_s: Floats
     off_m: Floats
     covariance_m2: Floats
+    true_m: Floats
 
 
 def solve(task: Task[Lost], cache: Path) -> Errors:
     """Localise a machine that loses GPS."""
     assert task.drive
-    lanes = _lanes(task, cache) if task.variant.other >= 0 else None
+    other = task.variant.other
+    lanes = lanes_of(other, task.seconds, cache) if other >= 0 else None
     return localise(task.drive.folder(cache), task.variant.machine, lanes)
 
 
 EXPERIMENT = Experiment("blackout", Errors, solve)
 
 
-def _lanes(task: Task[Lost], cache: Path) -> LaneMap:
-    """Lanes of the other day, whose nodes are there already."""
-    drive = day("driven", task.variant.other, task.seconds)
+def lanes_of(seed: int, seconds: float, cache: Path) -> LaneMap:
+    """Lanes of the day before, whose nodes are there already."""
+    drive = day("driven", seed, seconds)
     files = {name: NODES.file(replay_task(Machine(name), drive), cache) for name in drive.names}
     return lane_map(days_ago([(name, read_result(Nodes, file).rows) for name, file in files.items()], 1))
 
@@ -86,20 +91,25 @@ def localise(folder: Path, name: str, lanes: LaneMap | None) -> Errors:
     stamp_ns: Ints = np.array([pose.stamp_ns for pose in poses.values()])
     true_m = read_track(folder / "truth" / TRACKS_FOLDER / f"{name}.csv").at(stamp_ns)
     off_m = np.array([(pose.x_m, pose.y_m) for pose in poses.values()]) - true_m
-    return Errors((stamp_ns - lost_ns) * 1e-9, off_m, np.array([pose.covariance_m2 for pose in poses.values()]))
+    covariance_m2 = np.array([pose.covariance_m2 for pose in poses.values()])
+    return Errors((stamp_ns - lost_ns) * 1e-9, off_m, covariance_m2, true_m)
 
 
-def compare(runner: Runner, turns: Sequence[tuple[int, int]], seconds: float) -> list[Row]:
-    """Rows of errors so long after GPS was lost, with lanes of the first day of each turn, and without."""
-    rows: dict[bool, list[Errors]] = {}
+Courses = Mapping[bool, Sequence[Errors]]  # with lanes, and without
+
+
+def courses_of(runner: Runner, turns: Sequence[tuple[int, int]], seconds: float) -> Courses:
+    """All machines of the second day of each turn, with lanes of the first, and without."""
+    courses: dict[bool, list[Errors]] = {}
     for aided in (True, False):
         drives = [(first, day("driven", second, seconds)) for first, second in turns]
         who = [(Lost(name, first if aided else -1), drive) for first, drive in drives for name in drive.names]
-        rows[aided] = runner.run(EXPERIMENT, [replay_task(lost, drive) for lost, drive in who])
-    return [_row(after_s, rows) for after_s in AT_S]
+        courses[aided] = runner.run(EXPERIMENT, [replay_task(lost, drive) for lost, drive in who])
+    return courses
 
 
-def _row(after_s: float, courses: Mapping[bool, Sequence[Errors]]) -> Row:
+def row_of(after_s: float, courses: Courses) -> Row:
+    """Errors so long after GPS was lost."""
     row: Row = {"case": f"driven-lost-{after_s:g}s", "courses": len(courses[True])}
     for aided, ending in ((True, ""), (False, "_without")):
         at = [int(np.argmin(np.abs(course.after_s - after_s))) for course in courses[aided]]

@@ -1,8 +1,7 @@
-"""A picture: the ellipse of a machine that finds its lane shrinks as it takes a bend."""
+"""A picture: a machine without GPS, whose ellipse shrinks in each bend as it finds its lane."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -10,65 +9,50 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 
-from agents.localisation.filters.state import YAW
 from agents.localisation.lanes.lane_map import METRES, LaneMap
-from lab.fedback.maps import days_ago, lane_map
-from lab.fedback.nodes import Nodes
-from lab.fedback.rerun import Course, rerun
-from protocol.arrays import Floats, Ints
+from lab.fedback.blackout import LASTS_S, Errors
+from protocol.arrays import Floats
 from protocol.site.geometry import BLOCK_CELLS
 
 SIGMAS_95 = 2.448  # of an ellipse that holds 95 % of a normal distribution in the plane
-SHOWN_S, EVERY_S = 44, 4  # how much of a drive is drawn, an ellipse so often
-MARGIN_M = 8.0
+EVERY_S = 20  # an ellipse so often
+MARGIN_M, DARK_M = 12.0, 12.0  # around the way; metres driven that are drawn black
 WITH, WITHOUT = "#0072b2", "#d55e00"
 
 
-def draw(first: Mapping[str, Nodes], second: Mapping[str, Nodes], file: Path) -> None:
-    """Draw the bend of the second day in which the lanes of the first tell a machine most."""
-    lanes = lane_map(days_ago([(name, nodes.rows) for name, nodes in first.items()], 1))
-    courses = [(n, rerun(n, lambda _: None, aids=False), rerun(n, lambda _: lanes)) for n in second.values()]
-    nodes, without, aided = max(courses, key=lambda of: _fall(of[0], of[2]).max())
-    at = int(np.argmax(_fall(nodes, aided)))
-    shown = np.arange(max(at - SHOWN_S // 2, 0), min(at + SHOWN_S // 2, len(nodes.stamp_ns)))
-    figure, (plan, sizes) = plt.subplots(1, 2, figsize=(10, 4.6), width_ratios=(3, 2), layout="constrained")
-    _plan(plan, lanes, nodes, (without, aided), shown)
-    for course, colour, label in ((without, WITHOUT, "without"), (aided, WITH, "on the fleet's lanes")):
-        sizes.plot(shown - at, SIGMAS_95 * _std_m(course)[shown], color=colour, label=label)
-    sizes.set(xlabel="time [s]", ylabel="larger half axis of the 95 % ellipse [m]", ylim=(0, None))
+def draw(lanes: LaneMap, aided: Errors, without: Errors, file: Path) -> None:
+    """Draw where a machine believes to be without GPS, and how large its ellipse is."""
+    figure, (plan, sizes) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(1, 1), layout="constrained")
+    _draw_lanes(plan, lanes)
+    for course, colour, label in ((without, WITHOUT, "without lanes"), (aided, WITH, "on the fleet's lanes")):
+        lost = (course.after_s >= 0) & (course.after_s <= LASTS_S)
+        _draw_ellipses(plan, course, np.flatnonzero(lost)[::EVERY_S].tolist(), colour)
+        std_m = np.sqrt(np.linalg.eigvalsh(course.covariance_m2[lost])[:, -1])
+        sizes.plot(course.after_s[lost], SIGMAS_95 * std_m, color=colour, label=f"{label}: half axis of the ellipse")
+        off_m = np.hypot(*course.off_m[lost].T)
+        sizes.plot(course.after_s[lost], off_m, color=colour, ls=":", label=f"{label}: error")
+    way: Floats = aided.true_m[(aided.after_s >= 0) & (aided.after_s <= LASTS_S)]
+    plan.plot(*way.T, color="black", lw=0.8)
+    low, high = way.min(axis=0) - MARGIN_M, way.max(axis=0) + MARGIN_M
+    plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="east [m]", ylabel="north [m]")
+    sizes.set(xlabel="time without GPS [s]", ylabel="[m]", xlim=(0, LASTS_S), ylim=(0, None))
     sizes.legend(frameon=False)
     figure.savefig(file, dpi=110)
     plt.close(figure)
 
 
-def _std_m(course: Course) -> Floats:
-    std_m: Floats = np.sqrt(np.linalg.eigvalsh(course.live_m2)[:, -1])
-    return std_m
-
-
-def _fall(nodes: Nodes, course: Course) -> Floats:
-    """By how much the larger half axis falls over ten seconds around each node, 0 where the machine does not turn."""
-    turned = np.abs(np.roll(nodes.x[:, YAW], -5) - np.roll(nodes.x[:, YAW], 5)) % (2 * np.pi) > 1.0
-    std_m = _std_m(course)
-    fall: Floats = np.where(turned, np.roll(std_m, 5) - np.roll(std_m, -5), 0.0)
-    fall[:100] = fall[-SHOWN_S:] = 0.0
-    return fall
-
-
-def _plan(axes: Axes, lanes: LaneMap, nodes: Nodes, courses: tuple[Course, Course], shown: Ints) -> None:
-    """Lanes, the true way, and ellipses every few seconds."""
+def _draw_lanes(axes: Axes, lanes: LaneMap) -> None:
+    n = BLOCK_CELLS
     for (x, y), tile in lanes.tiles.items():
-        metres = METRES[tile.metres].sum(axis=0).reshape(BLOCK_CELLS, BLOCK_CELLS)
-        west, south = x * BLOCK_CELLS, y * BLOCK_CELLS
-        extent = (west, west + BLOCK_CELLS, south, south + BLOCK_CELLS)
-        axes.imshow(metres, cmap="Greys", vmin=0, vmax=12, extent=extent, origin="lower")
-    axes.plot(*nodes.true_m[shown].T, color="black", lw=1)
-    for course, colour in zip(courses, (WITHOUT, WITH), strict=True):
-        for k in shown[::EVERY_S].tolist():
-            values, vectors = np.linalg.eigh(course.live_m2[k])
-            angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
-            width, height = (2 * SIGMAS_95 * np.sqrt(values[::-1])).tolist()
-            middle = nodes.true_m[k] + course.live_m[k]
-            axes.add_patch(Ellipse(tuple(middle), width, height, angle=angle, fill=False, color=colour, lw=1.2))
-    low, high = nodes.true_m[shown].min(axis=0) - MARGIN_M, nodes.true_m[shown].max(axis=0) + MARGIN_M
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="east [m]", ylabel="north [m]")
+        metres = METRES[tile.metres].sum(axis=0).reshape(n, n)
+        extent = (x * n, (x + 1) * n, y * n, (y + 1) * n)
+        axes.imshow(metres, cmap="Greys", vmin=0, vmax=DARK_M, extent=extent, origin="lower")
+
+
+def _draw_ellipses(axes: Axes, course: Errors, at: list[int], colour: str) -> None:
+    for k in at:
+        values, vectors = np.linalg.eigh(course.covariance_m2[k])
+        angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
+        width, height = (2 * SIGMAS_95 * np.sqrt(values[::-1])).tolist()
+        x_m, y_m = (course.true_m[k] + course.off_m[k]).tolist()
+        axes.add_patch(Ellipse((x_m, y_m), width, height, angle=angle, fill=False, color=colour, lw=1.2))

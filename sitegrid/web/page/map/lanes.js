@@ -27,5 +27,5 @@ function drawStrokes(context, step) {
     context.moveTo(x - right, y + up);
     context.lineTo(x + right, y - up);
   });
-  stroke(context, choices.ink.accent, Math.min(2, Math.max(0.75, view.scale / 4)), step / STEPS);
+  stroke(context, choices.ink.text, Math.min(2, Math.max(0.75, view.scale / 4)), 0.4 + (0.6 * step) / STEPS);
 }
