@@ -90,9 +90,10 @@ def localise(folder: Path, name: str, lanes: LaneMap | None) -> Errors:
             poses[pose.stamp_ns // 10**9] = pose
     stamp_ns: Ints = np.array([pose.stamp_ns for pose in poses.values()])
     true_m = read_track(folder / "truth" / TRACKS_FOLDER / f"{name}.csv").at(stamp_ns)
-    off_m = np.array([(pose.x_m, pose.y_m) for pose in poses.values()]) - true_m
+    off_m: Floats = np.array([(pose.x_m, pose.y_m) for pose in poses.values()]) - true_m
     covariance_m2 = np.array([pose.covariance_m2 for pose in poses.values()])
-    return Errors((stamp_ns - lost_ns) * 1e-9, off_m, covariance_m2, true_m)
+    after_s = (stamp_ns - lost_ns).astype(float) * 1e-9
+    return Errors(after_s, off_m, covariance_m2, true_m)
 
 
 Courses = Mapping[bool, Sequence[Errors]]  # with lanes, and without

@@ -81,8 +81,8 @@ def run(
             continue
         judged = [figures_of_day(case, of_day[first], of_day[second], seconds) for first, second in turns]
         rows.append(_row(case, [figures for figures, _ in judged], [counts for _, counts in judged]))
-    judged = judge(goals("fedback"), rows)
-    return {"seeds": list(seeds), "seconds": seconds, "rows": rows, "goals": judged}, courses
+    report = {"seeds": list(seeds), "seconds": seconds, "rows": rows, "goals": judge(goals("fedback"), rows)}
+    return report, courses
 
 
 def _days(

@@ -16,7 +16,7 @@ from protocol.site.geometry import BLOCK_CELLS
 
 SIGMAS_95 = 2.448  # of an ellipse that holds 95 % of a normal distribution in the plane
 EVERY_S = 20  # an ellipse so often
-MARGIN_M, DARK_M = 12.0, 12.0  # around the way; metres driven that are drawn black
+MARGIN_M, DARK_M = 12.0, 4.0  # around the way; metres driven that are drawn black
 WITH, WITHOUT = "#0072b2", "#d55e00"
 
 
@@ -36,7 +36,7 @@ def draw(lanes: LaneMap, aided: Errors, without: Errors, file: Path) -> None:
     low, high = way.min(axis=0) - MARGIN_M, way.max(axis=0) + MARGIN_M
     plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="east [m]", ylabel="north [m]")
     sizes.set(xlabel="time without GPS [s]", ylabel="[m]", xlim=(0, LASTS_S), ylim=(0, None))
-    sizes.legend(frameon=False)
+    sizes.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=2, fontsize="small")
     figure.savefig(file, dpi=110)
     plt.close(figure)
 

@@ -41,9 +41,7 @@ def test_make_refuses_another_python_in_one_sentence_and_installs_nothing(root: 
     made = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert made.returncode == 2
     sentence, _ = made.stderr.splitlines()  # and what make says of its own
-    assert sentence.startswith(
-        f"Python 3.11, 3.12 or 3.13 is needed, and '{python}' is Python 3.14.0"
-    )
+    assert sentence.startswith(f"Python 3.11, 3.12 or 3.13 is needed, and '{python}' is Python 3.14.0")
     assert (made.stdout, venv.exists()) == ("", False)
 
 
