@@ -37,7 +37,7 @@ def number_of(values: Mapping[str, Any], name: str) -> float | None:
 
 def report_of(values: Mapping[str, Any]) -> dict[str, Any]:
     """What a page shows of an agent beside its problems; None of what it does not say."""
-    pipeline, spool, corrections = (table_of(values, name) for name in ("pipeline", "spool", "corrections"))
+    pipeline, spool, corrections, lanes = (table_of(values, n) for n in ("pipeline", "spool", "corrections", "lanes"))
     heard = values.get("heard")
     return {
         "status": status_of(values),
@@ -50,6 +50,7 @@ def report_of(values: Mapping[str, Any]) -> dict[str, Any]:
         "heard": [one_line(str(name)) for name in heard[:MOST_SENSORS]] if isinstance(heard, list) else [],
         "base": one_line(str(corrections["base"])) if "base" in corrections else None,
         "corrections_age_s": number_of(corrections, "age_s"),
+        "lanes": one_line(str(lanes["sentence"])) if "sentence" in lanes else None,
         "calibration_std": number_of(table_of(pipeline, "ground", "calibration"), "zero_std"),
     }
 

@@ -52,8 +52,7 @@ class LocalisationConfig:
     once: after a pause or a jump of the clock the machine may be anywhere. slip, slip_soft: wheel slip per traction on
     firm ground, and how much it rises with the rolling resistance; of the tyres. lag_s: how long places of the past are
     smoothed by what comes after them, 0 for not at all; "paper" never smooths. map_aid: "auto" finds the machine's lane
-    on the map that all machines draw, once there is one; "off" never does, nor does "paper". It is off as long as the
-    map counts aided samples like others.
+    on the map that all machines draw, once there is one; "off" never does, nor does "paper".
     """
 
     filter: str = "ukf"
@@ -62,7 +61,7 @@ class LocalisationConfig:
     slip: float = 0.1
     slip_soft: float = 0.9
     lag_s: float = 90.0
-    map_aid: str = "off"
+    map_aid: str = "auto"
 
     def __post_init__(self) -> None:
         if self.filter not in FILTERS:

@@ -11,10 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from lab.campaign.experiment import Experiment, Runner, replay_task
+from lab.campaign.experiment import Runner, replay_task
+from lab.campaign.figures import judge
+from lab.campaign.goals import goals
+from lab.fedback.blackout import AT_S, Courses, courses_of, row_of
 from lab.fedback.days import day
 from lab.fedback.maps import GROWING, MAPS, READ_S, Rows, Scene, days_ago, lane_map
-from lab.fedback.nodes import Machine, Nodes, solve
+from lab.fedback.nodes import EXPERIMENT, Machine, Nodes
 from lab.fedback.rerun import Course, Maps, placed_again, rerun
 from protocol.arrays import Floats
 from protocol.errors import ConfigError
@@ -27,7 +30,10 @@ REPEATED = ("loading", "haul", "two", "both", "crossings", "free")
 
 @dataclass(frozen=True)
 class FedbackCase:
-    """A site of `days`, a map of `maps`, or `row` for each day on those before it, and how many receivers count."""
+    """A site of `days`, a map of `maps`, and how many receivers count.
+
+    map: also `row`, each day on those before it; or `lost`, machines that lose GPS.
+    """
 
     site: str
     map: str
@@ -44,30 +50,39 @@ CASES = (
     FedbackCase("driven", "mature", receivers=1),
     *(FedbackCase(site, "mature") for site in REPEATED),
     FedbackCase("driven", "row"),
+    FedbackCase("driven", "lost"),
 )
-EXPERIMENT = Experiment("fedback", Nodes, solve)
 Drives = Mapping[str, Nodes]  # of one day, by machine
 Figures = Mapping[str, Floats]  # by machine
 
 
 def run(
     runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[FedbackCase] = CASES
-) -> tuple[Report, None]:
-    """Record, localise once, and filter again with each map; a row per case. Seeds count in pairs."""
+) -> tuple[Report, Courses]:
+    """Record, localise once, and filter again with each map; a row per case, and courses without GPS.
+
+    Seeds count in pairs.
+    """
     pairs = list(pairwise(seeds))[::2]
     if not pairs:
         raise ConfigError("--seeds", "two days are compared: give 2 or more")
     turns = [turn for a, b in pairs for turn in ((a, b), (b, a))]
     days = _days(runner, cases, [seed for pair in pairs for seed in pair], seconds)
-    rows = []
+    rows: list[Row] = []
+    courses: Courses = {}
     for case in cases:
         of_day = days[case.site, case.receivers]
+        if case.map == "lost":
+            courses = courses_of(runner, turns, seconds)
+            rows += [row_of(after_s, courses) for after_s in AT_S]
+            continue
         if case.map == "row":
             rows += _row_of_days(list(of_day.values()))
             continue
-        judged = [_day(case, of_day[first], of_day[second], seconds) for first, second in turns]
+        judged = [figures_of_day(case, of_day[first], of_day[second], seconds) for first, second in turns]
         rows.append(_row(case, [figures for figures, _ in judged], [counts for _, counts in judged]))
-    return {"seeds": list(seeds), "seconds": seconds, "rows": rows}, None
+    report = {"seeds": list(seeds), "seconds": seconds, "rows": rows, "goals": judge(goals("fedback"), rows)}
+    return report, courses
 
 
 def _days(
@@ -87,7 +102,7 @@ def _rows(drives: Drives) -> Rows:
     return [(name, nodes.rows) for name, nodes in drives.items()]
 
 
-def _day(case: FedbackCase, first: Drives, second: Drives, seconds: float) -> tuple[Figures, Counter[str]]:
+def figures_of_day(case: FedbackCase, first: Drives, second: Drives, seconds: float) -> tuple[Figures, Counter[str]]:
     """Figures of the machines of the second day, with the map and without, and what became of windows.
 
     A map that grows is of places that it aided itself: filtered again as often as it is read, these are all there.

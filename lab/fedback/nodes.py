@@ -21,7 +21,7 @@ from agents.localisation.filters.belief import Belief, Conditioned, Filter, Meas
 from agents.localisation.filters.smoother import NODE_NS, SmoothedPose
 from agents.pipeline import corrected
 from agents.positioning import PipelineConfig, Positioning
-from lab.campaign.experiment import Task
+from lab.campaign.experiment import Experiment, Task
 from protocol.arrays import Floats, Ints, Table
 from protocol.machine.log_folder import open_log
 from protocol.machine.machine_config import MachineConfig
@@ -77,6 +77,9 @@ def solve(task: Task[Machine], cache: Path) -> Nodes:
     """The nodes of one machine's drive."""
     assert task.drive
     return watch(task.drive.folder(cache), task.variant)
+
+
+EXPERIMENT = Experiment("fedback", Nodes, solve)
 
 
 class _Watched:

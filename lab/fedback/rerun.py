@@ -16,6 +16,7 @@ from agents.localisation.lanes.guards import OFF_NS, Guards, prior_m2, share_of,
 from agents.localisation.lanes.lane_map import LaneMap
 from agents.localisation.lanes.matching import Match, match
 from agents.localisation.lanes.window import Window
+from agents.localisation.localiser import PROVEN_S
 from lab.fedback.nodes import Nodes
 from protocol.arrays import Floats, Table
 
@@ -83,13 +84,14 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -
         P[n:, n:] = np.diag(prior_m2(young=young))
     offset_m2 = float(prior_m2(young=young)[0]) * aids
     smoother, live, live_m2, seen, at = _Smoother(states, offset_m2), [], [], [], 0
-    holds_ns = 0
+    holds_ns, proven_ns = 0, int(nodes.stamp_ns[0]) + round(PROVEN_S * 1e9)
     for k, stamp_ns in enumerate(nodes.stamp_ns.tolist()):
         if k:
             d, P = _moved(nodes, k - 1, d, P, smoother)
         full = False
         while aids and at < len(nodes.way_ns) and nodes.way_ns[at] <= stamp_ns:
-            full = window.add(_reckoned(nodes, int(nodes.way_ns[at])))
+            if nodes.way_ns[at] >= proven_ns:
+                full = window.add(_reckoned(nodes, int(nodes.way_ns[at])))
             at += 1
         if full:
             x = np.concatenate([nodes.x[k], np.zeros(3)]) + d
@@ -98,7 +100,7 @@ def rerun(nodes: Nodes, maps: Maps, *, aids: bool = True, young: bool = False) -
             window.add(_reckoned(nodes, stamp_ns))
             back_m, headings = window.end(heading)
             lanes = maps(stamp_ns) if guards.is_open(stamp_ns) else None
-            matched = match(lanes, H @ x, H @ P @ H.T, back_m, headings) if lanes else "closed"
+            matched = match(lanes.of_others(stamp_ns), H @ x, H @ P @ H.T, back_m, headings) if lanes else "closed"
             counts[matched if isinstance(matched, str) else "used"] += 1
             if isinstance(matched, Match):
                 d, P, nis = _matched(matched, x, d, P, H, smoother)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.arrays import Floats
 from protocol.errors import Refusal
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries.answers import MapVersion
@@ -82,6 +83,18 @@ def decode_lanes(data: bytes) -> LanesAnswer:
     tiles = tuple(map(LaneTile, x, y, newest_ns, passes, days, machines, metres))
     version = MapVersion(take_store(table), take_int(table, "row", 0, MAX_SEQ), take_int(table, "fact", 0, MAX_SEQ))
     return LanesAnswer(version, take_int(table, "stamp_ns", 0, MAX_STAMP_NS), cell_m, tiles)
+
+
+def strokes(answer: LanesAnswer) -> dict[str, Floats]:
+    """Cells that are driven, as columns: middle [m], heading of the sector that is driven most [rad], metres in it."""
+    steps = np.array([tile.metres for tile in answer.tiles], np.uint8).reshape(-1, *SHAPE)
+    metres = np.nan_to_num(SCALE_M.values())[steps]
+    most = metres.max(axis=1)
+    tile, cell = np.nonzero(most)
+    corner = np.array([(each.x, each.y) for each in answer.tiles], np.int64).reshape(-1, 2)[tile] * BLOCK_CELLS
+    place_m = (corner + np.stack([cell % BLOCK_CELLS, cell // BLOCK_CELLS], axis=1) + 0.5) * answer.cell_m
+    heading_rad = metres.argmax(axis=1)[tile, cell] * (2 * np.pi / SECTORS)
+    return {"x_m": place_m[:, 0], "y_m": place_m[:, 1], "heading_rad": heading_rad, "metres": most[tile, cell]}
 
 
 def _column(cols: dict[str, object], name: str, n: int, low: int, high: int) -> list[int]:

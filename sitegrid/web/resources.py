@@ -12,6 +12,7 @@ from starlette.responses import Response
 
 from protocol.errors import Refusal
 from protocol.queries.answers import MapVersion, Region
+from protocol.queries.lanes import LanesQuery, strokes
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.parameters import WORDS, name_of
 from protocol.queries.request import MapQuery, Parameter, parameters_of
@@ -128,6 +129,12 @@ async def as_it_is(feed: SiteFeed, query: MapQuery[Any], _: Parameters) -> Respo
     return of_version(await as_json(answer), MapVersion(answer.store, answer.merged, answer.fact))
 
 
+async def lanes(feed: SiteFeed, query: LanesQuery, _: Parameters) -> Response:
+    """Cells that machines drive through, as columns: where, the heading that most have there, and metres driven so."""
+    answer = await feed.answer_to(query)
+    return of_version(await as_json({**strokes(answer), "stamp_ns": answer.stamp_ns}), answer.version)
+
+
 async def tiles(feed: SiteFeed, query: TilesQuery, _: Parameters) -> Response:
     """The map in tiles of 8-bit layers, as the live page reads it: all, those since a version, or as of a time."""
     answer = await (feed.answer_to(query) if query.as_of_ns is None else feed.tiles_as_of(query.as_of_ns))
@@ -204,6 +211,7 @@ RESOURCES: dict[str, Resource] = {
     "history": Resource(history, HistoryQuery.help, HistoryQuery, follows_now=True),
     "machines": Resource(machines, MachinesQuery.help, MachinesQuery, follows_now=True),
     "agents": Resource(agents, "What each machine says of itself: what it lacks, what waits", follows_now=True),
+    "lanes": Resource(lanes, LanesQuery.help, LanesQuery, follows_now=True),
     "changes": Resource(changes, ChangesQuery.help, ChangesQuery, follows_now=True),
     "tiles": Resource(tiles, TilesQuery.help, TilesQuery, without=("place",), media=BINARY, follows_now=True),
     "features/segments": of_features(segment_features, "Roads as lines", SegmentsQuery),

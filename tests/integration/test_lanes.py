@@ -22,12 +22,7 @@ DRIVEN = SimConfig(scenario="paper_site_driven", machines=4, seconds=0, speed=3,
 
 
 class Driving(SiteRun):
-    """The same, of another scenario, whose agents use the map."""
-
-    def start_agent(self, config: Path):
-        table = "[pipeline.localisation]\n"
-        config.write_text(config.read_text("utf-8").replace(table, f'{table}map_aid = "auto"\n'), "utf-8")
-        return super().start_agent(config)
+    """The same, of another scenario."""
 
     def start_sim(self, *options: str | Path):
         return super().start_sim("--scenario", self.sim.scenario, *options)

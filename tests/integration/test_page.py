@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from protocol.machine.samples import empty
+from protocol.queries.lanes import LanesQuery, strokes
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.requests import WhyQuery
 from protocol.wire import keys
@@ -59,6 +60,25 @@ def test_the_colours_on_the_map_are_those_of_its_cells(tab: Tab, web: WebSite):
     tab.until(f"[16, 8, 0].every((s, i) => Math.abs({shown}[i] - ({expected} >> s & 255)) <= 6)")
 
 
+def test_lanes_are_drawn_where_machines_drove(tab: Tab, web: WebSite):
+    columns = strokes(web.client.ask(LanesQuery()))
+    most = int(np.argmax(columns["metres"]))
+    tab.js("(sitegrid.choices.setShow('machines', false), sitegrid.choices.setShow('unsure', false))")
+    left, top = tab.pixel_of(columns["x_m"][most], columns["y_m"][most])
+
+    def looks() -> bytes:
+        frames = tab.js("sitegrid.drawn.frames")
+        tab.until(f"sitegrid.drawn.frames > {frames + 1}")
+        return tab.page.screenshot(clip={"x": left - 3, "y": top - 3, "width": 6, "height": 6})
+
+    bare = looks()
+    with tab.page.expect_response("**/lanes"):
+        tab.page.keyboard.press("n")
+    until(lambda: looks() != bare, "lanes on the picture")
+    tab.page.keyboard.press("n")
+    until(lambda: looks() == bare, "a picture without lanes")
+
+
 def test_a_click_says_why(tab: Tab, web: WebSite):
     x_m, y_m = known_place(web)
     tab.page.mouse.click(*tab.pixel_of(x_m, y_m))
@@ -81,6 +101,7 @@ def test_a_click_on_a_machine_says_how_it_does(tab: Tab, web: WebSite):
         "problems": [status, fault],
         "heard": ["gps-1"],
         "corrections": {"base": "base-1", "age_s": 2.0},
+        "lanes": {"sentence": "on the fleet's lanes, 0.9 m"},
     }
     web.session.put(keys.health(NAME, "no-place-9"), encode_health(Health("no-place-9", web.now_ns, values)))
     x_m, y_m = known_place(web)
@@ -92,7 +113,9 @@ def test_a_click_on_a_machine_says_how_it_does(tab: Tab, web: WebSite):
     panel.first.wait_for(timeout=WAIT_MS)
     assert panel.first.inner_text().startswith("here-1")
     text = panel.filter(has_text="no-place-9").inner_text()
-    assert all(words in text for words in (status[1:], fault, "not known yet", "base-1, 2.0 s old", "gps-1"))
+    assert all(
+        words in text for words in (status[1:], fault, "not known yet", "base-1, 2.0 s old", "gps-1", "fleet's lanes")
+    )
     tab.page.keyboard.press("a")
     assert tab.page.locator("#panel").is_hidden()
 

@@ -17,6 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as open_socket
 
+from protocol.queries.lanes import LanesQuery, strokes
 from protocol.queries.map_tiles import TilesQuery
 from protocol.queries.requests import CalibrationQuery, HistoryQuery, PointsQuery, WhyQuery
 from protocol.site.site_config import Projection
@@ -127,6 +128,13 @@ def test_the_past_is_asked_for_by_time_or_stamp(web: WebSite):
     assert {(tile.x, tile.y): (tile.newest_ns, tile_planes(tile)) for tile in web.client.ask(TilesQuery(
         as_of_ns=1_767_225_620_000_000_000
     )).tiles} == frame.tiles  # fmt: skip
+
+
+def test_lanes_are_those_that_agents_get_as_columns(web: WebSite):
+    table, columns = web.get("lanes").json, strokes(web.client.ask(LanesQuery()))
+    assert len(table["metres"]) > 50
+    for name, column in columns.items():
+        np.testing.assert_allclose(table[name], column, rtol=1e-6)
 
 
 def tile_planes(tile) -> bytes:

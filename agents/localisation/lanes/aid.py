@@ -53,7 +53,8 @@ class LaneAid:
             return None
         self._held = 0.0
         H = shown(len(belief.x), heading_rad)
-        matched = match(self.lanes, H.dot(belief.x), H.dot(belief.P).dot(H.T), back_m, headings_rad)
+        lanes = self.lanes.of_others(belief.stamp_ns)
+        matched = match(lanes, H.dot(belief.x), H.dot(belief.P).dot(H.T), back_m, headings_rad)
         if not isinstance(matched, Match):
             self.counters[f"{LANES}_{matched}"] += 1
             return None

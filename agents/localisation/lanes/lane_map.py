@@ -29,6 +29,16 @@ class LaneMap:
         day = stamp_ns // DAY_NS
         return all(tile.days < 2 and tile.newest_ns // DAY_NS == day for tile in self.tiles.values())
 
+    def of_others(self, stamp_ns: int) -> LaneMap:
+        """Without squares that one machine alone drew, on the day of a stamp: mostly this one, which errs as it did."""
+        day = stamp_ns // DAY_NS
+        tiles = {
+            at: tile
+            for at, tile in self.tiles.items()
+            if tile.machines > 1 or tile.days > 1 or tile.newest_ns // DAY_NS != day
+        }
+        return LaneMap(self.cell_m, tiles)
+
     def patch(self, west: int, south: int, east: int, north: int, sectors: Ints) -> Floats:
         """Metres driven (sectors, rows, columns) in a rectangle of cells, up to before east and north.
 

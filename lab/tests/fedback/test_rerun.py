@@ -6,9 +6,10 @@ import pytest
 from lab.campaign.recordings import make
 from lab.fedback import maps
 from lab.fedback.days import day
-from lab.fedback.maps import MAPS, Scene, free, moved
+from lab.fedback.experiment import FedbackCase, figures_of_day
+from lab.fedback.maps import MAPS, Scene, days_ago, free, lane_map, moved
 from lab.fedback.nodes import Machine, watch
-from lab.fedback.rerun import rerun
+from lab.fedback.rerun import placed_again, rerun
 
 SECONDS = 130.0
 
@@ -53,3 +54,24 @@ def test_maps_are_what_their_names_say(nodes):
         else:
             assert maps_of(last).tiles
     assert len(free(5)) == 4
+
+
+@pytest.mark.slow
+def test_places_that_lanes_moved_say_so(nodes):
+    lanes = lane_map(days_ago([("machine-1", nodes.rows)], 1))
+    without, aided = rerun(nodes, lambda _: None, aids=False), rerun(nodes, lambda _: lanes)
+    again = placed_again(nodes, without, aided)
+    went_m = np.hypot(*(again[name] - nodes.rows[name] for name in ("x_m", "y_m")))
+    assert aided.counts["used"] > 3
+    assert 0.1 < again["aid_share"].max() < 1.0
+    assert not again["aid_share"].min() < 0
+    assert went_m.max() < 2.0
+    assert not placed_again(nodes, without, without)["aid_share"].any()
+
+
+@pytest.mark.slow
+def test_one_machine_from_an_empty_map_is_neither_helped_nor_harmed(nodes):
+    one = {"machine-1": nodes}
+    figures, windows = figures_of_day(FedbackCase("driven", "alone"), one, one, SECONDS)
+    assert figures["smoothed_m2"] == pytest.approx(figures["without_smoothed_m2"], rel=1e-9)
+    assert not windows["used"]

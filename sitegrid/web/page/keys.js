@@ -10,7 +10,7 @@ import { fit } from "./map/sight.js";
 import { choices, times, view } from "./state/index.js";
 
 const HELP = [
-  ["1 to 5", "Layer"], ["M T G P U O", "Show and hide"], ["Arrows, + −", "Move, zoom"], ["0", "Fit the site"],
+  ["1 to 5", "Layer"], ["M T G N P U O", "Show and hide"], ["Arrows, + −", "Move, zoom"], ["0", "Fit the site"],
   ["W, R, A", "Where to send the grader, what a drive costs, how machines do"],
   ["Enter", "Explain the cell at the cross"], ["Space, [ ]", "Play, step in time"], ["L", "Back to now"],
   ["C", "Compare two times"], ["D", "Light or dark"], ["Esc", "Close"],

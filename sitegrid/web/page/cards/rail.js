@@ -4,7 +4,7 @@ import { LAYERS } from "../layers.js";
 import { choices } from "../state/index.js";
 
 export const SHOWS = [["machines", "Machines", "M"], ["tracks", "Tracks, last minute", "T"],
-  ["changes", "Changed ground", "G"], ["plan", "Site picture", "P"],
+  ["changes", "Changed ground", "G"], ["lanes", "Lanes", "N"], ["plan", "Site picture", "P"],
   ["unsure", "Fade what is unsure", "U"], ["old", "Fade what is old", "O"]];
 
 export function buildRail() {

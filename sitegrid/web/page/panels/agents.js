@@ -39,12 +39,13 @@ function heading({ machine, age_s, problems, speed_mps: speed }) {
     element("small", {}, isSilent ? `silent for ${Math.round(age_s)} s` : moves));
 }
 
-function rows({ position_std_m: std, samples, acknowledged, waiting, heard, base, ...agent }) {
+function rows({ position_std_m: std, samples, acknowledged, waiting, heard, base, lanes, ...agent }) {
   const { calibration_std: calibration, corrections_age_s: age } = agent;
   const close = std < 1 ? `${(100 * std).toFixed(0)} cm` : `${std?.toFixed(1)} m`;
   const old = age === null ? "none yet" : `${age.toFixed(age < 10 ? 1 : 0)} s old`;
   return [
     ["Place", std === null ? "not known yet" : `± ${close}`],
+    lanes ? ["Lanes", lanes] : null,
     samples ? ["Samples", `${samples} drawn, ${acknowledged ?? 0} delivered`] : null,
     waiting ? ["In the spool", `${waiting}`] : null,
     heard.length ? ["Sensors", heard.join(", ")] : null,

@@ -11,7 +11,7 @@ class Choices extends Owner {
   #chosen = LAYERS.find((layer) => layer.id === parameter("layer"));
   layer = this.#chosen ?? LAYERS[0];
   palette = parameter("palette") ?? "ordered";
-  shows = { machines: true, tracks: true, changes: true, plan: true, unsure: true, old: false };
+  shows = { machines: true, tracks: true, changes: true, lanes: false, plan: true, unsure: true, old: false };
   ink = {}; // the style sheet's colours, for what is drawn
 
   get hasKinds() { return this.palette === "kinds" && this.layer.id === "resistance"; }

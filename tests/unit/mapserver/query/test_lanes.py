@@ -14,7 +14,7 @@ from mapserver.layers.cell_layers import LAYERS
 from mapserver.query.views import read_cells, read_lanes, view_of
 from protocol.errors import MessageError
 from protocol.machine.samples import empty
-from protocol.queries.lanes import SCALE_M, LanesQuery, decode_lanes, encode_lanes
+from protocol.queries.lanes import SCALE_M, LanesQuery, decode_lanes, encode_lanes, strokes
 from protocol.queries.requests import parse_query
 from protocol.site.geometry import Bounds, CellWindow
 from tests.unit.mapserver.data import SITE, incoming, open_writer, random_samples, send
@@ -102,6 +102,15 @@ def test_lanes_are_asked_for_whole_by_place_and_by_news(tmp_path):
     assert 0 < len(news.tiles) < len(whole.tiles)
     assert {tile.x for tile in news.tiles} <= {-1, 0, 1}
     assert whole.cell_m == SITE.cell_m
+
+
+def test_strokes_lie_where_machines_drove_and_the_way_they_did():
+    columns = strokes(lanes_of(passes(8.5, 3, BEGIN_NS)))
+    strong = columns["metres"] > 1
+    assert columns["y_m"][strong].min() < 1 < 63 < columns["y_m"][strong].max()
+    assert np.abs(columns["x_m"][strong] - 8.5).max() <= 1
+    assert columns["heading_rad"] == pytest.approx(np.pi / 2)
+    assert all(len(values) == 0 for values in strokes(replace(lanes_of(), tiles=())).values())
 
 
 def replace_stamps(rows, first_ns):

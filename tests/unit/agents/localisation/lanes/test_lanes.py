@@ -1,6 +1,7 @@
 """Laws of lanes: ground without any tells nothing, a covariance stays one, no place counts twice, a shift shows."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,6 +75,13 @@ def test_a_lane_shows_how_far_beside_it_the_machine_seems_to_be(off_m):
     assert matched.place_m[0] == pytest.approx(0.0, abs=0.25)
     assert 1.0 < matched.covariance_m2[0, 0] < 2.0
     assert matched.covariance_m2[1, 1] > 1000  # along a straight nothing shows
+
+
+def test_lanes_that_one_machine_drew_today_are_left_out():
+    tiles, day_ns = lane_north(0).tiles, 86_400 * 10**9
+    for days, machines, newest_ns, kept in ((1, 1, 1, 0), (1, 2, 1, 64), (2, 1, 1, 64), (1, 1, -day_ns, 64)):
+        drawn = {at: replace(t, days=days, machines=machines, newest_ns=newest_ns) for at, t in tiles.items()}
+        assert len(LaneMap(1.0, drawn).of_others(2).tiles) == kept
 
 
 def test_lanes_of_another_direction_tell_nothing():
