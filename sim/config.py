@@ -11,11 +11,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
+from agents.drivers.can.buses import split_bus
 from protocol.config import from_table, require_between
 from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.machine.machine_config import machine_toml
 from protocol.site.site_config import NAME, site_toml
+from sim.can.live import address_of, bus_toml
+from sim.can.node import SIGNALS
 from sim.receivers.ports import driver_toml
 from sim.receivers.receiver import WRITERS, wire
 from sim.scenario.file import check, load_scenario
@@ -32,7 +35,8 @@ class SimConfig:
     scenario: a name of `sim/scenario/`, or the path of a TOML file. machines: of the scenario's first fleet. names: of
     all machines. seconds: simulated time, 0 runs until stopped. preset, drive_mps, gps, imu, attitude, payload: of
     every fleet. speed: times real time, 0 as fast as possible. receivers: what they speak on ports, `ubx` or `nmea`;
-    empty: their readings are in bundles, like all others.
+    empty: their readings are in bundles, like all others. can: the bus of the first machine (`virtual://site`, `can0`),
+    of which the others count on; empty: drive trains are in bundles, or on the buses of the scenario alone.
     """
 
     scenario: str = "paper_site"
@@ -50,6 +54,7 @@ class SimConfig:
     payload: bool | None = None
     speed: float = 1.0
     receivers: str = ""
+    can: str = ""
 
     def __post_init__(self) -> None:
         require_between(self, 0, 1000, "speed")
@@ -58,6 +63,10 @@ class SimConfig:
             raise ValueError(f"receivers: {self.receivers!r} is none of {', '.join(WRITERS)}")
         if self.receivers and self.speed != 1:
             raise ValueError(f"speed: receivers state the time, so with them it is 1, not {self.speed:g}")
+        if self.can:
+            split_bus(self.can)
+        if self.can and not self.receivers:
+            raise ValueError("can: a bus states no time, so receivers must: set `receivers` (--ports)")
         for name in (self.site, *(self.names or ())):
             if name is not None and not NAME.fullmatch(name):
                 raise ValueError(f"site, names: {name!r} is not a name (lower-case letters, digits, - and _)")
@@ -73,7 +82,8 @@ def resolve(config: SimConfig) -> Scenario:
     scenario = load_scenario(config.scenario)
     where = f"scenario {config.scenario}"
     names = ("preset", "drive_mps", "gps", "imu", "attitude", "payload")
-    given = _given(config, *names) | ({"doppler": True} if config.receivers else {})
+    said = {"doppler": config.receivers, "can": config.can}
+    given = _given(config, *names) | {name: True for name, value in said.items() if value}
     fleets = tuple(_replace(fleet, where, **given) for fleet in scenario.fleet)
     if config.machines is not None:
         fleets = (_replace(fleets[0], where, count=config.machines), *fleets[1:])
@@ -96,11 +106,13 @@ def write_configs(config: SimConfig, folder: Path, ports: Path | None = None) ->
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "site.toml").write_text(site_toml(scenario.site), encoding="utf-8")
     paths = []
-    for rig in scenario.rigs():
+    for index, rig in enumerate(scenario.rigs()):
         path, wirings = folder / f"{rig.machine.name}.toml", wire(rig, config.receivers) if ports else []
         added = tuple(sensor for wiring in wirings for sensor in wiring.added)
         text = machine_toml(replace(rig.machine, sensors=(*rig.machine.sensors, *added)))
-        path.write_text(text + (driver_toml(ports, wirings, rig.machine) if ports else ""), encoding="utf-8")
+        text += driver_toml(ports, wirings, rig) if ports else ""
+        text += bus_toml(address_of(config.can, index), rig.feeds, SIGNALS) if config.can else ""
+        path.write_text(text, encoding="utf-8")
         paths.append(path)
     return paths
 

@@ -14,6 +14,7 @@ from typing import Any
 from protocol.errors import LinkError
 from protocol.wire.bundle_stream import BundleStream, StreamClock
 from protocol.wire.session import SessionConfig, open_session
+from sim.can.live import Buses
 from sim.config import SimConfig
 from sim.receivers.ports import Ports
 from sim.receivers.receiver import wire
@@ -58,13 +59,14 @@ def run(
         simulator = opened.enter_context(contextlib.closing(Simulator(config)))
         streams = opened.enter_context(_streams(simulator, session_config))
         ports = opened.enter_context(contextlib.closing(_ports(simulator, ports_dir))) if ports_dir else None
+        buses = opened.enter_context(contextlib.closing(_buses(simulator))) if simulator.config.can else None
         progress = throttled(on_progress, clock) if on_progress else None
         if not ports and (missing := _await_subscribers(streams, wait_s, stop, clock)):
             problem = f"nobody listens to machine {missing[0]} of site {simulator.site.name}"
             advice = f"start its agent with `sitegrid agent`, within {wait_s:g} s"
             raise LinkError(session_config.endpoint, f"{problem}: {advice}")
         try:
-            report = _drive(simulator, streams, ports, stop, clock, progress)
+            report = _drive(simulator, streams, ports, stop, clock, progress, buses)
         finally:
             if truth_dir:
                 write_truth(truth_dir, simulator)
@@ -78,6 +80,7 @@ def _drive(
     stop: threading.Event,
     clock: Callable[[], float],
     progress: Callable[[float], None] | None,
+    buses: Buses | None,
 ) -> SimReport:
     start, bundles, readings = clock(), 0, 0
     pace = StreamClock(simulator.config.speed, stop, clock)
@@ -89,6 +92,10 @@ def _drive(
         pace.wait(simulator.simulated_s)  # a bundle is due when its span is over
         for stream in streams:
             sensed = step[stream.machine]
+            if buses:
+                buses.send(stream.machine, simulator.frames[stream.machine])
+                on_bus = simulator.buses[stream.machine].sensors
+                sensed = [reading for reading in sensed if reading.sensor not in on_bus]
             stream.put(ports.send(stream.machine, sensed) if ports else tuple(sensed))
         bundles += 1
         readings += sum(map(len, step.values()))
@@ -102,6 +109,10 @@ def _drive(
 def _ports(simulator: Simulator, folder: Path) -> Ports:
     format_ = simulator.config.receivers
     return Ports(folder, {rig.machine.name: wire(rig, format_) for rig in simulator.scenario.rigs()})
+
+
+def _buses(simulator: Simulator) -> Buses:
+    return Buses(simulator.config.can, simulator.buses)
 
 
 @contextlib.contextmanager

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from agents.drivers.can.buses import CanFrame
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.errors import ConfigError
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from protocol.site.site_config import Projection, SiteConfig
+from sim.can.node import BusNode
 from sim.config import SimConfig, resolve
 from sim.machines.chassis import Bodies
 from sim.machines.model import MachineModel
@@ -38,7 +40,8 @@ class Simulator:
     """Simulates the machines of one site; the same config gives the same readings, bit for bit.
 
     site, machines: what agents may know. truth_map, tracks(): what only a comparison may see; former_truth_maps: the
-    ground before each change so far, with the simulated second of that change. close() ends the world.
+    ground before each change so far, with the simulated second of that change. buses: of machines that speak CAN, by
+    name; frames: what these carried in the last span. close() ends the world.
     """
 
     def __init__(self, config: SimConfig, scenario: Scenario | None = None, *, bundle_ms: int = BUNDLE_MS) -> None:
@@ -68,6 +71,8 @@ class Simulator:
             if start.payload_kg:
                 self._world.set_payload(machine, start.payload_kg)
         self._sensors = Sensors(rigs, seed, Projection(self.site))
+        self.buses = {rig.machine.name: BusNode(rig, i, seed) for i, rig in enumerate(rigs) if rig.can}
+        self.frames: dict[str, list[CanFrame]] = {}
         self._steps = 0
         self._work_j: Floats = np.zeros(len(starts))
         self._tracks: list[Table] = []
@@ -92,10 +97,13 @@ class Simulator:
     def advance(self) -> dict[str, list[Reading]]:
         """Simulate the span of one bundle; returns readings of each machine, in order of stamps."""
         span = self.sense()
-        return {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
+        readings = {machine.name: span.readings(i) for i, machine in enumerate(self.machines)}
+        for name, bus in self.buses.items():
+            readings[name] = sorted([*readings[name], *bus.readings(self.frames[name])], key=lambda one: one.stamp_ns)
+        return readings
 
     def sense(self) -> FleetReadings:
-        """Simulate the span of one bundle; returns the readings of all machines as columns."""
+        """Simulate the span of one bundle; returns the readings of all machines as columns, without those of buses."""
         count = self._bundle_ms // STEP_MS
         states = stack([self.step() for _ in range(count)])
         steps = np.arange(self._steps - count + 1, self._steps + 1)
@@ -105,6 +113,7 @@ class Simulator:
         self._work_j = work_j[-1]
         if due.any():
             self._tracks.append(_track_rows(stamps_ns[due], states, work_j, due))
+        self.frames = {name: bus.frames(steps, stamps_ns, states) for name, bus in self.buses.items()}
         return self._sensors.sample(steps, stamps_ns, states)
 
     def close(self) -> None:

@@ -158,6 +158,16 @@ class EngineLosses(Reading):
 
 
 @dataclass(frozen=True, slots=True)
+class FuelRate(Reading):
+    """Diesel that an engine burns, in litres per hour."""
+
+    kind: ClassVar[str] = "fuel_rate"
+    limits: ClassVar[dict[str, tuple[float, float]]] = {"litres_ph": (0, 3300)}
+
+    litres_ph: float
+
+
+@dataclass(frozen=True, slots=True)
 class Driveline(Reading):
     """Whether the clutch is closed, the converter locked, and a gear being changed: 0 or 1 each."""
 
@@ -261,6 +271,7 @@ KINDS: dict[str, type[Reading]] = {
         Torque,
         Engine,
         EngineLosses,
+        FuelRate,
         Driveline,
         Motor,
         MotorPower,

@@ -14,6 +14,7 @@ from protocol.errors import ConfigError
 from protocol.files import load_toml
 from protocol.machine.machine_config import BASE, FRONT, Mount
 from protocol.rotations import rpy_from_matrix
+from sim.machines.drive_train import DriveTrain
 from sim.machines.urdf import Mass, Robot, Transform, combined, read_urdf
 
 FOLDER = Path(__file__).parent
@@ -27,7 +28,7 @@ class MachineModel:
 
     urdf: file beside the TOML file. mass_kg: empty. payload_kg: the most it carries. load_centre_m: how far ahead of
     the rear axle the wheel loads' centre lies, empty. skid_grip: of a machine that skid-steers, whose joint only stands
-    for its steering: side force over load of wheels that slide; 0: none do.
+    for its steering: side force over load of wheels that slide; 0: none do. drive_train: of those that speak CAN.
     """
 
     name: str
@@ -54,6 +55,7 @@ class MachineModel:
     tyre_damping_nspm: float
     relaxation_m: float
     skid_grip: float = 0.0
+    drive_train: DriveTrain | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.max_articulation_rad < 1.2:

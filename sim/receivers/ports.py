@@ -11,9 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from protocol.errors import ConfigError
-from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Reading
 from sim.receivers.receiver import SimulatedReceiver, Wiring, carried
+from sim.sensors.rigs import Rig
 
 
 class PseudoTerminal:
@@ -78,14 +78,14 @@ class Ports:
             port.close()
 
 
-def driver_toml(folder: Path, wirings: Sequence[Wiring], machine: MachineConfig) -> str:
-    """[[driver]] tables of an agent that reads these ports, and from bundles what no receiver carries."""
+def driver_toml(folder: Path, wirings: Sequence[Wiring], rig: Rig) -> str:
+    """[[driver]] tables of an agent that reads these ports, and from bundles what neither they nor a bus carries."""
     tables = [
         f"kind = {json.dumps(w.format)}\naddress = {json.dumps(str(folder.absolute() / w.name))}\n"
         + _feeds({stream: sensor.name for stream, sensor in w.feeds.items()})
         for w in wirings
     ]
-    if rest := {s.name: s.name for s in machine.sensors if s.name not in carried(wirings)}:
+    if rest := {s.name: s.name for s in rig.off_bus if s.name not in carried(wirings)}:
         tables.append('kind = "zenoh"\n' + _feeds(rest))
     return "".join(f"\n[[driver]]\n{table}" for table in tables)
 

@@ -67,7 +67,7 @@ class FleetConfig:
     routes: taken in turn; other_way: every second round of turns is driven in the opposite direction. start: share of
     the cycle at which the first begins. gps, imu, attitude: numbers of the sensors, as the machine's URDF has them.
     payload: whether they weigh what they carry; None: if it changes on a route of theirs. doppler: whether their
-    receivers state velocities.
+    receivers state velocities. can: whether their drive trains speak J1939, in place of sensors at the wheels.
     """
 
     name: str
@@ -83,6 +83,7 @@ class FleetConfig:
     attitude: tuple[int, ...] = ()
     payload: bool | None = None
     doppler: bool = False
+    can: bool = False
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -180,10 +181,12 @@ class Scenario:
             model, preset = load_model(fleet.model), self.preset(fleet.preset)
             payload = self._loads(fleet) if fleet.payload is None else fleet.payload
             sensors = fleet.gps, fleet.imu, fleet.attitude
-            config = machine_config(name, model, preset, *sensors, payload=payload, doppler=fleet.doppler)
+            config = machine_config(
+                name, model, preset, *sensors, payload=payload, doppler=fleet.doppler, can=fleet.can
+            )
             if model.skid_grip and self.world != "fast":
                 raise ValueError(f'fleet: {fleet.name}: machines that skid-steer need world = "fast"')
-            rigs.append(Rig(config, model, preset, faults.get(name, Faults())))
+            rigs.append(Rig(config, model, preset, faults.get(name, Faults()), fleet.can))
         return rigs
 
     def journeys(self) -> list[tuple[Route, float, float]]:

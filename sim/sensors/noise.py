@@ -18,6 +18,7 @@ STREAMS += ("articulation", "outage", "imu-4", "attitude-1", "attitude-2", "atti
 STREAMS += ("receivers", "driver")  # what the receivers of one machine have in common; its driver
 STREAMS += ("vibration",)  # of one machine: all its IMUs shake alike
 STREAMS += ("brake", "doppler-1", "doppler-2", "doppler-3")
+STREAMS += ("pump", "fuel")  # of a machine whose bus speaks
 SITE = 2**32 - 1  # in the place of a machine's number: what all machines of a site share
 # Drawn at a time: a call for every reading would cost more than its numbers. No power of two, or the rows that all
 # sensors take together would share a few lines of the cache (six times slower).

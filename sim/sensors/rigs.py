@@ -15,6 +15,18 @@ from sim.machines.model import MachineModel
 from sim.sensors.noise import generator
 from sim.sensors.presets import BRAKE_READINGS, GpsNoise, Preset
 
+# What a machine's bus carries: the sensor of each stream of `agents.drivers.can`, or of a signal of its maker.
+CAN_SENSORS = {
+    "engine": SensorConfig("engine", "engine"),
+    "losses": SensorConfig("losses", "engine_losses"),
+    "gearbox": SensorConfig("gearbox", "driveline"),
+    "rear_speed": SensorConfig("speed", "odometry", measures=("speed",)),
+    "brake_switch": SensorConfig("brakes", "brake"),
+    "retarder": SensorConfig("retarder", "brake"),
+    "fuel": SensorConfig("fuel", "fuel_rate"),
+    "pump": SensorConfig("pump", "hydraulic_pressure"),
+}
+
 
 @dataclass(frozen=True)
 class Faults:
@@ -42,12 +54,27 @@ class Faults:
 
 @dataclass(frozen=True)
 class Rig:
-    """One machine's sensors. machine: what its agent may know; the rest is for the simulator alone."""
+    """One machine's sensors. machine: what its agent may know; the rest is for the simulator alone.
+
+    can: whether its drive train speaks on a bus (`CAN_SENSORS`), in place of sensors at the wheels.
+    """
 
     machine: MachineConfig
     model: MachineModel
     preset: Preset
     faults: Faults = Faults()
+    can: bool = False
+
+    @property
+    def feeds(self) -> dict[str, SensorConfig]:
+        """The sensor of each stream that its bus carries."""
+        return {stream: s for stream, s in CAN_SENSORS.items() if self.can and s in self.machine.sensors}
+
+    @property
+    def off_bus(self) -> tuple[SensorConfig, ...]:
+        """Its sensors that no bus carries."""
+        on_bus = self.feeds.values()
+        return tuple(sensor for sensor in self.machine.sensors if sensor not in on_bus)
 
 
 def machine_config(
@@ -60,23 +87,27 @@ def machine_config(
     *,
     payload: bool = False,
     doppler: bool = False,
+    can: bool = False,
 ) -> MachineConfig:
     """Describe a machine of a kind as its agent knows it; sensors by the numbers that the model's URDF gives them.
 
     attitude: IMUs that also say their orientation. payload: whether it weighs what it carries. doppler: whether its
-    receivers state velocities. Fast sensors stand first: readings of one stamp then have the same order live, in
-    bundles and in log folders.
+    receivers state velocities. can: whether its bus takes the place of sensors at the wheels. Fast sensors stand first:
+    readings of one stamp then have the same order live, in bundles and in log folders.
     """
     ticks = preset.encoder.ticks_per_rev
     sensors = [_inertial("imu", number, model) for number in imu]
     sensors += [_inertial("attitude", number, model) for number in attitude]
-    sensors += [SensorConfig("torque", "torque"), SensorConfig("wheels", "encoder", ticks_per_rev=ticks)]
+    if not can:
+        sensors += [SensorConfig("torque", "torque"), SensorConfig("wheels", "encoder", ticks_per_rev=ticks)]
     sensors += [] if model.skid_grip else [SensorConfig("articulation", "articulation")]
     sensors += [_receiver(number, model, preset.gps) for number in gps]
     mounts = model.gps_mounts()
     sensors += [SensorConfig(f"doppler-{number}", "gps_velocity", mounts[number - 1]) for number in gps if doppler]
     sensors += [SensorConfig("payload", "payload")] if payload else []
-    sensors += [SensorConfig("brake", kind)] if (kind := BRAKE_READINGS[preset.brake.reads]) else []
+    sensors += [SensorConfig("brake", kind)] if not can and (kind := BRAKE_READINGS[preset.brake.reads]) else []
+    sensors.sort(key=lambda sensor: -preset.rate_hz(sensor.kind))
+    sensors += can_sensors(model) if can else []
     payload_x_m, _, payload_z_m = np.round(model.payload_centre_m, 2).tolist()  # no finer than a data sheet
     return MachineConfig(
         name,
@@ -90,8 +121,17 @@ def machine_config(
         cog_height_m=round(model.centre_height_m(), 2),
         payload_x_m=payload_x_m,
         payload_z_m=payload_z_m,
-        sensors=tuple(sorted(sensors, key=lambda sensor: -preset.rate_hz(sensor.kind))),
+        sensors=tuple(sensors),
+        powertrain=model.drive_train.data_sheet if can and model.drive_train else None,
     )
+
+
+def can_sensors(model: MachineModel) -> list[SensorConfig]:
+    """Sensors that the bus of a kind of machine feeds."""
+    if not model.drive_train:
+        raise ValueError(f"can: a {model.name} has no drive train that speaks on a bus")
+    has_pump = model.drive_train.hydraulics > 0
+    return [sensor for stream, sensor in CAN_SENSORS.items() if has_pump or stream != "pump"]
 
 
 def draw_bodies(rigs: Sequence[Rig], seed: int) -> Bodies:

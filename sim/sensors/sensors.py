@@ -285,7 +285,7 @@ class Sensors:
         places: list[list[tuple[tuple[str, int, str], int]]] = []
         for i, rig in enumerate(rigs):
             places.append([])
-            for sensor in rig.machine.sensors:
+            for sensor in rig.off_bus:
                 key = (sensor.kind, rig.preset.rate_hz(sensor.kind), sensor.frame)
                 group = groups.setdefault(key, [])
                 places[i].append((key, len(group)))

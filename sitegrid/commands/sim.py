@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 HELP = "run the simulator: machines drive and publish sensor readings"
 EXTRA = "sim"
-OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site", "receivers")
+OVER = ("scenario", "world", "preset", "seconds", "speed", "machines", "seed", "site", "receivers", "can")
 ALL_SENSORS = {"gps": (1, 2, 3), "imu": (1, 2, 3, 4), "attitude": (1, 2, 3, 4)}
 
 
@@ -44,6 +44,7 @@ def add_options(parser: ArgumentParser) -> None:
     ports = "folder for the ports on which the machines' receivers speak; what they do not carry is published"
     add("--ports", type=FOLDER, help=ports)
     add("--receivers", choices=("ubx", "nmea"), help="what they speak there (default ubx)")
+    add("--can", metavar="BUS", help="bus of the first machine, the others count on (can0): drive trains speak J1939")
     add("--truth", type=FOLDER, help="folder for the true map and the true tracks")
     add("--record", type=FOLDER, help="folder for log folders, one per machine; nothing is published then")
     add("--all-sensors", action="store_true", help="use every GPS receiver and IMU of the machines")

@@ -41,14 +41,14 @@ class CanLine:
         self._by_group: dict[int, list[Signal]] = defaultdict(list)
         for signal in signals.values():
             self._by_group[signal.group].append(signal)
-        self._begun_by: dict[str, list[_Feed]] = defaultdict(list)
-        for feed in self._feeds:
+        self._begun_by: dict[str, list[int]] = defaultdict(list)  # numbers of feeds
+        for number, feed in enumerate(self._feeds):
             for name in feed.stream.begins:
-                self._begun_by[name].append(feed)
-        self._groups = {feed: {signals[name].group for name in feed.stream.begins} for feed in self._feeds}
+                self._begun_by[name].append(number)
+        self._groups = [{signals[name].group for name in feed.stream.begins} for feed in self._feeds]
         self._held: dict[str, tuple[float, int]] = {}
         self._senders: dict[int, dict[int, int]] = defaultdict(dict)  # when each was heard, by group; the first counts
-        self._valued_ns: dict[_Feed, int] = {}
+        self._valued_ns: dict[int, int] = {}  # by number of the feed
         self._begun_ns = 0
 
     def take(self, identifier: int, data: bytes, host_ns: int, *, is_extended: bool = True) -> list[Observed]:
@@ -67,20 +67,22 @@ class CanLine:
         if counts:
             self._held |= {name: (value, host_ns) for name, value in values.items()}
         taken_from = (ANY, sender) if counts else (sender,)
-        begun = {feed for name in values for feed in self._begun_by.get(name, ()) if feed.sender in taken_from}
+        begun = {feed for name in values for feed in self._begun_by.get(name, ())}
+        begun = {number for number in begun if self._feeds[number].sender in taken_from}
         if not begun:
             return []
         held = {name: value for name, (value, ns) in self._held.items() if host_ns - ns <= HELD_NS} | values
-        made = [self._observed(feed, held, host_ns) for feed in self._feeds if feed in begun]
+        made = [self._observed(number, held, host_ns) for number in sorted(begun)]
         return [observed for observed in made if observed]
 
     def problems(self, host_ns: int) -> Sequence[str]:
         """What is fed by nothing, or by several senders, as of `host_ns`."""
-        idle = [feed for feed in self._feeds if host_ns - self._valued_ns.get(feed, self._begun_ns) > SILENT_NS]
-        shared = {group for feed in self._feeds if feed.sender == ANY for group in self._groups[feed]}
+        begun = self._begun_ns
+        idle = [i for i in range(len(self._feeds)) if host_ns - self._valued_ns.get(i, begun) > SILENT_NS]
+        shared = {group for i, feed in enumerate(self._feeds) if feed.sender == ANY for group in self._groups[i]}
         rivals = {group: heard for group in sorted(shared) if len(heard := self._heard(group, host_ns)) > 1}
         return [
-            *(self._why_idle(feed, host_ns) for feed in idle),
+            *(self._why_idle(number, host_ns) for number in idle),
             *(_which_counts(group, heard) for group, heard in rivals.items()),
         ]
 
@@ -96,7 +98,8 @@ class CanLine:
     def _heard(self, group: int, host_ns: int) -> list[int]:
         return [sender for sender, ns in self._senders[group].items() if host_ns - ns <= SILENT_NS]
 
-    def _observed(self, feed: _Feed, held: Mapping[str, float], host_ns: int) -> Observed | None:
+    def _observed(self, number: int, held: Mapping[str, float], host_ns: int) -> Observed | None:
+        feed = self._feeds[number]
         try:
             values = feed.stream.make(held)
         except KeyError:
@@ -104,12 +107,13 @@ class CanLine:
         if values is None:
             self.counters["without_value"] += 1
             return None
-        self._valued_ns[feed] = host_ns
+        self._valued_ns[number] = host_ns
         return Observed(feed.sensor.name, feed.sensor.kind, stated(values, feed.sensor), host_ns)
 
-    def _why_idle(self, feed: _Feed, host_ns: int) -> str:
-        names = " nor ".join(map(group_name, sorted(self._groups[feed])))
-        if any(self._heard(group, host_ns) for group in self._groups[feed]):
+    def _why_idle(self, number: int, host_ns: int) -> str:
+        feed, groups = self._feeds[number], self._groups[number]
+        names = " nor ".join(map(group_name, sorted(groups)))
+        if any(self._heard(group, host_ns) for group in groups):
             return f"{names} comes, but what {feed.sensor.name} needs is marked as not available"
         return f"no {names} with a value comes: {feed.sensor.name} is not fed; is it the right bus?"
 

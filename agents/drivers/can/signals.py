@@ -1,9 +1,11 @@
-"""How a signal is read from a CAN frame, and which frames belong together. Pure.
+"""How a signal is read from a CAN frame, and put into one, and which frames belong together. Pure.
 
 What a sender marks as an error or as not available has no value.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 EXTENDED = 1 << 31  # added to the PGN of a 29-bit identifier, so that it never equals an 11-bit identifier
 NMEA_2000 = 0x1F000  # its parameter groups begin here
@@ -39,7 +41,12 @@ class Signal:
         """The value of a raw one; None where that means an error, or not available."""
         return None if raw > self._highest else self.scale * raw + self.offset
 
-    @property
+    def raw(self, value: float) -> int:
+        """The raw value that is nearest to a value, of those that are one."""
+        lowest = -(1 << self.bits - 1) if self.is_signed else 0
+        return min(max(round((value - self.offset) / self.scale), lowest), self._highest)
+
+    @cached_property
     def _highest(self) -> int:
         """The highest raw value that is a value: J1939 keeps first bytes from 0xFB on, NMEA 2000 the last three."""
         most = (1 << self.bits - self.is_signed) - 1
@@ -49,6 +56,15 @@ class Signal:
             return most - min(most - 1, 2)
         is_nmea = self.group - EXTENDED >= NMEA_2000
         return most - 3 if is_nmea or self.is_signed else (0xFB << self.bits - 8) - 1
+
+
+def frame_of(values: Iterable[tuple[Signal, float]], size: int = 8) -> bytes:
+    """The frame of so many bytes that has these values, and nothing else available."""
+    bits = (1 << 8 * size) - 1
+    for signal, value in values:
+        mask = (1 << signal.bits) - 1
+        bits = bits & ~(mask << signal.start) | (signal.raw(value) & mask) << signal.start
+    return bits.to_bytes(size, "little")
 
 
 def group_of(identifier: int, *, is_extended: bool) -> int:

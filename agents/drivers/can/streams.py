@@ -49,6 +49,7 @@ def _place(held: Held) -> Values:
 STREAMS = {
     "engine": CanStream("engine", ("engine_torque",), lambda h: (h["engine_torque"], h["engine_speed"])),
     "losses": CanStream("engine_losses", ("engine_friction",), _losses),
+    "fuel": CanStream("fuel_rate", ("fuel_rate",), lambda h: (h["fuel_rate"],)),
     "gearbox": CanStream("driveline", ("driveline_engaged", "converter_locked", "gear_shifting"), _driveline),
     "clutch": CanStream("driveline", ("clutch_switch",), lambda h: (1.0 - h["clutch_switch"], 1.0, 0.0)),
     "speed": CanStream("odometry", ("vehicle_speed",), lambda h: _gone(h, h["vehicle_speed"])),
