@@ -31,7 +31,7 @@ from agents.positioning import Accepted, PipelineConfig, Positioning, in_name_or
 from agents.sampling import NOTHING, Odometer, Sampler, Samples, joined
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
-from protocol.machine.readings import Reading
+from protocol.machine.readings import FuelRate, Reading
 from protocol.rotations import wrap_angle
 from protocol.site.site_config import SiteConfig
 
@@ -168,6 +168,8 @@ class Pipeline:
             dead_reckoning.mass_kg = mass_kg
         for reading, sensor in readings:
             self._estimator.update(reading, sensor, dead_reckoning, known_c_rr, newest)
+            if isinstance(reading, FuelRate):
+                self._sampler.fuel.add(reading, dead_reckoning.motion(reading.stamp_ns).speed_mps)
         distance_m = self._odometer.update(stamp_ns, dead_reckoning.wheels_ns, dead_reckoning.distance_m, speed_mps)
         self._sampler.mark(stamp_ns, distance_m)
         made += self._due_samples()

@@ -17,8 +17,10 @@ import numpy as np
 from agents.estimation.ground import GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
 from protocol.arrays import Table
+from protocol.machine.readings import FuelRate
 from protocol.machine.samples import SAMPLE_DTYPE
 from protocol.rotations import wrap_angle
+from protocol.units import HOUR_NS
 
 NOTHING = np.empty(0, SAMPLE_DTYPE)
 EVERY_M = 0.5  # driven from one sample to the next: a cell of the map at its usual size
@@ -33,10 +35,36 @@ _stamp = attrgetter("stamp_ns")
 
 @dataclass(frozen=True)
 class Mark:
-    """A place to sample: where the machine was at stamp_ns, after distance_m driven since the mark before."""
+    """A place to sample: where the machine was at stamp_ns, after distance_m and fuel_l since the mark before."""
 
     stamp_ns: int
     distance_m: float
+    fuel_l: float = math.nan
+
+
+class FuelMeter:
+    """Litres that an engine burns while its machine moves: rate times time, by the newest reading."""
+
+    def __init__(self) -> None:
+        self._newest: FuelRate | None = None
+        self._litres = 0.0
+
+    def add(self, reading: FuelRate, speed_mps: float) -> None:
+        """Take in a reading: the rate before it held until now, unless it is too old or the machine stands."""
+        before, self._newest = self._newest, reading
+        if before is None:
+            return
+        span_ns = reading.stamp_ns - before.stamp_ns
+        if not 0 < span_ns <= SILENT_NS:
+            self._litres = math.nan  # of this stretch; the next one is known again
+        elif abs(speed_mps) > MIN_SPEED_MPS:
+            self._litres += before.litres_ph * span_ns / HOUR_NS
+
+    def take(self, stamp_ns: int) -> float:
+        """Litres since it was asked last; NaN where no reading says so."""
+        is_fresh = self._newest and abs(stamp_ns - self._newest.stamp_ns) <= SILENT_NS
+        litres, self._litres = self._litres if is_fresh else math.nan, 0.0
+        return litres
 
 
 @dataclass(frozen=True)
@@ -112,7 +140,8 @@ class Odometer:
 class Sampler:
     """Makes samples; counts by reason what is `withheld` and what is sampled `without_resistance`.
 
-    poses: where the machine was, of a heading that is proven. load_centre_m: how far ahead of the pose a sample lies.
+    poses: where the machine was, of a heading that is proven. fuel: what it burns. load_centre_m: how far ahead of the
+    pose a sample lies.
     """
 
     def __init__(self, load_centre_m: float) -> None:
@@ -120,6 +149,7 @@ class Sampler:
         self.without_resistance: Counter[str] = Counter()
         self.poses = PoseHistory()
         self.is_clear: Callable[[int], bool] = lambda _: True  # whether the place of a stamp is
+        self.fuel = FuelMeter()
         self._load_centre_m = load_centre_m
         self._marked_m = 0.0
         self._marks: deque[Mark] = deque()  # wait for the estimator
@@ -146,7 +176,7 @@ class Sampler:
         since_m = distance_m - self._marked_m
         if since_m >= EVERY_M:
             self._marked_m = distance_m
-            self._marks.append(Mark(stamp_ns, min(since_m, 2 * EVERY_M)))
+            self._marks.append(Mark(stamp_ns, min(since_m, 2 * EVERY_M), self.fuel.take(stamp_ns)))
 
     def due_samples(self, now_ns: int, estimate_at: Callable[[int], GroundEstimate], *, waits: bool = True) -> Table:
         """Samples (n,) of all marks whose ground and place are known; waits: only of those that are LAG_S old."""
@@ -195,7 +225,7 @@ class Sampler:
         x, y = pose.x_m + c * self._load_centre_m, pose.y_m + s * self._load_centre_m
         grade = (c * e.slope_x - s * e.slope_y, s * e.slope_x + c * e.slope_y, e.slope_var)
         at = (pose.stamp_ns, x, y, xx, xy, yy, pose.heading_rad, pose.speed_mps, mark.distance_m)
-        return (*at, e.c_rr, e.c_rr_var, *grade, e.zero, e.scale, e.mass_kg, pose.aid_share)
+        return (*at, e.c_rr, e.c_rr_var, *grade, e.zero, e.scale, e.mass_kg, pose.aid_share, mark.fuel_l)
 
 
 def joined(made: Sequence[Samples]) -> Samples:

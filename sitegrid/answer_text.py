@@ -37,7 +37,7 @@ from protocol.queries.requests import (
     PointsQuery,
     RegionQuery,
 )
-from protocol.queries.roads import RoadSegment, Segments, SegmentsQuery, Worklist, WorklistQuery
+from protocol.queries.roads import Fuel, RoadSegment, Segments, SegmentsQuery, Worklist, WorklistQuery
 from protocol.queries.route_requests import LineQuery, RouteQuery
 from protocol.queries.routing import RouteAnswer
 from sitegrid.client import Client
@@ -151,14 +151,22 @@ def _worklist(_: Client, __: WorklistQuery, answer: Worklist) -> Answer:
         for row in answer.rows
     )
     lines = [f"{total}, traffic of {answer.hours:.2f} h", *_table(head, rows)]
+    lines += [f"{row.segment.id}: {fuel_text(row.segment.fuel)}" for row in answer.rows if row.segment.fuel]
     if any(row.segment.guessed for row in answer.rows):
         lines.append("no machine stated its mass on some of them: what is lost there is a guess")
     lines += [
         f"{utc_text(one.first_ns)} {one.id}: resistance {_value(one.before)} -> {_value(one.after)}, "
-        f"saves {one.saved_kwh_ph:.2f} kWh/h"
+        f"saves {one.saved_kwh_ph:.2f} kWh/h{f'; {fuel_text(one.fuel)}' if one.fuel else ''}"
         for one in answer.changes
     ]
     return answer, lines
+
+
+def fuel_text(fuel: Fuel) -> str:
+    """Litres predicted and burned, with their doubt and the share of the driving that they are of."""
+    (predicted, low, high), (burned, least, most) = fuel.predicted_ph, fuel.burned_ph
+    pairs = f"predicted {predicted:.2f} ({low:.2f} to {high:.2f}), burned {burned:.2f} ({least:.2f} to {most:.2f}) l/h"
+    return f"{pairs}, of {100 * fuel.share:.0f} % of the driving"
 
 
 def _place(segment: RoadSegment) -> list[str]:

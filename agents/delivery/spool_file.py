@@ -15,7 +15,7 @@ from pathlib import Path
 
 from protocol.files import make_private
 
-SCHEMA = 8
+SCHEMA = 9
 LOCK_WAIT_S = 1.0  # for a predecessor that is still closing the file
 _TABLES = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",

@@ -64,6 +64,7 @@ class Agent:
     """One machine of a drive, by its place among the names.
 
     calibrates: by its own work; closed_tours: by these as well; first_s: of the recording; bad: see `spoiled`.
+    blind: it is not told that hydraulics load its engine.
     configuration: its filter and sensors, None for those that it has.
     """
 
@@ -72,6 +73,7 @@ class Agent:
     closed_tours: bool = False
     first_s: float = 0.0
     bad: bool = False
+    blind: bool = False
     configuration: Configuration | None = None
 
     @property
@@ -83,6 +85,7 @@ class Agent:
             + "-plain" * (not self.calibrates)
             + "-tours" * self.closed_tours
             + "-bad" * self.bad
+            + "-blind" * self.blind
             + first
             + (f"-{self.configuration.name}" if self.configuration else "")
         )
@@ -134,6 +137,8 @@ def _samples(task: Task[Agent], cache: Path) -> AgentSamples:
         readings = tuple(reading for reading in readings if reading.stamp_ns <= end_ns)
     if task.variant.bad:
         machine, readings = spoiled(machine, readings)
+    if task.variant.blind and machine.powertrain:
+        machine = replace(machine, powertrain=replace(machine.powertrain, idle_pressure_pa=0.0))
     estimation = EstimationConfig(calibrate=task.variant.calibrates, closed_tours=task.variant.closed_tours)
     options = PipelineConfig(estimation=estimation)
     if chosen := task.variant.configuration:

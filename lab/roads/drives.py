@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from lab.calibration.drives import FleetDrive
+from lab.calibration.drives import Agent, FleetDrive
 from lab.campaign.recordings import Setup, toml_of
 from protocol.arrays import Floats
 from sim.scenario.file import load_scenario
@@ -37,7 +37,11 @@ class RoadDrive(FleetDrive):
         table = {**asdict(ground), "zone": [asdict(zone) for zone in (*ground.zone, *patches)]}
         changes = [{"at_s": self.seconds / 2, **asdict(zone)} for zone in repaired]
         top = {"base": self.setup.scenario, "ground": table} | ({"change": changes} if changes else {})
-        return "\n".join(f"{name} = {_inline(value)}" for name, value in top.items()) + "\n"
+        return "\n".join(f"{name} = {inline(value)}" for name, value in top.items()) + "\n"
+
+    def agent(self, index: int) -> Agent:
+        """The agent of a machine."""
+        return Agent(index, closed_tours=True)
 
     def _patches(self) -> tuple[list[ZoneConfig], list[ZoneConfig]]:
         """Patches along all routes, and those that are repaired, as they are then."""
@@ -81,11 +85,11 @@ def _outline(line: Floats) -> tuple[tuple[float, float], ...]:
     return tuple((x, y) for x, y in corners.tolist())
 
 
-def _inline(value: object) -> str:
+def inline(value: object) -> str:
     """A plain value as inline TOML."""
     if isinstance(value, dict):
-        inner = ", ".join(f"{name} = {_inline(part)}" for name, part in value.items() if part is not None)
+        inner = ", ".join(f"{name} = {inline(part)}" for name, part in value.items() if part is not None)
         return f"{{ {inner} }}"
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return f"[{', '.join(map(_inline, value))}]"
+        return f"[{', '.join(map(inline, value))}]"
     return toml_of({"value": value}).removeprefix("value = ")

@@ -90,7 +90,7 @@ def run(runner: Runner, seeds: Sequence[int], seconds: float, cases: Sequence[Ro
 
 def agent_tasks(drive: RoadDrive) -> list[Task[Agent]]:
     """All machines of a recording, replayed."""
-    return [replay_task(Agent(index, closed_tours=True), drive) for index in range(drive.machines)]
+    return [replay_task(drive.agent(index), drive) for index in range(drive.machines)]
 
 
 def _recorded(drive: RoadDrive, cache: Path) -> Recorded:

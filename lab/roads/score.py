@@ -129,10 +129,10 @@ class Recorded:
     end_ns: int
 
     @classmethod
-    def of_drive(cls, drive: FleetDrive, rows: Rows, scene: Scene, cache: Path) -> Recorded:
-        """What was recorded, with the corrections that the server's solver makes of it."""
-        solved, config = calibrated(rows), FoldConfig()
-        right = {name: corrected(table, of_machine(solved, name)) for name, table in rows.items()}
+    def of_drive(cls, drive: FleetDrive, rows: Rows, scene: Scene, cache: Path, *, calibrates: bool = True) -> Recorded:
+        """What was recorded, with the corrections that the server's solver makes of it, or without."""
+        solved, config = calibrated(rows) if calibrates else None, FoldConfig()
+        right = {name: corrected(table, of_machine(solved, name)) if solved else table for name, table in rows.items()}
         right = {name: table[is_foldable(table, config)] for name, table in right.items()}
         tracks = true_tracks(drive, scene, cache)
         stamps = np.concatenate([track.stamp_ns for track in tracks.values()])
@@ -229,7 +229,7 @@ def traffic_figures(recorded: Recorded, whole: SegmentTable) -> dict[str, float]
     ledger = ledgers.ledger(tally.table(), tally.slot_ns)
     known, true = losses(ledger, whole, TARGET), true_traffic(recorded.tracks.values(), ledgers, TARGET)
     metres = ledger.totals()["metres"] / PER_M
-    judged: Bools = true.metres.sum(axis=1) > LEAST_PASSES * whole.length_m
+    judged = judged_segments(true, whole)
     ratio = metres.sum(axis=1)[judged] / true.metres.sum(axis=1)[judged]
     share, right = (each[judged, 0] / each[judged].sum(axis=1) for each in (metres, true.metres))
     measured = judged & np.isfinite(known.c_rr) & np.isfinite(true.c_rr)
@@ -245,6 +245,11 @@ def traffic_figures(recorded: Recorded, whole: SegmentTable) -> dict[str, float]
         "inside_pct": 100.0 * float((np.abs(off) <= NINETY * known.c_std[measured]).mean()),
         **_list_figures(known, true, judged),
     }
+
+
+def judged_segments(true: TrueTraffic, whole: SegmentTable) -> Bools:
+    """Segments (k,) that were driven often enough."""
+    return np.asarray(true.metres.sum(axis=1) > LEAST_PASSES * whole.length_m, np.bool_)
 
 
 def _list_figures(known: Losses, true: TrueTraffic, judged: Bools) -> dict[str, float]:

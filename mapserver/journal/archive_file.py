@@ -31,7 +31,7 @@ from protocol.site.site_config import MAX_EXTENT_M, SiteConfig
 from protocol.site.site_config import NAME as MACHINE_NAME
 from protocol.wire.codec import MAX_SEQ
 
-SCHEMA = 5
+SCHEMA = 6
 KEY = b"sitegrid"  # of our own metadata
 NAME = re.compile(r"\d{4}-\d\d-\d\dT\d\d_(\d+)-(\d+)\.parquet")
 _IDENTITY = ["machine", "row", "spool_id", "seq", "received_ns"]  # columns beside those of samples

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from mapserver.error_model import NINETY
 from mapserver.query.road_maps import RoadMap
+from mapserver.roads.fuel import litres_of
 from mapserver.roads.ledger import Ledger
 from mapserver.roads.loss import Losses, losses
 from mapserver.roads.repairs import Repair
@@ -112,7 +114,7 @@ class _Records:
 
     def __init__(self, roads: RoadMap, traffic: Ledger, lost: Losses, hours: float) -> None:
         self._segments, self.lost, self.hours = roads.segments, lost, max(hours, 1e-9)
-        self._trends = trends(traffic)
+        self._trends, self._fuel = trends(traffic), litres_of(traffic, roads.segments, lost)
         machines = traffic.totals()["machines"]
         self._machines: Ints = np.bitwise_count(machines[:, 0] | machines[:, 1]).astype(np.int64)
 
@@ -131,7 +133,18 @@ class _Records:
             tonnes_ph=tuple((passes * lost.kg[i] / 1000).tolist()),
             guessed=bool(lost.guessed[i]),
             machines=int(self._machines[i]),
+            fuel=self.fuel(i),
         )
+
+    def fuel(self, i: int) -> answers.Fuel | None:
+        """What is burned on a segment, and what is predicted."""
+        fuel = self._fuel
+        if fuel is None or not fuel.share[i]:
+            return None
+        burned = fuel.burned[i] + np.array([0.0, -NINETY, NINETY]) * fuel.burned_std[i]
+        predicted = np.array([fuel.predicted[i], fuel.low[i], fuel.high[i]])
+        pairs = (tuple((litres / self.hours).tolist()) for litres in (burned, predicted))
+        return answers.Fuel(*pairs, share=float(fuel.share[i]))
 
     def line(self, i: int) -> answers.Corners:
         """Some points of a segment's line."""
@@ -180,7 +193,8 @@ class _Rows:
         """A change of the ground."""
         times, levels = (change.first_ns, change.seen_ns), (change.before, change.after)
         line = self._records.line(change.segment)
-        return answers.RoadChange(self._ids[change.segment], line, *times, *levels, self._saved_kwh_ph[change])
+        saved, fuel = self._saved_kwh_ph[change], self._records.fuel(change.segment)
+        return answers.RoadChange(self._ids[change.segment], line, *times, *levels, saved, fuel)
 
 
 def _known(value: float) -> float | None:

@@ -164,7 +164,7 @@ def _sum_up(
                 row, last[code] = out[used], used
                 row.segment, row.slot, row.direction = code // DIRECTIONS, now, code % DIRECTIONS
                 row.metres = row.weighed = row.measured = row.graded = row.kg = row.c = row.c2 = 0
-                row.east = row.north = 0
+                row.east = row.north = row.fuelled = row.fuel = row.ms = row.v2 = 0
                 row.machines = np.uint64(0)
                 used += 1
         for i in range(begin, end):
@@ -191,6 +191,10 @@ def _add(row: Any, total: Any, of_slice: Any) -> None:
     total.c2 += row.c2
     total.east += row.east
     total.north += row.north
+    total.fuelled += row.fuelled
+    total.fuel += row.fuel
+    total.ms += row.ms
+    total.v2 += row.v2
     total.machines |= row.machines
     of_slice[0] += row.metres
     of_slice[1] += row.weighed
@@ -201,6 +205,10 @@ def _add(row: Any, total: Any, of_slice: Any) -> None:
     of_slice[6] += row.c2
     of_slice[7] += row.east
     of_slice[8] += row.north
+    of_slice[9] += row.fuelled
+    of_slice[10] += row.fuel
+    of_slice[11] += row.ms
+    of_slice[12] += row.v2
 
 
 def resistance(ledger: Ledger) -> Floats:

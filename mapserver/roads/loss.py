@@ -48,11 +48,11 @@ def losses(ledger: Ledger, segments: SegmentTable, target: float, level: Floats 
     owner = np.repeat(np.arange(len(segments.ids)), np.diff(ledger.ends))
     metres, weighed, kg_m = (ledger.of_slices(name).astype(np.float64) / PER_M for name in ("metres", "weighed", "kg"))
     known_kg = kg_m.sum() / weighed.sum() if weighed.any() else GUESSED_KG
-    segment_kg = _by_segment(kg_m, ledger.ends) / np.maximum(_by_segment(weighed, ledger.ends), 1e-9)
-    guessed = _by_segment(weighed, ledger.ends).sum(axis=1) == 0
-    segment_kg = np.where(_by_segment(weighed, ledger.ends) > 0, segment_kg, known_kg)
+    segment_kg = by_segment(kg_m, ledger.ends) / np.maximum(by_segment(weighed, ledger.ends), 1e-9)
+    guessed = by_segment(weighed, ledger.ends).sum(axis=1) == 0
+    segment_kg = np.where(by_segment(weighed, ledger.ends) > 0, segment_kg, known_kg)
     kg = np.where(weighed > 0, kg_m / np.maximum(weighed, 1e-9), segment_kg[owner])
-    c, slope = resistance(ledger), _slope(ledger, segments, owner)
+    c, slope = resistance(ledger), slope_of(ledger, segments, owner)
     if level is not None:
         share = level / mean(c, ledger.ends)
         c = c * np.where(np.isfinite(share) & (share > 0), share, 1.0)[owner]
@@ -63,7 +63,7 @@ def losses(ledger: Ledger, segments: SegmentTable, target: float, level: Floats 
     def work(shift: Floats) -> Floats:
         ground = np.maximum((c + shift[owner])[:, None], 0.0)
         excess = np.maximum(ground + slopes, 0.0) - np.maximum(target + slopes, 0.0)
-        return np.asarray(_by_segment((np.maximum(excess, 0.0) * load).sum(axis=1), ledger.ends), np.float64)
+        return np.asarray(by_segment((np.maximum(excess, 0.0) * load).sum(axis=1), ledger.ends), np.float64)
 
     none = np.zeros(len(segments.ids))
     measured = ledger.of_slices("measured").sum(axis=1) > 0
@@ -77,18 +77,18 @@ def losses(ledger: Ledger, segments: SegmentTable, target: float, level: Floats 
         kg=segment_kg,
         guessed=guessed,
         unmeasured=mean(~measured, ledger.ends),
-        passes=_by_segment(metres, ledger.ends) / np.maximum(segments.length_m, 1e-9)[:, None],
+        passes=by_segment(metres, ledger.ends) / np.maximum(segments.length_m, 1e-9)[:, None],
     )
 
 
-def _by_segment(values: Floats, ends: Ints) -> Floats:
+def by_segment(values: Floats, ends: Ints) -> Floats:
     """Sum the slices of each segment, (k, ...)."""
     if not len(values):
         return np.zeros((0, *values.shape[1:]))
     return np.asarray(np.add.reduceat(values, ends[:-1], axis=0), np.float64)
 
 
-def _slope(ledger: Ledger, segments: SegmentTable, owner: Ints) -> Floats:
+def slope_of(ledger: Ledger, segments: SegmentTable, owner: Ints) -> Floats:
     """Rise over run of slices (s,) from beginning to end, 0 where it is not known."""
     graded = ledger.of_slices("graded").sum(axis=1)
     east, north = (ledger.of_slices(name).sum(axis=1) / np.maximum(graded, 1) / PER_C for name in ("east", "north"))
@@ -108,8 +108,8 @@ def _std(ledger: Ledger) -> Floats:
         squares_of(ledger.of_slices("c2").sum(axis=1)) / np.maximum(measured / PER_M, 1e-9) - mean_c**2, 0
     )
     count = np.maximum(np.add.reduceat(known, ledger.ends[:-1]), 1e-9) if len(known) else np.zeros(0)
-    within = _by_segment(np.where(known, variance, 0.0), ledger.ends) / count
-    driven_m = _by_segment(measured / PER_M, ledger.ends)
+    within = by_segment(np.where(known, variance, 0.0), ledger.ends) / count
+    driven_m = by_segment(measured / PER_M, ledger.ends)
     noise = within / np.maximum(driven_m / PASS_ALIKE_M, 1.0)
     c_rr = mean(resistance(ledger), ledger.ends)
     gaps = 1 - count / np.diff(ledger.ends) if len(known) else count

@@ -22,15 +22,19 @@ HOURS = 120  # with driving that are remembered; what is older is read from the 
 SECTORS = 16  # of the direction of travel, the first one centred on east
 PER_M = 1000  # metres, and places in the cell
 PER_C = 100_000  # c_rr and gradient
+SLOWEST_MPS = 0.1  # a slower machine is taken to drive so fast: it would take for ever
 _C2_SHIFT = 100  # squares are in units of this over PER_C squared, so that sums of any hour fit
 _AXIS_BITS, _SECTOR_BITS = 17, 4  # sites reach 100 km from their origin
 _HALF = 1 << (_AXIS_BITS - 1)  # with 25 bits left for slots, of a minute or more
 _SLOT_SHIFT = 2 * _AXIS_BITS + _SECTOR_BITS
 _PENDING_ROWS = 16_384  # merged at once: merging costs a sort of everything
 
-# metres driven; of these weighed, where the mass is known, measured, where c_rr is, and graded. Sums over metres: kg,
-# c_rr and its square, gradient east and north, place from the cell's corner.
-SUMS = ("metres", "weighed", "measured", "graded", "kg", "c", "c2", "east", "north", "x", "y")
+# metres driven; of these weighed, where the mass is known, measured, where c_rr is, graded, and fuelled, where the
+# burned litres are. Sums over metres: kg, c_rr and its square, gradient east and north, place from the corner. Of
+# what is fuelled: litres, milliseconds, and the square of the speed over metres.
+SUMS = ("metres", "weighed", "measured", "graded", "kg", "c", "c2", "east", "north")
+SUMS += ("fuelled", "fuel", "ms", "v2", "x", "y")
+PER_L, PER_V2 = 1_000_000, 100  # litres; squares of speeds
 TALLY = np.dtype([("key", "<i8"), *((name, "<i8") for name in SUMS), ("machines", "<u8")])
 _SECTOR_RAD = 2 * np.pi / SECTORS
 
@@ -153,5 +157,11 @@ def _measure(rows: Any, names: Any, cell_m: float, slot_ns: int, out: Any) -> in
             sums.graded = metres
             sums.east = metres * np.int64(np.rint(np.float64(row.grade_e) * PER_C))
             sums.north = metres * np.int64(np.rint(np.float64(row.grade_n) * PER_C))
+        if not np.isnan(row.fuel_l):
+            speed = abs(np.float64(row.speed_mps))
+            sums.fuelled = metres
+            sums.fuel = np.int64(np.rint(np.float64(row.fuel_l) * PER_L))
+            sums.ms = np.int64(metres / max(speed, SLOWEST_MPS))
+            sums.v2 = metres * np.int64(np.rint(speed * speed * PER_V2))
         used += 1
     return used

@@ -30,6 +30,7 @@ SAMPLE_DTYPE = np.dtype(
         ("applied_scale", "<f4"),
         ("mass_kg", "<f4"),
         ("aid_share", "<f4"),
+        ("fuel_l", "<f4"),
     ]
 )
 COLUMNS: tuple[str, ...] = SAMPLE_DTYPE.names or ()
@@ -41,9 +42,10 @@ GRADE = ("grade_e", "grade_n", "grade_var")  # may all be NaN
 APPLIED = ("applied_zero", "applied_scale")  # what the machine's own calibration has taken off its balance already
 MASS = "mass_kg"  # of machine and load; may be NaN
 AIDED = "aid_share"  # how much of the place came from lanes of the map [-]
-# Columns that a batch may lack, and what stands for them: nothing was taken off; the mass is not known; no lanes.
-OPTIONAL = {**dict.fromkeys(APPLIED, 0.0), MASS: np.nan, AIDED: 0.0}
-NAN_ALLOWED = (RESISTANCE, GRADE, (MASS,))  # groups of columns: NaN together, or not at all
+FUEL = "fuel_l"  # litres of diesel burned while it moved, since the sample before; may be NaN
+# Columns that a batch may lack, and what stands for them: nothing was taken off; mass and fuel are not known; no lanes.
+OPTIONAL = {**dict.fromkeys(APPLIED, 0.0), MASS: np.nan, AIDED: 0.0, FUEL: np.nan}
+NAN_ALLOWED = (RESISTANCE, GRADE, (MASS,), (FUEL,))  # groups of columns: NaN together, or not at all
 
 # Plausible range of each column.
 LIMITS: dict[str, tuple[float, float]] = {
@@ -65,6 +67,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "applied_scale": (-0.5, 0.5),
     "mass_kg": (1.0, 1e6),
     "aid_share": (0.0, 1.0),
+    "fuel_l": (0.0, 100.0),
 }
 # What machines differ by before any calibration, by data sheets, as machines and map server assume: standard deviations
 # of an accelerometer's zero over gravity (0.044 m/s2) and of the scale of drive force over weight; random walk of the
@@ -73,9 +76,9 @@ ZERO_STD, SCALE_STD, ZERO_WALK = 0.0045, 0.045, 8e-5
 
 
 def empty(n: int = 0) -> Table:
-    """Return `n` samples of zeros, of no known mass."""
+    """Return `n` samples of zeros, of no known mass and fuel."""
     rows = np.zeros(n, SAMPLE_DTYPE)
-    rows[MASS] = np.nan
+    rows[MASS] = rows[FUEL] = np.nan
     return rows
 
 

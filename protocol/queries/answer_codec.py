@@ -284,7 +284,7 @@ def _value(hint: Any, value: Any, field: str) -> Any:
 
 def _fields(cls: Any, table: dict[str, Any], field: str) -> Any:
     hints = _hints(cls)
-    names = [item.name for item in fields(cls)]
+    names = [item.name for item in fields(cls) if item.name in table or item.default is not None]
     if missing := [name for name in names if name not in table]:
         raise MessageError(Refusal.MISSING_FIELD, "missing", field=f"{field}.{missing[0]}")
     values = {name: _value(hints[name], table[name], f"{field}.{name}") for name in names}

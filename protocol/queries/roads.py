@@ -21,12 +21,25 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
+class Fuel:
+    """Litres an hour: value, low and high of 90 %. predicted: by resistance, grade, mass and speed of the same drives.
+
+    share: of the driving, by metres, that states what it burns; both are of this part.
+    """
+
+    burned_ph: tuple[float, ...]
+    predicted_ph: tuple[float, ...]
+    share: float
+
+
+@dataclass(frozen=True)
 class RoadSegment:
     """About 25 m of a road. Pairs are by direction: along the line, and back.
 
     id: a place, the same as long as the road is. line: x, y [m]. resistance with its standard deviation, grade (rise
     over run along the line), trend (change of resistance a day): None where not known. unmeasured: share of it without
-    a resistance. passes_ph, tonnes_ph: an hour; guessed: no machine stated a mass. machines: about how many.
+    a resistance. passes_ph, tonnes_ph: an hour; guessed: no machine stated a mass. machines: about how many. fuel: None
+    where no machine says what it burns.
     """
 
     id: str
@@ -41,6 +54,7 @@ class RoadSegment:
     tonnes_ph: tuple[float, ...]
     guessed: bool
     machines: int
+    fuel: Fuel | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +98,7 @@ class RoadChange:
 
     id, line: as of its segment. first_ns: of the first pass that saw it, to the minute; seen_ns: when that was sure.
     before, after: resistance. saved_kwh_ph: less lost an hour at the target, with the same traffic; below 0 where it
-    is worse.
+    is worse. fuel: as of its segment.
     """
 
     id: str
@@ -94,6 +108,7 @@ class RoadChange:
     before: float
     after: float
     saved_kwh_ph: float
+    fuel: Fuel | None = None
 
 
 @dataclass(frozen=True)
@@ -114,9 +129,14 @@ class Worklist:
     changes: tuple[RoadChange, ...]
 
 
+def _said(items: list[tuple[str, object]]) -> dict[str, object]:
+    """Fields of a record, fuel only where it is known."""
+    return {name: value for name, value in items if name != "fuel" or value is not None}
+
+
 def encode_segments(answer: Segments) -> bytes:
     """Answer of `segments`."""
-    return pack({"segments": asdict(answer)})
+    return pack({"segments": asdict(answer, dict_factory=_said)})
 
 
 def decode_segments(data: bytes) -> Segments:
@@ -126,7 +146,7 @@ def decode_segments(data: bytes) -> Segments:
 
 def encode_worklist(answer: Worklist) -> bytes:
     """Answer of `worklist`."""
-    return pack({"worklist": asdict(answer)})
+    return pack({"worklist": asdict(answer, dict_factory=_said)})
 
 
 def decode_worklist(data: bytes) -> Worklist:

@@ -8,7 +8,7 @@ import numpy as np
 
 from protocol.errors import MessageError, Refusal, one_line
 from protocol.machine.readings import KINDS, MAX_STAMP_NS, Reading, columns, parse_reading
-from protocol.machine.samples import AIDED, COLUMNS, LIMITS, OPTIONAL, SAMPLE_DTYPE, check_samples, empty
+from protocol.machine.samples import AIDED, COLUMNS, FUEL, LIMITS, OPTIONAL, SAMPLE_DTYPE, check_samples, empty
 from protocol.site.site_config import MAX_EXTENT_M
 from protocol.wire.fields import (
     MAX_INT,
@@ -50,8 +50,9 @@ _STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value
 
 
 def encode_batch(batch: SampleBatch) -> bytes:
-    """Columns of little-endian binary, one per name of SAMPLE_DTYPE; none of AIDED where no lanes were used."""
-    names = COLUMNS if batch.rows[AIDED].any() else [name for name in COLUMNS if name != AIDED]
+    """Columns of little-endian binary, one per name of SAMPLE_DTYPE; of AIDED and FUEL where they say anything."""
+    says = {AIDED: batch.rows[AIDED].any(), FUEL: np.isfinite(batch.rows[FUEL]).any()}
+    names = [name for name in COLUMNS if says.get(name, True)]
     table: dict[str, Any] = {
         "machine": batch.machine,
         "spool_id": batch.spool_id,

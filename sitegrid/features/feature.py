@@ -50,6 +50,8 @@ class Collection:
 
 
 def _part(item: Any, name: str) -> Any:
+    if item is None:
+        return None
     if isinstance(item, Mapping):
         return item[name]
     return item[int(name)] if name.isdigit() else getattr(item, name)

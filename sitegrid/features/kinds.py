@@ -25,6 +25,13 @@ def _floats(*names: str) -> dict[str, tuple[type, str]]:
     return {name: (float, name) for name in names}
 
 
+# Of `Fuel`, where it is known.
+FUEL = {
+    "burned_litres_ph": (float, "fuel.burned_ph.0"),
+    "predicted_litres_ph": (float, "fuel.predicted_ph.0"),
+    "burned_share": (float, "fuel.share"),
+}
+
 # Of `GroundChange`: rectangles around changes of the ground.
 CHANGE = FeatureKind(
     "Polygon",
@@ -68,6 +75,7 @@ SEGMENT = FeatureKind(
             for name in ("passes_ph", "tonnes_ph")
             for index, end in enumerate(("", "_back"))
         },
+        **FUEL,
     },
 )
 # Of `WorklistRow`; of what is lost its value, `_low` and `_high` (90 %).
@@ -98,6 +106,7 @@ REPAIR = FeatureKind(
         "resistance_before": (float, "before"),
         "resistance_after": (float, "after"),
         "saved_kwh_ph": (float, "saved_kwh_ph"),
+        **FUEL,
     },
 )
 

@@ -31,6 +31,7 @@ from protocol.queries.map_tiles import MapTile, TilesAnswer, decode_tiles, encod
 from protocol.queries.origin import Origin, decode_origin, encode_origin
 from protocol.queries.reasons import CellReasons, Votes, decode_why, encode_why
 from protocol.queries.roads import (
+    Fuel,
     RoadChange,
     RoadSegment,
     Segments,
@@ -73,10 +74,10 @@ def rows() -> np.ndarray:
     calibration = (0.00390625, -0.0625)
     return np.array(
         [
-            (*whole, *calibration, 17_500.0, 0.0),
-            (*level, *calibration, 44_000.5, 0.0),
-            (*ahead, 0.0, 0.0, NAN, 0.0),
-            (*place, *calibration, 17_500.0, 0.0),
+            (*whole, *calibration, 17_500.0, 0.0, NAN),
+            (*level, *calibration, 44_000.5, 0.0, NAN),
+            (*ahead, 0.0, 0.0, NAN, 0.0, NAN),
+            (*place, *calibration, 17_500.0, 0.0, NAN),
         ],
         SAMPLE_DTYPE,
     )
@@ -86,6 +87,13 @@ def aided(rows: np.ndarray) -> np.ndarray:
     """Return the samples of a machine that found its place on lanes."""
     rows["aid_share"] = 0.0, 0.25, 0.5, 1.0
     return rows
+
+
+def fuelled() -> np.ndarray:
+    """Return the same samples of a machine that says what it burns, but once."""
+    out = rows()
+    out["fuel_l"] = 0.0078125, 0.0, NAN, 0.25
+    return out
 
 
 def readings() -> tuple[Any, ...]:
@@ -139,6 +147,7 @@ def decode_info_table(data: bytes) -> dict[str, Any]:
 BATCH = SampleBatch("loader-1", 0xFEDC_BA98_7654_3210, 41, rows(), "0123abcd")
 AIDED = replace(BATCH, rows=aided(rows()))
 LOST = SampleBatch("loader-1", 1, 101, rows(), "0123abcd", lost_before=60, store=STORE)
+FUELLED = SampleBatch("loader-1", 1, 1, fuelled(), "0123abcd")
 ASK = SampleBatch("loader-1", 7, 1, rows()[:0], "0123abcd")
 OFFER = CalibrationOffer("loader-1", T0, 0.00390625, -0.0625, 2.0**-22, 2.0**-16, 2.0**-20)
 POSE = Pose("loader-1", T0, 12.25, -40.5, 0.5, 2.75, 1.5, 0.25, 2.0)
@@ -260,6 +269,12 @@ WORKLIST = Worklist(
     ),
     (RoadChange("3_-2_e", STRETCH.line, T0, T0 + 60 * 10**9, 0.0625, 0.03125, 2.5),),
 )
+BURNT = Fuel((3.5, 3.25, 3.75), (3.0, 2.75, 3.25), 0.75)
+BURNED = replace(
+    WORKLIST,
+    rows=(replace(WORKLIST.rows[0], segment=replace(STRETCH, fuel=BURNT)),),
+    changes=(replace(WORKLIST.changes[0], fuel=BURNT),),
+)
 ROUTE = RouteAnswer(
     version=records.MapVersion(STORE, 17, 3),
     stamp_ns=T0 + 9,
@@ -273,6 +288,7 @@ GOLDEN: dict[str, Golden] = {
     "batch.bin": Golden(BATCH, codec.encode_batch, decode_batch),
     "batch_aided.bin": Golden(AIDED, codec.encode_batch, decode_batch),
     "batch_lost.bin": Golden(LOST, codec.encode_batch, decode_batch),
+    "batch_fuel.bin": Golden(FUELLED, codec.encode_batch, decode_batch),
     "batch_empty.bin": Golden(ASK, codec.encode_batch, decode_batch),
     "ack.bin": Golden(Ack(43, 17, 2, STORE), codec.encode_reply, codec.decode_reply),
     "ack_epoch.bin": Golden(Ack(43, 17, 2, STORE, epoch=7), codec.encode_reply, codec.decode_reply),
@@ -299,6 +315,7 @@ GOLDEN: dict[str, Golden] = {
     "route.bin": Golden(ROUTE, encode_answer, decode_answer),
     "segments.bin": Golden(ROADS, encode_segments, decode_segments),
     "worklist.bin": Golden(WORKLIST, encode_worklist, decode_worklist),
+    "worklist_fuel.bin": Golden(BURNED, encode_worklist, decode_worklist),
     "calibration.bin": Golden(CALIBRATION, encode_calibration, decode_calibration),
     "piece.bin": Golden(piece(), answers.encode_region, answers.decode_region),
     "history.bin": Golden(HISTORY, answers.encode_history, answers.decode_history),

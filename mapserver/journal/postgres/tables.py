@@ -13,7 +13,7 @@ from mapserver.journal.postgres.connection import SCHEMA as NAMESPACE
 from mapserver.journal.table_writer import new_meta
 
 MAKING = 0x517E62D2  # an advisory lock for as long as tables are made
-SCHEMA = 3
+SCHEMA = 4
 CHANNEL = "sitegrid_journal"  # of notifications, one per database
 # `head` has one line, which every commit changes: rows are numbered by it, so that they are dense and in the order of
 # their commits. Numbers of a sequence are not, and whoever asks for what follows the last one he has seen loses rows.

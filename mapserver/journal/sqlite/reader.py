@@ -18,7 +18,7 @@ from mapserver.journal.table_queries import BYTES_AT_ONCE, TableQueries, size_of
 from protocol.errors import StoreError
 from protocol.files import make_private
 
-SCHEMA = 7
+SCHEMA = 8
 TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc32 INTEGER NOT NULL) WITHOUT ROWID;
 CREATE TABLE journal (

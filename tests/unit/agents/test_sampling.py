@@ -7,8 +7,9 @@ import pytest
 
 from agents.estimation.ground import NOTHING_KNOWN, GroundEstimate
 from agents.localisation.filters.belief import PoseBelief
-from agents.sampling import EVERY_M, HISTORY_S, LAG_S, Odometer, PoseHistory, Sampler
+from agents.sampling import EVERY_M, HISTORY_S, LAG_S, FuelMeter, Odometer, PoseHistory, Sampler
 from protocol.arrays import Table
+from protocol.machine.readings import FuelRate
 from protocol.machine.samples import GRADE, RESISTANCE, check_samples
 
 S = 10**9
@@ -205,3 +206,22 @@ def test_history_forgets_but_never_what_it_has_to_keep() -> None:
         if i >= 10 * HISTORY_S:
             assert history.at(round((100 + i * 0.1 - HISTORY_S) * S) + 1)
     assert len(history._poses) <= 20 * HISTORY_S + 2
+
+
+def test_fuel_of_a_sample_is_what_was_burned_while_it_moved() -> None:
+    """36 l/h are a hundredth of a litre a second, but none while it stands; a pause leaves its stretch unknown."""
+    meter = FuelMeter()
+    assert math.isnan(meter.take(ns(0.0)))
+    for i in range(11):
+        meter.add(FuelRate("fuel", ns(0.1 * i), 36.0), 2.0)
+    assert meter.take(ns(1.05)) == pytest.approx(0.01)
+    for i in range(11, 21):
+        meter.add(FuelRate("fuel", ns(0.1 * i), 36.0), 0.0)
+    assert meter.take(ns(2.0)) == 0.0
+    meter.add(FuelRate("fuel", ns(4.0), 36.0), 2.0)
+    assert math.isnan(meter.take(ns(4.1)))
+    meter.add(FuelRate("fuel", ns(4.2), 36.0), 2.0)
+    assert meter.take(ns(4.3)) == pytest.approx(0.002)
+    assert math.isnan(meter.take(ns(9.0)))
+    meter.add(FuelRate("fuel", ns(1.0), 36.0), 2.0)  # a clock that is set back
+    assert math.isnan(meter.take(ns(1.1)))

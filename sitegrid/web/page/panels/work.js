@@ -60,8 +60,12 @@ const list = (rows) => element("section", { className: "part stretches" },
   element("ol", {}, rows.map((row, i) => element("li", {}, stretch(row, i + 1)))),
   rows.some((row, i) => i && row.rank === rows[i - 1].rank) ? note(TIES) : null);
 
+const burned = ({ predicted_ph: [predicted], burned_ph: [litres] }) =>
+  `predicted ${figure(predicted)}, burned ${figure(litres)} L/h`;
+
 function stretch(row, place) {
-  const { segment: { id, line, resistance, passes_ph, length_m, trend, guessed } } = row, [kwh, low, high] = row.kwh_ph;
+  const { segment, segment: { id, line, resistance, passes_ph, length_m, trend, guessed } } = row;
+  const [kwh, low, high] = row.kwh_ph;
   const costs = `${figure(row.litres_ph[0])} L, ${Math.round(row.seconds_ph[0])} s`;
   const rolls = () => `${percent(resistance)} ${kindAt(resistance, site.boundaries).name}`;
   const passes = passes_ph[0] + passes_ph[1], change = `${trend > 0 ? "+" : "−"}${percent(Math.abs(trend))}/day`;
@@ -70,7 +74,7 @@ function stretch(row, place) {
     element("span", {}, bold(resistance === null ? "not measured" : rolls()), small(driven), small(since(row))),
     element("span", { className: "days" }, sparkline(row), Math.abs(trend) < CLEAR_TREND ? null : small(change)),
     element("span", { className: "lost" }, bold(`${guessed ? "~" : ""}${figure(kwh)}`),
-      small(`${figure(low)} to ${figure(high)}`), small(costs)));
+      small(`${figure(low)} to ${figure(high)}`), small(costs), segment.fuel ? small(burned(segment.fuel)) : null));
 }
 
 const when = (ns) => (site.stamp_ns - site.first_ns > 2 * DAY_NS ? dayShort(ns) : times.words(ns));

@@ -28,7 +28,7 @@ T0 = 1_750_000_000_000_000_000
 
 
 def rows(n: int = 5) -> np.ndarray:
-    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4, 1e-3, 0.01, 17_500.0, 0.25)
+    one = (T0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.1, 2.0, 0.5, 0.02, 1e-5, 0.1, -0.1, 1e-4, 1e-3, 0.01, 17_500.0, 0.25, 0.004)
     return np.array([one] * n, SAMPLE_DTYPE)
 
 
@@ -121,7 +121,7 @@ def test_bad_value_is_named_with_its_row(column):
         error = refusal(with_value(column, 3, value))
         assert (error.reason, error.row, error.field) == (reason, 3, column), value
         assert f"{column}[3]" in str(error)
-    if column not in ("stamp_ns", "mass_kg"):
+    if column not in ("stamp_ns", "mass_kg", "fuel_l"):
         error = refusal(with_value(column, 3, np.nan))
         assert (error.reason, error.row, error.field) == (Refusal.NOT_FINITE, 3, GROUPED.get(column, column))
 
@@ -136,7 +136,7 @@ def test_unknown_resistance_gradient_or_mass_is_allowed():
         table[name][1] = np.nan
     for name in ("grade_e", "grade_n", "grade_var"):
         table[name][2] = np.nan
-    table["mass_kg"][3] = np.nan
+    table["mass_kg"][3] = table["fuel_l"][2] = np.nan
     assert decode_batch(encode_batch(batch(table)), EXTENT_M).rows.tobytes() == table.tobytes()
 
 
@@ -160,6 +160,7 @@ def tables(draw):
         "applied_scale": st.floats(-0.5, 0.5, width=32),
         "mass_kg": st.floats(1, 1e6, width=32),
         "aid_share": st.floats(0, 1, width=32),
+        "fuel_l": st.floats(0, 100, width=32),
     }
     table = empty(draw(st.integers(0, 4)))
     for row in table:

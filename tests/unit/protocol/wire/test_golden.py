@@ -52,4 +52,4 @@ def test_columns_and_types_are_the_specified_ones():
     from protocol.machine.samples import SAMPLE_DTYPE
 
     assert SAMPLE_DTYPE.names[:3] == ("stamp_ns", "x_m", "y_m")
-    assert [SAMPLE_DTYPE[name].str for name in SAMPLE_DTYPE.names] == ["<i8", "<f8", "<f8", *["<f4"] * 15]
+    assert [SAMPLE_DTYPE[name].str for name in SAMPLE_DTYPE.names] == ["<i8", "<f8", "<f8", *["<f4"] * 16]

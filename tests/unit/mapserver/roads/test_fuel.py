@@ -1,0 +1,78 @@
+"""Litres burned on segments beside those that resistance, slope, mass and speed predict."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mapserver.evidence.fold_config import name_hash
+from mapserver.roads.fuel import BURNED_SHARE, ROTATING, Litres, litres_of
+from mapserver.roads.ledger import Ledgers
+from mapserver.roads.loss import losses
+from mapserver.roads.tally import Tally
+from protocol.arrays import Table
+from protocol.units import DIESEL_J_PER_L, GRAVITY_MPS2
+from tests.unit.mapserver.roads.drives import STEP_M, along, passes, roads
+
+PER_J, PER_H = 1 / (0.4 * DIESEL_J_PER_L), 6.0  # litres for work at the margin and for an hour
+LINE = along([(10, 20), (310, 20)])
+
+
+def driven(*, slope: float = 0.0, back: bool = False, accel_mps2: float = 0.0, fuel: bool = True) -> Table:
+    """Passes over good ground, then bad from the middle on; burning as Willans' line has it."""
+    rows = passes(LINE[::-1] if back else LINE, 6, 0.02)
+    rows["c_rr"] = np.where(rows["x_m"] < 160, 0.02, 0.06)
+    rows["grade_e"], rows["grade_n"], rows["grade_var"] = np.where(rows["x_m"] < 160, slope, 0.0), 0.0, 1e-4
+    along_m = np.abs(rows["x_m"] - (310 if back else 10))
+    rows["speed_mps"] = np.sqrt(25.0 + 2 * accel_mps2 * along_m)
+    rise = rows["grade_e"] * (-1 if back else 1)
+    force = rows["mass_kg"] * (GRAVITY_MPS2 * (rows["c_rr"] + rise) + ROTATING * accel_mps2)
+    hours = STEP_M / rows["speed_mps"] / 3600
+    rows["fuel_l"] = np.maximum(PER_J * force * STEP_M + PER_H * hours, 0.0) if fuel else np.nan
+    return rows
+
+
+def litres(*machines: Table) -> Litres | None:
+    kept = Tally()
+    for i, rows in enumerate(machines):
+        kept.add(rows, np.full(len(rows), name_hash(f"truck-{i}"), np.uint64))
+    segments = roads(*machines)
+    ledger = Ledgers(segments).ledger(kept.table(), kept.slot_ns)
+    return litres_of(ledger, segments, losses(ledger, segments, 0.02))
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.03, -0.05])
+@pytest.mark.parametrize("accel_mps2", [0.0, 0.05])
+def test_what_follows_resistance_slope_and_speed_is_predicted_as_burned(slope: float, accel_mps2: float) -> None:
+    """Downhill too, where engines burn nothing, on segments that burn three times as much as others."""
+    machines = driven(slope=slope, accel_mps2=accel_mps2), driven(slope=slope, back=True)
+    fuel = litres(*machines)
+    assert fuel
+    known = fuel.share > 0.5
+    assert known.sum() >= 10
+    assert fuel.burned.max() > 1.5 * fuel.burned[known].min()
+    assert fuel.predicted[known] == pytest.approx(fuel.burned[known], rel=0.06)
+    assert fuel.burned.sum() == pytest.approx(sum(rows["fuel_l"].sum() for rows in machines), rel=0.02)
+    assert (fuel.low[known] <= fuel.predicted[known]).all()
+    assert (fuel.high[known] >= fuel.predicted[known]).all()
+    assert fuel.burned_std == pytest.approx(BURNED_SHARE * fuel.burned)
+
+
+def test_ground_that_the_map_has_wrong_stands_out() -> None:
+    """A segment that burns a half more than its resistance says is off by that, and the others hardly."""
+    rows = driven()
+    odd = (rows["x_m"] > 200) & (rows["x_m"] < 225)
+    rows["fuel_l"][odd] *= 1.5
+    fuel = litres(rows)
+    assert fuel
+    off = fuel.predicted / fuel.burned
+    assert off.min() < 0.75
+    assert np.median(off) == pytest.approx(1.0, abs=0.08)
+
+
+def test_without_fuel_there_are_no_litres_and_the_share_is_that_of_the_driving() -> None:
+    silent = driven(fuel=False)
+    assert litres(silent) is None
+    fuel = litres(driven(), silent)
+    assert fuel
+    assert fuel.share[fuel.burned > 0] == pytest.approx(0.5, abs=0.02)
