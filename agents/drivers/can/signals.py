@@ -59,7 +59,7 @@ class Signal:
 
 
 def frame_of(values: Iterable[tuple[Signal, float]], size: int = 8) -> bytes:
-    """The frame of so many bytes that has these values; all other bits are ones, not available where nothing is signed."""
+    """The frame of so many bytes with these values; all other bits are ones, which mean not available."""
     bits = (1 << 8 * size) - 1
     for signal, value in values:
         mask = (1 << signal.bits) - 1

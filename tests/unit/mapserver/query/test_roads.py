@@ -23,6 +23,7 @@ from protocol.queries.roads import MAX_LIMIT, SegmentsQuery, WorklistQuery, deco
 from protocol.queries.route_requests import RouteQuery, WayQuery
 from protocol.queries.routing import decode_answer
 from protocol.site.geometry import Bounds
+from sitegrid.answer_text import fuel_text
 from tests.patience import PATIENCE_S
 from tests.unit.mapserver.data import incoming, open_writer, refused, send, wait_for
 from tests.unit.mapserver.query.fake_upkeep import answered, answers_of, source_of
@@ -495,3 +496,25 @@ def test_traffic_of_one_machine_on_the_roads_of_all(writer):
     assert not {row.segment.id for row in rows} & {one.id for one in driven}
     then_ns = int(rows_of()["a"]["stamp_ns"].max())
     assert worklist(answers, machine="b", as_of_ns=then_ns).rows == ()
+
+
+def test_burned_litres_stand_beside_predicted_ones_in_the_list_and_at_changes(tmp_path):
+    """All of one price: a section that burns as its resistance says is predicted right; one without fuel has none."""
+    worse = np.concatenate([of_both(8, 0.02, 0.0)["a"], of_both(6, 0.06, 1800.0)["a"]])
+    worse["fuel_l"] = 0.5 * 40_000 * 9.80665 * worse["c_rr"] / (0.4 * 35.8e6)
+    with closing(open_writer(tmp_path)) as opened:
+        deliver(opened, [{"a": worse, "b": rows_of()["b"]}])
+        answer = worklist(answers_of(opened))
+    fuels = {row.segment.id: row.segment.fuel for row in answer.rows}
+    burning = [fuel for fuel in fuels.values() if fuel]
+    assert 0 < len(burning) < len(fuels)
+    for fuel in burning:
+        (burned, low, high), (predicted, least, most) = fuel.burned_ph, fuel.predicted_ph
+        assert low < burned < high
+        assert least <= predicted <= most
+        assert predicted == pytest.approx(burned, rel=0.1)
+        assert fuel.share == pytest.approx(1.0)
+    total = sum(fuel.burned_ph[0] for fuel in burning) * answer.hours
+    assert total == pytest.approx(worse["fuel_l"].sum(), rel=0.2)
+    assert answer.changes[0].fuel == fuels[answer.changes[0].id]
+    assert "burned" in fuel_text(burning[0])
