@@ -10,13 +10,14 @@ from agents.localisation.alignment import DISTANCE_M
 from agents.localisation.localiser import PROVEN_S, UNSIGNED_M
 from agents.sampling import MAX_STD_M
 from protocol.machine.clock_watch import GAP_NS
-from protocol.machine.machine_config import MachineConfig, SensorConfig
-from protocol.machine.readings import Encoder, Gps, GpsVelocity, Imu, Odometry, Reading, Torque
+from protocol.machine.machine_config import DRIVES, MachineConfig, SensorConfig
+from protocol.machine.readings import Encoder, Engine, Gps, GpsVelocity, Imu, Odometry, Reading
 from protocol.machine.samples import ZERO_STD
 
 WAIT_NS = 30 * 10**9  # in the readings' time; a machine that drives off has its heading after 10 to 20 s
 SILENT_S = 10.0  # without a reading: sensors send each second
 CALIBRATED = 0.5  # of the accelerometer's first uncertainty: some metres in both directions, or a closed loop
+REFERENCE_OFF, SURE = 0.05, 3.0  # a scale of the torque beyond it is a wrong data sheet; standard deviations
 UNIT = 1.5  # no tyre is so far off: wheels that turn so much further or less far than the fixes go have another unit
 WHEELS = frozenset({Encoder.kind, Odometry.kind})
 SPEEDS = WHEELS | {GpsVelocity.kind}
@@ -124,7 +125,7 @@ class Status:
     def _of_ground(self, report: Mapping[str, Any]) -> Iterator[Hindrance]:
         """What samples lack."""
         ground = report["pipeline"]["ground"]
-        needed = {"accelerations": {Imu.kind}, "wheel speeds": WHEELS, "torque": {Torque.kind}}
+        needed = {"accelerations": {Imu.kind}, "wheel speeds": WHEELS, "torque": DRIVES}
         lacks = [what for what, kinds in needed.items() if not kinds & self._kinds]
         if self._spans_ns and lacks:
             configured = {shown(sensor) for sensor in self._sensors.values()}
@@ -136,6 +137,10 @@ class Status:
         calibration, spool = ground["calibration"], report["spool"]
         if self._is_sampled and spool["depth"] == spool["pending"] and not report["acknowledged"]:
             yield Hindrance("the first samples wait until their places are smoothed", is_problem=False)
+        scale, scale_std = calibration["scale"], calibration["scale_std"]
+        if Engine.kind in self._kinds and abs(scale) > max(REFERENCE_OFF, SURE * scale_std):
+            looks = f"{100 * abs(scale):.0f} % too {'high' if scale > 0 else 'low'}"
+            yield Hindrance(f"reference_torque_nm looks {looks}: compare it with the engine's plate, and `mass_kg`")
         if not lacks and calibration["calibrates"] and calibration["zero_std"] > CALIBRATED * ZERO_STD:
             yield Hindrance("calibrating: drive a closed loop, or reverse over your own track", is_problem=False)
 

@@ -9,15 +9,27 @@ from typing import Any
 
 from protocol.queries.answers import MachineState
 
+TORQUE_OFF, SURE = 0.05, 3.0  # a gain of the torque beyond it is more than data sheets allow; standard deviations
 MOST_LISTED = 12  # machines beside a picture
 
 
 def why(machine: MachineState) -> str:
     """In what it contradicts the others or its data sheet, and what was decided about it; empty for nothing."""
-    said = [*(_sentence(reason, machine.evidence) for reason in machine.reasons), rolls(machine)]
+    said = [*(_sentence(reason, machine.evidence) for reason in machine.reasons), pulls(machine), rolls(machine)]
     if machine.reason != ", ".join(machine.reasons):
         said.append(machine.reason)
     return "; ".join(filter(None, said))
+
+
+def pulls(machine: MachineState) -> str:
+    """How much its drive force reads too high or low by the ground, and why that may be; empty where it does not."""
+    known = machine.evidence
+    with suppress(KeyError, TypeError, ValueError):
+        off, std, is_known = known["torque_gain"] - 1, known["torque_gain_std"], known["torque_gain_by"]
+        if is_known and abs(off) > max(TORQUE_OFF, SURE * std):
+            how = f"{100 * abs(off):.0f} +- {100 * std:.0f} % {'high' if off > 0 else 'low'}"
+            return f"torque looks {how}: reference torque of its engine, its sensor, or its mass"
+    return ""
 
 
 def rolls(machine: MachineState) -> str:

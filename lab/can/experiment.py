@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,8 +91,8 @@ def _compare(table: list[Row]) -> None:
     """Errors over those by torque at the wheels, of the same machines."""
     wheels = {row["case"].split("_")[0]: row["c_pct"] for row in table if row["case"].endswith("_wheels")}
     for row in table:
-        if known := wheels.get(row["case"].split("_")[0]):
-            row["times"] = round(row["c_pct"] / known, DIGITS)
+        known = wheels.get(row["case"].split("_")[0], math.nan)
+        row["times"] = round(row["c_pct"] / known, DIGITS)
 
 
 def _solve(task: Task[Judging], cache: Path) -> Judged:

@@ -34,6 +34,7 @@ MODES = ABSOLUTE, DIFFERENTIAL, RELATIVE = ("absolute", "differential", "relativ
 WITH_MODE = ("gps", "attitude")
 MAX_DELAY_S = 0.4  # what is 0.5 s behind the newest reading is refused as late; readings do not arrive in perfect order
 BEFORE_THE_WHEELS = frozenset({"engine", "motor", "motor_power"})  # kinds whose readings need a powertrain
+DRIVES = BEFORE_THE_WHEELS | {"torque"}  # kinds whose readings show the drive force
 NOT_NEGATIVE = (
     "wheelbase_m",
     "axle_stiffness_npm",

@@ -10,13 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from agents.drivers.can.buses import is_recording
 from protocol.errors import ConfigError, LogFolderError, MessageError, one_line
 from protocol.files import whole_folder
 from protocol.machine.log_columns import VARIANCES
 from protocol.machine.log_folder import MANIFEST, log_files, manifest_toml, open_log
-from protocol.machine.machine_config import BASE, QUANTITIES, MachineConfig, SensorConfig
-from protocol.machine.readings import Imu, columns, parse_reading
+from protocol.machine.machine_config import BASE, BEFORE_THE_WHEELS, QUANTITIES, MachineConfig, SensorConfig
+from protocol.machine.readings import Imu, Odometry, columns, parse_reading
 from protocol.site.site_config import SiteConfig
+from sitegrid.convert.bus import BusRecording
 from sitegrid.convert.gpx import GpxRecording
 from sitegrid.convert.receivers import ReceiverRecording
 from sitegrid.convert.recording import Recording, Topic, Value
@@ -134,6 +136,8 @@ def open_recording(file: Path) -> Recording:
     is_folder = (file / "metadata.yaml").is_file()
     if not is_folder and not file.is_file():
         raise LogFolderError(file, "is neither a file nor the folder of a bag of ROS 2, with metadata.yaml")
+    if is_recording(file.name):
+        return BusRecording(file)
     head = b"" if is_folder else _head(file)
     if head.startswith(MCAP) and b"ros2" not in head[:40]:
         raise LogFolderError(file, "is an MCAP file, but not of ROS 2")
@@ -230,21 +234,22 @@ def _name(folder: Path) -> str:
 def _config(sensor: Sensor) -> tuple[SensorConfig, list[str]]:
     """A sensor of the manifest; what it is made of, and what somebody has to do about it."""
     topic, kind = sensor.topic, sensor.kind
-    is_useless = kind == "steering" or sensor.unstated == sensor.rows
+    lacks = {"steering": "wheelbase_m", **dict.fromkeys(BEFORE_THE_WHEELS, "powertrain")}.get(kind, "")
+    is_useless = bool(lacks) or sensor.unstated == sensor.rows
     to_do = [f"{sensor.source} ({topic.type}): {topic.kinds[kind]}", *([topic.note] if topic.note else [])]
     if sensor.back:
         to_do.append(f"{sensor.back} of {sensor.rows} stamps go back: see `sitegrid log check`")
     if sensor.unstated:
         std = f"`std = {{ {', '.join(f'{quantity} = ...' for quantity in QUANTITIES[kind])} }}`"
         to_do.append(f"{sensor.unstated} of {sensor.rows} rows state no error: write {std}")
-    if kind == "steering":
-        to_do.append("it is of no use without `wheelbase_m` of [machine]: write that")
+    if lacks:
+        to_do.append(f"it is of no use without `{lacks}` of [machine]: write that")
     if is_useless:
         to_do[-1] += ", then `use = true`"
     if topic.frame.lstrip("/") != BASE:
         frame = f"frame {topic.frame}" if topic.frame else "its frame"
         to_do.append(f"where {frame} is on the machine is not known: measure `mount`")
-    measures = topic.measures if kind == Imu.kind else ()
+    measures = topic.measures if kind in (Imu.kind, Odometry.kind) else ()
     return SensorConfig(sensor.name, kind, use=not is_useless, measures=measures), to_do
 
 

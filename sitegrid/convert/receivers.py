@@ -38,12 +38,11 @@ class ReceiverRecording:
     def values(self, wanted: Collection[tuple[str, str]]) -> Iterator[Value]:
         """Values of streams. What lacks the time or is broken is counted in `unread`."""
         topics = {f"s{i}": topic for i, (topic, _) in enumerate(wanted)}
-        line = Line(self._format, {topic: _sensor(f"s{i}", kind) for i, (topic, kind) in enumerate(wanted)})
+        line = Line(self._format, {topic: sensor_of(f"s{i}", kind) for i, (topic, kind) in enumerate(wanted)})
         for piece in _pieces(self._path):
             for seen in line.feed(piece, None):
                 if seen.sensor:
-                    named = zip(columns(seen.kind), seen.values, strict=True)
-                    values = tuple(0.0 if n.startswith("var_") and v == UNSTATED_STD**2 else v for n, v in named)
+                    values = unstated(seen.kind, seen.values)
                     yield Value(topics[seen.sensor], seen.kind, seen.utc_ns or seen.host_ns, values)
         counted = {name.replace("_", " "): n for name, n in line.counters.items() if n and "frames" not in name}
         self.unread += [f"{self._format}: {n} {name}" for name, n in counted.items()]
@@ -60,9 +59,16 @@ class ReceiverRecording:
         )
 
 
-def _sensor(name: str, kind: str) -> SensorConfig:
+def sensor_of(name: str, kind: str) -> SensorConfig:
+    """A sensor that takes values whether a variance is stated or not."""
     is_stating = any(column.startswith("var_") for column in columns(kind))
     return SensorConfig(name, kind, std=dict.fromkeys(QUANTITIES[kind][-1:] if is_stating else (), UNSTATED_STD))
+
+
+def unstated(kind: str, values: tuple[float, ...]) -> tuple[float, ...]:
+    """Values of a kind, 0 for a variance that nothing stated."""
+    named = zip(columns(kind), values, strict=True)
+    return tuple(0.0 if name.startswith("var_") and value == UNSTATED_STD**2 else value for name, value in named)
 
 
 def _pieces(path: Path) -> Iterator[bytes]:

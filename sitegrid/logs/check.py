@@ -20,8 +20,8 @@ from protocol.arrays import Floats, Ints
 from protocol.errors import ConfigError, LogFolderError
 from protocol.machine.clock_watch import GAP_NS
 from protocol.machine.log_folder import LogFolder, open_log
-from protocol.machine.machine_config import ABSOLUTE, QUANTITIES, MachineConfig, SensorConfig
-from protocol.machine.readings import Gps, Imu, Reading, Torque
+from protocol.machine.machine_config import ABSOLUTE, DRIVES, QUANTITIES, MachineConfig, SensorConfig
+from protocol.machine.readings import Gps, Imu, Reading
 from sitegrid.doctor import Finding, Level
 from sitegrid.logs.clocks import ALL_DIGITS, check_clocks, stands, time_of
 from sitegrid.logs.log_truth import SIDE_FILE, KnownArea, LogTruth, read_known_ground, read_log_truth, require_overlap
@@ -173,7 +173,7 @@ def missing_for_ground(machine: MachineConfig, areas: Sequence[KnownArea]) -> st
         return "no IMU with forces, which gradient and rolling resistance need"
     if not areas:
         return f"no ground is known; describe areas as [[ground]] in {SIDE_FILE} beside the manifest ({PAGE})"
-    if any(sensor.kind == Torque.kind for sensor in used) or any(area.has_gradient for area in areas):
+    if any(sensor.kind in DRIVES for sensor in used) or any(area.has_gradient for area in areas):
         return ""
     return "no torque sensor, which rolling resistance needs"
 

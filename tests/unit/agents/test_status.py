@@ -13,7 +13,9 @@ from agents.localisation.localiser import LocalisationConfig
 from agents.pipeline import Pipeline
 from agents.positioning import PipelineConfig
 from agents.status import DRAWS, SILENT_S, WAIT_NS, Hindrance, Status, described
-from protocol.machine.readings import Encoder, Gps, Reading
+from protocol.machine.machine_config import SensorConfig
+from protocol.machine.powertrain_config import PowertrainConfig
+from protocol.machine.readings import Encoder, Engine, Gps, Reading
 from tests.unit.agents.drives import SITE, VEHICLE, Leg, drive, thinned
 
 pytestmark = pytest.mark.slow
@@ -150,3 +152,22 @@ def test_nothing_is_said_of_a_machine_that_has_all_nor_before_the_time():
     early = [r for r in STANDING if r.stamp_ns < STANDING[0].stamp_ns + WAIT_NS]
     assert said(early) == []
     assert said([*early[:75], *(replace(r, stamp_ns=r.stamp_ns + WAIT_NS) for r in early[75:])]) == [], "a clock is set"
+
+
+@pytest.mark.parametrize(
+    ("scale", "std", "looks"), [(0.1, 0.02, "10 % too high"), (-0.2, 0.05, "20 % too low"), (0.1, 0.04, "")]
+)
+def test_torque_by_an_engine_is_torque_and_a_reference_that_is_wrong_is_one_sentence(scale, std, looks: str):
+    """A machine on CAN has no torque at the wheels, and lacks nothing."""
+    pipeline, status, _ = followed(without("torque"))
+    on_bus = replace(
+        VEHICLE, powertrain=PowertrainConfig(2000.0), sensors=(*VEHICLE.sensors, SensorConfig("engine", "engine"))
+    )
+    known, status = report(pipeline, acknowledged=1), Status(on_bus)
+    status.take([*DRIVEN, Engine("engine", DRIVEN[-1].stamp_ns, 0.5, 150.0)])
+    status.sampled()
+    known["pipeline"]["ground"]["fault"] = ""
+    known["pipeline"]["ground"]["calibration"] |= {"scale": scale, "scale_std": std, "zero_std": 0.0}
+    sentences = [hindrance.sentence for hindrance in status.judge(known)]
+    wrong = f"reference_torque_nm looks {looks}: compare it with the engine's plate, and `mass_kg`"
+    assert sentences == ([wrong] if looks else [])

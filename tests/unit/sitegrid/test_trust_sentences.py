@@ -25,6 +25,20 @@ def test_how_a_machine_rolls_is_said_with_its_doubt_and_what_it_costs() -> None:
 
 
 @pytest.mark.parametrize(
+    ("gain", "std", "said"),
+    [
+        (1.1, 0.02, "torque looks 10 +- 2 % high: reference torque of its engine, its sensor, or its mass"),
+        (0.9, 0.01, "torque looks 10 +- 1 % low: reference torque of its engine, its sensor, or its mass"),
+        (1.04, 0.001, ""),
+        (1.1, 0.04, ""),
+    ],
+)
+def test_a_wrong_reference_torque_is_one_sentence_once_the_ground_shows_it(gain: float, std: float, said: str) -> None:
+    known = {"torque_gain": gain, "torque_gain_std": std, "torque_gain_by": ("ground",)}
+    assert why(machine_state("b", evidence=known)) == said
+
+
+@pytest.mark.parametrize(
     ("reasons", "evidence", "words"),
     [
         (("offset",), {"offset_east_m": 3.0, "offset_north_m": -4.0}, "places 5.0 m off"),

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agents.drivers.can.pgns import SIGNALS
+from agents.drivers.can.signals import EXTENDED, frame_of
 from protocol.errors import ConfigError, LogFolderError, SitegridError
 from protocol.machine.log_folder import LogFolder, open_log
 from protocol.machine.readings import columns
@@ -354,3 +356,36 @@ def test_a_raw_bag_is_the_held_log_of_its_drive_but_for_the_digits_that_the_log_
 def test_two_talkers_are_one_receiver_or_two_and_somebody_says_so(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="gn, gp send positions; of several receivers say --take gn:fix=gps"):
         convert(recording("nmea_rtk_short.log"), tmp_path / "log")
+
+
+def test_a_recording_of_a_bus_becomes_a_log_folder_and_an_engine_waits_for_its_powertrain(tmp_path: Path) -> None:
+    """The same values as an agent reads; of two speeds one is taken, and one offered."""
+    values = {"engine_torque": 0.4, "engine_speed": 150.0, "rear_left_speed": 2.0, "rear_right_speed": 2.0}
+    values |= {"vehicle_speed": 2.0, "latitude": 49.01, "longitude": 8.4, "fuel_rate": 20.0}
+    groups = {SIGNALS[name].group for name in values}
+    lines = []
+    for i in range(20):
+        for group in groups:
+            own = [(SIGNALS[name], value) for name, value in values.items() if SIGNALS[name].group == group]
+            pgn = group - EXTENDED
+            lines.append(f"({1.75e9 + i / 10:.6f}) can0 {3 << 26 | pgn << 8:08X}#{frame_of(own).hex()}")
+    file = tmp_path / "drive.candump"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    report = convert(file, tmp_path / "log")
+    assert {row["kind"]: row["rows"] for row in report["took"]} == dict.fromkeys(
+        ("engine", "odometry", "gps", "fuel_rate"), 20
+    )
+    assert any("speed of CCVS1" in line and "--take" in line for line in report["left_out"])
+    assert any("`powertrain` of [machine]" in line for line in report["to_do"])
+    log = open_log(tmp_path / "log")
+    (engine,) = (sensor for sensor in log.machine.sensors if sensor.kind == "engine")
+    assert not engine.use
+    assert [one for one in log.machine.sensors if one.kind == "odometry"][0].measures == ("speed",)
+    assert {values[0] for _, *values in rows(log, "fuel_rate")} == {20.0}
+
+
+def test_a_bus_without_a_value_that_is_known_is_one_sentence(tmp_path: Path) -> None:
+    file = tmp_path / "drive.log"
+    file.write_text("(1750000000.000000) can0 18FF0000#0000000000000000\n", encoding="utf-8")
+    with pytest.raises(LogFolderError, match="1 frames, and none that the built-in table knows"):
+        convert(file, tmp_path / "log")
