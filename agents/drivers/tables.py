@@ -162,7 +162,7 @@ def _open(driver: DriverConfig, machine: MachineConfig, bundles: Callable[[], Dr
     if driver.kind in DECODERS:
         return ReceiverSource(driver.address, driver.baud, driver.kind, Line(driver.kind, feeds))
     if driver.kind == CAN:
-        return _open_bus(driver, feeds)
+        return _open_bus(driver, feeds, machine.mass_kg)
     plug_in = next(iter(entry_points(group=PLUG_INS, name=driver.kind)))
     try:
         factory: Factory = plug_in.load()
@@ -171,9 +171,9 @@ def _open(driver: DriverConfig, machine: MachineConfig, bundles: Callable[[], Dr
         raise ConfigError(f"[[driver]] {driver.kind}", str(error)) from None
 
 
-def _open_bus(driver: DriverConfig, feeds: Mapping[str, SensorConfig]) -> Source:
+def _open_bus(driver: DriverConfig, feeds: Mapping[str, SensorConfig], mass_kg: float) -> Source:
     try:
-        line = CanLine(feeds, all_signals(driver.signals, driver.dbc))
+        line = CanLine(feeds, all_signals(driver.signals, driver.dbc), mass_kg)
     except ValueError as error:
         raise ConfigError(f"[[driver]] {driver.address}", str(error)) from None
     return RecordingSource(driver.address, line) if is_recording(driver.address) else CanSource(driver.address, line)

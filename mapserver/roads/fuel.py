@@ -30,6 +30,7 @@ ROTATING = 1.1  # mass that speeds up over mass: wheels, gears and engine of a h
 BURNED_SHARE = 0.03  # standard deviation of what an engine's controller states, by data sheets
 LEAST_M = 100.0  # with fuel, on all segments together, for a fit
 JOULES = 1e6  # so that columns of the fit are about as large
+LEAST_L = 0.001  # of a segment, for a weight of its own: less are a second of idling
 ROUNDS = 4  # of the fit: where engines burn nothing hardly changes after two
 
 
@@ -73,11 +74,16 @@ def litres_of(ledger: Ledger, segments: SegmentTable, lost: Losses) -> Litres | 
 
 
 def _price(work: Floats, hours: Floats, burned: Floats, ledger: Ledger) -> tuple[float, float]:
-    """Litres for a joule and for an hour, by least squares over segments and directions; of slices (s, 2)."""
+    """Litres for a joule and for an hour, by least squares over segments and directions; of slices (s, 2).
+
+    What a segment is off by grows with the root of what is burned there, as passes differ by themselves.
+    """
     price, active = (0.0, 0.0), np.ones(work.shape, np.bool_)
+    litres = by_segment(burned, ledger.ends).ravel()
+    weights = np.where(litres > 0, 1.0 / np.sqrt(np.maximum(litres, LEAST_L)), 0.0)
     for _ in range(ROUNDS):
-        columns = (by_segment(np.where(active, one, 0.0), ledger.ends).ravel() for one in (work / JOULES, hours))
-        found, _ = nnls(np.stack(list(columns), axis=1), by_segment(burned, ledger.ends).ravel())
+        columns = [by_segment(np.where(active, one, 0.0), ledger.ends).ravel() for one in (work / JOULES, hours)]
+        found, _ = nnls(np.stack(columns, axis=1) * weights[:, None], litres * weights)
         price = float(found[0]) / JOULES, float(found[1])
         active = price[0] * work + price[1] * hours > 0
     return price

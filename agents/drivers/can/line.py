@@ -29,13 +29,35 @@ class _Feed(NamedTuple):
     sensor: SensorConfig
 
 
+class Axles:
+    """Sums the loads of a machine's axles, which come one by one, each with its location. mass_kg: as of `CanLine`."""
+
+    def __init__(self, mass_kg: float) -> None:
+        self._mass_kg = mass_kg
+        self._loads: dict[float, float] = {}  # by location, of the round that is under way
+        self._before: set[float] = set()  # locations of the round before
+        self._known: set[float] = set()  # those of two rounds in a row
+
+    def payload_kg(self, location: float, load_kg: float) -> float | None:
+        """What the axles of the round that this load ends carry above the empty machine; None where one is missing."""
+        total_kg = None
+        if location in self._loads:
+            self._known |= self._loads.keys() & self._before
+            if self._loads.keys() == self._known:
+                total_kg = max(sum(self._loads.values()) - self._mass_kg, 0.0)
+            self._before, self._loads = set(self._loads), {}
+        self._loads[location] = load_kg
+        return total_kg
+
+
 class CanLine:
     """Values of one bus. feeds: sensor by stream, `engine`, or `0x0f:retarder` of one sender among several.
 
-    signals: by name, those of streams and others that the configuration adds.
+    signals: by name, those of streams and others that the configuration adds. mass_kg: of the empty machine, above
+    which its axles carry a payload.
     """
 
-    def __init__(self, feeds: Mapping[str, SensorConfig], signals: Mapping[str, Signal]) -> None:
+    def __init__(self, feeds: Mapping[str, SensorConfig], signals: Mapping[str, Signal], mass_kg: float = 0.0) -> None:
         self.counters: Counter[str] = Counter()
         self._feeds = [_feed(key, sensor) for key, sensor in feeds.items()]
         self._by_group: dict[int, list[Signal]] = defaultdict(list)
@@ -50,6 +72,7 @@ class CanLine:
         self._senders: dict[int, dict[int, int]] = defaultdict(dict)  # when each was heard, by group; the first counts
         self._valued_ns: dict[int, int] = {}  # by number of the feed
         self._begun_ns = 0
+        self._axles = Axles(mass_kg)
 
     def take(self, identifier: int, data: bytes, host_ns: int, *, is_extended: bool = True) -> list[Observed]:
         """Values of a frame that came at `host_ns`."""
@@ -62,6 +85,9 @@ class CanLine:
         if not values:
             self.counters["frames_without_value"] += 1
             return []
+        if "axle_load" in values:
+            payload_kg = self._axles.payload_kg(values.get("axle_location", 0.0), values.pop("axle_load"))
+            values |= {"axle_load": payload_kg} if payload_kg is not None else {}
         sender = identifier & 0xFF if is_extended else 0
         counts = self._counts(group, sender, host_ns)
         if counts:

@@ -59,6 +59,7 @@ STREAMS = {
     "ebs_switch": CanStream("brake", ("ebs_switch",), lambda h: (h["ebs_switch"],)),
     "retarder": CanStream("brake", ("retarder_torque",), lambda h: (min(max(-h["retarder_torque"], 0.0), 1.0),)),
     "cargo": CanStream("payload", ("cargo_mass",), lambda h: (h["cargo_mass"],)),
+    "axles": CanStream("payload", ("axle_load",), lambda h: (h["axle_load"],)),
     "turn_rate": CanStream("odometry", ("turn_rate",), lambda h: (0.0, 0.0, h["turn_rate"])),
     "fix": CanStream("gps", ("latitude",), _place),
     "velocity": CanStream("gps_velocity", ("ground_speed",), _velocity),

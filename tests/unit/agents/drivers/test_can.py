@@ -151,6 +151,18 @@ def test_frames_of_any_sender_feed_their_stream(
     assert observed[0].host_ns == TEN_NS
 
 
+def test_loads_of_all_axles_less_the_empty_machine_are_its_payload() -> None:
+    """Axle by axle. A location that is none spoils its round alone; an axle that falls silent leaves no payload."""
+    bus = CanLine({"axles": SensorConfig("load", "payload")}, SIGNALS, mass_kg=22_000.0)
+    empty, loaded = {0x00: 9e3, 0x10: 13e3}, {0x00: 15e3, 0x10: 26e3}
+    seen = []
+    for loads in (empty, empty, loaded, {**loaded, 0x55: 3e4}, loaded, {0x00: 15e3}, {0x00: 15e3}, {0x00: 15e3}):
+        for location, load in loads.items():
+            identifier, data = frame(65258, axle_location=location, axle_load=load)
+            seen += [value.values[0] for value in bus.take(identifier, data, TEN_NS)]
+    assert seen == [0.0, 19_000.0, 19_000.0]
+
+
 def test_a_magnetic_course_is_no_velocity() -> None:
     assert line("velocity").take(*frame(129026, course_is_magnetic=1, course=1, ground_speed=3), TEN_NS) == []
 

@@ -380,7 +380,7 @@ def test_a_recording_of_a_bus_becomes_a_log_folder_and_an_engine_waits_for_its_p
     log = open_log(tmp_path / "log")
     (engine,) = (sensor for sensor in log.machine.sensors if sensor.kind == "engine")
     assert not engine.use
-    assert [one for one in log.machine.sensors if one.kind == "odometry"][0].measures == ("speed",)
+    assert next(one for one in log.machine.sensors if one.kind == "odometry").measures == ("speed",)
     assert {values[0] for _, *values in rows(log, "fuel_rate")} == {20.0}
 
 
