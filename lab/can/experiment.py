@@ -40,8 +40,8 @@ class BusCase:
 
     def drive(self, seed: int, seconds: float) -> BusDrive:
         """The recording of a seed."""
-        how = {"can": self.can, "reference": self.reference, "blind": self.blind}
-        return planned(self.scenario, seed, seconds, **how)
+        how = {"can": self.can, "blind": self.blind}
+        return planned(self.scenario, seed, seconds, reference=self.reference, **how)
 
 
 CASES = (

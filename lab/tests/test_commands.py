@@ -17,6 +17,7 @@ from sitegrid.options.values import count, positive, seed
 # Where the work of each command begins: module and function; these take seeds.
 WORK = {
     "calibration": "lab.calibration.experiment",
+    "can": "lab.can.experiment",
     "cooperation": "lab.cooperation.experiment",
     "fedback": "lab.fedback.experiment",
     "ground": "lab.ground.experiment",

@@ -143,8 +143,8 @@ class _Records:
             return None
         burned = fuel.burned[i] + np.array([0.0, -NINETY, NINETY]) * fuel.burned_std[i]
         predicted = np.array([fuel.predicted[i], fuel.low[i], fuel.high[i]])
-        pairs = (tuple((litres / self.hours).tolist()) for litres in (burned, predicted))
-        return answers.Fuel(*pairs, share=float(fuel.share[i]))
+        burned_ph, predicted_ph = (tuple((litres / self.hours).tolist()) for litres in (burned, predicted))
+        return answers.Fuel(burned_ph, predicted_ph, float(fuel.share[i]))
 
     def line(self, i: int) -> answers.Corners:
         """Some points of a segment's line."""

@@ -65,12 +65,12 @@ def litres_of(ledger: Ledger, segments: SegmentTable, lost: Losses) -> Litres | 
 
     def predicted(shift: float) -> Floats:
         spent = price[0] * (work + shift * doubt) + price[1] * hours
-        return by_segment(np.maximum(spent, 0.0), ledger.ends).sum(axis=1)
+        return np.asarray(by_segment(np.maximum(spent, 0.0), ledger.ends).sum(axis=1), np.float64)
 
     driven = by_segment(ledger.of_slices("metres") / PER_M, ledger.ends).sum(axis=1)
     share = by_segment(metres, ledger.ends).sum(axis=1) / np.maximum(driven, 1e-9)
     total = by_segment(burned, ledger.ends).sum(axis=1)
-    return Litres(total, BURNED_SHARE * total, *map(predicted, (0.0, -1.0, 1.0)), share)
+    return Litres(total, BURNED_SHARE * total, predicted(0.0), predicted(-1.0), predicted(1.0), share)
 
 
 def _price(work: Floats, hours: Floats, burned: Floats, ledger: Ledger) -> tuple[float, float]:
@@ -83,8 +83,8 @@ def _price(work: Floats, hours: Floats, burned: Floats, ledger: Ledger) -> tuple
     weights = np.where(litres > 0, 1.0 / np.sqrt(np.maximum(litres, LEAST_L)), 0.0)
     for _ in range(ROUNDS):
         columns = [by_segment(np.where(active, one, 0.0), ledger.ends).ravel() for one in (work / JOULES, hours)]
-        found, _ = nnls(np.stack(columns, axis=1) * weights[:, None], litres * weights)
-        price = float(found[0]) / JOULES, float(found[1])
+        solution, _ = nnls(np.stack(columns, axis=1) * weights[:, None], litres * weights)
+        price = float(solution[0]) / JOULES, float(solution[1])
         active = price[0] * work + price[1] * hours > 0
     return price
 

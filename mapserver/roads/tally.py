@@ -32,8 +32,10 @@ _PENDING_ROWS = 16_384  # merged at once: merging costs a sort of everything
 # metres driven; of these weighed, where the mass is known, measured, where c_rr is, graded, and fuelled, where the
 # burned litres are. Sums over metres: kg, c_rr and its square, gradient east and north, place from the corner. Of
 # what is fuelled: litres, milliseconds, and the square of the speed over metres.
-SUMS = ("metres", "weighed", "measured", "graded", "kg", "c", "c2", "east", "north")
-SUMS += ("fuelled", "fuel", "ms", "v2", "x", "y")
+SUMS = (
+    *("metres", "weighed", "measured", "graded", "kg", "c", "c2", "east", "north"),
+    *("fuelled", "fuel", "ms", "v2", "x", "y"),
+)
 PER_L, PER_V2 = 1_000_000, 100  # litres; squares of speeds
 TALLY = np.dtype([("key", "<i8"), *((name, "<i8") for name in SUMS), ("machines", "<u8")])
 _SECTOR_RAD = 2 * np.pi / SECTORS

@@ -78,9 +78,9 @@ class Gearbox:
     """An automatic one: gears by the engine's speed, the converter open where the engine would stall."""
 
     def __init__(self, train: DriveTrain) -> None:
-        sheet = train.data_sheet
-        self._ratios = np.array([*sheet.gears, *sheet.reverse_gears]) * sheet.final_drive
-        self._gears, self._train = len(sheet.gears), train
+        data = train.data_sheet
+        self._ratios = np.array([*data.gears, *data.reverse_gears]) * data.final_drive
+        self._gears, self._train = len(data.gears), train
         self._gear, self._since = 0, HELD_STEPS
 
     def run(self, wheel_radps: Floats) -> tuple[Ints, Floats, Bools]:
@@ -113,20 +113,20 @@ def shafts(
 ) -> Shafts:
     """What engine and brakes do for wheels that turn so fast and have this torque together, pumps taking a share."""
     gear, ratio, shifting = geared
-    sheet, idle, stall = train.data_sheet, train.idle_rpm * pi / 30, train.stall_rpm * pi / 30
-    full_nm, handed_on = sheet.reference_torque_nm, ratio * sheet.efficiency
+    data, idle, stall = train.data_sheet, train.idle_rpm * pi / 30, train.stall_rpm * pi / 30
+    full_nm, handed_on = data.reference_torque_nm, ratio * data.efficiency
     drives = torque_nm * np.where(gear < 0, -1.0, 1.0) >= 0
     wheels_nm, turning = np.abs(torque_nm), np.abs(wheel_radps) * ratio
     locked = turning > LOCKS * idle
     load = np.where(drives, wheels_nm, 0.0) / (handed_on * full_nm * train.stall_ratio)
     engine = np.where(locked, turning, np.maximum(turning, idle + (stall - idle) * np.sqrt(np.minimum(load, 1.0))))
     converter = np.where(locked, 1.0, 1.0 + (train.stall_ratio - 1.0) * (1.0 - turning / engine))
-    losses = sheet.losses * (0.5 + 0.5 * engine / (train.shift_up_rpm * pi / 30))
+    losses = data.losses * (0.5 + 0.5 * engine / (train.shift_up_rpm * pi / 30))
     # Braking: the engine first, as much as its losses take, then the retarder, then the brakes.
-    dragged_nm = np.minimum(wheels_nm, losses * full_nm * ratio / sheet.efficiency)
-    net = np.where(drives, wheels_nm / (handed_on * converter), -dragged_nm * sheet.efficiency / ratio) / full_nm
+    dragged_nm = np.minimum(wheels_nm, losses * full_nm * ratio / data.efficiency)
+    net = np.where(drives, wheels_nm / (handed_on * converter), -dragged_nm * data.efficiency / ratio) / full_nm
     rest_nm = np.where(drives, 0.0, wheels_nm - dragged_nm)
-    most_nm = train.retarder_nm * sheet.final_drive
+    most_nm = train.retarder_nm * data.final_drive
     torque = np.maximum(net + losses + pumps, 0.0)
     return Shafts(
         engine_radps=engine,

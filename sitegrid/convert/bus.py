@@ -27,7 +27,7 @@ class BusRecording:
         try:
             heard = heard_bus(path.name, read_recording(str(path)))
         except OSError as error:
-            raise LogFolderError(path, error.strerror) from None
+            raise LogFolderError(path, str(error.strerror)) from None
         if not heard.streams:
             raise LogFolderError(path, heard.problem)
         second = {name for names in ALIKE for name in [one for one in names if one in heard.streams][1:]}

@@ -108,7 +108,7 @@ def test_an_agent_reads_of_the_bus_what_the_machine_does() -> None:
         true.append(float(simulator.state.speed_mps[0]))
     assert [one.stamp_ns for one in readings] == sorted(one.stamp_ns for one in readings)
     by_kind = {kind: [one for one in readings if isinstance(one, kind)] for kind in (Engine, FuelRate, Odometry)}
-    rates = {kind.kind: len(found) / 30 for kind, found in by_kind.items()}
+    rates = {kind.kind: len(own) / 30 for kind, own in by_kind.items()}
     assert rates == pytest.approx({"engine": 50, "fuel_rate": 10, "odometry": 50}, rel=0.02)
     speeds = np.array([one.speed_x_mps for one in by_kind[Odometry]])[1::5][:590]
     assert np.abs(speeds).max() > 1.5
