@@ -204,10 +204,13 @@ class DeadReckoning:
             self._follow_ground(reading, sensor)
         elif isinstance(reading, Torque):
             weight_n = self.mass_kg * GRAVITY_MPS2
-            traction = reading.torque_nm / self._machine.wheel_radius_m / weight_n
-            self.traction = traction if abs(traction) <= MAX_TRACTION else 0.0
+            self.pull(reading.torque_nm / self._machine.wheel_radius_m / weight_n)
         elif isinstance(reading, Payload) and self._weighs:
             self.mass_kg = self._machine.mass_kg + reading.payload_kg
+
+    def pull(self, traction: float) -> None:
+        """Take this traction, of torque at the wheels or of what a caller makes of an engine's."""
+        self.traction = traction if abs(traction) <= MAX_TRACTION else 0.0
 
     @property
     def pose(self) -> DeadReckonedPose:

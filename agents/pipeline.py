@@ -170,6 +170,8 @@ class Pipeline:
             self._estimator.update(reading, sensor, dead_reckoning, known_c_rr, newest)
             if isinstance(reading, FuelRate):
                 self._sampler.fuel.add(reading, dead_reckoning.motion(reading.stamp_ns).speed_mps)
+        if (traction := self._estimator.traction) is not None:
+            dead_reckoning.pull(traction)
         distance_m = self._odometer.update(stamp_ns, dead_reckoning.wheels_ns, dead_reckoning.distance_m, speed_mps)
         self._sampler.mark(stamp_ns, distance_m)
         made += self._due_samples()

@@ -132,6 +132,11 @@ class Balancer:
         """Of the machine and its payload."""
         return self._machine.mass_kg + self.payload_kg
 
+    @property
+    def is_before_wheels(self) -> bool:
+        """Whether engine or motor state the drive."""
+        return self._drive.is_before_wheels
+
     def update(self, reading: Reading, sensor: SensorConfig, dead_reckoning: DeadReckoning) -> Balance | None:
         """Add a reading, after dead reckoning did; returns the balance of the step that it ends."""
         if self._drive.add(reading):

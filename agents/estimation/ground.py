@@ -151,6 +151,12 @@ class GroundEstimator:
         return self._machine.mass_kg / max(1 - self._resistance.scale, 1 / MAX_LOADED)
 
     @property
+    def traction(self) -> float | None:
+        """Drive force over weight by engine or motor, which dead reckoning cannot know; None where nobody does."""
+        newest = self._judged[-1].balance if self._judged and self._balancer.is_before_wheels else None
+        return newest.share if newest and not newest.unknown else None
+
+    @property
     def calibration(self) -> Calibration:
         """Zero and scale by the work so far."""
         return self._calibrator.calibration

@@ -69,6 +69,11 @@ class DriveReadings:
             self._newest[kind] = reading
         return kind in BESIDE
 
+    @property
+    def is_before_wheels(self) -> bool:
+        """Whether engine or motor state the drive, and no reading of the wheels."""
+        return self._kind not in (None, Torque)
+
     def restart(self) -> None:
         """Begin a step anew."""
         self._sums = 0, 0.0

@@ -498,6 +498,7 @@ def test_traffic_of_one_machine_on_the_roads_of_all(writer):
     assert worklist(answers, machine="b", as_of_ns=then_ns).rows == ()
 
 
+@pytest.mark.slow
 def test_burned_litres_stand_beside_predicted_ones_in_the_list_and_at_changes(tmp_path):
     """All of one price: a section that burns as its resistance says is predicted right; one without fuel has none."""
     worse = np.concatenate([of_both(8, 0.02, 0.0)["a"], of_both(6, 0.06, 1800.0)["a"]])

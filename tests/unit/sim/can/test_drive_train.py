@@ -11,8 +11,10 @@ import pytest
 from agents.drivers.can.pgns import SIGNALS
 from agents.drivers.can.signals import frame_of
 from agents.estimation.powertrain import engine_drive
+from agents.pipeline import Pipeline
+from agents.positioning import PipelineConfig
 from protocol.machine.readings import Brake, Driveline, Engine, EngineLosses, FuelRate, HydraulicPressure, Odometry
-from protocol.units import DIESEL_J_PER_L
+from protocol.units import DIESEL_J_PER_L, GRAVITY_MPS2
 from sim.can.live import address_of
 from sim.can.node import IDLE_PA
 from sim.config import SimConfig
@@ -93,6 +95,7 @@ def test_what_is_put_into_a_frame_is_read_from_it_to_half_a_step_and_the_rest_is
     assert signal.value(frame_of([(signal, 1e12)])) is not None, "the highest value, and no error"
 
 
+@pytest.mark.slow
 def test_an_agent_reads_of_the_bus_what_the_machine_does() -> None:
     """Speed, gearing and fuel within their steps; nothing of the truth reaches it by another way."""
     scenario = load_scenario("loading")
@@ -102,10 +105,15 @@ def test_an_agent_reads_of_the_bus_what_the_machine_does() -> None:
     kinds = {sensor.kind for sensor in machine.sensors}
     assert not kinds & {"torque", "encoder"}
     assert machine.powertrain == train_of("wheel_loader").data_sheet
-    readings, true = [], []
+    readings, pulls, pipeline = [], [], Pipeline(simulator.site, machine, PipelineConfig())
     for _ in range(600):
-        readings += simulator.advance()[machine.name]
-        true.append(float(simulator.state.speed_mps[0]))
+        readings += (heard := simulator.advance()[machine.name])
+        pipeline.step(heard)
+        true = float(simulator.state.drive_n[0] / simulator.state.mass_kg[0] / GRAVITY_MPS2)
+        pulls.append((true, pipeline._positioning.dead_reckoning.traction))
+    by_truth, by_agent = np.array(pulls[100:]).T
+    assert by_truth.max() > 0.05
+    assert np.median(np.abs(by_agent - by_truth)) < 0.015, "wheels slip by it"
     assert [one.stamp_ns for one in readings] == sorted(one.stamp_ns for one in readings)
     by_kind = {kind: [one for one in readings if isinstance(one, kind)] for kind in (Engine, FuelRate, Odometry)}
     rates = {kind.kind: len(own) / 30 for kind, own in by_kind.items()}
