@@ -25,7 +25,7 @@ from typing import Any
 import msgpack
 import zenoh
 
-# It has no calibration of its own, and knows neither mass nor fuel: it leaves these four columns away.
+# It has no calibration of its own, and knows no mass, lanes or fuel: it leaves these columns away.
 COLUMNS = (  # name, format of the struct module
     *(("stamp_ns", "q"), ("x_m", "d"), ("y_m", "d")),
     *((name, "f") for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "heading_rad", "speed_mps", "distance_m")),

@@ -213,7 +213,7 @@ def test_damaged_samples_are_quarantined_and_never_sent(tmp_path: Path) -> None:
     spool = opened(tmp_path)
     spool.record(ROWS[:10])
     spool.close()
-    for numbers, row in (("1, 2", "zeroblob(84)"), ("3", "x'0102'"), ("6", "5")):
+    for numbers, row in (("1, 2", "zeroblob(88)"), ("3", "x'0102'"), ("6", "5")):
         changed(tmp_path, f"UPDATE sample SET row = {row} WHERE number IN ({numbers})")
     spool = opened(tmp_path)
     first = spool.head(2)

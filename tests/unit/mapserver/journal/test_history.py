@@ -341,7 +341,7 @@ def test_what_is_no_file_of_this_archive_is_refused(day, tmp_path, monkeypatch):
     renamed = (day.folder / day.archive()[0]).rename(tmp_path / "2026-01-01T00_000001-000004.parquet")
     for path, problem in (
         (foreign, "no file of a map server's archive"),
-        (older, "has schema 1, this version knows 5"),
+        (older, "has schema 1, this version knows 6"),
         (renamed, r"000004\.parquet: holds the rows 1 to 3"),
         (tmp_path / "nothing.parquet", r"nothing\.parquet: cannot be read: No such file"),
     ):
