@@ -20,7 +20,7 @@ from protocol.site.geometry import Bounds
 from protocol.wire import keys
 
 # Of the machine's time: after a question that nobody answered, and while there are no lanes; after each answer SLOWER
-# times as long as before, since an old map changes little. An answer with all has 8 to 15 kB, and three come in the first hour.
+# times as long as before, since an old map changes little. An answer with all has 8 to 15 kB, three come in an hour.
 AGAIN_S, MOST_S, SLOWER = 60.0, 1800.0, 5
 ANSWER_S = 20.0
 REACH_M = 1000.0  # of the square that is asked for
