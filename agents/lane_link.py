@@ -19,9 +19,9 @@ from protocol.queries.parameters import selector_of
 from protocol.site.geometry import Bounds
 from protocol.wire import keys
 
-# Of the machine's time: after a question that nobody answered, and while there are no lanes; after each answer twice as
-# long as before, since an old map changes little. An answer with all has 10 to 20 kB.
-AGAIN_S, MOST_S = 60.0, 1800.0
+# Of the machine's time: after a question that nobody answered, and while there are no lanes; after each answer SLOWER
+# times as long as before, since an old map changes little. An answer with all has 8 to 15 kB, three come in an hour.
+AGAIN_S, MOST_S, SLOWER = 60.0, 1800.0, 5
 ANSWER_S = 20.0
 REACH_M = 1000.0  # of the square that is asked for
 MOVED_M = 500.0  # from its middle: another square is asked for
@@ -92,7 +92,7 @@ class LaneLink:
                 self.known = known_after(self.known, query, answer)
                 fresh = self.known.lanes if self.known else None
                 if fresh and fresh.tiles:
-                    self._rest_s = min(2 * self._rest_s, MOST_S)
+                    self._rest_s = min(SLOWER * self._rest_s, MOST_S)
                 self._next_s = now_s + self._rest_s * bool(fresh)  # at once where all has to be asked for anew
         if not self._next_s - MOST_S <= now_s < self._next_s:  # a clock may be set back
             self._ask(self.known.question(pose) if self.known else first_question(pose))

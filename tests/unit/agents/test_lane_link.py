@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.lane_link import AGAIN_S, MOST_S, MOVED_M, LaneLink
+from agents.lane_link import AGAIN_S, MOST_S, MOVED_M, SLOWER, LaneLink
 from agents.localisation.filters.belief import PoseBelief
 from protocol.queries.answers import MapVersion
 from protocol.queries.lanes import SHAPE, LanesAnswer, LanesQuery, LaneTile, encode_lanes
@@ -65,7 +65,7 @@ def test_lanes_are_kept_up_to_date():
 
     network.tiles[0, 0] = 30
     network.is_up = False
-    for now_s in np.arange(3.0, 2.0 + 6 * AGAIN_S, 1.0):  # the link is down: it asks now and then
+    for now_s in np.arange(3.0, 2.0 + (SLOWER + 4) * AGAIN_S, 1.0):  # the link is down: it asks now and then
         assert link.look(at(3.0, float(now_s))) is None
     assert len(network.asked) - 2 == 4
     network.is_up = True
@@ -82,6 +82,8 @@ def test_lanes_are_asked_for_ever_more_seldom():
     network.tiles = {(0, 0): 10}
     for now_s in range(8 * 3600):
         link.look(at(3.0, float(now_s)))
+        if now_s == 3599:
+            assert len(network.asked) == 3  # of 8 to 15 kB each
     assert 8 * 3600 / MOST_S < len(network.asked) < 8 * 3600 / MOST_S + 6
     link.look(at(3.0, -1e6))  # its clock was set back
     assert network.asked[-1].since_ns == 10
