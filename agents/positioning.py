@@ -14,6 +14,7 @@ from agents.localisation.filters.smoother import SmoothedPose
 from agents.localisation.imu_steps import Sensed
 from agents.localisation.lanes.aid import LaneAid
 from agents.localisation.localiser import HeadingRefutedError, LocalisationConfig, Localiser
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from agents.localisation.wheels.judge import WheelJudge
 from agents.sampling import PoseHistory
 from agents.stream_order import Decision, StreamOrder, by_stamp
@@ -53,8 +54,10 @@ class Positioning:
     lanes: of all machines, as this one uses them; None where it does not.
     """
 
-    def __init__(self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig) -> None:
-        self._machine, self._config = in_name_order(machine), config.localisation
+    def __init__(
+        self, site: SiteConfig, machine: MachineConfig, config: PipelineConfig, tuning: LocalisationTuning = TUNING
+    ) -> None:
+        self._machine, self._config, self._tuning = in_name_order(machine), config.localisation, tuning
         self._mass = config.estimation.mass
         self._projection, self._extent_m = Projection(site), site.extent_m
         self._sensors = {s.name: s for s in machine.sensors if s.use}
@@ -209,7 +212,12 @@ class Positioning:
         if self.lanes:
             self.lanes.restart()
         self.localiser = Localiser(
-            self._machine, self._projection, self._config, is_weighed=self._is_weighed(), lanes=self.lanes
+            self._machine,
+            self._projection,
+            self._config,
+            is_weighed=self._is_weighed(),
+            lanes=self.lanes,
+            tuning=self._tuning,
         )
         self.poses = PoseHistory()
         self._antennas.restart()

@@ -12,6 +12,7 @@ from agents.localisation.filters import state
 from agents.localisation.filters.belief import Belief
 from agents.localisation.fix import Fix
 from agents.localisation.imu_steps import FilterStep
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 from protocol.rotations import wrap_angle
 from protocol.units import GRAVITY_MPS2
@@ -22,10 +23,7 @@ MIN_FIXES = 4.0  # of equal weight
 MAX_STD_RAD = 0.3  # of a heading that a filter can start from: it linearises
 MAX_MISFIT = 2.5  # mean square of residuals over their variance; more, and a first stretch may be off
 MIN_SCALE, MAX_SCALE = 0.8, 1.25  # of dead reckoning: wheels of another radius, and slow errors of GPS on a short way
-SPEED_STD_MPS = 3.0  # of the first belief: the machine may drive already, and wheels take a moment to show it
 GIVEN_STD_M, GIVEN_STD_RAD = 0.5, 0.02  # of a start that is configured
-GYRO_BIAS_RADPS = 5e-3  # standard deviations of the first belief: bias of each yaw gyro,
-WHEEL_SCALE = 0.03  # and scale of the wheels
 TO_COMPLEX = np.array([1.0, 1.0j])
 TINY = 1e-9
 
@@ -120,7 +118,12 @@ def _turned(angle_rad: float, x: float, y: float) -> tuple[float, float]:
 
 
 def start_belief(
-    alignment: Alignment, step: FilterStep, forces_mps2: Sequence[Floats], layout: state.Layout, turn_error_radps: float
+    alignment: Alignment,
+    step: FilterStep,
+    forces_mps2: Sequence[Floats],
+    layout: state.Layout,
+    turn_error_radps: float,
+    tuning: LocalisationTuning = TUNING,
 ) -> Belief:
     """The belief at the first step. The filter uses the fixes again, so the position is left wide.
 
@@ -138,9 +141,13 @@ def start_belief(
     variance[state.POSITION] = (2 * alignment.fix_std_m) ** 2
     variance[state.ATTITUDE] = 0.1**2
     variance[state.YAW] = min(0.5, 2 * alignment.std_rad + 0.05) ** 2
-    variance[state.VELOCITY], variance[state.RATE], variance[state.ACCELERATION] = SPEED_STD_MPS**2, 0.1**2, 1.0
-    variance[layout.gyro_biases] = GYRO_BIAS_RADPS**2
-    variance[layout.wheel_scales] = WHEEL_SCALE**2
+    variance[state.VELOCITY], variance[state.RATE], variance[state.ACCELERATION] = (
+        tuning.first_speed_mps**2,
+        0.1**2,
+        1.0,
+    )
+    variance[layout.gyro_biases] = tuning.first_gyro_bias_radps**2
+    variance[layout.wheel_scales] = tuning.first_wheel_scale**2
     if layout.imus and turn_error_radps:
         variance[layout.gyro_biases.stop - 1] = turn_error_radps**2
     return Belief(step.stamp_ns, x, np.diag(variance))

@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from agents.localisation.filters.belief import Conditioned
+from agents.localisation.tuning import TUNING, LocalisationTuning
 
 REMEMBERED = 150  # innovations: half a minute of a 5 Hz receiver
 ENOUGH = 50  # fewer innovations show nothing
@@ -27,9 +28,6 @@ MAX_GATED, MIN_NIS, MAX_NIS, MAX_CORRELATION = 0.2, 0.2, 2.5, 0.6
 LEVEL_S = 300.0  # how long slow errors are remembered: some independent ones of less than a minute
 MAX_LEVEL = 1.6  # twice what they are on average where their stated variance is right
 MAX_SHARE = 0.5  # receivers with more of their slow variance in common do not check each other
-ADAPTING_S = 45.0  # time in which the factor follows: some slow errors must not pass for a wrong statement
-LEAST_FACTOR, MOST_FACTOR = 0.25, 16.0  # a smoothed output says nothing of slow errors: at most half of the deviation
-CLIPPED_NIS = 4.0  # of one innovation, per component: an outlier is no statement
 PAUSE_S = 2.0  # innovations further apart teach no more than that
 INCONSISTENT, CONSISTENT, CANNOT_TELL = "inconsistent", "consistent", "cannot_tell"
 
@@ -69,10 +67,10 @@ class Consistency:
 
 
 class InnovationMonitor:
-    """Remembers the last innovations of one receiver. adapts: whether its variance follows them."""
+    """Remembers the last innovations of one receiver. tuning: by which its variance follows them; None: it does not."""
 
-    def __init__(self, *, adapts: bool = False) -> None:
-        self._factor = VarianceFactor() if adapts else None
+    def __init__(self, tuning: LocalisationTuning | None = None) -> None:
+        self._factor = VarianceFactor(tuning=tuning) if tuning else None
         self._gated: deque[bool] = deque(maxlen=REMEMBERED)
         self._last: deque[tuple[float, ...]] = deque(maxlen=REMEMBERED)
         self._slow_error, self._slow_ns = 1.0, 0
@@ -116,15 +114,16 @@ class VarianceFactor:
     """What the variance that a receiver states is multiplied by [-], the slow part too, as its innovations show it."""
 
     factor: float = 1.0
+    tuning: LocalisationTuning = field(default=TUNING, repr=False)
     _stamp_ns: int = field(default=0, repr=False)
 
     def note(self, result: Conditioned) -> None:
         """Follow a finite innovation (k,) that was accepted: others may be the filter's fault, or outliers."""
         if not result.accepted:
             return
-        stamp_ns = result.belief.stamp_ns
+        stamp_ns, tuning = result.belief.stamp_ns, self.tuning
         passed_s = min(max(stamp_ns - (self._stamp_ns or stamp_ns), 0) * 1e-9, PAUSE_S)
         self._stamp_ns = max(stamp_ns, self._stamp_ns)
-        surplus = min(result.nis / len(result.innovation), CLIPPED_NIS) - 1.0
-        followed = self.factor * math.exp(passed_s / ADAPTING_S * surplus)
-        self.factor = min(max(followed, LEAST_FACTOR), MOST_FACTOR)
+        surplus = min(result.nis / len(result.innovation), tuning.clipped_nis) - 1.0
+        followed = self.factor * math.exp(passed_s / tuning.adapting_s * surplus)
+        self.factor = min(max(followed, tuning.least_factor), tuning.most_factor)

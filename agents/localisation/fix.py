@@ -9,8 +9,6 @@ from agents.dead_reckoning import DeadReckonedPose
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, SensorConfig
 
-GPS_GATE_SIGMA = 4.0  # what comes by satellites and is further off is refused: reflections make outliers
-
 
 @dataclass(frozen=True)
 class Fix:

@@ -18,20 +18,18 @@ from agents.ground_speed import MIN_FIX_STD_M
 from agents.localisation import measurements
 from agents.localisation.consistency import MAX_SHARE, Consistency, InnovationMonitor
 from agents.localisation.filters.belief import Belief, Change, Conditioned, Measurement, anchor_states, restate_states
-from agents.localisation.filters.late_measurements import RELOCK
 from agents.localisation.filters.motion import GpsError, gps_covariance
 from agents.localisation.filters.state import YAW, Layout
-from agents.localisation.fix import GPS_GATE_SIGMA, Fix
+from agents.localisation.fix import Fix
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
 from agents.localisation.shared_errors import MOST_SHARED, SharedFix, ShareEstimator
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, DIFFERENTIAL, RELATIVE, SensorConfig
 from protocol.machine.readings import Gps
 from protocol.site.site_config import Projection
 
 AGREED_NS = 3_000_000_000  # so old a fix may be to say whether its receiver agrees with the filter
-FADED = 15  # correlation times after which a jump is forgotten
-RESTATED = 4.0  # a receiver that states a variance so many times as large or small has another error from then on
 MIN_DRIFT_M2 = 1e-6  # a receiver without slow error must not make the covariance singular
 
 
@@ -52,21 +50,22 @@ class Receivers(ModalSensors[Fix]):
         sensors: Sequence[SensorConfig],
         projection: Projection,
         layout: Layout,
+        tuning: LocalisationTuning = TUNING,
         *,
         slow: bool,
         machine_share: float | None = None,
     ) -> None:
         super().__init__()
         self._sensors = {s.name: s for s in sensors if s.kind == "gps" and s.use}
-        self._projection, self._layout, self._slow = projection, layout, slow
+        self._projection, self._layout, self._tuning, self._slow = projection, layout, tuning, slow
         self._states = {s.name: i for i, s in enumerate(drifting(sensors))} if slow else {}
         self._drift_m2 = dict.fromkeys(self._states, MIN_DRIFT_M2)  # variance of the slow error, without an anchor's
         self._stated_m2: dict[str, float] = {}  # the same, as it was when it last became another one
         absolute = [s.name for s in self._sensors.values() if s.mode == ABSOLUTE]
         self._compared = {name: i for i, name in enumerate(absolute)} if slow and machine_share is None else {}
-        self._estimator = ShareEstimator(len(absolute))
+        self._estimator = ShareEstimator(len(absolute), tuning)
         self._configured = machine_share
-        self._monitors = {name: InnovationMonitor(adapts=slow) for name in self._sensors}
+        self._monitors = {name: InnovationMonitor(tuning if slow else None) for name in self._sensors}
         self._judged: dict[str, tuple[int, bool]] = {}  # stamp of the last fix of each, and whether it was accepted
         self._refused: Counter[str] = Counter()  # in a row
         self._off_m: dict[str, list[Floats]] = {}  # innovations of these, since the last relock
@@ -139,7 +138,7 @@ class Receivers(ModalSensors[Fix]):
         if not result.accepted:
             self._refused[name] += 1
             self._off_m.setdefault(name, []).append(result.innovation)
-            if self._refused[name] % RELOCK:
+            if self._refused[name] % self._tuning.relock:
                 return
             del self._off_m[name]
             if self.is_outvoted(fix):
@@ -147,7 +146,8 @@ class Receivers(ModalSensors[Fix]):
             return
         self._refused[name] = 0
         self._off_m.pop(name, None)
-        if name in self._jumps and fix.stamp_ns - self._jumps[name][0] > FADED * fix.sensor.drift_time_s * 1e9:
+        faded_ns = self._tuning.faded * fix.sensor.drift_time_s * 1e9
+        if name in self._jumps and fix.stamp_ns - self._jumps[name][0] > faded_ns:
             del self._jumps[name]
         if len(self._compared) > 1 and name in self._compared:
             white_m2, slow_m2, time_s = _mean(self._white(fix)), self._drift_m2[name], fix.sensor.drift_time_s
@@ -192,12 +192,13 @@ class Receivers(ModalSensors[Fix]):
                 # nobody tells whether receiver or filter went wrong: the motion will show
                 opens = (measurements.PLACE, error)
         R = np.diag(self._white(fix))
-        gate = sensor.gate(GPS_GATE_SIGMA)
+        gate = sensor.gate(self._tuning.gps_gate_sigma)
         return measurements.fix(fix.stamp_ns, sensor.name, place, R, fix.lever_m, error, gate, opens, change)
 
     def _is_restated(self, name: str) -> bool:
         """Whether a receiver states so much more or less than before that its slow error is another one."""
-        return not 1 / RESTATED < self._drift_m2[name] / self._stated_m2[name] < RESTATED
+        times = self._tuning.restated
+        return not 1 / times < self._drift_m2[name] / self._stated_m2[name] < times
 
     def is_outvoted(self, fix: Fix) -> bool:
         """Whether as many other receivers agree with the filter as do not: then a refused one errs, not the filter."""
@@ -209,11 +210,11 @@ class Receivers(ModalSensors[Fix]):
 
         Else the motion is wrong, as with a wheel that is stuck or a machine that is carried, and will show nothing.
         """
-        off_m, half = self._off_m.get(name), RELOCK // 2
+        off_m, half = self._off_m.get(name), self._tuning.relock // 2
         if not off_m:
             return True
         first_m, last_m = (math.hypot(*np.mean(part, axis=0)) for part in (off_m[:half], off_m[-half:]))
-        return last_m - first_m < GPS_GATE_SIGMA * math.sqrt(2 * white_m2 / half)
+        return last_m - first_m < self._tuning.gps_gate_sigma * math.sqrt(2 * white_m2 / half)
 
     def _votes(self, fix: Fix) -> list[bool]:
         """Of each other receiver that is heard: whether it agrees with the filter."""
@@ -243,7 +244,7 @@ class Receivers(ModalSensors[Fix]):
         if self._slow:
             R += np.eye(2) * (2 * self._differential_m2(fix) * -math.expm1(-dt_s / sensor.drift_time_s) / dt_s**2)
         return measurements.velocity(
-            mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, sensor.gate(GPS_GATE_SIGMA)
+            mean.stamp_ns, sensor.name, mean.values, R, fix.lever_m, sensor.gate(self._tuning.gps_gate_sigma)
         )
 
     def _differential_m2(self, fix: Fix) -> float:

@@ -23,19 +23,14 @@ from agents.localisation.filters.belief import Belief, Change, Measurement, anch
 from agents.localisation.filters.motion import HeadingError
 from agents.localisation.filters.state import YAW, Layout
 from agents.localisation.imu_steps import FilterStep
-from agents.localisation.measurements import GATE_SIGMA
 from agents.localisation.sensor_modes import ModalSensors, StampedValue
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, BASE, RELATIVE, SensorConfig
 from protocol.machine.readings import Attitude
 from protocol.rotations import matrix_from_quaternion, rpy_from_matrix
 
 UNKNOWN_STD = 1e4  # of a quantity that a sensor does not measure
-# Of absolute headings. Data sheets state 1 to 2 degrees, of a clean magnetic field; machines are of steel.
-MIN_HEADING_STD_RAD = math.radians(3)  # unless it is configured
-WHITE_SHARE = 0.1  # of the variance
-HEADING_TIME_S = 300.0  # between a disturbance beside the road (seconds) and the steel of the machine (for ever)
-DUE_S = 0.5  # between two that are used: more of a slow error tell nothing new
 
 
 @dataclass(frozen=True)
@@ -63,16 +58,18 @@ class References(ModalSensors[Orientation]):
     slow: whether errors of absolute ones are slow, else white.
     """
 
-    def __init__(self, sensors: Sequence[SensorConfig], layout: Layout, *, slow: bool) -> None:
+    def __init__(
+        self, sensors: Sequence[SensorConfig], layout: Layout, tuning: LocalisationTuning = TUNING, *, slow: bool
+    ) -> None:
         super().__init__()
         self._sensors = {s.name: s for s in sensors if s.kind == "attitude" and s.use}
         self._base_from_sensor = {name: s.mount.frame_from_sensor() for name, s in self._sensors.items()}
         references, states = heading_references(sensors), range(layout.heading_errors.start, layout.heading_errors.stop)
         self._states = dict(zip((s.name for s in references), states, strict=False))
         self._turns: dict[str, float] = {}  # of relative ones
-        self._slow = slow
+        self._tuning, self._slow = tuning, slow
         absolute = [s.name for s in references if s.mode == ABSOLUTE] if slow else []
-        self._errors = dict.fromkeys(absolute, HeadingError(MIN_HEADING_STD_RAD, HEADING_TIME_S))
+        self._errors = dict.fromkeys(absolute, HeadingError(tuning.least_heading_rad, tuning.heading_s))
         self._used_ns: dict[str, int] = {}
 
     @property
@@ -85,7 +82,9 @@ class References(ModalSensors[Orientation]):
         absolute = [a for a in step.attitudes.values() if self._sensors[a.sensor].mode == ABSOLUTE]
         if not self._slow:
             return [self._attitude(o, step.stamp_ns, o.value.values) for o in map(self._orientation, absolute)]
-        due = [a for a in absolute if step.stamp_ns - self._used_ns.get(a.sensor, 0) >= DUE_S * 1e9]
+        due = [
+            a for a in absolute if step.stamp_ns - self._used_ns.get(a.sensor, 0) >= self._tuning.heading_due_s * 1e9
+        ]
         self._used_ns.update((a.sensor, step.stamp_ns) for a in due)
         return [m for a in due for m in self._heading(self._orientation(a), step.stamp_ns, belief)]
 
@@ -125,14 +124,20 @@ class References(ModalSensors[Orientation]):
         if sensor.name not in self._errors:
             return []
         state, variance = self._states[sensor.name], float(orientation.value.variances[2])
-        stated = math.sqrt(variance) if "heading" in sensor.std else max(math.sqrt(variance), MIN_HEADING_STD_RAD)
+        stated = (
+            math.sqrt(variance) if "heading" in sensor.std else max(math.sqrt(variance), self._tuning.least_heading_rad)
+        )
         times = max(1.0, abs(float(belief.x[state])) / stated)
         std = math.sqrt(len(self._errors)) * times * stated
-        self._errors[sensor.name] = HeadingError(std, HEADING_TIME_S * times**2)
+        self._errors[sensor.name] = HeadingError(std, self._tuning.heading_s * times**2)
         first = partial(reset_states, states=slice(state, state + 1), variance=std**2)
         change = None if sensor.name in self._confirmed else first
         self._confirmed.add(sensor.name)
-        yaw, white, gate = float(orientation.value.values[2]), WHITE_SHARE * stated**2, sensor.gate(GATE_SIGMA)
+        yaw, white, gate = (
+            float(orientation.value.values[2]),
+            self._tuning.heading_white * stated**2,
+            sensor.gate(self._tuning.gate_sigma),
+        )
         return [measurements.heading(stamp_ns, sensor.name, yaw, white, state, gate, change)]
 
     def _attitude(
@@ -140,7 +145,9 @@ class References(ModalSensors[Orientation]):
     ) -> Measurement:
         sensor, R = orientation.sensor, np.diag(orientation.value.variances)
         error = self._states.get(sensor.name)
-        return measurements.orientation(stamp_ns, sensor.name, rpy_rad, R, sensor.gate(GATE_SIGMA), error, change)
+        return measurements.orientation(
+            stamp_ns, sensor.name, rpy_rad, R, sensor.gate(self._tuning.gate_sigma), error, change
+        )
 
     def _first_change(self, orientation: Orientation) -> Change | None:
         """Gives the state of the anchor's error its first value."""
@@ -159,7 +166,7 @@ class References(ModalSensors[Orientation]):
         body_from_rates = np.array([[1.0, 0.0, -sp], [0.0, cr, cp * sr], [0.0, -sr, cp * cr]])
         R = body_from_rates * mean.variances @ body_from_rates.T
         rates = body_from_rates @ mean.values
-        return measurements.rotation(mean.stamp_ns, sensor.name, rates, R, sensor.gate(GATE_SIGMA))
+        return measurements.rotation(mean.stamp_ns, sensor.name, rates, R, sensor.gate(self._tuning.gate_sigma))
 
 
 def rpy_of_base(attitude: Attitude, base_from_sensor: Floats) -> Floats:

@@ -1,7 +1,7 @@
 """The localiser: readings in, poses out. It collects until the heading shows, then judges it until it is proven.
 
 A heading that GPS shows may be wrong: a receiver that has just started is tens of metres off, and says so or not. So it
-is unproven at first, and all events are kept. A receiver that the filter refuses RELOCK times in a row takes such a
+is unproven at first, and all events are kept. A receiver that the filter refuses so often that it relocks takes such a
 heading back: what came before its refusals counts no longer, and the rest is aligned and filtered again.
 """
 
@@ -24,6 +24,7 @@ from agents.localisation.lanes.aid import LaneAid
 from agents.localisation.place_watch import PlaceWatch
 from agents.localisation.repeats import Repeats
 from agents.localisation.tracker import Event, Tracker, TrackerConfig, gps_velocity
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from agents.localisation.wheels.travel_sign import TravelSign
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
@@ -112,6 +113,7 @@ class Localiser:
         *,
         is_weighed: bool = True,
         lanes: LaneAid | None = None,
+        tuning: LocalisationTuning = TUNING,
     ) -> None:
         """lanes: those of all machines, as this one uses them."""
         self.engine = _engine(config)
@@ -120,7 +122,7 @@ class Localiser:
         self._config = config
         tyres, is_started = (config.slip, config.slip_soft), bool(config.start)
         self._tracker_config = TrackerConfig(
-            machine, projection, config.profile, tyres, step_s, config.smoothing_s, is_started, is_weighed
+            machine, projection, config.profile, tyres, step_s, config.smoothing_s, is_started, is_weighed, tuning
         )
         self._tracker, self._lanes = Tracker(self._tracker_config), lanes
         self._gatherer = StepGatherer(machine, step_s)
@@ -268,7 +270,7 @@ class Localiser:
                 if not self._repeats.is_repeated(reading, dead_reckoning.distance_m):
                     events.append(self._tracker.receivers.fix(reading, dead_reckoning.pose))
             elif isinstance(reading, GpsVelocity):
-                events.append(gps_velocity(reading, sensor))
+                events.append(gps_velocity(reading, sensor, self._tracker_config.tuning))
         step = self._gatherer.gather(readings, dead_reckoning)
         return [step, *events] if step else events
 

@@ -13,23 +13,11 @@ import numpy as np
 from agents.localisation.filters.belief import Change, Measurement, Model
 from agents.localisation.filters.motion import EYE, map_from_base, turned_jacobian
 from agents.localisation.filters.state import ACCELERATION, ATTITUDE, POSITION, RATE, VELOCITY, YAW_RATE
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 from protocol.units import GRAVITY_MPS2
 
-# Standard deviations where neither a reading nor the sensor's configuration states one.
-RATE_RADPS = 0.005  # angular rate of an IMU, mean over a filter step
-FORCE_MPS2 = 2.0  # specific force of an IMU: its zero and mounting error do not average out, and are in it
-TURN_RADPS = 0.02  # turn rate of odometry, and its lasting error at first; that of steering per m/s
-STEERING_RAD = 0.01  # steering angle: resolution, play, tyres that do not roll where they point
-SPEED_MPS = 0.04  # of wheels
-SIDE_MPS = 0.04  # how fast a machine slides sideways
-STILL_MPS = 0.005  # of a machine at rest
-STILL_R = np.diag([STILL_MPS**2] * 3 + [(0.1 * RATE_RADPS) ** 2] * 3)
-SIDES_R, REST_R = SIDE_MPS**2 * EYE[:2, :2], RATE_RADPS**2 * EYE
 STANDSTILL = "standstill"  # the name that its measurement counts under
-GATE_SIGMA = 6.0  # measurements further off are refused; mounting and slip are not Gaussian
-REST_SIGMA = 3.0  # the same for a standstill that wheels do not show
-
 ROLL, PITCH, YAW = range(ATTITUDE.start, ATTITUDE.stop)
 PLACE = slice(POSITION.start, POSITION.start + 2)
 
@@ -168,14 +156,15 @@ def wheels(
     return Measurement(sensor, stamp_ns, velocity_mps, R, h, jacobian, gate_sigma=gate, considers=considers)
 
 
-def sides(stamp_ns: int, considers: tuple[int, ...]) -> Measurement:
+def sides(stamp_ns: int, considers: tuple[int, ...], tuning: LocalisationTuning = TUNING) -> Measurement:
     """A machine whose wheels say nothing still moves along its own axis: 0 = (v_y, v_z) at `base_link`."""
-    return _nothing("sides", stamp_ns, slice(VELOCITY.start + 1, VELOCITY.stop), SIDES_R, GATE_SIGMA, considers)
+    states, R = slice(VELOCITY.start + 1, VELOCITY.stop), tuning.side_mps**2 * EYE[:2, :2]
+    return _nothing("sides", stamp_ns, states, R, tuning.gate_sigma, considers)
 
 
-def rest(stamp_ns: int) -> Measurement:
+def rest(stamp_ns: int, tuning: LocalisationTuning = TUNING) -> Measurement:
     """No rotation of a machine that stands as far as GPS shows: 0 = w. It may creep round a bend: the gate is close."""
-    return _nothing(STANDSTILL, stamp_ns, RATE, REST_R, REST_SIGMA)
+    return _nothing(STANDSTILL, stamp_ns, RATE, tuning.rate_radps**2 * EYE, tuning.rest_sigma)
 
 
 def turn(
@@ -257,12 +246,13 @@ def rotation(stamp_ns: int, sensor: str, rates_radps: Floats, R: Floats, gate: f
     return Measurement(sensor, stamp_ns, rates_radps, R, *_picked(RATE), gate_sigma=gate)
 
 
-def standstill(stamp_ns: int) -> Measurement:
+def standstill(stamp_ns: int, tuning: LocalisationTuning = TUNING) -> Measurement:
     """A machine at rest (zero velocity update), which shows the bias of gyros: 0 = (v, w).
 
     Gated without relocking: an articulated machine turns its rear frame as it steers, also while its wheels stand.
     """
-    return _nothing(STANDSTILL, stamp_ns, slice(VELOCITY.start, RATE.stop), STILL_R, GATE_SIGMA)
+    R = np.diag([tuning.still_mps**2] * 3 + [(0.1 * tuning.rate_radps) ** 2] * 3)
+    return _nothing(STANDSTILL, stamp_ns, slice(VELOCITY.start, RATE.stop), R, tuning.gate_sigma)
 
 
 def _nothing(

@@ -19,20 +19,16 @@ import numpy as np
 from agents.dead_reckoning import LOADING_S, turn_source
 from agents.localisation import measurements
 from agents.localisation.filters.belief import Measurement
-from agents.localisation.filters.motion import SLIP_STD
 from agents.localisation.filters.state import Layout
 from agents.localisation.headings import UNKNOWN_STD
 from agents.localisation.imu_steps import FilterStep, Turn
-from agents.localisation.measurements import GATE_SIGMA
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 from protocol.machine.machine_config import ABSOLUTE, BASE, DIFFERENTIAL, RELATIVE, MachineConfig, SensorConfig
 from protocol.units import GRAVITY_MPS2
 
 STANDSTILL_S = 1.0  # after so long without travel the machine stands; coarse ticks of one that crawls come sooner
 REST_S = 2.0  # and so long without a speed over ground, of which there may be one a second
-STEERED_S = 1.0  # how long the error of a steering angle stays the same
-ROLLING_S = 0.5  # time constant of the low-pass on the rolling resistance
-LOAD_DOUBT = 0.5  # standard deviation of the slip, over the slip, where a load of up to the empty mass is not weighed
 
 
 class MotionSensors:
@@ -52,9 +48,10 @@ class MotionSensors:
         *,
         on_plane: bool,
         is_weighed: bool = True,
+        tuning: LocalisationTuning = TUNING,
     ) -> None:
         self.counters: Counter[str] = Counter()
-        self.slip_std, self._is_weighed = SLIP_STD, is_weighed
+        self.slip_std, self._is_weighed, self._tuning = tuning.slip_std, is_weighed, tuning
         self._load_doubt = 0.0
         self._layout, self._step_s, self._on_plane = layout, step_s, on_plane
         (self._slip, self._slip_soft), self._rolling = tyres, 0.0
@@ -63,9 +60,9 @@ class MotionSensors:
         self._whole = {s.name: self._whole_imu(i, s) for i, s in enumerate(self._imus.values())}
         self._wheels = [s for s in used if s.kind in ("encoder", "odometry") and s.provides("speed")]
         # They slip together, so the mean of several is as unsure as the least sure of them.
-        forward_std = max((s.std.get("speed", measurements.SPEED_MPS) for s in self._wheels), default=0.0)
-        self._wheels_R = np.diag([forward_std**2, measurements.SIDE_MPS**2, measurements.SIDE_MPS**2])
-        self._wheels_gate = max((s.gate(GATE_SIGMA) for s in self._wheels), default=0.0)
+        forward_std = max((s.std.get("speed", tuning.speed_mps) for s in self._wheels), default=0.0)
+        self._wheels_R = np.diag([forward_std**2, tuning.side_mps**2, tuning.side_mps**2])
+        self._wheels_gate = max((s.gate(tuning.gate_sigma) for s in self._wheels), default=0.0)
         self._turn_sensor = turn_source(machine)
         self._turned_ns, self._wheelbase_m = 0, machine.wheelbase_m
 
@@ -73,7 +70,7 @@ class MotionSensors:
     def turn_error_radps(self) -> float:
         """Standard deviation of the lasting error of the turn, 0 where IMUs measure it or nothing does."""
         source = self._turn_sensor
-        return _turn_std(source) if source and source.kind != "imu" else 0.0
+        return self._turn_std(source) if source and source.kind != "imu" else 0.0
 
     def forces(self, step: FilterStep) -> list[Floats]:
         """Specific forces (3,) of the IMUs that measure them."""
@@ -96,22 +93,22 @@ class MotionSensors:
         if source is None or step.turn is None:
             return []
         error = layout.gyro_biases.stop - 1 if layout.imus else None
-        rate, per_error, gate = step.turn.rate_radps, step.turn.per_error, source.gate(GATE_SIGMA)
+        rate, per_error, gate = step.turn.rate_radps, step.turn.per_error, source.gate(self._tuning.gate_sigma)
         dt_s, self._turned_ns = (step.stamp_ns - self._turned_ns) * 1e-9, step.stamp_ns
-        std = self._steered_std(source, step.turn, dt_s) if source.kind == "steering" else _turn_std(source)
+        std = self._steered_std(source, step.turn, dt_s) if source.kind == "steering" else self._turn_std(source)
         return [measurements.turn(step.stamp_ns, "turn", rate, std, error, per_error, gate)]
 
     def _steered_std(self, source: SensorConfig, turn: Turn, dt_s: float) -> float:
         """Standard deviation of a rate by steering, dt_s after the one before: white noise, and the angle's error.
 
-        That is e v / (L cos^2 angle), v the speed, L the wheelbase, and stays for STEERED_S: a coarse angle is wrong
-        by the same for as long as the driver holds it. White noise as strong in the long run has 2 STEERED_S / dt times
+        That is e v / (L cos^2 angle), v the speed, L the wheelbase, and stays for steered_s: a coarse angle is wrong
+        by the same for as long as the driver holds it. White noise as strong in the long run has 2 steered_s / dt times
         its variance.
         """
         speed = turn.per_error
         tangent = self._wheelbase_m * turn.rate_radps / speed if speed else 0.0
-        std = source.std.get("angle", measurements.STEERING_RAD) * speed / self._wheelbase_m * (1 + tangent**2)
-        return math.hypot(measurements.RATE_RADPS, std * math.sqrt(max(2 * STEERED_S / dt_s, 1.0)))
+        std = source.std.get("angle", self._tuning.steering_rad) * speed / self._wheelbase_m * (1 + tangent**2)
+        return math.hypot(self._tuning.rate_radps, std * math.sqrt(max(2 * self._tuning.steered_s / dt_s, 1.0)))
 
     def wheels(self, step: FilterStep, considers: tuple[int, ...] = ()) -> list[Measurement]:
         """Speed of the wheels less their slip, and a standstill. Silent ones leave what holds without them.
@@ -119,42 +116,53 @@ class MotionSensors:
         considers: states that the speed leaves as they are; a standstill does not jitter, and teaches them.
         """
         if step.silent:
-            still = [measurements.rest(step.stamp_ns)] if step.still_s >= REST_S else []
-            return [measurements.sides(step.stamp_ns, considers), *still]
+            still = [measurements.rest(step.stamp_ns, self._tuning)] if step.still_s >= REST_S else []
+            return [measurements.sides(step.stamp_ns, considers, self._tuning), *still]
         if not step.rolled or not self._wheels:
             return []
         if forces := self.forces(step):
             ahead = sum(float(force[0]) for force in forces) / len(forces)
-            self._rolling = rolling_resistance(self._rolling, step.traction, ahead, self._step_s)
+            share = min(self._step_s / self._tuning.rolling_s, 1.0)
+            self._rolling = rolling_resistance(self._rolling, step.traction, ahead, share)
         slip = self._slip + self._slip_soft * self._rolling
         if not self._is_weighed:
             self._doubt_load(step.still_s)
-        self.slip_std = math.hypot(SLIP_STD, self._load_doubt * slip)
+        self.slip_std = math.hypot(self._tuning.slip_std, self._load_doubt * slip)
         z = np.array([machine_speed(step.wheels.speed_mps, step.traction, slip), 0.0, 0.0])
         scale = self._layout.wheel_scales.start if self._layout.wheel_scale else None
         R, gate, offset_m = self._wheels_R, self._wheels_gate, step.wheels.offset_m
         rolled = measurements.wheels(step.stamp_ns, "wheels", z, R, scale, gate, offset_m, considers)
-        return [rolled, measurements.standstill(step.stamp_ns)] if step.still_s >= STANDSTILL_S else [rolled]
+        if step.still_s < STANDSTILL_S:
+            return [rolled]
+        return [rolled, measurements.standstill(step.stamp_ns, self._tuning)]
 
     def _doubt_load(self, still_s: float) -> None:
         """Doubt the slip from the first stop on at which the machine may have loaded."""
         if still_s >= LOADING_S:
-            self._load_doubt = LOAD_DOUBT
+            self._load_doubt = self._tuning.load_doubt
 
     def _whole_imu(self, index: int, sensor: SensorConfig) -> Measurement:
         """A measurement of an IMU, of which only stamp and value are to be set."""
-        rate_std = _gyro_std(sensor) if sensor.provides("rate") else UNKNOWN_STD
-        force_std = sensor.std.get("force", measurements.FORCE_MPS2) if sensor.provides("force") else UNKNOWN_STD
+        rate_std = self._gyro_std(sensor) if sensor.provides("rate") else UNKNOWN_STD
+        force_std = sensor.std.get("force", self._tuning.force_mps2) if sensor.provides("force") else UNKNOWN_STD
         R, lever = np.diag([rate_std**2] * 3 + [force_std**2] * 3), np.array(sensor.mount.xyz_m)
-        return measurements.inertial(0, sensor.name, np.zeros(6), R, lever, self._bias(index), sensor.gate(GATE_SIGMA))
+        gate = sensor.gate(self._tuning.gate_sigma)
+        return measurements.inertial(0, sensor.name, np.zeros(6), R, lever, self._bias(index), gate)
 
     def _yaw_rate(self, step: FilterStep, index: int, sensor: SensorConfig) -> Measurement:
-        rate, gate = float(step.imu_means[sensor.name].rates_radps[2]), sensor.gate(GATE_SIGMA)
-        return measurements.turn(step.stamp_ns, sensor.name, rate, _gyro_std(sensor), self._bias(index), 1.0, gate)
+        rate, gate = float(step.imu_means[sensor.name].rates_radps[2]), sensor.gate(self._tuning.gate_sigma)
+        return measurements.turn(step.stamp_ns, sensor.name, rate, self._gyro_std(sensor), self._bias(index), 1.0, gate)
 
     def _bias(self, index: int) -> int | None:
         """State of a yaw gyro's bias."""
         return self._layout.gyro_bias(index) if self._layout.imus else None
+
+    def _gyro_std(self, imu: SensorConfig) -> float:
+        return imu.std.get("rate", self._tuning.rate_radps)
+
+    def _turn_std(self, source: SensorConfig) -> float:
+        """Standard deviation of the rate of odometry, and of what lasts of its error; of steering only the latter."""
+        return source.std.get("rate", self._tuning.turn_radps)
 
 
 def shows_tilt(machine: MachineConfig, profile: str) -> bool:
@@ -174,21 +182,15 @@ def shows_tilt(machine: MachineConfig, profile: str) -> bool:
     return turns and any(s.provides("force") for s in imus)
 
 
-def rolling_resistance(before: float, traction: float, force_ahead_mps2: float, dt_s: float) -> float:
-    """Rolling resistance over weight [-], low-passed from the one before; force_ahead_mps2: of the accelerometer."""
+def rolling_resistance(before: float, traction: float, force_ahead_mps2: float, share: float) -> float:
+    """Rolling resistance over weight [-], low-passed from the one before with the share of a new value.
+
+    force_ahead_mps2: of the accelerometer.
+    """
     rolling = abs(traction - force_ahead_mps2 / GRAVITY_MPS2)
-    return before + min(dt_s / ROLLING_S, 1.0) * (rolling - before)
+    return before + share * (rolling - before)
 
 
 def machine_speed(wheel_mps: float, traction: float, slip_per_traction: float) -> float:
     """Speed of a machine [m/s] from that of its wheels."""
     return wheel_mps * (1 - traction * slip_per_traction * math.copysign(1.0, wheel_mps))
-
-
-def _gyro_std(imu: SensorConfig) -> float:
-    return imu.std.get("rate", measurements.RATE_RADPS)
-
-
-def _turn_std(source: SensorConfig) -> float:
-    """Standard deviation of the rate of odometry, and of what lasts of its error; of steering only the latter."""
-    return source.std.get("rate", measurements.TURN_RADPS)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats, Ints
 
 CANDIDATES = np.concatenate([[0.0], (np.arange(16) + 0.5) / 16])
@@ -26,10 +27,7 @@ CANDIDATES = np.concatenate([[0.0], (np.arange(16) + 0.5) / 16])
 # (docs/how-the-map-comes-about.md, measured facts)
 PRIOR = np.array([0.5] + [0.5 / 16] * 16)
 MOST_SHARED = 0.99  # a configured share counts up to here: errors that are wholly the same have no definite covariance
-MEMORY_S = 1800.0  # how long differences count: shares change with reflections, from place to place
-SPAN_NS = 1_000_000_000  # fixes of a second are averaged,
-EVERY_S = 10.0  # and compared so often: oftener, the white noise would count, which receivers know badly
-GATE_SIGMA = 4.0  # a difference that not even independent receivers would show is an outlier and says nothing
+SPAN_NS = 1_000_000_000  # fixes of a second are averaged
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,8 @@ class SharedFix:
 class ShareEstimator:
     """Estimates the share of the slow variance that receivers of one machine have in common: `share`, by now."""
 
-    def __init__(self, receivers: int) -> None:
-        self.share = float(PRIOR.dot(CANDIDATES))
+    def __init__(self, receivers: int, tuning: LocalisationTuning = TUNING) -> None:
+        self.share, self._tuning = float(PRIOR.dot(CANDIDATES)), tuning
         self._first, self._second = np.triu_indices(receivers, 1)  # of p pairs
         self._x = np.zeros((len(self._first), 2, len(CANDIDATES)))  # d of both axes
         self._P = np.zeros((len(self._first), len(CANDIDATES)))  # the same for both
@@ -79,7 +77,7 @@ class ShareEstimator:
         """Compare the pairs that are due and have fixes in the span that ends."""
         count, now_s = self._sums[:, 0], self._span * SPAN_NS * 1e-9
         seen = (count > 0)[self._first] & (count > 0)[self._second]
-        due = np.flatnonzero(seen & (now_s - self._compared >= EVERY_S))
+        due = np.flatnonzero(seen & (now_s - self._compared >= self._tuning.compared_s))
         if not due.size:
             return
         mean = self._sums[:, 1:] / np.maximum(count, 1.0)[:, None]
@@ -91,7 +89,7 @@ class ShareEstimator:
         self._compared[due] = now_s
         likelihood = self._filter(due, off[i] - off[j], white[i] + white[j], keep)
         # g receivers have g (g - 1) / 2 pairs, but only g - 1 differences that are independent
-        self._log = self._log * math.exp((self._judged_s - now_s) / MEMORY_S) + 2 / len(count) * likelihood
+        self._log = self._log * math.exp((self._judged_s - now_s) / self._tuning.shared_s) + 2 / len(count) * likelihood
         self._judged_s = now_s
         weights = PRIOR * np.exp(self._log - self._log.max())
         self.share = float(weights.dot(CANDIDATES) / weights.sum())
@@ -107,10 +105,10 @@ class ShareEstimator:
         P = variance + keep[:, None] ** 2 * (self._P[due] - variance)
         S = P + white_m2[:, None]
         y = differences[:, :, None] - x
-        squares = y**2 / S[:, None]
-        fits = squares[:, :, 0].max(axis=1) <= GATE_SIGMA**2  # the first candidate expects the largest ones
+        gate, squares = self._tuning.gps_gate_sigma**2, y**2 / S[:, None]
+        fits = squares[:, :, 0].max(axis=1) <= gate  # the first candidate expects the largest ones
         gain = np.where(fits[:, None], P / S, 0.0)
         self._x[due], self._P[due] = x + gain[:, None] * y, P - gain * P
-        likelihood = -np.log(S) - 0.5 * np.minimum(squares, GATE_SIGMA**2).sum(axis=1)
+        likelihood = -np.log(S) - 0.5 * np.minimum(squares, gate).sum(axis=1)
         of_fitting: Floats = likelihood[fits].sum(axis=0)
         return of_fitting

@@ -15,7 +15,7 @@ from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
 from agents.localisation.filters.smoother import nothing_past
 from agents.localisation.filters.state import SPEED, YAW, Layout, X, Y, Z
-from agents.localisation.fix import GPS_GATE_SIGMA, Fix
+from agents.localisation.fix import Fix
 from agents.localisation.gps import Receivers, drifting
 from agents.localisation.headings import References, heading_references
 from agents.localisation.imu_steps import FilterStep
@@ -23,16 +23,12 @@ from agents.localisation.lanes.aid import LANES, LaneAid
 from agents.localisation.measurements import PLACE
 from agents.localisation.motion_sensors import MotionSensors, shows_tilt
 from agents.localisation.sensor_modes import ModalSensors, Value
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, SensorConfig
 from protocol.machine.readings import GpsVelocity
 from protocol.site.site_config import Projection
 
-# Without GPS for so long, wheels and IMUs teach neither place and heading nor the gyros' bias: they show none of them,
-# but the centripetal w x v is linearised at a speed and a rate that jitter from step to step, which looks like
-# information. Fixes outweigh it; without them it bent the bias by 0.4 degrees per second in ten minutes. Standstills
-# and absolute headings still teach all that correlates with them.
-UNPLACED_S = 5.0
 Event = FilterStep | Fix | Measurement  # what the filter takes; a measurement stands for itself
 
 
@@ -52,6 +48,7 @@ class TrackerConfig:
     smoothing_s: float
     is_started: bool
     is_weighed: bool
+    tuning: LocalisationTuning = TUNING
 
     @property
     def slow(self) -> bool:
@@ -67,23 +64,29 @@ class Tracker:
     """
 
     def __init__(self, config: TrackerConfig) -> None:
-        machine, slow = config.machine, config.slow
+        machine, slow, tuning = config.machine, config.slow, config.tuning
         layout = layout_of(machine) if slow else Layout()
         share, projection = machine.machine_share, config.projection
         self.fusion: Fusion | None = None
         self.has_relocked = False
         self.lanes: LaneAid | None = None
-        self.receivers = Receivers(machine.sensors, projection, layout, slow=slow, machine_share=share)
+        self.receivers = Receivers(machine.sensors, projection, layout, tuning, slow=slow, machine_share=share)
         self._config = config
-        self._references = References(machine.sensors, layout, slow=slow)
+        self._references = References(machine.sensors, layout, tuning, slow=slow)
         source, on_plane = turn_source(machine), not shows_tilt(machine, config.profile)
         self._body = MotionSensors(
-            machine, layout, config.step_s, config.tyres, on_plane=on_plane, is_weighed=config.is_weighed or not slow
+            machine,
+            layout,
+            config.step_s,
+            config.tyres,
+            on_plane=on_plane,
+            is_weighed=config.is_weighed or not slow,
+            tuning=tuning,
         )
         turn_error = self._body.turn_error_radps if slow and source and source.kind == "odometry" else 0.0
         unseen = slow and source is None
         self._model = MotionModel(
-            layout, on_plane, self.receivers.errors, turn_error_radps=turn_error, turns_unseen=unseen
+            layout, on_plane, self.receivers.errors, turn_error_radps=turn_error, turns_unseen=unseen, tuning=tuning
         )
         self._doubt: Change | None = None
         self._placed_ns = 0  # stamp of the newest fix or velocity by GPS that was accepted
@@ -135,9 +138,10 @@ class Tracker:
     def start(self, engine: Filter, alignment: Alignment, first: FilterStep) -> Belief:
         """Begin to filter, with the belief at the first step."""
         layout = self._model.layout
-        belief = start_belief(alignment, first, self._body.forces(first), layout, self._body.turn_error_radps)
+        forces, turn_error, tuning = self._body.forces(first), self._body.turn_error_radps, self._config.tuning
+        belief = start_belief(alignment, first, forces, layout, turn_error, tuning)
         belief = replace(belief, past=nothing_past(layout.n, self._config.smoothing_s))
-        self.fusion = Fusion(engine, self._model, belief)
+        self.fusion = Fusion(engine, self._model, belief, relock=tuning.relock)
         return belief
 
     def filter(self, event: Event) -> list[Belief]:
@@ -157,11 +161,17 @@ class Tracker:
         return last.innovation if last else np.zeros(2)
 
     def _filter_step(self, fusion: Fusion, event: FilterStep) -> list[Belief]:
-        """Beliefs that the machine's motion changed."""
+        """Beliefs that the machine's motion changed.
+
+        Without GPS, wheels and IMUs teach neither place and heading nor the gyros' bias: they show none of them, but
+        the centripetal w x v is linearised at a speed and a rate that jitter from step to step, which looks like
+        information. Fixes outweigh it; without them it bends the bias by 0.4 degrees per second in ten minutes.
+        Standstills and absolute headings still teach all that correlates with them.
+        """
         absolute = self._references.measurements(event, fusion.belief)
         errors = self._references.errors
         layout = fusion.model.layout
-        unplaced = layout.wheel_scale and event.stamp_ns - self._placed_ns > UNPLACED_S * 1e9
+        unplaced = layout.wheel_scale and event.stamp_ns - self._placed_ns > self._config.tuning.unplaced_s * 1e9
         reckons = unplaced and bool(self._placed_ns or self._config.is_started)  # else the fix that aligned it comes
         # Wheels show nothing of their own scale s; but h = (1 + s) v is linearised at a speed that jitters.
         considers = tuple(range(layout.wheel_scales.start, layout.wheel_scales.stop))
@@ -232,7 +242,7 @@ def layout_of(machine: MachineConfig) -> Layout:
     return Layout(turns, True, len(receivers), len(references))
 
 
-def gps_velocity(reading: GpsVelocity, sensor: SensorConfig) -> Measurement:
+def gps_velocity(reading: GpsVelocity, sensor: SensorConfig, tuning: LocalisationTuning = TUNING) -> Measurement:
     """Velocity of the antenna in `map` by Doppler, with the variance that is configured, else with its own.
 
     It knows nothing of the slow errors of fixes: carrier frequencies suffer little from what delays the code. So it
@@ -240,5 +250,5 @@ def gps_velocity(reading: GpsVelocity, sensor: SensorConfig) -> Measurement:
     """
     variances = np.array(velocity_variances(reading, sensor))
     z, lever_m = np.array([reading.velocity_e_mps, reading.velocity_n_mps]), np.array(sensor.mount.xyz_m)
-    gate = sensor.gate(GPS_GATE_SIGMA)
+    gate = sensor.gate(tuning.gps_gate_sigma)
     return measurements.velocity(reading.stamp_ns, sensor.name, z, np.diag(variances), lever_m, gate)

@@ -17,6 +17,7 @@ from lab.maps.methods import folded
 from mapserver.calibration.calibrate import Solution, calibrate
 from mapserver.calibration.correction import LAST_NS, Correction, corrected, measured
 from mapserver.calibration.ledger import StayLedger
+from mapserver.calibration.tuning import TUNING, CalibrationTuning
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
 from mapserver.trust.auditor import Auditor
@@ -59,12 +60,12 @@ class CaseResult:
     distrusted: Mapping[str, str]
 
 
-def solved(case: FleetCase, recorded: Rows, true: Scene) -> CaseResult:
+def solved(case: FleetCase, recorded: Rows, true: Scene, tuning: CalibrationTuning = TUNING) -> CaseResult:
     """Calibrate a case's samples, and judge its maps."""
     data = tampered(case, recorded, true)
     names = sorted(data.rows)
-    distrusted = accused(data.rows, calibrated(data.rows))
-    result = calibrated(data.rows, set(distrusted))
+    distrusted = accused(data.rows, calibrated(data.rows, tuning=tuning))
+    result = calibrated(data.rows, set(distrusted), tuning)
     let_in = {names[index] for index in case.let_in}
     shown = [name for name in names if name in let_in or name not in distrusted]
     errors = {name: true_errors(data, name, true, case.spans) for name in shown}
@@ -106,14 +107,14 @@ def accused(rows: Rows, result: Solution) -> dict[str, str]:
     return {name: ", ".join(verdict.reasons) for name, verdict in verdicts.items() if verdict.contradicts}
 
 
-def calibrated(rows: Rows, excluded: Collection[str] = ()) -> Solution:
+def calibrated(rows: Rows, excluded: Collection[str] = (), tuning: CalibrationTuning = TUNING) -> Solution:
     """What the server's ledger and solver make of samples."""
     config, stays = ServerConfig(), {}
     for name, table in rows.items():
         ledger = StayLedger()
         ledger.add(table[is_foldable(table, config.fold)])
         stays[name] = ledger.stays()
-    return calibrate(stays, excluded)
+    return calibrate(stays, excluded, tuning=tuning)
 
 
 def judged(rows: Rows, data: Tampered, true: Scene) -> JudgedMap:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from agents.localisation.localiser import LocalisationConfig
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from agents.positioning import PipelineConfig
 from lab.positions.published import POSITIONS, Group
 
@@ -48,6 +49,11 @@ class Configuration:
     def options(self) -> PipelineConfig:
         """The pipeline's."""
         return PipelineConfig(localisation=LocalisationConfig(filter=self.filter, profile=self.profile))
+
+    @property
+    def tuning(self) -> LocalisationTuning:
+        """Of localisation."""
+        return TUNING
 
     @property
     def published_net_m(self) -> float | None:

@@ -165,7 +165,7 @@ def _replay(task: Task[Configuration], cache: Path) -> Score:
         options = replace(options, localisation=replace(options.localisation, start=recording.start))
     in_use = {sensor.name for sensor in machine.sensors if sensor.use}
     readings = [reading for reading in recording.readings if reading.sensor in in_use]
-    return score(replay(Positioning(recording.site, machine, options), readings), recording.truth)
+    return score(replay(Positioning(recording.site, machine, options, row.tuning), readings), recording.truth)
 
 
 def _with_share(task: Task[Configuration], cache: Path) -> RecordedDrive:

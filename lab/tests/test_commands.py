@@ -26,7 +26,7 @@ WORK = {
     "positions": "lab.positions.experiment",
     "roads": "lab.roads.experiment",
     "routes": "lab.routes.experiment",
-    "sensitivity": "lab.ground.sensitivity",
+    "sensitivity": "lab.sensitivity",
 }
 WRONG = {count: "0", seed: "-1", positive: "inf"}
 REPORT = {"scenario": "paper_site", "seconds": math.nan, "rows": [{"name": "a", "net_m": 1.5, "by_seed": [1, 2]}]}

@@ -18,7 +18,6 @@ from mapserver.calibration.passages import sound
 from mapserver.calibration.rolling import rolling
 from mapserver.calibration.select import (
     FAULT_SIGMAS,
-    FAULTY_SIGMAS,
     AppliedPart,
     CommonScale,
     MachineErrors,
@@ -30,13 +29,12 @@ from mapserver.calibration.select import (
     observe,
 )
 from mapserver.calibration.solver import Estimate, FleetProblem, Prior, against, estimate, problem
+from mapserver.calibration.tuning import TUNING, CalibrationTuning
 from protocol.arrays import Floats, Table
 from protocol.machine.samples import SCALE_STD
 from protocol.site.site_config import KnownGround
 
 KNOWN = CommonScale(True, 0.0, "")  # of machines that are solved together: what their estimate says is all there is
-# Errors of the model: no evidence makes a zero or a scale surer than this.
-ZERO_FLOOR, SCALE_FLOOR = 0.0004, 0.004
 # A sensor that measures less than half or more than twice of the drive force has no gain: it is stuck, or on its head.
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 # A solve takes so many epochs of all machines together, the newest, and no more machines than that: time and memory
@@ -68,6 +66,7 @@ def calibrate(
     excluded: Collection[str] = (),
     areas: Sequence[KnownGround] = (),
     remembered: Mapping[str, Prior] | None = None,
+    tuning: CalibrationTuning = TUNING,
 ) -> Solution:
     """Solve for all machines.
 
@@ -79,11 +78,11 @@ def calibrate(
     known = {name: newest(table, epochs_of_each(len(sane))) for name, table in sane.items()}
     if not set(known) - set(excluded):
         return Solution((), {}, CommonScale(False, SCALE_STD, "no_machine"))
-    solved = _solved(known, excluded, areas, {})
+    solved = _solved(known, excluded, areas, {}, tuning)
     states = solved.machines
     silent = {name: prior for name, prior in (remembered or {}).items() if is_surer(prior, states.get(name))}
     if silent:
-        solved = _solved(known, excluded, areas, silent)
+        solved = _solved(known, excluded, areas, silent, tuning)
     own = {name: stated(table) for name, table in known.items()}
     return replace(solved, stated=own, remembered=frozenset(silent))
 
@@ -116,15 +115,16 @@ def _solved(
     excluded: Collection[str],
     areas: Sequence[KnownGround],
     priors: Mapping[str, Prior],
+    tuning: CalibrationTuning,
 ) -> Solution:
     """What a solve with these priors says."""
     trusted = {name: table for name, table in known.items() if name not in excluded}
-    pb, result, unlike = _with_rolling(*_common_ground(trusted, areas, priors))
+    pb, result, unlike = _with_rolling(*_common_ground(trusted, areas, priors, tuning))
     observed = observe(pb, result)
     corrections, states = _said(pb, result, observed, unlike)
     states |= {pb.names[i]: replace(states[pb.names[i]], rolling=one) for i, one in unlike.items()}
     for name in sorted(set(known) - set(pb.names)):
-        own = problem({name: known[name]}, areas, priors)
+        own = problem({name: known[name]}, areas, priors, tuning)
         alone = against(own, pb, result)
         more, state = _said(own, alone, observe(own, alone), {}, observed.common)
         corrections, states = corrections + more, states | state
@@ -132,7 +132,10 @@ def _solved(
 
 
 def _common_ground(
-    trusted: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]
+    trusted: Mapping[str, Table],
+    areas: Sequence[KnownGround],
+    priors: Mapping[str, Prior],
+    tuning: CalibrationTuning,
 ) -> tuple[FleetProblem, Estimate]:
     """The ground of all machines but those that are at fault: one alone can put the slopes of a whole site in doubt.
 
@@ -141,13 +144,13 @@ def _common_ground(
     """
 
     def solved(some: Mapping[str, Table]) -> tuple[FleetProblem, Estimate]:
-        pb = problem(some, areas, priors)
+        pb = problem(some, areas, priors, tuning)
         return pb, estimate(pb)
 
     all_of_them = solved(trusted)
     most_seem = all_of_them[1].edges and 2 * len(_odd(*all_of_them, FAULT_SIGMAS)) >= len(trusted)
     others = all_of_them if most_seem else _without_odd(trusted, all_of_them, FAULT_SIGMAS[1], solved)
-    fewer = _without_odd(trusted, others, FAULTY_SIGMAS, solved) if others[1].edges else others
+    fewer = _without_odd(trusted, others, tuning.faulty_sigmas, solved) if others[1].edges else others
     return others if fewer[1].edges else fewer
 
 
@@ -227,7 +230,7 @@ def _corrections(pb: FleetProblem, applied: AppliedPart, unlike: Mapping[int, Ro
                 zero=round(zero, DIGITS),
                 scale=round(k / (1 + k), DIGITS),
                 across=round(across, DIGITS),
-                covariance=_covariance(applied.covariance[np.ix_(at, at)]),
+                covariance=_covariance(applied.covariance[np.ix_(at, at)], pb.tuning),
                 most_share=most_share,
                 rolls=round(float(m), DIGITS),
                 drags=round(float(b), DIGITS),
@@ -236,9 +239,9 @@ def _corrections(pb: FleetProblem, applied: AppliedPart, unlike: Mapping[int, Ro
     return out
 
 
-def _covariance(covariance: Floats) -> tuple[tuple[float, ...], ...]:
+def _covariance(covariance: Floats, tuning: CalibrationTuning) -> tuple[tuple[float, ...], ...]:
     """With the floors of zero, scale and lateral zero, rounded to what a fact keeps."""
-    floored = covariance + np.diag(np.square([ZERO_FLOOR, SCALE_FLOOR, ZERO_FLOOR]))
+    floored = covariance + np.diag(np.square([tuning.zero_floor, tuning.scale_floor, tuning.zero_floor]))
     return tuple(tuple(float(f"{value:.4g}") for value in row) for row in floored.tolist())
 
 
@@ -246,7 +249,7 @@ def _states(
     pb: FleetProblem, applied: AppliedPart, shown: Mapping[str, Mapping[str, tuple[str, ...]]]
 ) -> dict[str, MachineErrors]:
     """States of the machines of a problem. shown: by which sources."""
-    layout = pb.layout
+    layout, tuning = pb.layout, pb.tuning
     x, std = applied.x, np.sqrt(np.diag(applied.covariance))
     out = {}
     for index, name in enumerate(pb.names):
@@ -254,11 +257,11 @@ def _states(
         scale, across = layout.scales.start + index, layout.lateral.start + index
         out[name] = MachineErrors(
             zero=float(x[epoch]),
-            zero_std=float(np.hypot(std[epoch], ZERO_FLOOR)),
+            zero_std=float(np.hypot(std[epoch], tuning.zero_floor)),
             scale=float(x[scale]),
-            scale_std=float(np.hypot(std[scale], SCALE_FLOOR)),
+            scale_std=float(np.hypot(std[scale], tuning.scale_floor)),
             across=float(x[across]),
-            across_std=float(np.hypot(std[across], ZERO_FLOOR)),
+            across_std=float(np.hypot(std[across], tuning.zero_floor)),
             zero_by=shown[name]["zero"],
             scale_by=shown[name]["scale"],
             beyond=(float(applied.beyond[index, 0]), float(applied.beyond[index, 1])),

@@ -29,7 +29,8 @@ from mapserver.calibration.correction import (
 )
 from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.calibration.ledger import EPOCH_NS, NOTHING_STATED, Stated
-from mapserver.calibration.select import FAULT_SIGMAS, OBSERVED, state_of
+from mapserver.calibration.select import FAULT_SIGMAS, state_of
+from mapserver.calibration.tuning import TUNING
 
 # Between two decisions of the solver, each of which folds samples again; in a machine's first minutes, when there is
 EVERY_NS = 600 * 10**9  # little to fold, as soon as it has driven twice as long as at the last decision
@@ -193,7 +194,7 @@ def _filled(counts: Sequence[Correction], changed: Sequence[Correction]) -> list
         if one.most_share == LEVEL_SHARE and known:
             scale = now.covariance[1][1]
             filled = replace(filled, scale=now.scale, most_share=now.most_share)
-        if now.covariance[2][2] < OBSERVED * across:
+        if now.covariance[2][2] < TUNING.observed * across:
             across = now.covariance[2][2]
             filled = replace(filled, across=now.across)
         if filled is not one:

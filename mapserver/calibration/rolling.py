@@ -24,10 +24,6 @@ from protocol.arrays import Floats, Ints
 from protocol.machine.samples import SCALE_STD
 from protocol.units import GRAVITY_MPS2
 
-# By so much machines of one kind may roll unlike each other for sure, by tyres, loads, and masses known to 3 %; and so
-# near to each other they are not told apart.
-UNLIKE, ALIKE = 0.06, 0.1
-FLOOR = 0.02  # errors of the model: no evidence makes it surer
 MET_EPOCHS = 2  # in which a machine has to meet others: in one it may be rain
 ROUNDS = 5  # of weighing anew
 
@@ -37,7 +33,8 @@ def rolling(pb: FleetProblem, result: Estimate) -> tuple[dict[int, Rolling], tup
 
     The others' scales are within their data sheets, as far as anybody knows, and stand for how they roll.
     """
-    m, machines = src.means(pb.passages), len(pb.names)
+    tuning, machines = pb.tuning, len(pb.names)
+    m = src.means(pb.passages, tuning)
     number, known = pb.epochs.number[m.epoch], np.isfinite(m.c_rr)
     _, place = np.unique(np.stack([m.cell, number]), axis=1, return_inverse=True)
     epochs = _met_epochs(m.machine[known], place.ravel()[known], number[known], machines)
@@ -57,10 +54,10 @@ def rolling(pb: FleetProblem, result: Estimate) -> tuple[dict[int, Rolling], tup
         harder[on_slopes, layout.rolls] = np.eye(len(free.unlike))
         harder[on_slopes, layout.drags] = np.eye(len(free.unlike)) / c_rr
         g = harder[i] - harder  # this one less each
-        variance = FLOOR**2 + doubt[i] ** 2 + doubt**2
+        variance = tuning.rolls_floor**2 + doubt[i] ** 2 + doubt**2
         std = np.sqrt(((g @ covariance) * g).sum(axis=1) + variance)
-        unlike = np.abs(g @ x) - SURE * std > UNLIKE
-        alike = (np.abs(g @ x) < ALIKE) & (std < ALIKE)  # with itself
+        unlike = np.abs(g @ x) - SURE * std > tuning.unlike
+        alike = (np.abs(g @ x) < tuning.alike) & (std < tuning.alike)  # with itself
         if unlike.sum() >= alike.sum() and unlike.any():
             mean, against[i] = g[unlike].mean(axis=0), set(np.flatnonzero(unlike).tolist())
             share, off = float(mean @ x), float(np.sqrt(mean @ covariance @ mean + variance[unlike].mean()))
@@ -85,7 +82,7 @@ def _solved(
         matrix[others, others] += result.information[name].matrix[others, others]
         vector[others] += result.information[name].vector[others]
     same = src.same_ground(m, layout, result.ground, free.known, place)
-    sources = same, src.known_ground(m, layout, result.ground, free.known)
+    sources = same, src.known_ground(m, layout, result.ground, free.known, free.tuning)
     shown = [eliminate(each, each.weights(vector, None)) for each in sources]
     for _ in range(ROUNDS):
         whole = matrix + shown[0].matrix + shown[1].matrix

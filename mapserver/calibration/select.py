@@ -1,6 +1,6 @@
 """What of the parameters the evidence shows, and by what; and the part of an estimate that may be applied.
 
-A direction is a sum of parameters, each in units of its prior. Directions whose variance is below OBSERVED of the
+A direction is a sum of parameters, each in units of its prior. Directions whose variance is below a share of the
 prior's are observed. All others stay at the data sheet: there an estimate would be the noise of weak evidence, or what
 the prior shares out among the machines.
 
@@ -22,7 +22,6 @@ from mapserver.calibration.solver import Estimate, FleetProblem, Prior, inverse
 from protocol.arrays import Bools, Floats, Ints
 from protocol.machine.samples import SCALE_STD, ZERO_STD
 
-OBSERVED = 0.25  # of the prior's variance: half its standard deviation
 WEAK = 0.01  # of the weight of data sheets: evidence has to do without
 REMEMBERED = "remembered"  # an earlier solve showed it
 # By which a source is named: each alone, beside the ground that all share.
@@ -31,11 +30,7 @@ SURE = 2.0  # standard deviations by which an estimate must be beyond a limit
 # Of a scale that was observed once, and is not seen any more: temperature, tyres and oil change it by so much. Surer
 # than what counts as observed, so that it counts until something contradicts it.
 REMEMBERED_STD = 0.02
-FAULTY_SIGMAS = 3.0  # of the data sheet: a scale so far off is worse than anything that a slope may hide
 FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a zero, and a scale of 30 %, that no sensor of its kind has
-# Where only the difference of machines is known, nobody can be named: then none may be further off than this, in
-# standard deviations of the data sheet, or nothing is applied. Between two sound machines that is one case in 200.
-UNNAMED_SIGMAS = 2.0
 
 
 @dataclass(frozen=True)
@@ -65,23 +60,25 @@ class ObservedPart:
 def observe(pb: FleetProblem, result: Estimate) -> ObservedPart:
     """Split an estimate into what is observed and what is not."""
     layout = pb.layout
-    x, covariance = observed_part(result)
+    x, covariance = observed_part(result, pb.tuning.observed)
     evidence = _by_evidence(pb, result)
-    absolute = np.diag(evidence)[layout.scales] < OBSERVED * SCALE_STD**2
+    least = pb.tuning.observed * SCALE_STD**2
+    absolute = np.diag(evidence)[layout.scales] < least
     std = float(np.sqrt(evidence[layout.scales, layout.scales].mean()))
-    observed = std**2 < OBSERVED * SCALE_STD**2
+    observed = std**2 < least
     common = CommonScale(observed, min(std, SCALE_STD), "" if observed else result.edges or "no_slope_both_ways")
     return ObservedPart(x, covariance, _by(pb, result), absolute, common)
 
 
-def observed_part(result: Estimate) -> tuple[Floats, Floats]:
+def observed_part(result: Estimate, share: float) -> tuple[Floats, Floats]:
     """The estimate projected on observed directions, from what is known beforehand; the covariance of what it leaves.
 
+    share: of the prior's variance, below which a direction is observed.
     With L L' the prior's information, directions are eigenvectors of L' P L, whose eigenvalues are ratios of variances.
     """
     lower = np.linalg.cholesky(result.prior.matrix)
     ratios, directions = np.linalg.eigh(lower.T @ result.covariance() @ lower)
-    shown = ratios < OBSERVED
+    shown = ratios < share
     left = np.where(shown, ratios, 1.0)  # of the prior's variance
     units = np.linalg.solve(lower.T, directions)
     before = np.linalg.solve(result.prior.matrix, result.prior.vector)
@@ -98,7 +95,7 @@ def _by_evidence(pb: FleetProblem, result: Estimate) -> Floats:
 def without_data_sheet(pb: FleetProblem, matrix: Floats, machines: Sequence[int]) -> Floats:
     """An information matrix (p, p), which is changed, without the data sheets' word on the scales of machines."""
     scales, own = pb.layout.scales, np.array([p.covariance[1][1] for p in pb.priors])
-    weak = np.isin(np.arange(len(own)), machines) & (own >= OBSERVED * SCALE_STD**2)
+    weak = np.isin(np.arange(len(own)), machines) & (own >= pb.tuning.observed * SCALE_STD**2)
     at = np.arange(scales.start, scales.stop)[weak]
     matrix[at, at] -= (1 - WEAK) / own[weak]
     return matrix
@@ -106,7 +103,7 @@ def without_data_sheet(pb: FleetProblem, matrix: Floats, machines: Sequence[int]
 
 def _by(pb: FleetProblem, result: Estimate) -> dict[str, dict[str, tuple[str, ...]]]:
     """Which sources show zero and scale of each machine, each source alone beside the ground that all share."""
-    layout = pb.layout
+    layout, share = pb.layout, pb.tuning.observed
     present = [name for name in NAMED if name in result.information]
     variances = {name: np.diag(result.covariance(*{name, src.SAME_GROUND})) for name in present}
     before = np.diag(inverse(result.prior.matrix))
@@ -117,15 +114,15 @@ def _by(pb: FleetProblem, result: Estimate) -> dict[str, dict[str, tuple[str, ..
         shown = {"zero": epochs, "scale": np.array([layout.scales.start + index])}
         own = dict(zip(shown, np.diag(pb.priors[index].covariance).tolist(), strict=True))
         out[name] = {
-            what: (*([REMEMBERED] if own[what] < OBSERVED * data_sheet[what] else []), *_shown(variances, before, at))
+            what: (*[REMEMBERED] * (own[what] < share * data_sheet[what]), *_shown(variances, before, at, share))
             for what, at in shown.items()
         }
     return out
 
 
-def _shown(variances: Mapping[str, Floats], before: Floats, at: Ints) -> Sequence[str]:
+def _shown(variances: Mapping[str, Floats], before: Floats, at: Ints, share: float) -> Sequence[str]:
     """Sources by which the variance of these parameters falls enough, on average; what all share needs no other."""
-    names = [name for name, after in variances.items() if np.mean(after[at] / before[at]) < OBSERVED]
+    names = [name for name, after in variances.items() if np.mean(after[at] / before[at]) < share]
     return [src.SAME_GROUND] if src.SAME_GROUND in names else names
 
 
@@ -224,7 +221,7 @@ def applied_part(pb: FleetProblem, result: Estimate, observed: ObservedPart, oth
     covariance, beyond = result.covariance(), beyond_data_sheet(pb, result, 0.0 if others.observed else others.std)
     if result.edges:
         beyond[:, 1] *= absolute
-    far = beyond[:, 1] > FAULTY_SIGMAS
+    far = beyond[:, 1] > pb.tuning.faulty_sigmas
     if 2 * far.sum() >= len(far) > 1:
         beyond[:, 1] *= absolute
         far &= absolute
@@ -251,10 +248,10 @@ def _unnamed(pb: FleetProblem, zero: Floats, variance: Floats) -> Ints:
     """
     machines = len(pb.names)
     known, off = np.zeros(machines, np.bool_), np.zeros(machines)
-    np.logical_or.at(known, pb.epochs.machine, variance < OBSERVED * ZERO_STD**2)
+    np.logical_or.at(known, pb.epochs.machine, variance < pb.tuning.observed * ZERO_STD**2)
     np.maximum.at(off, pb.epochs.machine, np.abs(zero))
     some = np.flatnonzero(~known)
-    return some if machines > 1 and (off[some] > UNNAMED_SIGMAS * ZERO_STD).any() else some[:0]
+    return some if machines > 1 and (off[some] > pb.tuning.unnamed_sigmas * ZERO_STD).any() else some[:0]
 
 
 def moved(epochs: Epochs, zero: Floats, variance: Floats) -> Floats:

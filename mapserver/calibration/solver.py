@@ -20,21 +20,14 @@ from mapserver.calibration.equations import NO_GROUND, Equations, Information, e
 from mapserver.calibration.ledger import CELL_M, EPOCH_NS
 from mapserver.calibration.passages import Epochs, Passages, passages
 from mapserver.calibration.sources import GroundState, Parameters
+from mapserver.calibration.tuning import TUNING, CalibrationTuning
 from protocol.arrays import Floats, Ints, Table
 from protocol.machine.samples import SCALE_STD, ZERO_STD, ZERO_WALK
 from protocol.site.site_config import KnownGround
 
 ZERO_S = 2 * ZERO_STD**2 / ZERO_WALK**2  # a Gauss-Markov process with this walk stays within the data sheet
-# Of machines that roll unlike the others: half of the ground's c_rr, and what a brake costs on any ground.
-ROLLS_STD, DRAGS_STD = 0.5, 0.02
-RAMPS_STD = 0.07  # of c_rr per slope: of what all ramps of a site differ by, 0.02 at 15 degrees
-INSIDE_M = 6.0  # of a cell's centre in an area of known ground: two standard deviations of a position, and 3 m
 MOST_ROUNDS = 20
 SETTLED = 2e-6  # of all parameters: below what a correction is rounded to
-# Edges are believed where the ground itself does not change with the slope: neither everywhere (by so much c_rr per
-# slope, 0.004 at 15 degrees, and so many standard deviations), nor in many places (by so much c_rr, in this share).
-RAMPS_LIMIT, RAMPS_SIGMAS = 0.015, 2.0
-STEP_LIMIT, STEPPED_SHARE = 0.008, 0.3
 
 
 @dataclass(frozen=True)
@@ -63,6 +56,7 @@ class FleetProblem:
     known: Floats
     priors: tuple[Prior, ...]
     unlike: tuple[int, ...] = ()
+    tuning: CalibrationTuning = TUNING
 
     @property
     def layout(self) -> Parameters:
@@ -91,23 +85,29 @@ class Estimate:
         return inverse(self.prior.matrix + sum(self.information[name].matrix for name in chosen))
 
 
-def problem(ledgers: Mapping[str, Table], areas: Sequence[KnownGround], priors: Mapping[str, Prior]) -> FleetProblem:
+def problem(
+    ledgers: Mapping[str, Table],
+    areas: Sequence[KnownGround],
+    priors: Mapping[str, Prior],
+    tuning: CalibrationTuning = TUNING,
+) -> FleetProblem:
     """Stays by machine as `Ledger.stays` has them; areas: whose c_rr is stated; priors: where not the data sheet."""
     names = tuple(sorted(name for name, table in ledgers.items() if len(table)))
     p, epochs, cells = passages({name: ledgers[name] for name in names})
+    known = known_cells(cells, areas, tuning.inside_m)
     return FleetProblem(
-        names, p, epochs, cells, known_cells(cells, areas), tuple(priors.get(name, DATA_SHEET) for name in names)
+        names, p, epochs, cells, known, tuple(priors.get(name, DATA_SHEET) for name in names), tuning=tuning
     )
 
 
-def known_cells(cells: Ints, areas: Sequence[KnownGround]) -> Floats:
+def known_cells(cells: Ints, areas: Sequence[KnownGround], inside_m: float = TUNING.inside_m) -> Floats:
     """The c_rr (n,) that the site states of cells (n,) well inside of its areas; NaN elsewhere."""
     out = np.full(len(cells), np.nan)
     centres = (np.stack(stays.column_row(cells), axis=1) + 0.5) * CELL_M
     for area in areas:
         low, high = np.min(area.outline, axis=0), np.max(area.outline, axis=0)
         for i in np.flatnonzero(((centres > low) & (centres < high)).all(axis=1)).tolist():
-            if area.inside_m(*centres[i].tolist()) > INSIDE_M:
+            if area.inside_m(*centres[i].tolist()) > inside_m:
                 out[i] = area.c_rr
     return out
 
@@ -115,7 +115,7 @@ def known_cells(cells: Ints, areas: Sequence[KnownGround]) -> Floats:
 def estimate(pb: FleetProblem) -> Estimate:
     """Solve; where the slopes' edges contradict each other, or the ground itself changes there, without them."""
     result = _rounds(pb, with_edges=True)
-    reason = _doubt(result, pb.layout)
+    reason = _doubt(result, pb)
     return _rounds(pb, with_edges=False, reason=reason) if reason else result
 
 
@@ -139,15 +139,15 @@ def inverse(information: Floats) -> Floats:
 
 def _rounds(pb: FleetProblem, *, with_edges: bool, reason: str = "", frozen: GroundState | None = None) -> Estimate:
     """Iterate until nothing moves any more. frozen: ground that is known from elsewhere."""
-    layout, cells = pb.layout, len(pb.cells)
-    means, ground = src.means(pb.passages), src.first_ground(pb.passages, cells)
+    layout, cells, tuning = pb.layout, len(pb.cells), pb.tuning
+    means, ground = src.means(pb.passages, tuning), src.first_ground(pb.passages, cells)
     prior = prior_equations(pb)
     fixed = {
         src.CROSSINGS: src.crossings(means, layout, cells),
-        src.HEIGHTS: src.heights(pb.passages, layout, cells),
+        src.HEIGHTS: src.heights(pb.passages, layout, cells, tuning),
     }
     if with_edges:
-        fixed[src.EDGES] = src.edges(pb.passages, layout, ground)
+        fixed[src.EDGES] = src.edges(pb.passages, layout, ground, tuning)
     if frozen:
         fixed[src.CROSSINGS] = fixed[src.CROSSINGS].on(frozen.gradient.T.ravel())
         ground = _filled(frozen, ground)
@@ -156,7 +156,7 @@ def _rounds(pb: FleetProblem, *, with_edges: bool, reason: str = "", frozen: Gro
         same = src.same_ground(means, layout, ground, pb.known)
         system = fixed | {
             src.SAME_GROUND: same.on(frozen.c_rr) if frozen else same,
-            src.KNOWN_GROUND: src.known_ground(means, layout, ground, pb.known),
+            src.KNOWN_GROUND: src.known_ground(means, layout, ground, pb.known, tuning),
         }
         information = {name: eliminate(eq, eq.weights(x, unknowns.get(name))) for name, eq in system.items()}
         own = eliminate(prior, prior.weights(x, NO_GROUND if rounds > 1 else None))
@@ -188,7 +188,7 @@ def _filled(first: GroundState, second: GroundState) -> GroundState:
 
 def prior_equations(pb: FleetProblem) -> Equations:
     """Data sheets, and zeros that wander from epoch to epoch within them."""
-    layout, n = pb.layout, len(pb.epochs.number)
+    layout, tuning, n = pb.layout, pb.tuning, len(pb.epochs.number)
     machine, number = pb.epochs.machine, pb.epochs.number
     follows = np.r_[False, machine[1:] == machine[:-1]]
     apart_s = np.diff(number, prepend=number[:1]) * (EPOCH_NS * 1e-9)
@@ -200,16 +200,18 @@ def prior_equations(pb: FleetProblem) -> Equations:
         (kept, (np.arange(n), np.maximum(np.arange(n) - 1, 0))), shape=(layout.size, layout.size)
     )
     b = np.concatenate([(1 - kept) * zero[machine], scale, np.zeros(layout.size - layout.lateral.start)])
-    beside = np.repeat([ZERO_STD, RAMPS_STD, ROLLS_STD, DRAGS_STD], [layout.machines, 1, *[len(layout.unlike)] * 2])
+    of_rolling = np.repeat([tuning.rolls_std, tuning.drags_std], len(layout.unlike))
+    beside = np.concatenate([np.full(layout.machines, ZERO_STD), [tuning.ramps_std], of_rolling])
     std = np.concatenate([zero_std[machine] * np.sqrt(1 - kept**2), scale_std, beside])
     return equations(A.tocsr(), None, b, std)
 
 
-def _doubt(result: Estimate, layout: Parameters) -> str:
+def _doubt(result: Estimate, pb: FleetProblem) -> str:
     """Why edges of slopes must not count: a word."""
+    layout, tuning = pb.layout, pb.tuning
     ramps, std = result.x[layout.ramps], np.sqrt(result.covariance()[layout.ramps, layout.ramps])
-    if abs(ramps) > max(RAMPS_LIMIT, RAMPS_SIGMAS * std):
+    if abs(ramps) > max(tuning.ramps_limit, tuning.ramps_sigmas * std):
         return "ground_changes_with_slope"
-    if len(result.steps) and np.mean(np.abs(result.steps) > STEP_LIMIT) > STEPPED_SHARE:
+    if len(result.steps) and np.mean(np.abs(result.steps) > tuning.step_limit) > tuning.stepped_share:
         return "places_disagree"
     return ""

@@ -21,28 +21,12 @@ import scipy.sparse as sp
 
 from mapserver.calibration.equations import Equations, equations, sparse, stacked
 from mapserver.calibration.passages import Links, Passages, grouped, links
+from mapserver.calibration.tuning import CalibrationTuning
 from protocol.arrays import AnyArray, Floats, Ints
 
 SAME_GROUND, CROSSINGS, HEIGHTS, EDGES, KNOWN_GROUND = "same_ground", "crossings", "heights", "edges", "known_ground"
 
-# Standard deviations of one stay: of c_rr, which grows with it; of the slope and of the rise of a link [m], which grow
-# with the slope. What a machine repeats where it passes again, by its place in the lane, is SAME of the variance.
-C_STD, C_SHARE = 0.004, 0.08
-SLOPE_STD, SLOPE_SHARE = 0.006, 0.3
-RISE_STD_M, RISE_SHARE_M = 0.02, 0.3
-# Standard deviation of a rise across a bend on which samples are withheld, of its length times the change of the slope:
-# a bend anywhere in it would be 0.29, but they are withheld around its middle.
-BEND_SHARE = 0.16
-SAME = 0.25
 LEAST_C_RR = 0.002  # of ground, for the share of drive force on it
-KNOWN_STD = 0.001  # of c_rr that the site states
-# An edge compares stays so far apart, with the bend of the slope in the middle: the estimate of c_rr follows a change
-# late, and is settled after SETTLE_M on either side.
-EDGE_M, SETTLE_M = 20.0, 7.0
-BEND = 0.1  # least change of the slope that is an edge
-STEP = 0.05  # from stay to stay, of a slope that is not settled
-# What one place steps by on its own, however often it is passed: a border of two soils lies near many ramps.
-PLACE_M, PLACE_STD = 15.0, 0.004
 SECTORS = 8  # of headings that are summed
 EDGE_SECTORS = 4
 
@@ -134,7 +118,7 @@ def gradients(p: Passages) -> Floats:
     return out
 
 
-def means(p: Passages) -> Means:
+def means(p: Passages, tuning: CalibrationTuning) -> Means:
     """Sum up stays: what a day holds is bounded by the ground, not by the number of passages."""
     sector = _sector(p.ahead, SECTORS)
     first, group, count = grouped(p.epoch, p.cell, sector * 2 + (p.direction > 0))
@@ -143,8 +127,8 @@ def means(p: Passages) -> Means:
     with np.errstate(invalid="ignore"):
         c_rr = np.bincount(group[known], p.c_rr[known], len(first)) / known_count
     along, across, east, north = (mean(values, group, count) for values in (p.along, p.across, *p.ahead.T))
-    c_std = np.hypot(C_STD, C_SHARE * np.abs(c_rr)) * repeated(np.maximum(known_count, 1))
-    slope_std = np.hypot(SLOPE_STD, SLOPE_SHARE * np.hypot(along, across)) * repeated(count)
+    c_std = np.hypot(tuning.c_std, tuning.c_share * np.abs(c_rr)) * repeated(np.maximum(known_count, 1), tuning.same)
+    slope_std = np.hypot(tuning.slope_std, tuning.slope_share * np.hypot(along, across)) * repeated(count, tuning.same)
     ahead = np.stack([east, north], axis=1)
     where = p.epoch[first], p.machine[first], p.cell[first], p.direction[first]
     return Means(*where, ahead, c_rr, along, across, c_std, slope_std)
@@ -161,9 +145,9 @@ def mean(values: Floats, group: Ints, count: Ints) -> Floats:
     return np.asarray(np.bincount(group, values, len(count)) / count, np.float64)
 
 
-def repeated(count: AnyArray) -> Floats:
-    """Factor of a standard deviation after so many passages."""
-    return np.sqrt((1 - SAME) / count + SAME)
+def repeated(count: AnyArray, same: float) -> Floats:
+    """Factor of a standard deviation after so many passages, of which a share of the variance is the same."""
+    return np.sqrt((1 - same) / count + same)
 
 
 def same_ground(
@@ -184,7 +168,9 @@ def same_ground(
     )
 
 
-def known_ground(m: Means, layout: Parameters, ground: GroundState, known: Floats) -> Equations:
+def known_ground(
+    m: Means, layout: Parameters, ground: GroundState, known: Floats, tuning: CalibrationTuning
+) -> Equations:
     """The same where c is known, but for an error that all cells of the same value share."""
     at = np.flatnonzero(np.isfinite(m.c_rr) & np.isfinite(known[m.cell]))
     c_rr = known[m.cell[at]]
@@ -193,7 +179,9 @@ def known_ground(m: Means, layout: Parameters, ground: GroundState, known: Float
     measured = equations(
         _balance(m, at, layout, c_rr, ground), sparse(len(at), n, (which, 1.0)), m.c_rr[at] - c_rr, m.c_std[at]
     )
-    stated = equations(sparse(n, layout.size), sparse(n, n, (np.arange(n), 1.0)), np.zeros(n), np.full(n, KNOWN_STD))
+    stated = equations(
+        sparse(n, layout.size), sparse(n, n, (np.arange(n), 1.0)), np.zeros(n), np.full(n, tuning.known_std)
+    )
     return stacked(measured, stated)
 
 
@@ -229,7 +217,7 @@ def crossings(m: Means, layout: Parameters, cells: int) -> Equations:
     return stacked(ahead, left)
 
 
-def heights(p: Passages, layout: Parameters, cells: int) -> Equations:
+def heights(p: Passages, layout: Parameters, cells: int, tuning: CalibrationTuning) -> Equations:
     """From cell to cell h_j - h_i = rise + z times the distance, which counts down in reverse."""
     all_links = links(p)
     first, group, count = grouped(all_links.epoch, all_links.start * cells + all_links.end, all_links.bend_m > 0)
@@ -237,22 +225,24 @@ def heights(p: Passages, layout: Parameters, cells: int) -> Equations:
     rise, per_zero, slope, bend = (mean(values, group, count) for values in measured)
     link = Links._make(values[first] for values in all_links)
     n = len(first)
-    std = np.hypot(np.hypot(RISE_STD_M, RISE_SHARE_M * slope), BEND_SHARE * bend) * repeated(count)
+    link_std = np.hypot(np.hypot(tuning.rise_std_m, tuning.rise_share_m * slope), tuning.bend_share * bend)
+    std = link_std * repeated(count, tuning.same)
     ground = sparse(n, cells, (link.end, 1.0), (link.start, -1.0))
     return equations(sparse(n, layout.size, (link.epoch, -per_zero)), ground, rise, std, blocks=0)
 
 
-def edges(p: Passages, layout: Parameters, ground: GroundState) -> Equations:
+def edges(p: Passages, layout: Parameters, ground: GroundState, tuning: CalibrationTuning) -> Equations:
     """Over bends of the slope dc = d k ds + b d|s| + the step of the place itself, which is the ground here."""
     slope = (ground.gradient[p.cell] * p.ahead).sum(axis=1)
-    i, j = _across_bends(p, slope)
+    i, j = _across_bends(p, slope, tuning)
     change, steeper = p.direction[i] * (slope[j] - slope[i]), np.abs(slope[j]) - np.abs(slope[i])
     sector = _sector(p.ahead[i], EDGE_SECTORS)
-    square = np.floor((p.place_m[i] + p.place_m[j]) / 2 / PLACE_M)
+    square = np.floor((p.place_m[i] + p.place_m[j]) / 2 / tuning.place_m)
     _, place, passed = grouped(*square.T, sector, np.sign(change), p.direction[i])
     first, group, count = grouped(p.machine[i], place)
     c_rr = np.minimum(np.abs(p.c_rr[i]), np.abs(p.c_rr[j]))
-    std = np.sqrt(2) * np.hypot(C_STD, C_SHARE * mean(c_rr, group, count)) * repeated(count)
+    stays_std = np.sqrt(2) * np.hypot(tuning.c_std, tuning.c_share * mean(c_rr, group, count))
+    std = stays_std * repeated(count, tuning.same)
     n, places = len(first), len(passed)
     scale = layout.scales.start + p.machine[i][first]
     measured = equations(
@@ -262,23 +252,23 @@ def edges(p: Passages, layout: Parameters, ground: GroundState) -> Equations:
         std,
     )
     own = sparse(places, places, (np.arange(places), 1.0))
-    steps = equations(sparse(places, layout.size), own, np.zeros(places), np.full(places, PLACE_STD))
+    steps = equations(sparse(places, layout.size), own, np.zeros(places), np.full(places, tuning.place_std))
     both = stacked(measured, steps)
     both.heavy[n:] = True
     return both
 
 
-def _across_bends(p: Passages, slope: Floats) -> tuple[Ints, Ints]:
-    """Stays i and j, EDGE_M apart, both on settled slopes, which differ."""
+def _across_bends(p: Passages, slope: Floats, tuning: CalibrationTuning) -> tuple[Ints, Ints]:
+    """Stays i and j, edge_m apart, both on settled slopes, which differ."""
     apart_m = np.hypot(*np.diff(p.place_m, axis=0, prepend=p.place_m[:1]).T)
     run = np.cumsum(~p.follows)
     driven_m = np.cumsum(np.where(p.follows, apart_m, 0.0)) + run * 1e6  # runs lie far apart
-    bends = np.cumsum(p.follows & (np.abs(np.diff(slope, prepend=slope[:1])) > STEP))
-    before = np.searchsorted(driven_m, driven_m - SETTLE_M)
-    after = np.searchsorted(driven_m, driven_m + SETTLE_M, side="right") - 1
+    bends = np.cumsum(p.follows & (np.abs(np.diff(slope, prepend=slope[:1])) > tuning.step))
+    before = np.searchsorted(driven_m, driven_m - tuning.settle_m)
+    after = np.searchsorted(driven_m, driven_m + tuning.settle_m, side="right") - 1
     usable = (bends[after] == bends[before]) & np.isfinite(p.c_rr)
-    j = np.searchsorted(driven_m, driven_m + EDGE_M)
+    j = np.searchsorted(driven_m, driven_m + tuning.edge_m)
     i = np.flatnonzero(j < len(p))
     j = j[i]
-    good = (run[i] == run[j]) & usable[i] & usable[j] & (np.abs(slope[j] - slope[i]) > BEND)
+    good = (run[i] == run[j]) & usable[i] & usable[j] & (np.abs(slope[j] - slope[i]) > tuning.bend)
     return i[good], j[good]

@@ -36,11 +36,10 @@ from mapserver.trust.judgement import (
     judge,
     outvoted,
 )
+from mapserver.trust.tuning import TUNING, TrustTuning
 from protocol.arrays import Ints, Table
 from protocol.queries.roads import WorklistQuery
 
-# Standard errors that are added to each limit: a vote may be doubtful where several are needed, a verdict may not.
-PAIR_SIGMAS, VERDICT_SIGMAS = 1.0, 2.0
 _PRINTED = {AGREE: "agrees_with", DISAGREE: "disagrees_with", UNKNOWN: "undecided_with"}
 
 Pairs = dict[tuple[str, str], dict[Reason, Judgement]]  # of the first of two machines
@@ -68,8 +67,8 @@ class Verdict:
 class Auditor:
     """Compares all machines of one site. cell_m: of the site's grid; fold: which samples know their place."""
 
-    def __init__(self, cell_m: float, fold: FoldConfig | None = None) -> None:
-        self._cell_m = cell_m
+    def __init__(self, cell_m: float, fold: FoldConfig | None = None, tuning: TrustTuning = TUNING) -> None:
+        self._cell_m, self._tuning = cell_m, tuning
         self._fold = fold or FoldConfig()
         self._maps: dict[str, CoarseMap] = {}
         self._clocks = ClockLeads()
@@ -119,7 +118,7 @@ class Auditor:
         suspected = [any(groups[reason][i] for reason in Reason if reason != Reason.CLOCK) for i in range(len(names))]
         verdicts = {}
         for i, difference in enumerate(self._from_pool(maps, suspected)):
-            judgements = judge(difference, VERDICT_SIGMAS)
+            judgements = judge(difference, self._tuning.verdict_sigmas, self._tuning)
             judgements[Reason.CLOCK], lead = self._clock(names, i, groups[Reason.CLOCK][i])
             judgements[Reason.BEYOND_DATA_SHEET] = beyond_data_sheet(known[i])
             reasons = tuple(r for r in Reason if groups[r][i] and judgements[r].state == DISAGREE)
@@ -132,11 +131,12 @@ class Auditor:
 
     def _pairs(self, names: Sequence[str], maps: Sequence[ComparedMap]) -> Pairs:
         """Judge every machine against every other."""
-        pairs: Pairs = {}
+        pairs, tuning = Pairs(), self._tuning
         for (one, one_map), (other, other_map) in combinations(zip(names, maps, strict=True), 2):
-            difference = compare(one_map, other_map, map_cell_m(self._cell_m))
-            pairs[one, other] = judge(difference, PAIR_SIGMAS)
-            pairs[other, one] = judge(reverse(difference) if difference else None, PAIR_SIGMAS)
+            difference = compare(one_map, other_map, map_cell_m(self._cell_m), tuning)
+            pairs[one, other] = judge(difference, tuning.pair_sigmas, tuning)
+            back = reverse(difference) if difference else None
+            pairs[other, one] = judge(back, tuning.pair_sigmas, tuning)
         for (one, other), judgements in pairs.items():
             judgements[Reason.CLOCK] = self._clocks.compare(one, other)[1]
         return pairs
@@ -147,7 +147,7 @@ class Auditor:
         pool = ComparedMap(pooled([each.timed for each in good]), pooled([each.placed for each in good]))
         for own, bad in zip(maps, suspected, strict=True):
             rest = pool if bad else ComparedMap(pool.timed.without(own.timed), pool.placed.without(own.placed))
-            yield compare(own, rest, map_cell_m(self._cell_m))
+            yield compare(own, rest, map_cell_m(self._cell_m), self._tuning)
 
     def _clock(self, names: Sequence[str], i: int, group: Sequence[int]) -> tuple[Judgement, dict[str, Any]]:
         """Typical lead over the machines that outvote this one, or else over all others."""

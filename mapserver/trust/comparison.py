@@ -12,17 +12,12 @@ import numpy as np
 
 from mapserver.trust.coarse_map import LEVEL_FLOOR, ROW, Surface
 from mapserver.trust.shift import Shift, find_shift, near_borders
+from mapserver.trust.tuning import TUNING, TrustTuning
 from protocol.arrays import Floats, Ints
 
-MIN_CELLS = 20  # of about 4 m2 that two machines must share; with fewer nothing is decided
-ZERO_ERROR = 0.003  # of c_rr: an accelerometer's zero error divided by g may explain a difference on hard ground
-TOLERANCE = 0.3  # of log(c_rr + 0.01), within which cells agree; dry and wet dirt are 0.34 apart
 _LOWEST_C_RR = 0.004  # the lowest that the map knows: ratios of less mean nothing
-_SCATTER = 0.1  # of log(c_rr) between two machines on one cell, besides the zero error
 _MOST_CELLS = 8000
-# Neighbouring cells share samples and errors: so many count as one; and 1.25 / 0.6745 turns a median absolute
-# deviation into the standard error of a median.
-CELLS_PER_DRAW, _MEDIAN_ERROR = 4, 1.85
+_MEDIAN_ERROR = 1.85  # 1.25 / 0.6745 turns a median absolute deviation into the standard error of a median
 
 
 @dataclass(frozen=True)
@@ -44,8 +39,8 @@ class Difference:
     """How one map differs from another.
 
     cells: compared, of the same period; shift: None where no border shows it; agreement: share of the cells whose
-    levels agree within TOLERANCE once gain and shift are taken out; spreads: standard deviations of the levels, own and
-    other, on these cells.
+    levels agree once gain and shift are taken out; spreads: standard deviations of the levels, own and other, on these
+    cells.
     """
 
     cells: int
@@ -68,7 +63,7 @@ class ComparedMap:
         return near_borders(self.placed)
 
 
-def compare(one: ComparedMap, other: ComparedMap, cell_m: float) -> Difference | None:
+def compare(one: ComparedMap, other: ComparedMap, cell_m: float, tuning: TrustTuning = TUNING) -> Difference | None:
     """Compare two maps with cells of this edge; None where they have too little ground in common.
 
     Gain and agreement compare cells of the same period, for it may have rained in between. The shift compares places:
@@ -76,16 +71,16 @@ def compare(one: ComparedMap, other: ComparedMap, cell_m: float) -> Difference |
     """
     a, b = _common(one.timed.codes, other.timed.codes)
     cells = len(a)
-    if cells < MIN_CELLS:
+    if cells < tuning.min_cells:
         return None
     a, b = _thinned(a, b)
-    gain = _gain(one.timed, other.timed, a, b, cell_m)
-    shift = _shift(one, other, cell_m)
+    gain = _gain(one.timed, other.timed, a, b, cell_m, tuning)
+    shift = _shift(one, other, cell_m, tuning)
     return Difference(
         cells=cells,
         gain=gain,
         shift=shift,
-        agreement=_agreement(one.timed, other.timed, b, gain.log, shift, cell_m),
+        agreement=_agreement(one.timed, other.timed, b, gain.log, shift, cell_m, tuning.tolerance),
         spreads=(float(np.std(one.timed.level[a])), float(np.std(other.timed.level[b]))),
     )
 
@@ -105,15 +100,15 @@ def _common(one: Ints, other: Ints) -> tuple[Ints, Ints]:
     return place[hit], hit
 
 
-def _gain(one: Surface, other: Surface, a: Ints, b: Ints, cell_m: float) -> Gain:
+def _gain(one: Surface, other: Surface, a: Ints, b: Ints, cell_m: float, tuning: TrustTuning) -> Gain:
     """Median of the log ratio; a zero error hides it on concrete, so that each cell weighs by what it can tell."""
     c_one, c_other = _c_rr(one.level[a]), _c_rr(other.level[b])
     c_rr = np.sqrt(c_one * c_other)
     metres = np.minimum(np.minimum(one.metres[a], other.metres[b]), cell_m)
-    weight = metres / (_SCATTER**2 + (ZERO_ERROR / c_rr) ** 2)
+    weight = metres / (tuning.scatter**2 + (tuning.zero_error / c_rr) ** 2)
     ratio = np.log(c_one / c_other)
     log = _weighted_median(ratio, weight)
-    draws = max(1.0, weight.sum() ** 2 / (weight @ weight) / CELLS_PER_DRAW)
+    draws = max(1.0, weight.sum() ** 2 / (weight @ weight) / tuning.cells_per_draw)
     same_direction = ratio * np.sign(log) > abs(log) / 2
     return Gain(
         log=log,
@@ -123,14 +118,17 @@ def _gain(one: Surface, other: Surface, a: Ints, b: Ints, cell_m: float) -> Gain
     )
 
 
-def _shift(one: ComparedMap, other: ComparedMap, cell_m: float) -> Shift | None:
+def _shift(one: ComparedMap, other: ComparedMap, cell_m: float, tuning: TrustTuning) -> Shift | None:
     """Displacement of the places, once the gain between them is taken out."""
     a, b = _thinned(*_common(one.placed.codes, other.placed.codes))
-    expected = _with_gain(other.placed.level[other.borders], _gain(one.placed, other.placed, a, b, cell_m).log)
+    gain = _gain(one.placed, other.placed, a, b, cell_m, tuning)
+    expected = _with_gain(other.placed.level[other.borders], gain.log)
     return find_shift(one.placed, other.placed, other.borders, expected, cell_m)
 
 
-def _agreement(one: Surface, other: Surface, b: Ints, log_gain: float, shift: Shift | None, cell_m: float) -> float:
+def _agreement(
+    one: Surface, other: Surface, b: Ints, log_gain: float, shift: Shift | None, cell_m: float, tolerance: float
+) -> float:
     """Share of these cells whose levels agree: where the maps lie, or moved by the shift, whichever is better."""
     moves = {0}
     if shift:
@@ -139,7 +137,7 @@ def _agreement(one: Surface, other: Surface, b: Ints, log_gain: float, shift: Sh
     shares = []
     for move in moves:
         own, at = _common(one.codes, other.codes[b] + move)
-        shares.append(float(np.mean(np.abs(one.level[own] - expected[at]) <= TOLERANCE)) if len(at) else 0.0)
+        shares.append(float(np.mean(np.abs(one.level[own] - expected[at]) <= tolerance)) if len(at) else 0.0)
     return max(shares)
 
 

@@ -11,20 +11,12 @@ from math import hypot, log, sqrt
 import numpy as np
 
 from mapserver.calibration.select import FAULT_SIGMAS, MachineErrors
-from mapserver.trust.comparison import CELLS_PER_DRAW, ZERO_ERROR, Difference, Gain
+from mapserver.trust.comparison import Difference, Gain
 from mapserver.trust.shift import Shift
+from mapserver.trust.tuning import TUNING, TrustTuning
 from protocol.arrays import Ints
 
 AGREE, UNKNOWN, DISAGREE = 1, 0, -1
-ALIKE = 0.75  # share of the limit up to which maps agree; between it and the limit nothing is said
-GAIN_LIMIT = 1.15  # ratio of coefficients: agents know mass and torque to 3 % each, a class is wrong from about 1.25
-# Share of the ground that must differ by a gain in the same direction, and of the borders that must speak for a
-# displacement: a repaved corner is neither.
-SHARE = 0.75
-OFFSET_LIMIT_M = 1.5  # of positions: what slow receiver errors leave after hours
-AGREEMENT = 0.6  # share of the ground on which two machines must agree within the tolerance of a comparison
-# A sensor is stuck where its levels vary by less than this share of what the others' do, if those vary by so much.
-STUCK_SPREAD, MIN_SPREAD = 0.25, 0.3
 CLOCK_LIMIT_S = 300.0  # lead or lag that batches and links may explain
 # A clock is wrong where its lead stays within so much for so long; the lag of a machine that catches up shrinks faster.
 CLOCK_STEADY_S, CLOCK_SPAN_S = 60.0, 600.0
@@ -58,7 +50,7 @@ _NO_JUDGEMENT = Judgement()
 # --- the ground ------------------------------------------------------------------------------------------------------
 
 
-def judge(difference: Difference | None, sigmas: float) -> dict[Reason, Judgement]:
+def judge(difference: Difference | None, sigmas: float, tuning: TrustTuning = TUNING) -> dict[Reason, Judgement]:
     """Judge the first of two maps, for every reason that shows in the ground.
 
     sigmas: so many standard errors are added to each limit. Between maps that have nothing in common, gain and offset
@@ -67,46 +59,46 @@ def judge(difference: Difference | None, sigmas: float) -> dict[Reason, Judgemen
     judgements = dict.fromkeys(GROUND, _NO_JUDGEMENT)
     if difference is None:
         return judgements
-    judgements[Reason.STUCK] = _stuck(difference.spreads)
-    if DISAGREE in (judgements[Reason.STUCK].state, _stuck(difference.spreads[::-1]).state):
+    judgements[Reason.STUCK] = _stuck(difference.spreads, tuning)
+    if DISAGREE in (judgements[Reason.STUCK].state, _stuck(difference.spreads[::-1], tuning).state):
         return judgements
-    judgements[Reason.DISAGREES] = _disagrees(difference, sigmas)
+    judgements[Reason.DISAGREES] = _disagrees(difference, sigmas, tuning)
     if judgements[Reason.DISAGREES].state != DISAGREE:
-        judgements[Reason.GAIN] = _gain(difference.gain, sigmas)
-        judgements[Reason.OFFSET] = _offset(difference.shift, sigmas)
+        judgements[Reason.GAIN] = _gain(difference.gain, sigmas, tuning)
+        judgements[Reason.OFFSET] = _offset(difference.shift, sigmas, tuning)
     return judgements
 
 
-def _stuck(spreads: tuple[float, float]) -> Judgement:
+def _stuck(spreads: tuple[float, float], tuning: TrustTuning) -> Judgement:
     own, theirs = spreads
-    if theirs < MIN_SPREAD:
+    if theirs < tuning.min_spread:
         return _NO_JUDGEMENT
-    excess = STUCK_SPREAD * theirs / max(own, 1e-3)
+    excess = tuning.stuck_spread * theirs / max(own, 1e-3)
     return Judgement(excess, DISAGREE if excess > 1 else AGREE)
 
 
-def _disagrees(difference: Difference, sigmas: float) -> Judgement:
-    error = 0.5 * sqrt(CELLS_PER_DRAW / difference.cells)  # of a share, at most
-    excess = (1 - difference.agreement) / (1 - AGREEMENT + sigmas * error)
-    return Judgement(excess, DISAGREE if excess > 1 else AGREE if excess <= ALIKE else UNKNOWN)
+def _disagrees(difference: Difference, sigmas: float, tuning: TrustTuning) -> Judgement:
+    error = 0.5 * sqrt(tuning.cells_per_draw / difference.cells)  # of a share, at most
+    excess = (1 - difference.agreement) / (1 - tuning.agreement + sigmas * error)
+    return Judgement(excess, DISAGREE if excess > 1 else AGREE if excess <= tuning.alike else UNKNOWN)
 
 
-def _gain(gain: Gain, sigmas: float) -> Judgement:
-    limit = log(GAIN_LIMIT) + ZERO_ERROR / gain.c_rr
+def _gain(gain: Gain, sigmas: float, tuning: TrustTuning) -> Judgement:
+    limit = log(tuning.gain_limit) + tuning.zero_error / gain.c_rr
     excess = abs(gain.log) / (limit + sigmas * gain.std)
-    if excess > 1 and gain.share >= SHARE:
+    if excess > 1 and gain.share >= tuning.share:
         return Judgement(excess, DISAGREE)
     return Judgement(excess, AGREE if abs(gain.log) <= limit else UNKNOWN)
 
 
-def _offset(shift: Shift | None, sigmas: float) -> Judgement:
+def _offset(shift: Shift | None, sigmas: float, tuning: TrustTuning) -> Judgement:
     if shift is None:
         return _NO_JUDGEMENT
-    far_m = hypot(shift.east_m, shift.north_m)
-    excess = far_m / (OFFSET_LIMIT_M + sigmas * shift.std_m)
-    if excess > 1 and shift.share >= SHARE:
+    far_m, limit_m = hypot(shift.east_m, shift.north_m), tuning.offset_limit_m
+    excess = far_m / (limit_m + sigmas * shift.std_m)
+    if excess > 1 and shift.share >= tuning.share:
         return Judgement(excess, DISAGREE)
-    agrees = far_m <= OFFSET_LIMIT_M and shift.std_m <= OFFSET_LIMIT_M
+    agrees = far_m <= limit_m and shift.std_m <= limit_m
     return Judgement(excess, AGREE if agrees else UNKNOWN)
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from agents.localisation.filters.belief import Belief, Conditioned, Filter, Measurement, extended, open_states
 from agents.localisation.filters.motion import MotionModel, motion
 from agents.localisation.filters.smoother import SmoothedPose
+from agents.localisation.tuning import TUNING
 from protocol.arrays import Floats
 
 WINDOW_S = 1.0  # how far back measurements may come; receivers and networks are late by less
-RELOCK = 15  # refusals in a row after which a sensor is accepted again: the filter is lost, not the sensor
 NO_SENSOR: frozenset[str] = frozenset()
 _stamp = attrgetter("stamp_ns")
 
@@ -38,12 +38,12 @@ class Fusion:
     """Filters measurements into beliefs.
 
     model: how the machine moves; it is replaced as more is known, and holds for all that is filtered from then on.
-    counters: measurements used, gated and refused, by sensor. last: the newest result of each sensor. window_s, relock:
-    as WINDOW_S, RELOCK.
+    counters: measurements used, gated and refused, by sensor. last: the newest result of each sensor. window_s:
+    as WINDOW_S. relock: as of a LocalisationTuning.
     """
 
     def __init__(
-        self, engine: Filter, model: MotionModel, start: Belief, window_s: float = WINDOW_S, relock: int = RELOCK
+        self, engine: Filter, model: MotionModel, start: Belief, window_s: float = WINDOW_S, relock: int = TUNING.relock
     ) -> None:
         self.counters: Counter[str] = Counter()
         self.last: dict[str, Conditioned] = {}

@@ -35,30 +35,14 @@ from agents.localisation.filters.state import (
     Layout,
     Z,
 )
+from agents.localisation.tuning import TUNING, LocalisationTuning
 from protocol.arrays import Floats
 
 OFF_PLANE_VARIANCE = 1e-6  # of states that are zero on a plane, as robot_localization measures them
 EYE = np.eye(3)
 MIN_COS_PITCH = 0.05  # Euler angles are singular at +-90 deg; no machine drives there, but a sigma point may
-
-# Standard deviations of what the model does not know. The distance driven along and across the body is unsure by its
-# square root [m/sqrt(m)], so a machine at rest does not slip; the others are random walks.
-SLIP_ALONG, SLIP_ACROSS = 0.02, 0.03
-HEIGHT_WALK = 0.02  # [m/sqrt(s)]
-TILT_WALK = 5e-3  # roll and pitch [rad/sqrt(s)]
-HEADING_WALK = 1e-3  # [rad/sqrt(s)], also of the heading that an attitude reference counts from
-VELOCITY_WALK = 0.05  # [m/s/sqrt(s)]
-RATE_WALK = 0.3  # angular rate [rad/s/sqrt(s)]
-ACCELERATION_WALK = 1.0  # [m/s2/sqrt(s)]
-GYRO_BIAS_WALK = 5e-5  # [rad/s/sqrt(s)]
-WHEEL_SCALE_WALK = 2e-4  # [1/sqrt(s)]
-SLIP_STD = 0.08  # of the wheels' slip per traction, which the speed is corrected by
-SLIP_TIME_S = 5.0  # how long a ground's slip stays the same
 OFFSET_WALK = 1e-3  # offset of the map [m/sqrt(s)]: one that is drawn of many days stays where it is
 BESIDE_STD_M, BESIDE_S = 2.0, 300.0  # how far beside the fleet's lanes a machine keeps, and for how long so
-TURN_S = 3.0  # how long a turn lasts that no sensor shows
-CURVATURE, MAX_TURN_RADPS, LEAST_TURN_RADPS = 0.1, 0.3, 0.005  # it: standard deviation per metre driven, and its limits
-BEND_S = 60.0  # how long the error of an odometry's turn rate stays the same: a wrong scale makes another in every bend
 
 
 @dataclass(frozen=True)
@@ -104,10 +88,11 @@ class MotionModel:
     gps_errors: tuple[GpsError, ...] = ()
     heading_errors: tuple[HeadingError, ...] = ()
     traction: float = 0.0
-    slip_std: float = SLIP_STD
+    slip_std: float = TUNING.slip_std
     turn_error_radps: float = 0.0
     reckons: bool = False
     turns_unseen: bool = False
+    tuning: LocalisationTuning = TUNING
 
     def __post_init__(self) -> None:
         if len(self.gps_errors) != self.layout.receivers:
@@ -120,7 +105,8 @@ class MotionModel:
     ) -> "MotionModel":
         """The model of another step; `replace` takes four times as long."""
         sensors = (self.layout, self.on_plane, self.gps_errors, heading_errors)
-        return MotionModel(*sensors, traction, slip_std, self.turn_error_radps, reckons, self.turns_unseen)
+        own = (reckons, self.turns_unseen, self.tuning)
+        return MotionModel(*sensors, traction, slip_std, self.turn_error_radps, *own)
 
     @property
     def max_step_ns(self) -> int:
@@ -130,8 +116,8 @@ class MotionModel:
 
 def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
     """The motion over dt_s from a belief, whose attitude and velocity direct the slip noise."""
-    layout = model.layout
-    keep, walks = _constants(layout, on_plane=model.on_plane)
+    layout, tuning = model.layout, model.tuning
+    keep, walks = _constants(layout, tuning, on_plane=model.on_plane)
     scale, Q = keep.copy(), walks * dt_s
     if model.on_plane:
         Q[OFF_PLANE, OFF_PLANE] = OFF_PLANE_VARIANCE
@@ -151,16 +137,17 @@ def motion(model: MotionModel, belief: Belief, dt_s: float) -> Motion:
         Q[beside, beside] = BESIDE_STD_M**2 * -math.expm1(-2 * dt_s / BESIDE_S)
     of_position = Q[POSITION, POSITION]
     slip_mps = model.slip_std * model.traction * float(belief.x[SPEED])
-    # The integral of a Gauss-Markov error of SLIP_TIME_S grows by 2 std^2 time per second.
-    of_position += _slip(belief.x * scale, dt_s, 2 * SLIP_TIME_S * slip_mps**2 * dt_s)
+    # The integral of a Gauss-Markov error of slip_s grows by 2 std^2 time per second.
+    of_position += _slip(belief.x * scale, dt_s, 2 * tuning.slip_s * slip_mps**2 * dt_s, tuning)
     if model.turn_error_radps:
         turn = layout.gyro_biases.stop - 1
-        Q[turn, turn] += 2 * model.turn_error_radps**2 * dt_s / BEND_S
+        Q[turn, turn] += 2 * model.turn_error_radps**2 * dt_s / tuning.bend_s
 
     if model.turns_unseen:  # a stationary Gauss-Markov process: a machine that stands does not turn
-        std_radps = min(CURVATURE * abs(float(belief.x[SPEED])), MAX_TURN_RADPS) + LEAST_TURN_RADPS
-        scale[YAW_RATE] = math.exp(-dt_s / TURN_S)
-        Q[YAW_RATE, YAW_RATE] = std_radps**2 * -math.expm1(-2 * dt_s / TURN_S)
+        bends_radps = min(tuning.curvature * abs(float(belief.x[SPEED])), tuning.max_turn_radps)
+        std_radps = bends_radps + tuning.least_turn_radps
+        scale[YAW_RATE] = math.exp(-dt_s / tuning.turn_s)
+        Q[YAW_RATE, YAW_RATE] = std_radps**2 * -math.expm1(-2 * dt_s / tuning.turn_s)
 
     def f(states: Floats) -> Floats:
         return _moved(states, scale, dt_s)
@@ -283,10 +270,11 @@ def _jacobian(x: Floats, dt_s: float) -> Floats:
     return F
 
 
-def _slip(x: Floats, dt_s: float, along_m2: float) -> Floats:
+def _slip(x: Floats, dt_s: float, along_m2: float, tuning: LocalisationTuning) -> Floats:
     """Variance (3, 3) in map of the distance driven in a step [m2]; along_m2: added along the body."""
     distance_m = math.hypot(*x[VELOCITY][:2].tolist()) * dt_s
-    along, across = math.sqrt(SLIP_ALONG**2 * distance_m + along_m2), SLIP_ACROSS * math.sqrt(distance_m)
+    along = math.sqrt(tuning.slip_along**2 * distance_m + along_m2)
+    across = tuning.slip_across * math.sqrt(distance_m)
     forward, left, _ = _axes(x[ATTITUDE].tolist())
     deviation = np.array([[along * part for part in forward], [across * part for part in left]])
     slip: Floats = deviation.T.dot(deviation)
@@ -304,7 +292,7 @@ def _fading(times_s: tuple[float, ...], dt_s: float) -> tuple[Floats, tuple[tupl
 
 
 @lru_cache
-def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats]:
+def _constants(layout: Layout, tuning: LocalisationTuning, *, on_plane: bool) -> tuple[Floats, Floats]:
     """What every motion of a layout begins with.
 
     Factor (n,) that sets the states off the plane to zero, and covariance (n, n) of the random walks of a second.
@@ -312,14 +300,14 @@ def _constants(layout: Layout, *, on_plane: bool) -> tuple[Floats, Floats]:
     keep, deviation = np.ones(layout.n), np.zeros(layout.n)
     if on_plane:
         keep[OFF_PLANE] = 0.0
-    deviation[Z] = HEIGHT_WALK
-    deviation[ATTITUDE] = TILT_WALK, TILT_WALK, HEADING_WALK
-    deviation[VELOCITY] = VELOCITY_WALK
-    deviation[RATE] = RATE_WALK
-    deviation[ACCELERATION] = ACCELERATION_WALK
-    deviation[layout.gyro_biases] = GYRO_BIAS_WALK
-    deviation[layout.wheel_scales] = WHEEL_SCALE_WALK
-    deviation[layout.heading_errors] = HEADING_WALK
+    deviation[Z] = tuning.height_walk
+    deviation[ATTITUDE] = tuning.tilt_walk, tuning.tilt_walk, tuning.heading_walk
+    deviation[VELOCITY] = tuning.velocity_walk
+    deviation[RATE] = tuning.rate_walk
+    deviation[ACCELERATION] = tuning.acceleration_walk
+    deviation[layout.gyro_biases] = tuning.gyro_bias_walk
+    deviation[layout.wheel_scales] = tuning.wheel_scale_walk
+    deviation[layout.heading_errors] = tuning.heading_walk
     deviation[layout.map_offset] = OFFSET_WALK
     walks = np.diag(deviation**2)
     for shared in (keep, walks):

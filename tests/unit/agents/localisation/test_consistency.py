@@ -6,13 +6,12 @@ from agents.localisation.consistency import (
     CONSISTENT,
     ENOUGH,
     INCONSISTENT,
-    LEAST_FACTOR,
     MAX_LEVEL,
-    MOST_FACTOR,
     InnovationMonitor,
     VarianceFactor,
 )
 from agents.localisation.filters.belief import Belief, Conditioned
+from agents.localisation.tuning import TUNING
 from tests.unit.agents.drives import START_NS
 
 BELIEF = Belief(1, np.zeros(2), np.eye(2))
@@ -117,6 +116,6 @@ def test_the_variance_follows_the_innovations_within_five_minutes(std: float, ra
 
 
 def test_the_variance_stays_within_its_bounds_and_follows_no_refused_innovation() -> None:
-    assert followed(0.01, 3600) == LEAST_FACTOR
-    assert followed(100.0, 3600) == MOST_FACTOR
+    assert followed(0.01, 3600) == TUNING.least_factor
+    assert followed(100.0, 3600) == TUNING.most_factor
     assert followed(3.0, accepted=False) == 1.0

@@ -12,12 +12,13 @@ from agents.localisation import measurements
 from agents.localisation.consistency import VarianceFactor
 from agents.localisation.filters.belief import Belief, Conditioned
 from agents.localisation.filters.ekf import Ekf
-from agents.localisation.filters.late_measurements import RELOCK, Fusion
+from agents.localisation.filters.late_measurements import Fusion
 from agents.localisation.filters.motion import MotionModel
 from agents.localisation.filters.state import POSITION, SPEED, VELOCITY
 from agents.localisation.filters.ukf import Ukf
 from agents.localisation.gps import Receivers
 from agents.localisation.tracker import gps_velocity, layout_of
+from agents.localisation.tuning import TUNING
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig, Mount, SensorConfig
 from protocol.machine.readings import Encoder, Gps, GpsVelocity, Reading
@@ -117,13 +118,13 @@ def test_a_receiver_that_goes_off_for_long_does_not_take_the_place_with_it(share
 # --- a receiver that comes back wrong, or a machine that was carried -------------------------------------------------
 
 KNOWN_S, GAP_S = 60, 60
-RELOCKED_S = KNOWN_S + GAP_S + RELOCK - 1  # index of the second in which the filter accepts them again
+RELOCKED_S = KNOWN_S + GAP_S + TUNING.relock - 1  # index of the second in which the filter accepts them again
 DRIFT_S = SensorConfig("gps-1", "gps").drift_time_s
 
 
 def returning(receivers: int, jumps_m: Floats, seconds: int) -> Floats:
     """Errors of receivers that are right, silent for a minute, and then off by so much each (receivers, 2)."""
-    errors = np.zeros((KNOWN_S + GAP_S + RELOCK + seconds, receivers, 2))
+    errors = np.zeros((KNOWN_S + GAP_S + TUNING.relock + seconds, receivers, 2))
     errors[KNOWN_S : KNOWN_S + GAP_S] = np.nan
     errors[KNOWN_S + GAP_S :] = jumps_m
     return errors

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from agents.dead_reckoning import DeadReckonedPose, DeadReckoning, WheelSpeed
-from agents.localisation import measurements
 from agents.localisation.filters.motion import map_from_base
 from agents.localisation.filters.state import YAW_RATE, Layout
 from agents.localisation.headings import UNKNOWN_STD, rpy_of_base
 from agents.localisation.imu_steps import FilterStep, ImuMean, StepGatherer, Turn
 from agents.localisation.motion_sensors import STANDSTILL_S, MotionSensors
+from agents.localisation.tuning import TUNING
 from agents.stream_order import by_stamp
 from protocol.arrays import Floats
 from protocol.machine.machine_config import FRONT, MachineConfig, Mount, SensorConfig
@@ -183,10 +183,10 @@ def deviations(R: Any) -> list[float]:
 @pytest.mark.parametrize(
     ("options", "rate", "force"),
     [
-        ({}, measurements.RATE_RADPS, measurements.FORCE_MPS2),
+        ({}, TUNING.rate_radps, TUNING.force_mps2),
         ({"std": {"rate": 0.1, "force": 0.5}}, 0.1, 0.5),
-        ({"measures": ("rate",)}, measurements.RATE_RADPS, UNKNOWN_STD),
-        ({"measures": ("force",)}, UNKNOWN_STD, measurements.FORCE_MPS2),
+        ({"measures": ("rate",)}, TUNING.rate_radps, UNKNOWN_STD),
+        ({"measures": ("force",)}, UNKNOWN_STD, TUNING.force_mps2),
     ],
 )
 def test_an_imu_is_as_sure_as_it_is_configured(options: dict[str, Any], rate: float, force: float) -> None:
@@ -205,7 +205,7 @@ def test_on_a_plane_an_imu_measures_the_turn_alone() -> None:
     assert sensors(SensorConfig("imu", "imu", measures=("force",)), on_plane=True).inertial(step) == []
 
 
-@pytest.mark.parametrize(("gate_sigma", "expected"), [(0.0, measurements.GATE_SIGMA), (2.5, 2.5)])
+@pytest.mark.parametrize(("gate_sigma", "expected"), [(0.0, TUNING.gate_sigma), (2.5, 2.5)])
 def test_each_sensor_may_have_its_own_gate(gate_sigma: float, expected: float) -> None:
     imu, wheels = (SensorConfig(kind, kind, gate_sigma=gate_sigma) for kind in ("imu", "encoder"))
     steering = SensorConfig("steering", "steering", gate_sigma=gate_sigma)
@@ -229,7 +229,7 @@ def test_wheels_that_are_silent_or_without_speed_measure_nothing() -> None:
     assert sensors(wheels).wheels(replace(STEP, rolled=False, still_s=9.0)) == []
     assert sensors(replace(wheels, measures=("rate",))).wheels(STEP) == []
     (measurement,) = sensors(replace(wheels, std={"speed": 0.5})).wheels(STEP)
-    assert deviations(measurement.R) == pytest.approx([0.5, measurements.SIDE_MPS, measurements.SIDE_MPS])
+    assert deviations(measurement.R) == pytest.approx([0.5, TUNING.side_mps, TUNING.side_mps])
 
 
 def test_a_machine_stands_once_its_wheels_do_not_turn_for_a_second() -> None:

@@ -12,17 +12,11 @@ from mapserver.calibration.select import FAULT_SIGMAS, MachineErrors
 from mapserver.journal.rows import Event
 from mapserver.trust.auditor import Verdict
 from mapserver.trust.coarse_map import LEVEL_FLOOR, CoarseMap, Surface, pooled
-from mapserver.trust.comparison import ZERO_ERROR, Difference, Gain
+from mapserver.trust.comparison import Difference, Gain
 from mapserver.trust.decisions import AUDIT, DISTRUST_AFTER, PERSON, TRUST_AFTER, TrustDecision, TrustDecisions
 from mapserver.trust.judgement import (
     AGREE,
-    AGREEMENT,
     DISAGREE,
-    GAIN_LIMIT,
-    MIN_SPREAD,
-    OFFSET_LIMIT_M,
-    SHARE,
-    STUCK_SPREAD,
     UNKNOWN,
     ClockLeads,
     Judgement,
@@ -33,10 +27,12 @@ from mapserver.trust.judgement import (
     outvoted,
 )
 from mapserver.trust.shift import Shift
+from mapserver.trust.tuning import TUNING
 from protocol.arrays import Ints, Table
 from protocol.machine.samples import SCALE_STD, ZERO_STD
 from tests.unit.mapserver.data import random_samples, samples
 
+LIMIT, SHARE, FAR_M = TUNING.gain_limit, TUNING.share, TUNING.offset_limit_m
 ALIKE = Difference(10**9, Gain(0.0, 0.0, 1.0, 1e9), Shift(0.0, 0.0, 0.0, 1.0), 1.0, (0.5, 0.5))
 
 
@@ -52,25 +48,25 @@ def shift(far_m: float, **more: float) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("reason", "changed", "state"),
     [
-        (Reason.GAIN, gain(GAIN_LIMIT * 1.01), DISAGREE),
-        (Reason.GAIN, gain(1 / GAIN_LIMIT / 1.01), DISAGREE),
-        (Reason.GAIN, gain(GAIN_LIMIT / 1.01), AGREE),
-        (Reason.GAIN, gain(GAIN_LIMIT * 1.01, share=SHARE - 0.01), UNKNOWN),
-        (Reason.GAIN, gain(GAIN_LIMIT * 1.01, std=0.1), UNKNOWN),
-        (Reason.GAIN, gain(GAIN_LIMIT * 1.01, c_rr=ZERO_ERROR), AGREE),
-        (Reason.OFFSET, shift(OFFSET_LIMIT_M + 0.01), DISAGREE),
-        (Reason.OFFSET, shift(OFFSET_LIMIT_M - 0.01), AGREE),
-        (Reason.OFFSET, shift(OFFSET_LIMIT_M + 0.01, share=SHARE - 0.01), UNKNOWN),
-        (Reason.OFFSET, shift(OFFSET_LIMIT_M + 0.01, std_m=0.1), UNKNOWN),
-        (Reason.OFFSET, shift(0.0, std_m=OFFSET_LIMIT_M + 0.01), UNKNOWN),
+        (Reason.GAIN, gain(LIMIT * 1.01), DISAGREE),
+        (Reason.GAIN, gain(1 / LIMIT / 1.01), DISAGREE),
+        (Reason.GAIN, gain(LIMIT / 1.01), AGREE),
+        (Reason.GAIN, gain(LIMIT * 1.01, share=SHARE - 0.01), UNKNOWN),
+        (Reason.GAIN, gain(LIMIT * 1.01, std=0.1), UNKNOWN),
+        (Reason.GAIN, gain(LIMIT * 1.01, c_rr=TUNING.zero_error), AGREE),
+        (Reason.OFFSET, shift(FAR_M + 0.01), DISAGREE),
+        (Reason.OFFSET, shift(FAR_M - 0.01), AGREE),
+        (Reason.OFFSET, shift(FAR_M + 0.01, share=SHARE - 0.01), UNKNOWN),
+        (Reason.OFFSET, shift(FAR_M + 0.01, std_m=0.1), UNKNOWN),
+        (Reason.OFFSET, shift(0.0, std_m=FAR_M + 0.01), UNKNOWN),
         (Reason.OFFSET, {"shift": None}, UNKNOWN),
-        (Reason.DISAGREES, {"agreement": AGREEMENT - 0.01}, DISAGREE),
-        (Reason.DISAGREES, {"agreement": AGREEMENT + 0.01}, UNKNOWN),
-        (Reason.DISAGREES, {"agreement": AGREEMENT - 0.01, "cells": 10_000}, UNKNOWN),
+        (Reason.DISAGREES, {"agreement": TUNING.agreement - 0.01}, DISAGREE),
+        (Reason.DISAGREES, {"agreement": TUNING.agreement + 0.01}, UNKNOWN),
+        (Reason.DISAGREES, {"agreement": TUNING.agreement - 0.01, "cells": 10_000}, UNKNOWN),
         (Reason.DISAGREES, {}, AGREE),
-        (Reason.STUCK, {"spreads": (0.5 * STUCK_SPREAD * 0.99, 0.5)}, DISAGREE),
-        (Reason.STUCK, {"spreads": (0.5 * STUCK_SPREAD * 1.01, 0.5)}, AGREE),
-        (Reason.STUCK, {"spreads": (0.0, MIN_SPREAD - 0.01)}, UNKNOWN),
+        (Reason.STUCK, {"spreads": (0.5 * TUNING.stuck_spread * 0.99, 0.5)}, DISAGREE),
+        (Reason.STUCK, {"spreads": (0.5 * TUNING.stuck_spread * 1.01, 0.5)}, AGREE),
+        (Reason.STUCK, {"spreads": (0.0, TUNING.min_spread - 0.01)}, UNKNOWN),
     ],
 )
 def test_every_limit_counts(reason: Reason, changed: dict[str, Any], state: int) -> None:

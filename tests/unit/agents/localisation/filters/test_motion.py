@@ -7,12 +7,7 @@ import pytest
 
 from agents.localisation.filters.belief import Belief
 from agents.localisation.filters.motion import (
-    HEIGHT_WALK,
     OFF_PLANE_VARIANCE,
-    SLIP_ACROSS,
-    SLIP_ALONG,
-    SLIP_STD,
-    SLIP_TIME_S,
     GpsError,
     HeadingError,
     MotionModel,
@@ -21,6 +16,7 @@ from agents.localisation.filters.motion import (
     motion,
 )
 from agents.localisation.filters.state import ACCELERATION, ATTITUDE, OFF_PLANE, POSITION, RATE, VELOCITY, Layout
+from agents.localisation.tuning import TUNING
 from protocol.arrays import Floats
 
 PAPER, FULL = Layout(), Layout(imus=2, wheel_scale=True, receivers=2)
@@ -131,9 +127,9 @@ def test_slip_lies_along_and_across_the_body() -> None:
     x[ATTITUDE], x[VELOCITY] = (0.1, -0.2, 2.5), (-3.0, 0.0, 0.0)
     moves = motion(replace(PLAIN, traction=0.3), at(x), 0.5)
     R = map_from_base(x[ATTITUDE])
-    height = np.diag([0.0, 0.0, HEIGHT_WALK**2 * 0.5])
-    wrong_slip_m2 = SLIP_STD**2 * 2 * SLIP_TIME_S * (0.3 * 3.0) ** 2 * 0.5
-    along, across = SLIP_ALONG**2 * 1.5 + wrong_slip_m2, SLIP_ACROSS**2 * 1.5
+    height = np.diag([0.0, 0.0, TUNING.height_walk**2 * 0.5])
+    wrong_slip_m2 = TUNING.slip_std**2 * 2 * TUNING.slip_s * (0.3 * 3.0) ** 2 * 0.5
+    along, across = TUNING.slip_along**2 * 1.5 + wrong_slip_m2, TUNING.slip_across**2 * 1.5
     expected = np.diag([along, across, 0.0])
     np.testing.assert_allclose(R.T @ (moves.Q[POSITION, POSITION] - height) @ R, expected, atol=1e-15)
 

@@ -1,0 +1,148 @@
+"""Which constants matter: each of one stage's Tuning is varied alone, on the same recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+from agents.estimation.tuning import TUNING as ESTIMATION
+from agents.estimation.tuning import EstimationTuning
+from agents.localisation.tuning import TUNING as LOCALISATION
+from agents.localisation.tuning import LocalisationTuning
+from lab.calibration import experiment as calibration
+from lab.calibration.cases import CASES
+from lab.campaign.experiment import Runner
+from lab.campaign.recordings import PAPER
+from lab.ground import experiment as ground
+from lab.ground.experiment import GroundConfiguration
+from lab.positions import experiment as positions
+from lab.positions.configurations import Configuration
+from mapserver.calibration.tuning import TUNING as CALIBRATION
+from sitegrid.proof.figures import Report, Row, rounded
+
+BY = 0.3  # of a constant, both ways
+Tuning = TypeVar("Tuning")
+Variant = tuple[str, float]  # constant, and what it is multiplied by
+FAST = replace(PAPER, world="fast")  # drives are cheap there, and their errors those of sensors alike
+AS_IT_IS: Variant = ("", 1.0)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is varied and judged.
+
+    rows: of all variants one row of figures each. intervals: half-widths of the 95 % intervals of published figures
+    over seeds; of a normalised error, what is no better known.
+    """
+
+    tuning: Any
+    rows: Callable[[Runner, Sequence[int], float, Sequence[Variant]], Sequence[Row]]
+    intervals: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VariedGround(GroundConfiguration):
+    """The published row of the ground with one constant varied."""
+
+    variant: Variant = AS_IT_IS
+
+    @property
+    def name(self) -> str:
+        """Short and unique."""
+        return f"{super().name}-{self.variant[0]}-{self.variant[1]:g}"
+
+    @property
+    def tuning(self) -> EstimationTuning:
+        """With the constant varied."""
+        return varied(ESTIMATION, self.variant)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VariedPositions(Configuration):
+    """A published row of positions with one constant varied."""
+
+    variant: Variant = AS_IT_IS
+
+    @property
+    def name(self) -> str:
+        """Short and unique."""
+        return f"{super().name}-{self.variant[0]}-{self.variant[1]:g}"
+
+    @property
+    def tuning(self) -> LocalisationTuning:
+        """With the constant varied."""
+        return varied(LOCALISATION, self.variant)
+
+
+def varied(tuning: Tuning, variant: Variant) -> Tuning:
+    """A Tuning with one constant varied; a whole number stays one."""
+    constant, factor = variant
+    if not constant:
+        return tuning
+    value = getattr(tuning, constant)
+    changes: dict[str, Any] = {constant: round(value * factor) if isinstance(value, int) else value * factor}
+    return replace(tuning, **changes)  # type: ignore[type-var]
+
+
+def variants(tuning: object) -> list[Variant]:
+    """Each constant both ways."""
+    names = [field.name for field in fields(tuning)]  # type: ignore[arg-type]
+    return [(name, factor) for name in names for factor in (1 - BY, 1 + BY)]
+
+
+def run(runner: Runner, seeds: Sequence[int], seconds: float, stage: str = "estimation") -> tuple[Report, None]:
+    """Vary all constants of a stage; a row for each: what its figures move by, and which beyond their intervals."""
+    chosen = STAGES[stage]
+    whole, *others = chosen.rows(runner, seeds, seconds, [AS_IT_IS, *variants(chosen.tuning)])
+    names = [field.name for field in fields(chosen.tuning)]
+    triples = zip(names, others[::2], others[1::2], strict=True)
+    rows = [moved(chosen, name, whole, (less, more)) for name, less, more in triples]
+    as_it_is = {name: whole[name] for name in chosen.intervals}
+    return {"stage": stage, "seeds": list(seeds), "seconds": seconds, "as_it_is": as_it_is, "rows": rows}, None
+
+
+def moved(stage: Stage, constant: str, whole: Row, both: tuple[Row, Row]) -> Row:
+    """By how much a constant's two variants move the figures."""
+    by = {name: [row[name] - whole[name] for row in both] for name in stage.intervals}
+    beyond = [name for name, steps in by.items() if not max(map(abs, steps)) <= stage.intervals[name]]
+    value = getattr(stage.tuning, constant)
+    return rounded({"constant": constant, "value": value, **by, "moves": " ".join(beyond)}, 3, value=6)
+
+
+def _ground(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
+    rows = [VariedGround("kalman", "calibrated", variant=variant) for variant in some]
+    return ground.run(runner, seeds, seconds, rows)[0]["rows"]
+
+
+def _positions(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
+    rows = [VariedPositions("ukf", 2, 1, "default", variant=variant) for variant in some]
+    return positions.run(runner, seeds, seconds, rows, FAST)[0]["rows"]
+
+
+def _calibration(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
+    """The map after calibration of three machines, whose samples are made once."""
+    cases = [case for case in CASES if case.name == "machines_3"]
+    reports = [calibration.run(runner, seeds, seconds, cases, varied(CALIBRATION, each))[0] for each in some]
+    return [row for report in reports for row in report["rows"] if row["map"] == "after"]
+
+
+STAGES = {
+    "estimation": Stage(
+        ESTIMATION,
+        _ground,
+        {
+            "right_class_pct": 0.5,
+            "wrong_cells_pct": 0.6,
+            "grade_bias_deg": 0.02,
+            "grade_std_deg": 0.02,
+            "normalised_error": 0.05,
+        },
+    ),
+    "localisation": Stage(
+        LOCALISATION, _positions, {"net_m": 0.13, "smoothed_net_m": 0.13, "coverage95": 0.02, "smoothed_nees": 0.4}
+    ),
+    "calibration": Stage(
+        CALIBRATION, _calibration, {"wrong_pct": 0.3, "rms_zero": 1e-4, "rms_scale": 0.003, "normalised": 0.1}
+    ),
+}
