@@ -51,8 +51,8 @@ _STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value
 
 def encode_batch(batch: SampleBatch) -> bytes:
     """Columns of little-endian binary, one per name of SAMPLE_DTYPE; of AIDED and FUEL where they say anything."""
-    says = {AIDED: batch.rows[AIDED].any(), FUEL: np.isfinite(batch.rows[FUEL]).any()}
-    names = [name for name in COLUMNS if says.get(name, True)]
+    is_stated = {AIDED: batch.rows[AIDED].any(), FUEL: np.isfinite(batch.rows[FUEL]).any()}
+    names = [name for name in COLUMNS if is_stated.get(name, True)]
     table: dict[str, Any] = {
         "machine": batch.machine,
         "spool_id": batch.spool_id,
