@@ -50,9 +50,9 @@ _STAND_IN = {name: np.array(value, SAMPLE_DTYPE[name]).tobytes() for name, value
 
 
 def encode_batch(batch: SampleBatch) -> bytes:
-    """Columns of little-endian binary, one per name of SAMPLE_DTYPE; of AIDED and FUEL where they tell anything."""
-    told = {AIDED: batch.rows[AIDED].any(), FUEL: np.isfinite(batch.rows[FUEL]).any()}
-    names = [name for name in COLUMNS if told.get(name, True)]
+    """Columns of little-endian binary, one per name of SAMPLE_DTYPE; of AIDED and FUEL where they say anything."""
+    is_stated = {AIDED: batch.rows[AIDED].any(), FUEL: np.isfinite(batch.rows[FUEL]).any()}
+    names = [name for name in COLUMNS if is_stated.get(name, True)]
     table: dict[str, Any] = {
         "machine": batch.machine,
         "spool_id": batch.spool_id,
