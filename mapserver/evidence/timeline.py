@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.page_kernels import note, sum_pages, sum_planes
-from mapserver.evidence.pages import EMPTY, CompactPages, PackedPages, Page, pick
+from mapserver.evidence.pages import Page, Pages, Record, as_numbers, known_cells, page_count, pick
+from mapserver.evidence.record_kernels import sum_pages, sum_planes
 from mapserver.evidence.settling import Space, Tiers, settled
-from protocol.arrays import Bools, Ints
+from protocol.arrays import Ints
 
 PATIENCE = 24  # pages that wait before a timeline is settled: fewer cost time, more cost memory
 Block = tuple[int, int]  # column and row
@@ -42,36 +42,36 @@ class TimedPages(Sequence[TimedPage]):
     nothing was folded into a block, its pages are this same object.
     """
 
-    __slots__ = ("_pages", "_tiers", "derived")
+    __slots__ = ("_record", "_tiers", "derived")
 
-    def __init__(self, pages: CompactPages, tiers: Tiers) -> None:
-        self._pages, self._tiers = pages, tiers
+    def __init__(self, record: Record, tiers: Tiers) -> None:
+        self._record, self._tiers = record, tiers
         self.derived: dict[object, Any] = {}
 
     def __len__(self) -> int:
-        return len(self._pages.table)
+        return page_count(self._record)
 
     def __iter__(self) -> Iterator[TimedPage]:
         spans = self._tiers.spans_ns.tolist()
-        pages = sorted(self._pages.expanded().items(), key=lambda item: (-item[0], item[1]))
+        pages = sorted(Pages.unpacked(self._record).items(), key=lambda item: (-item[0], item[1]))
         return (TimedPage(*_time_of(spans[tier], index, page), page) for tier, index, page in pages)
 
     def packed_votes(self) -> tuple[NDArray[np.uint64], Ints]:
         """As the function of this name, without a page by itself."""
-        table, votes = self._pages.expanded_votes()
-        table = _in_order(table)
-        parts = [votes[first:end] for first, end in table[:, 2:4].tolist()]
+        pages = Pages.unpacked(self._record)
+        table = _in_order(pages.table)
+        parts = [pages.votes[first:end] for first, end in table[:, 2:4].tolist()]
         return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(table[:, 3] - table[:, 2])
 
     def plane_counts(self, planes: slice) -> Ints:
         """As the function of this name."""
-        pages, out = self._pages, np.zeros((planes.stop - planes.start, ev.CELLS), np.int64)
-        sum_planes(pages.runs, pages.cells, pages.counts, pages.high, planes.start, out)
+        out = np.zeros((planes.stop - planes.start, ev.CELLS), np.int64)
+        sum_planes(as_numbers(self._record), planes.start, out)
         return out
 
     def add_to(self, start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints) -> None:
         """Add what counts from page `start` (256,) of each cell on, as `sum_pages` does."""
-        pages = self._pages.expanded()
+        pages = Pages.unpacked(self._record)
         sum_pages(_in_order(pages.table), pages.votes, pages.cells, start, counts, bitmaps, newest_ns)
 
     @overload
@@ -83,12 +83,12 @@ class TimedPages(Sequence[TimedPage]):
 
 
 def _in_order(table: Ints) -> Ints:
-    """The table of PackedPages in the order of time."""
+    """The table of Pages in the order of time."""
     return np.asarray(table[np.lexsort((table[:, 1], -table[:, 0]))])
 
 
 def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
-    """Votes of pages as PackedPages has them, in the order of time, and where those of each page end."""
+    """Votes of pages as Pages has them, in the order of time, and where those of each page end."""
     if isinstance(pages, TimedPages):
         return pages.packed_votes()
     columns = ((timed.page.votes["place"], timed.page.votes["count"].astype(np.uint64)) for timed in pages)
@@ -107,62 +107,50 @@ def plane_counts(pages: Sequence[TimedPage], planes: slice) -> Ints:
 
 
 class Timeline:
-    """Pages of one block: kept are those that are settled, fresh those that came since, waiting is how many.
+    """Evidence of one block: a record that is settled, those that came since, and how many pages of them wait.
 
-    known_cells: how many cells have evidence. space: where it is settled, that of the thread which adds or reads.
+    known: a bit for each cell with evidence. turn: of the grid, when it was added to last. timed: its pages, once read.
     """
 
-    __slots__ = ("_known", "_timed", "fresh", "kept", "known_cells", "space", "tiers", "waiting")
+    __slots__ = ("known", "records", "timed", "turn", "waiting")
 
-    def __init__(self, tiers: Tiers, space: Space, settled: CompactPages = EMPTY) -> None:
-        self.tiers, self.space = tiers, space
-        self.kept = settled
-        self.fresh: list[PackedPages] = []
-        self.waiting = 0
-        self._timed: TimedPages | None = None
-        self._known: Bools = np.zeros(ev.CELLS, np.bool_)
-        self._known[settled.marks[:, 0]] = True
-        self.known_cells = int(np.count_nonzero(self._known))
+    def __init__(self, settled: Sequence[Record] = ()) -> None:
+        self.records = [*settled]
+        self.known = known_cells(settled[0]) if settled else 0
+        self.waiting = self.turn = 0
+        self.timed: TimedPages | None = None
 
-    def add(self, pages: PackedPages) -> int:
+    def add(self, record: Record) -> int:
         """Add evidence of any tiers and spans, also of those that are there; returns how many cells are new.
 
         It waits to be settled; see `settle_all`.
         """
-        self.fresh.append(pages)
-        self.waiting += len(pages.table)
-        more = note(self._known, pages.cells)
-        self.known_cells += more
-        return more
-
-    def keep(self, pages: CompactPages) -> None:
-        """Go on with these pages, which hold the fresh ones as well."""
-        self.kept, self.fresh, self.waiting, self._timed = pages, [], 0, None
-
-    def settled(self) -> CompactPages:
-        """All pages, in the order of tier and index, each cell's newest spans apart."""
-        settle_all([self])
-        return self.kept
-
-    def items(self) -> Iterator[tuple[int, int, Page]]:
-        """Tier, index on it, and page, sorted."""
-        return self.settled().expanded().items()
-
-    def timed(self) -> TimedPages:
-        """Pages in the order of time; the same object until something is added."""
-        settle_all([self])
-        if self._timed is None:
-            self._timed = TimedPages(self.kept, self.tiers)
-        return self._timed
+        self.records.append(record)
+        self.waiting += page_count(record)
+        before = self.known
+        self.known |= known_cells(record)
+        return (self.known ^ before).bit_count()
 
 
-def settle_all(timelines: Iterable[Timeline], least: int = 1) -> None:
-    """Settle those timelines, of one grid, on which at least so many pages wait: quicker than one by one."""
+def settle_all(timelines: Iterable[Timeline], tiers: Tiers, space: Space, least: int = 1) -> None:
+    """Settle those timelines on which at least so many pages wait: quicker than one by one."""
     some = [timeline for timeline in timelines if timeline.waiting >= least]
-    if some:
-        blocks = [(timeline.kept, timeline.fresh) for timeline in some]
-        for timeline, pages in zip(some, settled(blocks, some[0].tiers, some[0].space), strict=True):
-            timeline.keep(pages)
+    keep = int(tiers.keeps[0])  # buckets: so few pages of one record, each of another span, are all kept apart
+    sums = [timeline for timeline in some if len(timeline.records) > 1 or page_count(timeline.records[0]) > keep]
+    for timeline, record in zip(sums, settled([timeline.records for timeline in sums], tiers, space), strict=True):
+        timeline.records = [record]
+    for timeline in some:
+        timeline.waiting, timeline.timed = 0, None
+
+
+def timed(timelines: Iterable[Timeline | None], tiers: Tiers, space: Space) -> list[Sequence[TimedPage]]:
+    """Pages of blocks in the order of time, none of one without evidence; the same object until something is added."""
+    lines = list(timelines)
+    settle_all(filter(None, lines), tiers, space)
+    for line in lines:
+        if line and line.timed is None:
+            line.timed = TimedPages(line.records[0], tiers)
+    return [line.timed if line and line.timed else () for line in lines]
 
 
 def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
