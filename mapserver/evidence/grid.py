@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -15,7 +15,7 @@ from mapserver.evidence.grid_state import GridCounts, GridState
 from mapserver.evidence.pages import Record, is_sound
 from mapserver.evidence.sample_kernels import count_foldable, extent
 from mapserver.evidence.settling import Space, Tiers
-from mapserver.evidence.timeline import PATIENCE, Block, TimedPage, Timeline, evidence, settle_all, timed
+from mapserver.evidence.timeline import PATIENCE, Block, TimedPages, Timeline, evidence, settle_all, timed
 from mapserver.evidence.workers import ALONE, Workers
 from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
@@ -109,7 +109,7 @@ class Grid:
         inside = ((x, y) for x in range(first_x, last_x + 1) for y in range(first_y, last_y + 1))
         return [block for block in inside if block in self._timelines]
 
-    def pages(self, blocks: Iterable[Block]) -> list[Sequence[TimedPage]]:
+    def pages(self, blocks: Iterable[Block]) -> list[TimedPages]:
         """Pages of each of these blocks in the order of time, none for a block without evidence."""
         self._drain()
         return timed([self._timelines.get(block) for block in blocks], self._tiers, self._spaces[0])

@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mapserver.evidence import cells as ev
 from mapserver.evidence import record_kernels
-from protocol.arrays import AnyArray, Bools, Ints, Table
+from protocol.arrays import AnyArray, Ints, Table
 
 # place: bin * 256 + cell. Counts of a few passes fit into 16 bits; where one does not, all of a block are wide.
 TIERS = 4  # of a timeline: buckets, hours, days, all before
@@ -24,7 +23,7 @@ NARROW = np.dtype([("place", "<u2"), ("count", "<u2")])
 WIDE = np.dtype([("place", "<u2"), ("count", "<u4")])
 CELL = np.dtype([("cell", "u1"), ("visits", "<u8"), ("machines", "<u8"), ("newest_ns", "<i8")])
 Record = bytes  # of a block: record_kernels.py says how pages lie in it
-_PAGES, _VOTES, _MARKS = 0, 3, 1  # in its header
+_PAGES, _MARKS, _VOTES = 0, 1, 3  # in its header
 _KNOWN = slice(record_kernels.FIELDS * 4, record_kernels.HEADER_BYTES)
 
 
@@ -34,14 +33,6 @@ class Page:
 
     votes: Table
     cells: Table
-
-    def add_to(self, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints) -> None:
-        """Add to counts (COUNTS * 256,), bitmaps (256, 2), newest_ns (256,)."""
-        counts[self.votes["place"]] += self.votes["count"]
-        cells = self.cells["cell"]
-        bitmaps[cells, ev.VISITS] |= self.cells["visits"]
-        bitmaps[cells, ev.MACHINES] |= self.cells["machines"]
-        newest_ns[cells] = np.maximum(newest_ns[cells], self.cells["newest_ns"])
 
 
 class Pages(NamedTuple):
@@ -89,6 +80,11 @@ def page_count(record: Record) -> int:
     return int.from_bytes(record[:4], "little")
 
 
+def vote_count(record: Record) -> int:
+    """How many votes it has."""
+    return int.from_bytes(record[12:16], "little")
+
+
 def known_cells(record: Record) -> int:
     """A bit for each cell that has evidence."""
     return int.from_bytes(record[_KNOWN], "little")
@@ -130,12 +126,6 @@ def is_sound(record: bytes) -> bool:
     known = np.frombuffer(record[_KNOWN], np.uint64)
     votes = in_place and record_kernels.are_votes(table, runs, places, counts)
     return bool(votes and record_kernels.are_cells(table, marks, words, known))
-
-
-def pick(page: Page, wanted: Bools) -> Page:
-    """Only what a page has of some cells (256,)."""
-    votes = page.votes[wanted[page.votes["place"] % ev.CELLS]]
-    return Page(votes, page.cells[wanted[page.cells["cell"]]])
 
 
 EMPTY = Pages(np.empty((0, 6), np.int64), np.empty(0, np.uint64), np.empty(0, CELL)).record

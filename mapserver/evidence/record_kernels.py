@@ -93,14 +93,19 @@ def read_votes(runs: Any, places: Any, counts: Any, high: Any, out: Any) -> None
 
 
 @numba.njit(cache=True, nogil=True)
+def _words_of(words: Any, at: int) -> tuple[int, int, int, int]:
+    """Where visits, machines and stamps of the page begin whose words begin here, and where they end."""
+    sizes, visits = words[at], at + 1
+    machines = visits + int(sizes & np.uint64(511))
+    stamps = machines + int(sizes >> np.uint64(9) & np.uint64(511))
+    return visits, machines, stamps, stamps + int(sizes >> np.uint64(18))
+
+
+@numba.njit(cache=True, nogil=True)
 def _read_cells(table: Any, marks: Any, words: Any, out: Any) -> None:
     at = 0
     for p in range(len(table)):
-        sizes = words[at]
-        visits = at + 1
-        machines = visits + int(sizes & np.uint64(511))
-        stamps = machines + int(sizes >> np.uint64(9) & np.uint64(511))
-        at = stamps + int(sizes >> np.uint64(18))
+        visits, machines, stamps, at = _words_of(words, at)
         for j in range(table[p, 4], table[p, 5]):
             out[j].cell = marks[j, 0]
             out[j].visits = words[visits + marks[j, 1]]
@@ -236,23 +241,58 @@ def sum_planes(data: Any, first: int, out: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def sum_pages(table: Any, votes: Any, cells: Any, start: Any, counts: Any, bitmaps: Any, newest_ns: Any) -> None:
-    """Add pages, in the order of their table, to counts (256, COUNTS), bitmaps (256, 2) and newest_ns (256,).
-
-    start (256,): the place in that order of the first page that counts in each cell.
-    """
+def ranks(table: Any) -> Any:
+    """Place (n,) of each page in the order of time: coarser tiers first, as in each cell the finer one is newer."""
+    out = np.zeros(len(table), np.int64)
     for p in range(len(table)):
-        for j in range(table[p, 2], table[p, 3]):
-            place = votes[j] & _LOW
-            cell = place & _CELL
-            if start[cell] <= p:
-                counts[cell, place >> np.uint64(8)] += votes[j] >> np.uint64(16)
-        for j in range(table[p, 4], table[p, 5]):
-            cell = np.uint64(cells[j].cell)
-            if start[cell] <= p:
-                bitmaps[cell, 0] |= cells[j].visits
-                bitmaps[cell, 1] |= cells[j].machines
-                newest_ns[cell] = max(newest_ns[cell], cells[j].newest_ns)
+        for q in range(len(table)):
+            out[p] += table[q, 0] > table[p, 0] or (table[q, 0] == table[p, 0] and q < p)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def votes_in_time(data: Any, out: Any, ends: Any) -> None:
+    """Votes of one record, pages in the order of time, and where those of each page end (n,)."""
+    table, _, _, counts, high, places, runs = parts(data, 0)
+    rank, run, vote = ranks(table), 0, 0
+    for p in range(len(table)):
+        ends[rank[p]] = table[p, 3] - (table[p - 1, 3] if p else 0)
+    for k in range(1, len(ends)):
+        ends[k] += ends[k - 1]
+    for p in range(len(table)):
+        of_page = slice(vote, table[p, 3])
+        first = ends[rank[p]] - (of_page.stop - vote)
+        some_high = high[of_page] if len(high) else high
+        read_votes(runs[run : table[p, 2]], places[of_page], counts[of_page], some_high, out[first:])
+        run, vote = table[p, 2], table[p, 3]
+
+
+@numba.njit(cache=True, nogil=True)
+def sum_records(data: Any, begins: Any, start: Any, counts: Any, bitmaps: Any, newest_ns: Any) -> None:
+    """Add records, each of another block, to counts (b, 256, COUNTS), bitmaps (b, 256, 2) and newest_ns (b, 256).
+
+    begins (b,): of the records in data. start (b, 256): the place in the order of time of the first page that counts in
+    each cell.
+    """
+    for block in range(len(begins)):
+        table, marks, words, low, high, places, runs = parts(data, begins[block])
+        rank, run, vote, word = ranks(table), 0, 0, 0
+        for p in range(len(table)):
+            while run < table[p, 2]:
+                plane, end = np.uint64(runs[run, 0]), vote + int(runs[run, 1]) + 1
+                for i in range(vote, end):
+                    if start[block, places[i]] <= rank[p]:
+                        counts[block, places[i], plane] += low[i]
+                        if len(high):
+                            counts[block, places[i], plane] += np.uint64(high[i]) << np.uint64(16)
+                run, vote = run + 1, end
+            visits, machines, stamps, word = _words_of(words, word)
+            for j in range(table[p, 4], table[p, 5]):
+                cell = marks[j, 0]
+                if start[block, cell] <= rank[p]:
+                    bitmaps[block, cell, 0] |= words[visits + marks[j, 1]]
+                    bitmaps[block, cell, 1] |= words[machines + marks[j, 2]]
+                    newest_ns[block, cell] = max(newest_ns[block, cell], np.int64(words[stamps + marks[j, 3]]))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import cells as ev
-from mapserver.evidence.pages import Page, Pages, Record, as_numbers, known_cells, page_count, pick
-from mapserver.evidence.record_kernels import sum_pages, sum_planes
+from mapserver.evidence.fold_config import FoldConfig
+from mapserver.evidence.pages import EMPTY, Page, Pages, Record, as_numbers, known_cells, page_count, vote_count
+from mapserver.evidence.record_kernels import ranks, sum_planes, sum_records, votes_in_time
 from mapserver.evidence.settling import Space, Tiers, settled
 from protocol.arrays import Ints
 
@@ -34,7 +35,7 @@ class TimedPage:
     page: Page
 
 
-class TimedPages(Sequence[TimedPage]):
+class TimedPages:
     """Pages of one block in the order of time, as they were at one moment; expanded anew whenever they are read.
 
     A page of a coarser tier may begin before one of a finer tier ends: both have evidence of the same hour. In each
@@ -42,68 +43,44 @@ class TimedPages(Sequence[TimedPage]):
     nothing was folded into a block, its pages are this same object.
     """
 
-    __slots__ = ("_record", "_tiers", "derived")
+    __slots__ = ("_tiers", "derived", "record")
 
     def __init__(self, record: Record, tiers: Tiers) -> None:
-        self._record, self._tiers = record, tiers
+        self.record, self._tiers = record, tiers
         self.derived: dict[object, Any] = {}
 
     def __len__(self) -> int:
-        return page_count(self._record)
+        return page_count(self.record)
 
     def __iter__(self) -> Iterator[TimedPage]:
         spans = self._tiers.spans_ns.tolist()
-        pages = sorted(Pages.unpacked(self._record).items(), key=lambda item: (-item[0], item[1]))
+        pages = sorted(Pages.unpacked(self.record).items(), key=lambda item: (-item[0], item[1]))
         return (TimedPage(*_time_of(spans[tier], index, page), page) for tier, index, page in pages)
 
     def packed_votes(self) -> tuple[NDArray[np.uint64], Ints]:
-        """As the function of this name, without a page by itself."""
-        pages = Pages.unpacked(self._record)
-        table = _in_order(pages.table)
-        parts = [pages.votes[first:end] for first, end in table[:, 2:4].tolist()]
-        return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum(table[:, 3] - table[:, 2])
+        """Votes as Pages has them, and where those of each page end."""
+        votes, ends = np.empty(vote_count(self.record), np.uint64), np.zeros(len(self), np.int64)
+        votes_in_time(as_numbers(self.record), votes, ends)
+        return votes, ends
 
     def plane_counts(self, planes: slice) -> Ints:
-        """As the function of this name."""
+        """Counts (planes, 256) of some planes, of all pages together: quicker than all that there is of them."""
         out = np.zeros((planes.stop - planes.start, ev.CELLS), np.int64)
-        sum_planes(as_numbers(self._record), planes.start, out)
+        sum_planes(as_numbers(self.record), planes.start, out)
         return out
 
-    def add_to(self, start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints) -> None:
-        """Add what counts from page `start` (256,) of each cell on, as `sum_pages` does."""
-        pages = Pages.unpacked(self._record)
-        sum_pages(_in_order(pages.table), pages.votes, pages.cells, start, counts, bitmaps, newest_ns)
-
-    @overload
-    def __getitem__(self, index: int) -> TimedPage: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[TimedPage]: ...
-    def __getitem__(self, index: int | slice) -> TimedPage | list[TimedPage]:
-        return list(self)[index]
+    def older(self, count: int) -> TimedPages:
+        """The first pages alone."""
+        pages = Pages.unpacked(self.record)
+        kept = ranks(pages.table) < count
+        lengths = pages.table[:, [3, 5]] - pages.table[:, [2, 4]]
+        votes, cells = (part[np.repeat(kept, n)] for part, n in zip(pages[1:], lengths.T, strict=True))
+        table, ends = pages.table[kept], lengths[kept].cumsum(axis=0)
+        table[:, [3, 5]], table[:, [2, 4]] = ends, ends - lengths[kept]
+        return TimedPages(Pages(table, votes, cells).record, self._tiers)
 
 
-def _in_order(table: Ints) -> Ints:
-    """The table of Pages in the order of time."""
-    return np.asarray(table[np.lexsort((table[:, 1], -table[:, 0]))])
-
-
-def packed_votes(pages: Sequence[TimedPage]) -> tuple[NDArray[np.uint64], Ints]:
-    """Votes of pages as Pages has them, in the order of time, and where those of each page end."""
-    if isinstance(pages, TimedPages):
-        return pages.packed_votes()
-    columns = ((timed.page.votes["place"], timed.page.votes["count"].astype(np.uint64)) for timed in pages)
-    parts = [count << np.uint64(16) | place for place, count in columns]
-    return np.concatenate([np.empty(0, np.uint64), *parts]), np.cumsum([len(part) for part in parts], dtype=np.int64)
-
-
-def plane_counts(pages: Sequence[TimedPage], planes: slice) -> Ints:
-    """Counts (planes, 256) of some planes, of all pages together: quicker than all that there is of them."""
-    if isinstance(pages, TimedPages):
-        return pages.plane_counts(planes)
-    packed, _ = packed_votes(pages)
-    counts = np.zeros(ev.COUNTS * ev.CELLS, np.int64)
-    np.add.at(counts, (packed & np.uint64(0xFFFF)).astype(np.int64), (packed >> np.uint64(16)).astype(np.int64))
-    return counts.reshape(ev.COUNTS, ev.CELLS)[planes]
+NO_PAGES = TimedPages(EMPTY, Tiers.from_config(FoldConfig()))
 
 
 class Timeline:
@@ -143,14 +120,14 @@ def settle_all(timelines: Iterable[Timeline], tiers: Tiers, space: Space, least:
         timeline.waiting, timeline.timed = 0, None
 
 
-def timed(timelines: Iterable[Timeline | None], tiers: Tiers, space: Space) -> list[Sequence[TimedPage]]:
+def timed(timelines: Iterable[Timeline | None], tiers: Tiers, space: Space) -> list[TimedPages]:
     """Pages of blocks in the order of time, none of one without evidence; the same object until something is added."""
     lines = list(timelines)
     settle_all(filter(None, lines), tiers, space)
     for line in lines:
         if line and line.timed is None:
             line.timed = TimedPages(line.records[0], tiers)
-    return [line.timed if line and line.timed else () for line in lines]
+    return [line.timed if line and line.timed else NO_PAGES for line in lines]
 
 
 def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
@@ -158,38 +135,25 @@ def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
     return index * span_ns, (index + 1) * span_ns if span_ns else int(page.cells["newest_ns"].max()) + 1
 
 
-def evidence(pages: Sequence[Sequence[TimedPage]], first: Sequence[Ints] | None = None) -> ev.Evidence:
+def evidence(pages: Sequence[TimedPages], first: Sequence[Ints] | None = None) -> ev.Evidence:
     """Sum the pages of blocks, in the order of time.
 
     first: for each block, index (256,) of the first page that counts in each of its cells; without it all pages count.
     """
+    records = [each.record for each in pages]
     counts = np.zeros((len(pages), ev.CELLS, ev.COUNTS), np.uint64)
     bitmaps = np.zeros((len(pages), ev.CELLS, 2), np.uint64)
-    newest_ns = np.zeros((len(pages), ev.CELLS), np.int64)
-    changed_ns = np.zeros((len(pages), ev.CELLS), np.int64)
-    for i, block_pages in enumerate(pages):
-        start = first[i] if first else np.zeros(ev.CELLS, np.int64)
-        if isinstance(block_pages, TimedPages):
-            block_pages.add_to(start, counts[i], bitmaps[i], newest_ns[i])
-        else:
-            _sum(block_pages, start, counts[i], bitmaps[i], newest_ns[i])
-        if start.any():
-            changed_ns[i] = _changed_ns(block_pages, start)
+    newest_ns, start, changed_ns = np.zeros((3, len(pages), ev.CELLS), np.int64)
+    if first:
+        start[:] = first
+    begins = np.cumsum([0, *map(len, records)])[:-1]
+    sum_records(as_numbers(b"".join(records)), begins, start, counts, bitmaps, newest_ns)
+    for i in np.flatnonzero(start.any(axis=1)).tolist():
+        changed_ns[i] = _changed_ns(pages[i], start[i])
     return ev.Evidence(counts, bitmaps, newest_ns, changed_ns)
 
 
-def _sum(
-    pages: Sequence[TimedPage], start: Ints, counts: NDArray[np.uint64], bitmaps: NDArray[np.uint64], newest_ns: Ints
-) -> None:
-    last = int(start.max(initial=0))
-    planes = np.zeros(ev.COUNTS * ev.CELLS, np.uint64)
-    for index, timed in enumerate(pages):
-        page = timed.page if index >= last else pick(timed.page, start <= index)
-        page.add_to(planes, bitmaps, newest_ns)
-    counts += planes.reshape(ev.COUNTS, ev.CELLS).T
-
-
-def _changed_ns(pages: Sequence[TimedPage], start: Ints) -> Ints:
+def _changed_ns(pages: TimedPages, start: Ints) -> Ints:
     """When each cell (256,) changed, 0 where it did not: after its last old sample, and within the first new span."""
     changed_ns = np.zeros(ev.CELLS, np.int64)
     for index, timed in enumerate(pages):

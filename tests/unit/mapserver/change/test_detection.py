@@ -87,7 +87,7 @@ def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for
         begins = np.array([timed.first_ns for timed in pages], float)
         for value, index in ((cells.from_ns, first), (cells.until_ns, last)):
             assert np.array_equal(value, np.full(256, begins[index] if index == index else np.nan), equal_nan=True)
-    assert np.isnan(known([]).from_ns).all()
+    assert np.isnan(known(NO_PAGES).from_ns).all()
 
 
 def test_medians_nearer_than_bins_are_no_change():

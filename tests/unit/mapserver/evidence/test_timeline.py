@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
-from mapserver.evidence.pages import CELL, Page, Pages, Record, is_sound, pick
+from mapserver.evidence.pages import CELL, Page, Pages, Record, is_sound
 from mapserver.evidence.settling import DAY_S, HOUR_S, Space, Tiers
-from mapserver.evidence.timeline import TimedPages, Timeline, plane_counts, settle_all, timed
+from mapserver.evidence.timeline import NO_PAGES, TimedPages, Timeline, evidence, settle_all, timed
 
 S = 10**9
 BUCKET_S = 300
@@ -119,7 +119,7 @@ def test_blocks_of_wide_counts_are_settled_beside_others():
 @pytest.mark.parametrize("offset", [0, PER_HOUR - 1])
 def test_spans_are_whole_buckets_hours_and_days(offset):
     buckets = [START + offset + i * PER_HOUR for i in range(4 * 24)]
-    pages = pages_in(timeline(buckets))
+    pages = list(pages_in(timeline(buckets)))
     lengths = [(one.end_ns - one.first_ns) // S for one in pages]
     assert lengths[1:] == [DAY_S, DAY_S, HOUR_S, HOUR_S, BUCKET_S, BUCKET_S]
     assert pages[0].first_ns == 0
@@ -144,9 +144,8 @@ def test_planes_are_summed_as_all_pages_are(weight):
         np.add.at(whole.reshape(-1), one.page.votes["place"], one.page.votes["count"].astype(np.int64))
     assert whole.any(axis=1).sum() == 40
     for part in (ev.HEADING, slice(0, 1), slice(0, ev.COUNTS)):
-        np.testing.assert_array_equal(plane_counts(pages, part), whole[part])
-        np.testing.assert_array_equal(plane_counts(list(pages), part), whole[part])
-    assert not plane_counts((), ev.HEADING).any()
+        np.testing.assert_array_equal(pages.plane_counts(part), whole[part])
+    assert not NO_PAGES.plane_counts(ev.HEADING).any()
 
 
 PLACES = ev.COUNTS * ev.CELLS
@@ -168,18 +167,6 @@ def packed(drawn_pages: list[tuple[dict[int, int], dict[int, tuple[int, int]]]])
     return Pages(np.array(table, np.int64).reshape(-1, 6), np.array(all_votes, np.uint64), np.array(all_cells, CELL))
 
 
-def page_of(places: dict[int, int], stamps: dict[int, tuple[int, int]] | None = None) -> Page:
-    ((_, _, one),) = packed([(places, stamps or {})]).items()
-    return one
-
-
-def unpacked(one: Page) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    counts, bitmaps = np.zeros(PLACES, np.uint64), np.zeros((ev.CELLS, 2), np.uint64)
-    newest_ns = np.zeros(ev.CELLS, np.int64)
-    one.add_to(counts, bitmaps, newest_ns)
-    return counts, bitmaps, newest_ns
-
-
 @settings(max_examples=15)
 @given(st.lists(drawn, max_size=5))
 def test_pages_come_back_from_their_record_to_the_bit(drawn_pages):
@@ -192,13 +179,44 @@ def test_pages_come_back_from_their_record_to_the_bit(drawn_pages):
     assert is_sound(record)
 
 
-@given(drawn, st.sets(st.integers(0, 255)))
-def test_a_part_of_the_cells_and_the_rest_are_the_page(drawn_page, chosen):
-    one, inside = page_of(*drawn_page), np.zeros(ev.CELLS, np.bool_)
-    inside[list(chosen)] = True
-    part, rest = pick(one, inside), pick(one, ~inside)
-    assert set(part.cells["cell"].tolist()) <= chosen
-    assert not set((part.votes["place"] % ev.CELLS).tolist()) - chosen
-    together = unpacked(part)
-    rest.add_to(*together)
-    assert all(map(np.array_equal, together, unpacked(one)))
+def summed(pages: TimedPages, start: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Counts, bitmaps and newest stamps of a block, page by page, as `evidence` has them."""
+    counts, bitmaps = np.zeros((256, ev.COUNTS), np.uint64), np.zeros((256, 2), np.uint64)
+    newest_ns = np.zeros(256, np.int64)
+    for index, one in enumerate(pages):
+        plane, cell = np.divmod(one.page.votes["place"].astype(int), 256)
+        holds = start[cell] <= index
+        np.add.at(counts, (cell[holds], plane[holds]), one.page.votes["count"][holds].astype(np.uint64))
+        cells = one.page.cells[start[one.page.cells["cell"]] <= index]
+        bitmaps[cells["cell"]] |= np.stack([cells["visits"], cells["machines"]], axis=1)
+        newest_ns[cells["cell"]] = np.maximum(newest_ns[cells["cell"]], cells["newest_ns"])
+    return counts, bitmaps, newest_ns
+
+
+@settings(max_examples=15)
+@given(st.lists(st.lists(drawn, max_size=6), min_size=1, max_size=3), st.randoms(use_true_random=False))
+def test_evidence_is_the_sum_of_the_pages_that_hold(drawn_blocks, random):
+    draw = np.random.default_rng(random.getrandbits(32))
+    blocks = []
+    for drawn_pages in drawn_blocks:
+        pages = packed(drawn_pages)
+        tiers = np.sort(draw.integers(0, 4, len(drawn_pages)))
+        pages.table[:, 0] = tiers
+        blocks.append(TimedPages(pages.record, FEW))
+    start = [draw.integers(0, 1 + len(pages), 256) for pages in blocks]
+    sums = evidence(blocks, start)
+    for i, pages in enumerate(blocks):
+        assert all(map(np.array_equal, (sums.counts[i], sums.bitmaps[i], sums.newest_ns[i]), summed(pages, start[i])))
+        votes, ends = pages.packed_votes()
+        parts = np.split(votes, ends[:-1]) if len(ends) else []
+        for part, one in zip(parts, pages, strict=True):
+            assert (part & np.uint64(0xFFFF)).tolist() == one.page.votes["place"].tolist()
+            assert (part >> np.uint64(16)).tolist() == one.page.votes["count"].tolist()
+        for count in range(len(pages) + 1):
+            some = zip(pages.older(count), pages, strict=False)
+            assert len(pages.older(count)) == count
+            assert all(bits(a.page) == bits(b.page) for a, b in some)
+
+
+def bits(one: Page) -> tuple[list, list, bytes]:
+    return one.votes["place"].tolist(), one.votes["count"].tolist(), one.cells.tobytes()
