@@ -1,6 +1,6 @@
 """Pages: the evidence of one block over a span of time, packed and never changed.
 
-Of the 107 counts of a cell about ten are not zero. A page keeps those alone, with bitmaps and newest stamp of its
+Of the 108 counts of a cell about ten are not zero. A page keeps those alone, with bitmaps and newest stamp of its
 cells. All pages of a block are one `Record`, a run of bytes, about 45 per cell and page: in memory, in snapshots and in
 checkpoints. As nothing changes it, readers and snapshots take it without a copy.
 """
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapserver.evidence import record_kernels
+from mapserver.evidence.record_writing import write_records
 from protocol.arrays import AnyArray, Ints, Table
 
 # place: bin * 256 + cell. Counts of a few passes fit into 16 bits; where one does not, all of a block are wide.
@@ -102,7 +103,7 @@ def records(ends: Ints, table: Ints, votes: NDArray[np.uint64], cells: Table, sp
     table (n, 6), votes, cells: as of Pages, of all blocks, in their order.
     """
     out_ends = np.empty_like(ends)
-    record_kernels.write_records(ends, table, votes, cells, as_numbers(space), out_ends)
+    write_records(ends, table, votes, cells, as_numbers(space), out_ends)
     return cut(space, out_ends)
 
 

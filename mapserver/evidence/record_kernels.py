@@ -22,22 +22,18 @@ import numba
 import numpy as np
 
 from mapserver.evidence.cells import CELLS, COUNTS
-from mapserver.evidence.fold_config import HASH
 
 FIELDS = 6  # of the header, before the bits
 HEADER_BYTES = FIELDS * 4 + CELLS // 8
-_ROW_BYTES, _MARK_BYTES, _WORD_BYTES = 24, 4, 8
-_PLANE, _CELL = np.uint64(0xFF00), np.uint64(CELLS - 1)  # of a place
-_LOW, _NARROW_END = np.uint64(0xFFFF), np.uint64(1 << 32)  # of a count; of a vote whose count has 16 bits
-_ONE, _HASH = np.uint64(1), np.uint64(HASH)  # unsigned, as indices below: the compiler need not look for negative ones
-_SLOTS = 1024  # of a hash table: a list has 256 words at most
+ROW_BYTES, MARK_BYTES, WORD_BYTES = 24, 4, 8
+_ONE = np.uint64(1)  # unsigned, as indices below: the compiler need not look for negative ones
 
 
 @numba.njit(cache=True, nogil=True)
 def record_bytes(pages: int, marks: int, words: int, votes: int, wide: int, runs: int) -> int:
     """Length of a record, whose header has these numbers."""
-    before_words = HEADER_BYTES + _ROW_BYTES * pages + (_MARK_BYTES * marks + 7) // 8 * 8
-    return int((before_words + _WORD_BYTES * words + (3 + 2 * wide) * votes + 2 * runs + 7) // 8 * 8)
+    before_words = HEADER_BYTES + ROW_BYTES * pages + (MARK_BYTES * marks + 7) // 8 * 8
+    return int((before_words + WORD_BYTES * words + (3 + 2 * wide) * votes + 2 * runs + 7) // 8 * 8)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -46,15 +42,15 @@ def parts(data: Any, at: int) -> Any:
     whole, halves, quarters, eighths = data
     pages, marks, words, votes, wide, runs = quarters[at >> 2 : (at >> 2) + FIELDS]
     table = at + HEADER_BYTES
-    mark = table + _ROW_BYTES * pages
-    word = mark + (_MARK_BYTES * marks + 7) // 8 * 8
-    count = word + _WORD_BYTES * words
+    mark = table + ROW_BYTES * pages
+    word = mark + (MARK_BYTES * marks + 7) // 8 * 8
+    count = word + WORD_BYTES * words
     high = count + 2 * votes
     place = high + 2 * votes * wide
     run = place + votes
     return (
         quarters[table >> 2 : mark >> 2].reshape(pages, 6),
-        whole[mark : mark + _MARK_BYTES * marks].reshape(marks, 4),
+        whole[mark : mark + MARK_BYTES * marks].reshape(marks, 4),
         eighths[word >> 3 : count >> 3],
         halves[count >> 1 : high >> 1],
         halves[high >> 1 : place >> 1],
@@ -111,117 +107,6 @@ def _read_cells(table: Any, marks: Any, words: Any, out: Any) -> None:
             out[j].visits = words[visits + marks[j, 1]]
             out[j].machines = words[machines + marks[j, 2]]
             out[j].newest_ns = np.int64(words[stamps + marks[j, 3]])
-
-
-@numba.njit(cache=True, nogil=True)
-def new_slots() -> Any:
-    """Scratch of `write_record`: a hash table that knows by the number of a list, its last element, what is new."""
-    return np.zeros(_SLOTS + 1, np.int64)
-
-
-@numba.njit(cache=True, nogil=True)
-def write_record(table: Any, votes: Any, cells: Any, slots: Any, out: Any, at: int) -> Any:
-    """Write pages, whose votes and cells lie end to end, as a record; returns where it ends."""
-    whole, halves, quarters, eighths = out
-    pages, vote, cell = len(table), 0, 0
-    if pages:
-        votes, cells = votes[table[0, 2] : table[-1, 3]], cells[table[0, 4] : table[-1, 5]]
-        vote, cell = table[0, 2], table[0, 4]
-    wide = 0
-    for packed in votes:
-        wide |= packed >= _NARROW_END
-    head, known, rows = at >> 2, (at >> 3) + FIELDS // 2, (at + HEADER_BYTES) >> 2
-    mark = at + HEADER_BYTES + _ROW_BYTES * pages
-    word = mark + (_MARK_BYTES * len(cells) + 7) // 8 * 8
-    eighths[known : known + CELLS // 64] = 0
-    eighths[mark >> 3 : word >> 3] = 0
-    marks = whole[mark : mark + _MARK_BYTES * len(cells)].reshape(len(cells), 4)
-    words = _write_cells(table, cells, cell, slots, eighths[known:], marks, eighths[word >> 3 :])
-    count = word + _WORD_BYTES * words
-    high = count + 2 * len(votes)
-    place = high + 2 * len(votes) * wide
-    run = place + len(votes)
-    runs = _write_votes(
-        table, votes, vote, quarters[rows:], halves[count >> 1 : high >> 1], halves[high >> 1 : place >> 1],
-        whole[place:run], whole[run:],
-    )  # fmt: skip
-    for p in range(pages):
-        row = rows + 6 * p
-        quarters[row], quarters[row + 1] = table[p, 0], table[p, 1]
-        quarters[row + 4], quarters[row + 5] = table[p, 4] - cell, table[p, 5] - cell
-    quarters[head], quarters[head + 1], quarters[head + 2] = pages, len(cells), words
-    quarters[head + 3], quarters[head + 4], quarters[head + 5] = len(votes), wide, runs
-    end = run + 2 * runs
-    filled = (end + 7) // 8 * 8
-    whole[end:filled] = 0
-    return filled
-
-
-@numba.njit(cache=True, nogil=True)
-def _write_votes(table: Any, votes: Any, first: int, rows: Any, counts: Any, high: Any, places: Any, runs: Any) -> int:
-    """Split votes into counts, cells and runs, and write where both end into the rows; returns how many runs."""
-    used, i = 0, np.uint64(0)
-    for p in range(len(table)):
-        end = np.uint64(table[p, 3] - first)
-        while i < end:
-            plane = votes[i] & _PLANE
-            begin = i
-            while i < end and votes[i] & _PLANE == plane:
-                places[i] = votes[i] & _CELL
-                counts[i] = votes[i] >> np.uint64(16) & _LOW
-                i += _ONE
-            runs[2 * used], runs[2 * used + 1] = plane >> np.uint64(8), i - begin - _ONE
-            used += 1
-        rows[6 * p + 2], rows[6 * p + 3] = used, end
-    for j in range(np.uint64(len(high))):
-        high[j] = votes[j] >> np.uint64(32)
-    return used
-
-
-@numba.njit(cache=True, nogil=True)
-def _write_cells(table: Any, cells: Any, first: int, slots: Any, known: Any, marks: Any, words: Any) -> Any:
-    """Replace bitmaps and stamps of cells by numbers of words, and set bits of known cells; returns how many words."""
-    used, list_number = np.uint64(0), slots[_SLOTS]
-    for p in range(len(table)):
-        cells_of_page = range(np.uint64(table[p, 4] - first), np.uint64(table[p, 5] - first))
-        header = used
-        used += _ONE
-        sizes = np.uint64(0)
-        for part in range(3):
-            begin = used
-            list_number += 1
-            for j in cells_of_page:
-                if part == 0:
-                    word = cells[j].visits
-                elif part == 1:
-                    word = cells[j].machines
-                else:
-                    word = np.uint64(cells[j].newest_ns)
-                slot = (word * _HASH) >> np.uint64(54)
-                while slots[slot] >> 16 == list_number and words[begin + np.uint64(slots[slot] & 0xFFFF)] != word:
-                    slot = (slot + _ONE) & np.uint64(_SLOTS - 1)
-                if slots[slot] >> 16 != list_number:
-                    slots[slot] = list_number << 16 | np.int64(used - begin)
-                    words[used] = word
-                    used += _ONE
-                marks[j, np.uint64(1 + part)] = slots[slot] & 0xFFFF
-            sizes |= (used - begin) << np.uint64(9 * part)
-        words[header] = sizes
-        for j in cells_of_page:
-            number = np.uint64(cells[j].cell)
-            marks[j, 0] = number
-            known[number >> np.uint64(6)] |= _ONE << (number & np.uint64(63))
-    slots[_SLOTS] = list_number
-    return used
-
-
-@numba.njit(cache=True, nogil=True)
-def write_records(ends: Any, table: Any, votes: Any, cells: Any, out: Any, out_ends: Any) -> None:
-    """A record for each block. ends, out_ends (b,): of the pages of each block, and of its record."""
-    slots, first, at = new_slots(), 0, 0
-    for block in range(len(ends)):
-        at = write_record(table[first : ends[block]], votes, cells, slots, out, at)
-        out_ends[block], first = at, ends[block]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -8,7 +8,8 @@ import numba
 import numpy as np
 
 from mapserver.evidence.cells import CELLS, COUNT_MAX, COUNTS
-from mapserver.evidence.record_kernels import new_slots, read_record, write_record
+from mapserver.evidence.record_kernels import read_record
+from mapserver.evidence.record_writing import new_slots, write_record
 
 _INDEX_BITS = 40  # of a span, below its tier
 # Indices of long loops are unsigned: the compiler then need not look for negative ones, which count from the end.

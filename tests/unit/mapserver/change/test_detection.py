@@ -19,7 +19,7 @@ from mapserver.error_model import MACHINE_SHARE
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.timeline import TimedPage
+from mapserver.evidence.timeline import NO_PAGES, TimedPages
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.geometry import BLOCK_CELLS
 from tests.unit.mapserver.data import NOW_NS, samples
@@ -30,7 +30,7 @@ CENTRES = np.arange(16) + 0.5
 BIN = float(np.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0]))
 
 
-def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise: float = 0.0) -> list[TimedPage]:
+def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise: float = 0.0) -> TimedPages:
     """Pages of one block that is driven all over once an hour, with the ground as given."""
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     grid, draw = Grid(1.0, FoldConfig(keep_buckets=100)), np.random.default_rng(1)
@@ -41,7 +41,7 @@ def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise
     return grid.pages([(0, 0)])[0]
 
 
-def firsts(pages: list[TimedPage], config: ChangeConfig = CONFIG) -> Ints:
+def firsts(pages: TimedPages, config: ChangeConfig = CONFIG) -> Ints:
     return np.unique(cuts(pages, config).first)
 
 
@@ -119,7 +119,7 @@ def test_a_change_is_more_than_its_samples_state_by_machines_and_by_passes(machi
         assert firsts(grid.pages([(0, 0)])[0]) == [change * passes_each]
 
 
-def two_passes(*grounds: dict[float, float]) -> list[TimedPage]:
+def two_passes(*grounds: dict[float, float]) -> TimedPages:
     """Pages of one block that is driven all over twice; for each pass the metres on each kind of ground."""
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     grid = Grid(1.0, FoldConfig())
