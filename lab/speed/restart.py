@@ -14,14 +14,12 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-
 from lab.speed.measure import Figures, in_child, in_turn, rows_of, timed
 from lab.speed.site import OPTIONS as STORE_OPTIONS
 from lab.speed.site import SITE, Site, ask, forget_peak_mb, send, session
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, warm_up
-from mapserver.evidence.pages import CompactPages
+from mapserver.evidence.pages import Pages
 from mapserver.ingest.snapshot_times import RESTART_SAMPLES
 from mapserver.ingest.store import Store
 from mapserver.journal.history import History, fold_history
@@ -133,21 +131,16 @@ def fill(hours: float) -> Figures:
     for name, rows in islice(batches(), samples_of(hours) // BATCH):
         grid.fold(rows, name)
     resident_mb = memory_mb()
-    blocks = [pages for _, _, pages in grid.state().blocks]
-    evidence_bytes = sum(map(_bytes, blocks))
+    blocks = [record for _, _, record in grid.state().blocks]
+    evidence_bytes, pages = sum(map(sys.getsizeof, blocks)), sum(len(Pages.unpacked(record).cells) for record in blocks)
     return {
         "samples": grid.folded,
         "cells": grid.known_cells(),
-        "bytes_per_cell_and_bucket": evidence_bytes / max(1, sum(len(pages.marks) for pages in blocks)),
+        "bytes_per_cell_and_bucket": evidence_bytes / max(1, pages),
         "evidence_mb": evidence_bytes / MB,
         "resident_mb": max(resident_mb, memory_mb()),  # with all pages settled, or with some that wait
         **_snapshot(grid),
     }
-
-
-def _bytes(pages: CompactPages) -> int:
-    """Bytes of the pages of one block, with their Python objects."""
-    return pages.nbytes + sys.getsizeof(pages) + len(pages.__slots__) * sys.getsizeof(np.empty(0))
 
 
 def _snapshot(grid: Grid) -> Figures:

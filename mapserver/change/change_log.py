@@ -6,7 +6,7 @@ change, which is then larger.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from mapserver.change.validity import image_of, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.timeline import Block, TimedPage, evidence
+from mapserver.evidence.timeline import Block, TimedPages, evidence
 from mapserver.layers import cell_layers
 from protocol.arrays import Bools, Floats32, Ints
 from protocol.machine.samples import SAMPLE_DTYPE
@@ -48,7 +48,7 @@ class ChangeLog:
         """All changes with a number beyond `after`."""
         return [change for number, change in sorted(self._changes.items()) if number > after]
 
-    def look(self, blocks: Collection[Block], pages: Mapping[Block, Sequence[TimedPage]]) -> list[GroundChange]:
+    def look(self, blocks: Collection[Block], pages: Mapping[Block, TimedPages]) -> list[GroundChange]:
         """Look at blocks, given their pages and those of their neighbours; returns changes that are new or grew."""
         first = valid_pages(pages, self._cell_m, self._config)
         changed = [block for block in blocks if block in first and first[block].any()]
@@ -74,7 +74,7 @@ class ChangeLog:
                 grown[change.id] = change
         return list(grown.values())
 
-    def _fresh(self, block: Block, pages: Sequence[TimedPage], first: Ints, changed_ns: Ints) -> Bools:
+    def _fresh(self, block: Block, pages: TimedPages, first: Ints, changed_ns: Ints) -> Bools:
         """Cells (256,) that changed, and are not part of a change yet."""
         logged = self._logged.setdefault(block, np.zeros(ev.CELLS, np.int64))
         spans_ns = np.array([timed.end_ns - timed.first_ns for timed in pages])
@@ -136,9 +136,9 @@ def _of_one_time(area: Bools, changed_ns: Ints) -> tuple[Ints, Ints]:
     return row, column
 
 
-def _older(pages: Sequence[TimedPage], first: Ints) -> Sequence[TimedPage]:
+def _older(pages: TimedPages, first: Ints) -> TimedPages:
     """Pages of a block from before its change; where cells changed at different times, before most of them."""
-    return pages[: int(np.median(first[first > 0]))]
+    return pages.older(int(np.median(first[first > 0])))
 
 
 def _before_and_after(old: ev.Evidence, now: ev.Evidence, config: cell_layers.ReadConfig) -> dict[str, Floats32]:

@@ -8,7 +8,6 @@ by more than what their samples state. What comes after a cut is cut again, so t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from mapserver.change.kernels import differ, histograms, likeliest_cuts, medians, sums, weights
 from mapserver.error_model import MACHINE_SHARE
 from mapserver.evidence import cells as ev
-from mapserver.evidence.timeline import TimedPage, packed_votes
+from mapserver.evidence.timeline import TimedPages
 from protocol.arrays import Bools, Floats, Ints
 from protocol.config import require_positive
 from protocol.site.geometry import BLOCK_CELLS
@@ -92,12 +91,12 @@ def _unchanged() -> Cuts:
 UNCHANGED = _unchanged()  # one for all blocks without a change, which are most: 8 KB each, kept with their pages
 
 
-def cuts(pages: Sequence[TimedPage], config: ChangeConfig, tuning: ChangeTuning = TUNING) -> Cuts:
+def cuts(pages: TimedPages, config: ChangeConfig, tuning: ChangeTuning = TUNING) -> Cuts:
     """Find the last change in every cell of a block."""
     if len(pages) < 2 or not config.detect:
         return UNCHANGED
     last = _unchanged()
-    votes_of_pages, ends = packed_votes(pages)
+    votes_of_pages, ends = pages.packed_votes()
     least, most = 0.1 * tuning.weight_m * ev.WEIGHT_UNITS_PER_M, min(tuning.alike_bins, tuning.bins / 2)
     for part in _PARTS:
         cells = np.flatnonzero(differ(votes_of_pages, ends, part.start, part.stop, least, most))
@@ -142,9 +141,9 @@ class Known:
     until_ns: Floats
 
 
-def known(pages: Sequence[TimedPage], tuning: ChangeTuning = TUNING) -> Known:
+def known(pages: TimedPages, tuning: ChangeTuning = TUNING) -> Known:
     """What is known of the cells (256,) of a block."""
-    packed, ends = packed_votes(pages)
+    packed, ends = pages.packed_votes()
     span = ev.RESISTANCE.start, ev.RESISTANCE.stop
     weight = weights(packed, ends, *span) / ev.WEIGHT_UNITS_PER_M
     median = medians(sums(packed, *span) / ev.WEIGHT_UNITS_PER_M)
@@ -195,7 +194,7 @@ def reach_blocks(cell_m: float, config: ChangeConfig) -> int:
     return -(-(2 * edge + (edge - 1) + 2 * edge + (edge - 1)) // BLOCK_CELLS)
 
 
-def _begins_ns(pages: Sequence[TimedPage]) -> Floats:
+def _begins_ns(pages: TimedPages) -> Floats:
     return np.array([float(timed.first_ns) for timed in pages])
 
 
@@ -276,9 +275,7 @@ def _best_cut(votes: Floats, first: Ints, part: slice, tuning: ChangeTuning) -> 
     return np.where(changed, best, first), after, step
 
 
-def _doubt(
-    pages: Sequence[TimedPage], packed: NDArray[np.uint64], ends: Ints, cells: Ints, first: Ints, cut: Ints
-) -> Floats:
+def _doubt(pages: TimedPages, packed: NDArray[np.uint64], ends: Ints, cells: Ints, first: Ints, cut: Ints) -> Floats:
     """Standard deviation (cells,) of c_rr after a cut less that before it, by what samples state.
 
     packed, ends: as of `packed_votes`. More metres of one pass make a side no surer: they err alike, by how an estimate

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from typing import TypeVar
 
@@ -19,11 +19,11 @@ from mapserver.change.detection import (
     known,
     reach_blocks,
 )
-from mapserver.evidence.timeline import Block, TimedPage, TimedPages
+from mapserver.evidence.timeline import Block, TimedPages
 from protocol.arrays import AnyArray, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-Pages = Mapping[Block, Sequence[TimedPage]]
+Pages = Mapping[Block, TimedPages]
 Ages = Mapping[Block, Ints]  # since when (256,) the ground of cells is as it is [ns], 0 for ever; blocks with any
 T = TypeVar("T")
 
@@ -53,7 +53,7 @@ def valid_pages(
     return valid
 
 
-def _since(pages: Sequence[TimedPage], age_ns: Ints) -> Ints:
+def _since(pages: TimedPages, age_ns: Ints) -> Ints:
     """Index (256,) of the first page with evidence of a cell that begins in its age.
 
     Where there is none, of the page that it begins in, which has older evidence as well: better than to know nothing.
@@ -80,19 +80,17 @@ def clusters(blocks: Iterable[Block], reach: int) -> list[list[Block]]:
     return parts
 
 
-def _cuts(pages: Sequence[TimedPage], config: ChangeConfig, tuning: ChangeTuning) -> Cuts:
+def _cuts(pages: TimedPages, config: ChangeConfig, tuning: ChangeTuning) -> Cuts:
     """As `cuts`, found once for the same pages."""
     return _derived(pages, (config, tuning), lambda: cuts(pages, config, tuning))
 
 
-def _known(pages: Sequence[TimedPage], tuning: ChangeTuning) -> Known:
+def _known(pages: TimedPages, tuning: ChangeTuning) -> Known:
     """As `known`, found once for the same pages."""
     return _derived(pages, tuning, lambda: known(pages, tuning))
 
 
-def _derived(pages: Sequence[TimedPage], key: object, derive: Callable[[], T]) -> T:
-    if not isinstance(pages, TimedPages):
-        return derive()
+def _derived(pages: TimedPages, key: object, derive: Callable[[], T]) -> T:
     if key not in pages.derived:
         pages.derived[key] = derive()
     value: T = pages.derived[key]

@@ -12,9 +12,9 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.buffers import Buffers
 from mapserver.evidence.fold_config import STD_FLOOR_M, FoldConfig
 from mapserver.evidence.fold_kernels import BUCKET_BITS, fold_sorted
-from mapserver.evidence.pages import CELL, RAW_CELL, PackedPages, copied
+from mapserver.evidence.pages import CELL, Record, most_bytes, records
 from mapserver.evidence.sample_kernels import locate, split, weigh
-from protocol.arrays import AnyArray, Bools, Ints, Table
+from protocol.arrays import AnyArray, Ints, Table
 
 MOST_SHARES = 1 << 24  # of stencils that are weighed at once, 64 MB
 MOST_VOTES = 1 << 20  # that are packed at once, 8 MB
@@ -39,8 +39,8 @@ def fold(
     config: FoldConfig,
     scratch: Scratch,
     spans: Ints | None = None,
-) -> Iterator[tuple[int, int, PackedPages]]:
-    """Fold samples; yields block column, block row and pages of buckets (tier 0), a block maybe more than once.
+) -> Iterator[tuple[tuple[int, int], Record]]:
+    """Fold samples; yields a block and a record of its buckets (tier 0), a block maybe more than once.
 
     names (n,): hashes of the rows' machines. The weight of all samples together stays within COUNT_MAX. Samples that
     do not know their place well enough have no vote. spans (n,): numbers below 2**BUCKET_BITS of the pages that the
@@ -77,10 +77,10 @@ def fold(
 
 def _pages(
     keys: Ints, touching: Ints, samples: tuple[Any, ...], area: int, scratch: Scratch
-) -> Iterator[tuple[int, int, PackedPages]]:
+) -> Iterator[tuple[tuple[int, int], Record]]:
     """Fold sorted pairs, as many at a time as there is space for."""
     block = ev.COUNTS * ev.CELLS
-    pages = scratch.array("pages", min(len(keys), MOST_PAGES), np.int64, 7)
+    pages = scratch.array("pages", min(len(keys), MOST_PAGES), np.int64, 8)
     votes = scratch.array("votes", min(_VOTES_OF_CELL * area, MOST_VOTES) + block, np.uint64)
     cells = scratch.array("cells", min(area, len(pages) * ev.CELLS) + ev.CELLS, CELL)
     done = 0
@@ -91,23 +91,10 @@ def _pages(
 
 def _by_block(
     pages: Ints, votes: NDArray[np.uint64], cells: Table, scratch: Scratch
-) -> Iterator[tuple[int, int, PackedPages]]:
-    """Cut pages into those of each block; copies, which keep nothing else alive."""
-    if not len(pages):
-        return
-    begins: Bools = np.ones(len(pages), np.bool_)
-    begins[1:] = (pages[1:, :2] != pages[:-1, :2]).any(axis=1)
-    firsts = np.flatnonzero(begins)
-    ends = np.append(firsts[1:], len(pages))
-    tables = np.zeros((len(pages), 6), np.int64)
-    tables[:, 1:] = pages[:, 2:]
-    tables[:, 2:] -= np.repeat(pages[firsts][:, [3, 3, 5, 5]], ends - firsts, axis=0)
-    few: AnyArray = votes
-    if int(votes.max()) < 2**32:
-        few = scratch.array("few", len(votes), np.uint32)
-        few[:] = votes
-    raw = cells.view(RAW_CELL)
-    places = np.column_stack([pages[firsts][:, [0, 1, 3, 5]], pages[ends - 1][:, [4, 6]], firsts, ends])
-    for x, y, vote, cell, end_vote, end_cell, first, end in places.tolist():
-        own_cells = copied(raw[cell:end_cell]).view(CELL)
-        yield x, y, PackedPages(copied(tables[first:end]), copied(few[vote:end_vote]), own_cells)
+) -> Iterator[tuple[tuple[int, int], Record]]:
+    """Pack the pages of each block."""
+    firsts = np.flatnonzero((np.diff(pages[:, :2], axis=0, prepend=pages[:1, :2] - 1) != 0).any(axis=1))
+    ends, table = np.append(firsts[1:], len(pages)), pages[:, 2:].copy()
+    space = scratch.array("records", most_bytes(table, votes, cells), np.uint8)
+    blocks = zip(*pages[firsts, :2].T.tolist(), strict=True)
+    yield from zip(blocks, records(ends[: len(firsts)], table, votes, cells, space), strict=True)

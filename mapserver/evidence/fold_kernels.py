@@ -37,7 +37,7 @@ def fold_sorted(
     keys, touching: as of `locate`, sorted by key. samples: (stencils of `locate`, starts and shares of `weigh`, bins,
     shares, bits and stamps of `split`). scratch: (counts (COUNTS * 256,) uint32, lines (COUNTS,) int32 one bit for each
     row of 16 cells, visits, machines (256,) uint64, newest (256,) int64), zero before and after.
-    Fills pages (m, 7): block column and row, bucket, first and end of its votes and of its cells; votes; cells CELL.
+    Fills pages (m, 8): block column and row, and a row of the table of Pages, whose index is the bucket; votes; cells.
     Stops where another page might not fit. Returns the number of the next pair, and how many pages, votes and cells
     were written.
     """
@@ -80,8 +80,8 @@ def fold_sorted(
         end_cells = _pack_cells(visits, machines, newest, low, high, out_cells, cells)
         if end_cells > cells:
             page = out_pages[pages]
-            page[0], page[1], page[2] = left >> 4, bottom >> 4, key & _BUCKET_MASK
-            page[3], page[4], page[5], page[6] = votes, end_votes, cells, end_cells
+            page[0], page[1], page[2], page[3] = left >> 4, bottom >> 4, 0, key & _BUCKET_MASK
+            page[4], page[5], page[6], page[7] = votes, end_votes, cells, end_cells
             pages += 1
         votes, cells = end_votes, end_cells
     return at, pages, votes, cells

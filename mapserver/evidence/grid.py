@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -12,10 +12,10 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import Scratch, fold
 from mapserver.evidence.fold_config import FoldConfig, name_hash
 from mapserver.evidence.grid_state import GridCounts, GridState
-from mapserver.evidence.pages import PackedPages
+from mapserver.evidence.pages import Record, is_sound
 from mapserver.evidence.sample_kernels import count_foldable, extent
 from mapserver.evidence.settling import Space, Tiers
-from mapserver.evidence.timeline import PATIENCE, Block, TimedPage, Timeline, evidence, settle_all
+from mapserver.evidence.timeline import PATIENCE, Block, TimedPages, Timeline, evidence, settle_all, timed
 from mapserver.evidence.workers import ALONE, Workers
 from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
@@ -41,7 +41,7 @@ class Grid:
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
-        self._turn, self._turns = 0, dict[Block, int]()  # how often anything was folded; the last turn of each block
+        self._turn = 0  # how often anything was folded
         self._workers, self._scratch, self._spaces = ALONE, [Scratch()], [Space()]
         self._rows: AnyArray = np.empty(waiting_rows, RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
@@ -81,9 +81,7 @@ class Grid:
         self._turn += 1
         self._extend(other._timelines)
         for block, timeline in other._timelines.items():
-            self._cells += self._timeline(block).add(timeline.settled().expanded())
-            self._touched.add(block)
-            self._turns[block] = self._turn
+            self._cells += sum(self._add(block, record) for record in timeline.records)
         self._folded += other._folded
         self._skipped += other._skipped
         self._widen(other.oldest_ns, other.newest_ns)
@@ -111,12 +109,10 @@ class Grid:
         inside = ((x, y) for x in range(first_x, last_x + 1) for y in range(first_y, last_y + 1))
         return [block for block in inside if block in self._timelines]
 
-    def pages(self, blocks: Iterable[Block]) -> list[Sequence[TimedPage]]:
+    def pages(self, blocks: Iterable[Block]) -> list[TimedPages]:
         """Pages of each of these blocks in the order of time, none for a block without evidence."""
         self._drain()
-        timelines = [self._timelines.get(block) for block in blocks]
-        settle_all(timeline for timeline in timelines if timeline)
-        return [timeline.timed() if timeline else () for timeline in timelines]
+        return timed([self._timelines.get(block) for block in blocks], self._tiers, self._spaces[0])
 
     def touch_all(self) -> None:
         """Count all blocks as touched."""
@@ -131,7 +127,7 @@ class Grid:
     def folded_since(self, turn: int) -> tuple[list[Block], int]:
         """Blocks that were folded into after a turn of this grid, all after turn -1; and the turn that it is now."""
         self._drain()
-        return [block for block, last in self._turns.items() if last > turn], self._turn
+        return [block for block, timeline in self._timelines.items() if timeline.turn > turn], self._turn
 
     def evidence(self, blocks: Iterable[Block]) -> ev.Evidence:
         """Everything that was ever seen of these blocks, whether it still holds or not."""
@@ -140,7 +136,8 @@ class Grid:
     def last_turns(self, blocks: Iterable[Block]) -> list[int]:
         """The last turn of this grid in which each of these blocks was folded into, -1 for one without evidence."""
         self._drain()
-        return [self._turns.get(block, -1) for block in blocks]
+        timelines = (self._timelines.get(block) for block in blocks)
+        return [timeline.turn if timeline else -1 for timeline in timelines]
 
     def bounds(self) -> tuple[int, int, int, int] | None:
         """First column, first row, end column, end row of all blocks with evidence."""
@@ -165,8 +162,8 @@ class Grid:
     def state(self) -> GridState:
         """Everything, in the order of places, so that equal grids have equal states."""
         self._drain()
-        settle_all(self._timelines.values())
-        blocks = ((x, y, self._timelines[x, y].kept) for x, y in sorted(self._timelines))
+        settle_all(self._timelines.values(), self._tiers, self._spaces[0])
+        blocks = ((x, y, self._timelines[x, y].records[0]) for x, y in sorted(self._timelines))
         return GridState(tuple(blocks), self._folded, self._skipped, self.newest_ns, self.oldest_ns)
 
     @classmethod
@@ -174,10 +171,8 @@ class Grid:
         """Undo `state`."""
         grid = cls(cell_m, config)
         grid._extend((x, y) for x, y, _ in state.blocks)
-        for x, y, pages in state.blocks:
-            timeline = grid._timelines[x, y] = Timeline(grid._tiers, grid._spaces[0], pages)
-            grid._turns[x, y] = 0
-            grid._cells += timeline.known_cells
+        grid._timelines = {(x, y): Timeline([record]) for x, y, record in state.blocks}
+        grid._cells = sum(timeline.known.bit_count() for timeline in grid._timelines.values())
         grid._folded, grid._skipped = state.folded, state.skipped
         grid.newest_ns, grid.oldest_ns = state.newest_ns, state.oldest_ns
         return grid
@@ -210,40 +205,39 @@ class Grid:
             return
         rows, names = self._rows[: self._waiting].view(SAMPLE_DTYPE), self._names[: self._waiting]
         count = self._workers.count
-        pages: list[list[tuple[Block, PackedPages]]] = [[] for _ in range(count)]  # of each worker's blocks
+        records: list[list[tuple[Block, Record]]] = [[] for _ in range(count)]  # of each worker's blocks
         cells = [0] * count
 
         def fold_share(worker: int) -> None:
             """Fold a stretch of the samples."""
             share = slice(worker * len(rows) // count, (worker + 1) * len(rows) // count)
-            for x, y, packed in fold(rows[share], names[share], self.cell_m, self.config, self._scratch[worker]):
-                pages[_worker_of((x, y), count)].append(((x, y), packed))
+            for block, record in fold(rows[share], names[share], self.cell_m, self.config, self._scratch[worker]):
+                records[_worker_of(block, count)].append((block, record))
 
         def add_share(worker: int) -> None:
             """Add what all have folded to one's own blocks: no timeline is changed by two."""
-            for block, packed in pages[worker]:
-                timeline = self._timeline(block)
-                timeline.space = self._spaces[worker]
-                cells[worker] += timeline.add(packed)
-                self._touched.add(block)
-                self._turns[block] = self._turn
-            settle_all({self._timelines[block] for block, _ in pages[worker]}, PATIENCE)
+            cells[worker] = sum(self._add(block, record) for block, record in records[worker])
+            own = (self._timelines[block] for block in {block for block, _ in records[worker]})
+            settle_all(own, self._tiers, self._spaces[worker], PATIENCE)
 
         self._turn += 1
         self._workers.each(fold_share)
         self._workers.each(add_share)
         self._cells += sum(cells)
-        self._extend({block for share in pages for block, _ in share})
+        self._extend({block for share in records for block, _ in share})
         voting = count_foldable(rows, self.config.std_cap_m**2)
         self._folded += voting
         self._skipped += len(rows) - voting
         self._waiting, self._weight = 0, 0
 
-    def _timeline(self, block: Block) -> Timeline:
+    def _add(self, block: Block, record: Record) -> int:
+        """Add evidence of a block in this turn; returns how many cells are new."""
         timeline = self._timelines.get(block)
         if timeline is None:
-            timeline = self._timelines[block] = Timeline(self._tiers, self._spaces[0])
-        return timeline
+            timeline = self._timelines[block] = Timeline()
+        timeline.turn = self._turn
+        self._touched.add(block)
+        return timeline.add(record)
 
     def _extend(self, blocks: Iterable[Block]) -> None:
         """Keep the bounds of all blocks."""
@@ -254,9 +248,7 @@ class Grid:
     def _settle(self, worker: int) -> None:
         """Settle a worker's own blocks."""
         own = [line for block, line in self._timelines.items() if _worker_of(block, self._workers.count) == worker]
-        for timeline in own:
-            timeline.space = self._spaces[worker]
-        settle_all(own)
+        settle_all(own, self._tiers, self._spaces[worker])
 
     def _engage(self, workers: Workers, waiting_rows: int) -> None:
         """Go on with other workers, each with space of its own."""
@@ -265,8 +257,6 @@ class Grid:
         self._rows, self._names = np.empty(waiting_rows, RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
         self._scratch = [Scratch() for _ in range(workers.count)]
         self._spaces = [Space() for _ in range(workers.count)]
-        for timeline in self._timelines.values():
-            timeline.space = self._spaces[0]
 
 
 def _worker_of(block: Block, count: int) -> int:
@@ -283,7 +273,9 @@ def warm_up(config: FoldConfig) -> None:
         grid.fold(row, "")
         grid.state()
     Grid(1.0, config).merge(grid)
-    assert all(pages.is_sound for *_, pages in grid.state().blocks)
+    assert all(is_sound(record) for *_, record in grid.state().blocks)
+    for pages in grid.pages([(0, 0)]):
+        list(pages)
 
 
 def chunks(blocks: list[Block]) -> Iterator[list[Block]]:

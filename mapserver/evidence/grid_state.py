@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mapserver.evidence.pages import CompactPages, Page
+from mapserver.evidence.pages import Page, Pages, Record
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class PlacedPage:
 class GridState:
     """Everything that a snapshot keeps; equal grids have equal states.
 
-    blocks: column, row and pages of each block, in the order of places. newest_ns, oldest_ns: of all samples, or 0.
+    blocks: column, row and record of each block, in the order of places. newest_ns, oldest_ns: of all samples, or 0.
     """
 
-    blocks: tuple[tuple[int, int, CompactPages], ...]
+    blocks: tuple[tuple[int, int, Record], ...]
     folded: int
     skipped: int
     newest_ns: int
@@ -36,8 +36,8 @@ class GridState:
         """All pages, one by one."""
         return [
             PlacedPage(x, y, tier, index, page)
-            for x, y, pages in self.blocks
-            for tier, index, page in pages.expanded().items()
+            for x, y, record in self.blocks
+            for tier, index, page in Pages.unpacked(record).items()
         ]
 
 

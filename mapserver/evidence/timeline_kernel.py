@@ -1,7 +1,4 @@
-"""Timelines compiled: all pages of a block at once into those that are kept apart.
-
-Votes are packed in 64 bits: the place (bin * 256 + cell) in the lower 16, the count above them.
-"""
+"""Timelines compiled: all records of a block at once into one, of the pages that are kept apart."""
 
 from __future__ import annotations
 
@@ -11,6 +8,8 @@ import numba
 import numpy as np
 
 from mapserver.evidence.cells import CELLS, COUNT_MAX, COUNTS
+from mapserver.evidence.record_kernels import read_record
+from mapserver.evidence.record_writing import new_slots, write_record
 
 _INDEX_BITS = 40  # of a span, below its tier
 # Indices of long loops are unsigned: the compiler then need not look for negative ones, which count from the end.
@@ -18,52 +17,33 @@ _INDEX_BITS = 40  # of a span, below its tier
 
 @numba.njit(cache=True, nogil=True)
 def settle_blocks(
-    ends: Any, table: Any, votes: Any, cells: Any, spans: Any, keeps: Any, counts: Any, tiers: Any,
-    out_ends: Any, out_table: Any, out_votes: Any, out_cells: Any,
-) -> tuple[int, int, int]:  # fmt: skip
-    """Sum the pages of blocks, so that each cell keeps its newest spans of each tier apart.
+    ends: Any, starts: Any, data: Any, spans: Any, keeps: Any, scratch: Any, out: Any, out_ends: Any
+) -> None:
+    """Sum the records of blocks, so that each cell keeps its newest spans of each tier apart.
 
-    ends (b,): of the pages of each block. table (n, 6): tier, index, first and end of the votes and of the cells of
-    each page, those of a block in any order. spans, keeps: length [ns] and number of the spans of each tier; the last
-    tier is everything before, its span 0. Scratch: counts (COUNTS * 256,) uint64, zero before and after; tiers, an int8
-    each cell. Fills pages, votes and cells in the order of block, tier and index, and where the pages of
-    each block end, and returns how many of each.
+    ends (b,): of the records of each block; starts (r,): where each begins in data. spans, keeps: length [ns] and
+    number of the spans of each tier; the last tier is everything before, its span 0. scratch: for the pages of one
+    block, tables, votes and cells before and after, an int8 for each cell before, and counts (COUNTS * 256,) uint64,
+    zero before and after. Fills a record of each block, and where they end.
     """
-    pages, used, filled, first = 0, 0, 0, 0
+    before, after, tiers, counts = scratch
+    table, votes, cells = before
+    slots, at, record = new_slots(), 0, 0
     for block in range(len(ends)):
-        rows = table[first : ends[block]]
-        if _is_settled(rows, keeps[0]):
-            for p in range(len(rows)):
-                row = out_table[pages]
-                row[0], row[1], row[2], row[4] = rows[p, 0], rows[p, 1], used, filled
-                used = _copy(votes, rows[p, 2], rows[p, 3], out_votes, used)
-                filled = _copy(cells, rows[p, 4], rows[p, 5], out_cells, filled)
-                row[3], row[5] = used, filled
-                pages += 1
-        else:
-            pages, used, filled = _settle(
-                rows, votes, cells, spans, keeps, counts, tiers, out_table, out_votes, out_cells, pages, used, filled
-            )
-        out_ends[block] = pages
-        first = ends[block]
-    return pages, used, filled
+        done = (0, 0, 0)
+        while record < ends[block]:
+            done = read_record(data, starts[record], table, votes, cells, done)
+            record += 1
+        pages = _settle(table[: done[0]], votes, cells, spans, keeps, counts, tiers, after)
+        at = write_record(after[0][:pages], after[1], after[2], slots, out, at)
+        out_ends[block] = at
 
 
 @numba.njit(cache=True, nogil=True)
-def _is_settled(table: Any, keep: int) -> bool:
-    """Whether these are few buckets, in order and each once, as one fold gives them: all are kept apart."""
-    last, p = -1, 0
-    while p < len(table) and table[p, 0] == 0 and table[p, 1] > last:
-        last, p = table[p, 1], p + 1
-    return len(table) == p <= keep
-
-
-@numba.njit(cache=True, nogil=True)
-def _settle(
-    table: Any, votes: Any, cells: Any, spans: Any, keeps: Any, counts: Any, tiers: Any,
-    out_table: Any, out_votes: Any, out_cells: Any, pages: int, used: int, filled: int,
-) -> tuple[int, int, int]:  # fmt: skip
-    """The pages of one block; pages, used, filled: how many pages, votes and cells there are already."""
+def _settle(table: Any, votes: Any, cells: Any, spans: Any, keeps: Any, counts: Any, tiers: Any, after: Any) -> int:
+    """Write the pages of one block to tables, votes and cells `after`, in the order of tier and index; how many."""
+    out_table, out_votes, out_cells = after
+    pages, used, filled = 0, 0, 0
     indices = _indices(table, spans)
     _find_tiers(table, indices, cells, keeps, tiers)
     held = _held(table, tiers, len(spans))
@@ -91,7 +71,7 @@ def _settle(
             filled = _emit_cells(visits, machines, newest, out_cells, filled)
         row[3], row[5] = used, filled
         pages += 1
-    return pages, used, filled
+    return pages
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,7 +1,7 @@
 """Credit for ground: a machine may open as much of the map as it has driven for. No files, no clock.
 
 A block costs memory for as long as the map lives, and a sample of 80 bytes opens up to four: scattered over a site,
-each would cost 14 kB. So would one on ground that others have opened: its block gets one more page for the time bucket.
+each would cost 7 kB. So would one on ground that others have opened: its block gets one more page for the time bucket.
 What is refused is never journalled, so the map stays a function of the journal. Credit is not kept: after a start of
 the server each machine has that of a new one (docs/decisions/0011-credit-for-new-ground.md).
 """

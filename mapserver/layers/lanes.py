@@ -10,13 +10,11 @@ A pass whose place came from lanes in part counts by what is left, so that lanes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.settling import DAY_S
-from mapserver.evidence.timeline import Block, TimedPage
+from mapserver.evidence.timeline import Block, TimedPage, TimedPages
 from protocol.arrays import Floats, Ints
 from protocol.queries.lanes import SCALE_M, LaneTile
 from protocol.site.geometry import BLOCK_CELLS
@@ -26,7 +24,7 @@ FADES_DAYS = 7.0  # in which a lane that nobody drives counts half
 LEAST_M = 0.1  # less of a cell is left out
 
 
-def lane_tile(block: Block, pages: Sequence[TimedPage], first: Ints, stamp_ns: int) -> LaneTile | None:
+def lane_tile(block: Block, pages: TimedPages, first: Ints, stamp_ns: int) -> LaneTile | None:
     """Lanes of one block; first: index (256,) of the page from which on each cell counts. None where nobody drove."""
     metres, later_m = np.zeros((ev.SECTORS, ev.CELLS)), np.zeros(ev.SECTORS)
     visits, machines = np.zeros(ev.CELLS, np.uint64), np.uint64(0)

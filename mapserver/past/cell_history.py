@@ -15,7 +15,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.fold import Scratch, fold
 from mapserver.evidence.fold_config import STD_FLOOR_M
 from mapserver.evidence.grid import PIECE
-from mapserver.evidence.pages import PackedPages
+from mapserver.evidence.pages import Pages
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.rows import ALL, Selection
 from mapserver.past.past import NamedSamples, StorePast, reach_of
@@ -82,17 +82,17 @@ def _evidence(past: StorePast, cell: Cell, span_ns: int, some: NamedSamples, scr
     block = cell[0] // BLOCK_CELLS, cell[1] // BLOCK_CELLS
     place = cell[1] % BLOCK_CELLS * BLOCK_CELLS + cell[0] % BLOCK_CELLS
     if len(samples):
-        for x, y, pages in fold(samples, names, past.cell_m, past.config, scratch, spans):
-            if (x, y) == block:
-                yield _of_cell(pages, place, numbers)
+        for folded, record in fold(samples, names, past.cell_m, past.config, scratch, spans):
+            if folded == block:
+                yield _of_cell(Pages.unpacked(record), place, numbers)
 
 
-def _of_cell(pages: PackedPages, place: int, numbers: Ints) -> _Part:
+def _of_cell(pages: Pages, place: int, numbers: Ints) -> _Part:
     """What pages have of one cell of their block. numbers: of the spans that their indices stand for."""
     n, table = len(pages.table), pages.table
     page = np.repeat(np.arange(n), table[:, 3] - table[:, 2])
     here = pages.votes & np.uint64(0xFF) == place
-    votes = pages.votes[here].astype(np.uint64)
+    votes = pages.votes[here]
     counts = np.zeros((n, ev.COUNTS), np.uint64)
     counts[page[here], (votes >> np.uint64(8) & np.uint64(0xFF)).astype(np.int64)] = votes >> np.uint64(16)
     page = np.repeat(np.arange(n), table[:, 5] - table[:, 4])

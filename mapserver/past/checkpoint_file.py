@@ -1,6 +1,6 @@
 """One checkpoint on disk: the evidence of samples stamped before a time, block by block, each to be read alone.
 
-    MAGIC | blocks, each padded to 8 bytes | index, one INDEX per block in the order of places | header, JSON | TAIL
+    MAGIC | records of blocks | index, one INDEX per block in the order of places | header, JSON | TAIL
 
 The tail has the lengths of index and header and the CRC-32 of both; the index has one of each block. So a read of a few
 blocks checks what it uses, and needs nothing of the rest. Files never change.
@@ -9,7 +9,6 @@ blocks checks what it uses, and needs nothing of the rest. Files never change.
 from __future__ import annotations
 
 import json
-import math
 import os
 import struct
 import zlib
@@ -21,23 +20,18 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 
 from mapserver.evidence.grid_state import GridState
-from mapserver.evidence.pages import EMPTY, CompactPages, copied
+from mapserver.evidence.pages import Record, is_sound
 from protocol.arrays import Ints, Table
 from protocol.errors import StoreError
 from protocol.files import PRIVATE, whole_file
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-MAGIC = b"SGCHECK1"
+MAGIC = b"SGCHECK2"
 OPEN_END_NS = MAX_STAMP_NS + 1  # closing time of a snapshot: it has every sample of its rows
-# As they lie in a block: large numbers first, so that all are aligned.
-PARTS = ("words", "table", "counts", "high", "runs", "cells", "marks")
-INDEX = np.dtype([("x", "<i4"), ("y", "<i4"), ("first", "<i8"), ("lengths", "<i4", len(PARTS)), ("crc32", "<u4")])
+INDEX = np.dtype([("x", "<i4"), ("y", "<i4"), ("first", "<i8"), ("bytes", "<i4"), ("crc32", "<u4")])
 TAIL = struct.Struct("<QII8s")  # blocks, bytes of the header, CRC-32 of index and header, MAGIC
 READ_BYTES = 2**22  # of neighbouring blocks at once
-_EMPTY = [getattr(EMPTY, name) for name in PARTS]
-_WIDTHS = np.array([part.itemsize * math.prod(part.shape[1:]) for part in _EMPTY])  # bytes of each one's rows
-
 
 FileState = tuple[int, int, int]
 
@@ -93,7 +87,6 @@ class Checkpoint:
         except BaseException:
             self.close()
             raise
-        self._sizes = _padded((self.index["lengths"] * _WIDTHS).sum(axis=1))
 
     def __enter__(self) -> Self:
         return self
@@ -117,9 +110,7 @@ class Checkpoint:
     def records(self, numbers: Ints) -> Iterator[memoryview]:
         """The bytes of some blocks, in order of places, each checked; neighbours are read at once."""
         at = 0
-        firsts, sizes, crcs = (
-            part[numbers].tolist() for part in (self.index["first"], self._sizes, self.index["crc32"])
-        )
+        firsts, sizes, crcs = (self.index[name][numbers].tolist() for name in ("first", "bytes", "crc32"))
         while at < len(numbers):
             end = at + 1
             while end < len(numbers) and firsts[end] == firsts[end - 1] + sizes[end - 1] < firsts[at] + READ_BYTES:
@@ -133,19 +124,13 @@ class Checkpoint:
                 yield record
             at = end
 
-    def blocks(self, numbers: Ints) -> Iterator[tuple[int, int, CompactPages]]:
-        """Column, row and pages of some blocks."""
+    def blocks(self, numbers: Ints) -> Iterator[tuple[int, int, Record]]:
+        """Column, row and record of some blocks."""
         places = zip(self.index["x"][numbers].tolist(), self.index["y"][numbers].tolist(), strict=True)
-        ends = np.cumsum(self.index["lengths"][numbers] * _WIDTHS, axis=1).tolist()
-        for (x, y), record, ends_of_parts in zip(places, self.records(numbers), ends, strict=True):
-            parts = zip(PARTS, _EMPTY, [0, *ends_of_parts], ends_of_parts, strict=False)
-            data = copied(np.frombuffer(record, np.uint8))  # alone: a block that grows gives its memory back
-            pages = CompactPages(
-                **{name: data[i:j].view(empty.dtype).reshape(-1, *empty.shape[1:]) for name, empty, i, j in parts}
-            )
-            if not pages.is_sound:
+        for (x, y), record in zip(places, map(bytes, self.records(numbers)), strict=True):
+            if not is_sound(record):
                 raise self._damaged(f"block {x}, {y}")
-            yield x, y, pages
+            yield x, y, record
 
     def _read_end(self, size: int) -> tuple[Header, Table]:
         if size < len(MAGIC) + TAIL.size:
@@ -164,7 +149,6 @@ class Checkpoint:
             raise self._damaged("its header") from None
 
     def _read(self, first: int, length: int) -> memoryview:
-        """Bytes of the file, in memory that may be written to: kernels are compiled for such arrays."""
         data = np.empty(length, np.uint8).data
         if length and os.preadv(self._file.fileno(), [data], first) != length:
             raise self._damaged("its length")
@@ -185,14 +169,9 @@ class CheckpointWriter:
         self._index: list[Table] = []
         self.bytes_written = file.write(MAGIC)
 
-    def add(self, x: int, y: int, pages: CompactPages) -> None:
+    def add(self, x: int, y: int, record: Record) -> None:
         """Write a block."""
-        parts = [getattr(pages, name) for name in PARTS]
-        data = b"".join(part.tobytes() for part in parts)
-        data += bytes(int(_padded(len(data))) - len(data))
-        entry: Table = np.zeros(1, INDEX)
-        entry["x"], entry["y"], entry["lengths"], entry["crc32"] = x, y, [[*map(len, parts)]], zlib.crc32(data)
-        self._put(entry, data)
+        self._put(np.array([(x, y, 0, len(record), zlib.crc32(record))], INDEX), record)
 
     def copy(self, source: Checkpoint, numbers: Ints) -> None:
         """Write blocks as they are in another checkpoint."""
@@ -216,11 +195,6 @@ def write_checkpoint(path: Path, header: Header, state: GridState) -> None:
     """Write the whole state of a grid; the header says what it is true for. Raises OSError."""
     with whole_file(path, PRIVATE) as file:
         writer = CheckpointWriter(file)
-        for x, y, pages in state.blocks:
-            writer.add(x, y, pages)
+        for x, y, record in state.blocks:
+            writer.add(x, y, record)
         writer.finish(header.with_totals(state))
-
-
-def _padded(length: Any) -> Any:
-    """Bytes with those that fill up the last eight."""
-    return (length + 7) // 8 * 8

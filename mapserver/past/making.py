@@ -14,7 +14,7 @@ import numpy as np
 
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridState
-from mapserver.evidence.pages import CompactPages
+from mapserver.evidence.pages import Record
 from mapserver.evidence.timeline import Block
 from mapserver.journal.facts import Facts
 from mapserver.journal.journal import JournalReader
@@ -77,7 +77,7 @@ def _reopened(base: Checkpoint | None, path: Path) -> Checkpoint:
 def _write(path: Path, base: Checkpoint | None, part: Grid, header: Header) -> Iterator[None]:
     """Write the evidence of a checkpoint and a grid together, step by step."""
     state = part.state()
-    fresh = {(x, y): pages for x, y, pages in state.blocks}
+    fresh = {(x, y): record for x, y, record in state.blocks}
     numbers = _numbers(base)
     places = sorted(fresh.keys() | numbers.keys())
     path.parent.mkdir(exist_ok=True)
@@ -106,16 +106,16 @@ def _numbers(base: Checkpoint | None) -> dict[Block, int]:
 
 
 def _merged(
-    base: Checkpoint | None, numbers: Mapping[Block, int], part: Grid, fresh: Mapping[Block, CompactPages]
-) -> dict[Block, CompactPages]:
-    """The pages of some blocks with those that a checkpoint has of them."""
+    base: Checkpoint | None, numbers: Mapping[Block, int], part: Grid, fresh: Mapping[Block, Record]
+) -> dict[Block, Record]:
+    """The records of some blocks with those that a checkpoint has of them."""
     both = sorted(numbers[place] for place in fresh if place in numbers)
     if base is None or not both:
         return dict(fresh)
     grids = (
         Grid.from_state(part.cell_m, part.config, GridState(tuple(blocks), 0, 0, 0, 0))
-        for blocks in (base.blocks(np.array(both)), ((*place, pages) for place, pages in fresh.items()))
+        for blocks in (base.blocks(np.array(both)), ((*place, record) for place, record in fresh.items()))
     )
     merged, more = grids
     merged.merge(more)
-    return {(x, y): pages for x, y, pages in merged.state().blocks}
+    return {(x, y): record for x, y, record in merged.state().blocks}

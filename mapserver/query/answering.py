@@ -81,7 +81,7 @@ class Answers:
         self._routes = Routes(source, self._layers, self._look_at_squares)
         self._open = OpenRegions()
         self._roads = RoadMaps(source)
-        self._tiles = Tiles(source, self._roads.lately)
+        self._tiles = Tiles(source, self._layers, self._roads.lately)
         self._past_tiles: TilesAnswer | None = None  # the last ones, which readers ask for in pieces
         self._answers: dict[type[MapQuery[Any]], Callable[[Any], Any]] = {
             PointQuery: self.point,
@@ -233,7 +233,7 @@ class Answers:
             return TilesAnswer(version, as_of_ns, self._site.cell_m, whole=True, tiles=())
         west, south, east, north = bounds
         view = self._view(CellWindow(west, south, east - west, north - south), as_of_ns)
-        return tiles_of(view, self._site.cell_m, self._config)
+        return tiles_of(view, self._layers)
 
     def why(self, query: WhyQuery) -> CellReasons:
         """Everything that is known of the cell that a position lies in."""

@@ -30,7 +30,7 @@ from mapserver.evidence.timeline import Block, evidence
 from mapserver.layers import cell_layers
 from mapserver.layers.gap_filling import AREA_LAYERS
 from mapserver.query.source import MapState
-from mapserver.query.views import StillMap, View, check_blocks, place
+from mapserver.query.views import StillGrid, StillMap, View, check_blocks, place
 from protocol.arrays import AnyArray, Floats, Floats32, Ints
 from protocol.queries.answers import MapVersion
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
@@ -89,7 +89,7 @@ class BlockLayers:
 
     def __init__(self, cell_m: float, config: ServerConfig, most: int = MOST_KEPT) -> None:
         """most: layers of blocks that are kept."""
-        self._cell_m, self._config, self._most = cell_m, config, most
+        self.cell_m, self._config, self._most = cell_m, config, most
         self._reach = reach_blocks(cell_m, config.change)
         self._lock = threading.Lock()
         self._cells: OrderedDict[Block, Kept] = OrderedDict()
@@ -124,7 +124,11 @@ class BlockLayers:
 
     def look_cells(self, state: MapState | StillMap, cells: Ints, names: Sequence[str]) -> Look:
         """What these layers of cells (n, 2), columns and rows, are read from."""
-        area_names, blocks = _areas_of(names), _blocks_with(cells)
+        return self.look_blocks(state, _blocks_with(cells), names)
+
+    def look_blocks(self, state: MapState | StillMap, blocks: Set[Block], names: Sequence[str]) -> Look:
+        """What these layers of blocks are read from, those of areas in the squares that have any of them."""
+        area_names = _areas_of(names)
         squares = {(x // SQUARE, y // SQUARE) for x, y in blocks} if area_names else set[Block]()
         (left, bottom), (right, top) = (
             tuple(side(block[axis] for block in blocks) for axis in (0, 1)) for side in (min, max)
@@ -143,7 +147,8 @@ class BlockLayers:
     ) -> Look:
         """Layers of cells in a rectangle of blocks, or in some of it only, and of areas in squares that touch it."""
         grid, margin = state.grid, self._margin(area_names)
-        ages, owner = (state.ages, state.grid.grid) if isinstance(state, StillMap) else ({}, ref(state.grid))
+        ages = state.ages if isinstance(state, StillMap) else {}
+        owner = grid.grid if isinstance(grid, StillGrid) else ref(grid)
         whole = _of_squares(_squares_of(inner)) if squares else inner
         wide = _grown(whole, margin + self._reach)
         blocks = grid.blocks_in(_cells_of(wide))
@@ -190,8 +195,8 @@ class BlockLayers:
         """Layers (rows, columns) of a window within that of the look."""
         cell_names, area_names, inner = _stored(names), _areas_of(names), _blocks_of(window)
         areas = self.squares(look, squares_of(window), area_names) if area_names else {}
-        blocks = _within(look.cell_states, inner) if cell_names else {}
-        cells = self._cells_of(look, blocks, cell_names)
+        blocks = _within(look.cell_states, inner) if cell_names else ()
+        cells = self.blocks(look, blocks, cell_names)
         out: dict[str, Floats32] = {name: np.full((window.rows, window.columns), np.nan, np.float32) for name in names}
         for name, layer in out.items():
             if name in AREA_LAYERS:
@@ -214,8 +219,7 @@ class BlockLayers:
 
     def _at_few_cells(self, look: Look, cells: Ints, names: Sequence[str]) -> dict[str, Floats32]:
         cell_names, area_names, asked = _stored(names), _areas_of(names), _blocks_with(cells)
-        states = {block: look.cell_states[block] for block in asked if block in look.cell_states}
-        blocks = self._cells_of(look, states, cell_names) if cell_names else {}
+        blocks = self.blocks(look, asked, cell_names) if cell_names else {}
         of_blocks = {
             block: {name: _at(kept.layers, name, look.stamp_ns) for name in names if name not in area_names}
             for block, kept in blocks.items()
@@ -243,9 +247,7 @@ class BlockLayers:
         made, derived = dict[Block, Kept](), 0
         for first in range(0, len(stale), SQUARES_AT_ONCE):
             some = stale[first : first + SQUARES_AT_ONCE]
-            needed = self._around(some, names)
-            blocks = {block: look.cell_states[block] for block in needed if block in look.cell_states}
-            cells = self._cells_of(look, blocks, cell_layers.required(names))
+            cells = self.blocks(look, self._around(some, names), cell_layers.required(names))
             for square in some:
                 old, origin = look.areas.get(square), self._origin_of(square, cells, names)
                 layers = old.layers if old and old.origin == origin else {}
@@ -263,11 +265,12 @@ class BlockLayers:
 
     def _margin(self, names: Sequence[str]) -> int:
         """How many blocks around one the layers of areas depend on."""
-        return -(-cell_layers.margin_cells(names, self._cell_m, self._config.read) // BLOCK_CELLS)
+        return -(-cell_layers.margin_cells(names, self.cell_m, self._config.read) // BLOCK_CELLS)
 
-    def _cells_of(self, look: Look, blocks: Mapping[Block, State], names: Sequence[str]) -> dict[Block, Kept]:
-        """Layers of the cells of these blocks, kept or derived."""
-        known = {**look.cells}
+    def blocks(self, look: Look, asked: Iterable[Block], names: Sequence[str]) -> dict[Block, Kept]:
+        """Layers of the cells of those of these blocks that have evidence, kept or derived."""
+        blocks = {block: look.cell_states[block] for block in asked if block in look.cell_states}
+        known = _some(look.cells, blocks)
         with self._lock:
             if look.grid is not None and look.grid is self._grid:  # what was kept since, by others or another piece
                 known |= _some(self._cells, blocks)
@@ -275,7 +278,7 @@ class BlockLayers:
         missing = [block for block in blocks if block not in cells]
         near = {one for block in missing for one in around(block, self._reach) if one in look.pages}
         pages = {block: look.pages[block] for block in sorted(near)}
-        first = valid_pages(pages, self._cell_m, self._config.change, look.ages)
+        first = valid_pages(pages, self.cell_m, self._config.change, look.ages)
         made: dict[Block, Kept] = {}
         for block in missing:
             old, origin = known.get(block), (look.turns[block], *_beginning(first[block]))
@@ -302,7 +305,7 @@ class BlockLayers:
 
     def _derive(self, square: Block, cells: Mapping[Block, Kept], names: Sequence[str]) -> Layers:
         """Layers of an area in one square, from those of its cells and of the cells around."""
-        reach = cell_layers.margin_cells(names, self._cell_m, self._config.read)
+        reach = cell_layers.margin_cells(names, self.cell_m, self._config.read)
         edge = SQUARE_CELLS
         wide = CellWindow(square[0] * edge - reach, square[1] * edge - reach, edge + 2 * reach, edge + 2 * reach)
         shape = (wide.rows, wide.columns)
@@ -311,7 +314,7 @@ class BlockLayers:
             if kept := cells.get(near):
                 for name, layer in needs.items():
                     place(layer, wide, near, kept.layers[name])
-        made = cell_layers.derive_area(names, needs, self._cell_m, self._config.read)
+        made = cell_layers.derive_area(names, needs, self.cell_m, self._config.read)
         inside = slice(reach, reach + edge)
         return {name: np.ascontiguousarray(layer[inside, inside]) for name, layer in made.items()}
 

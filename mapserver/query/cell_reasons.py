@@ -12,7 +12,7 @@ from mapserver.change.validity import valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import name_hash
-from mapserver.evidence.timeline import evidence
+from mapserver.evidence.timeline import NO_PAGES, evidence
 from mapserver.layers import cell_layers
 from mapserver.query.views import View
 from protocol.arrays import AnyArray
@@ -34,7 +34,7 @@ def reasons(
     somewhere else only, where more than a few machines work: 64 bits are for all names.
     """
     block = cell[0] // BLOCK_CELLS, cell[1] // BLOCK_CELLS
-    pages = view.pages.get(block, ())
+    pages = view.pages.get(block, NO_PAGES)
     first = valid_pages(view.pages, cell_m, config.change, view.ages).get(block)
     place = cell[1] % BLOCK_CELLS * BLOCK_CELLS + cell[0] % BLOCK_CELLS
     holds = _one(evidence([pages], None if first is None else [first]), place)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +16,7 @@ from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import Ages, Pages, valid_pages
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, chunks
-from mapserver.evidence.timeline import Block, TimedPage, evidence
+from mapserver.evidence.timeline import NO_PAGES, Block, TimedPages, evidence
 from mapserver.journal.facts import Facts
 from mapserver.journal.journal import JournalReader
 from mapserver.journal.location import JournalLocation
@@ -94,19 +94,19 @@ class StillGrid:
         """As `Grid.last_turns`."""
         return [self.turns.get(block, -1) for block in blocks]
 
-    def pages(self, blocks: Iterable[Block]) -> list[Sequence[TimedPage]]:
+    def pages(self, blocks: Iterable[Block]) -> list[TimedPages]:
         """As `Grid.pages`."""
-        return [self.all_pages.get(block, ()) for block in blocks]
+        return [self.all_pages.get(block, NO_PAGES) for block in blocks]
 
 
 @dataclass(frozen=True)
 class StillMap:
-    """A version of the map as it was, with the ages that changes of roads give. newest_ns: as in MapState.
+    """A version of the map with the ages that changes of roads give, of now or as it was. newest_ns: as in MapState.
 
     marks: what stands for the ages in and near a block or square, kept by who reads it.
     """
 
-    grid: StillGrid
+    grid: StillGrid | Grid
     version: MapVersion
     newest_ns: int
     ages: Ages

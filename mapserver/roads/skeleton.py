@@ -11,7 +11,7 @@ The number of rounds is fixed, so that a cell depends on nothing farther than `R
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -20,7 +20,7 @@ import numba
 import numpy as np
 
 from mapserver.evidence.cells import CELLS, HEADING
-from mapserver.evidence.timeline import Block, TimedPage, TimedPages, plane_counts
+from mapserver.evidence.timeline import Block, TimedPages
 from mapserver.roads.ridges import AXES, Blur, ridges
 from protocol.arrays import AnyArray, Bools, Ints
 from protocol.site.geometry import BLOCK_CELLS
@@ -96,7 +96,7 @@ EDGE = REACH + 1  # cells of ridges around a tile that its lines depend on
 _OF_WINDOW = {-1: slice(0, EDGE), 0: slice(EDGE, EDGE + TILE), 1: slice(EDGE + TILE, None)}
 _OF_TILE = {-1: slice(TILE - EDGE, None), 0: slice(None), 1: slice(0, EDGE)}
 
-Pages = Mapping[Block, Sequence[TimedPage]]
+Pages = Mapping[Block, TimedPages]
 Tile = tuple[int, int]  # column and row
 
 
@@ -132,7 +132,7 @@ class Skeletons:
         self._raster_m = self._join * cell_m
         self._blur = Blur(self._raster_m)
         self._margin = self._blur.reach + self._blur.side
-        self._pages: dict[Block, Sequence[TimedPage]] = {}
+        self._pages: dict[Block, TimedPages] = {}
         self._ridges: dict[Tile, Bools] = {}  # of tiles that have any
         self._lines: dict[Tile, _Lines] = {}
         self.made = 0
@@ -231,16 +231,15 @@ class Skeletons:
         return codes, metres, ends, np.array(blocks, np.int64).reshape(-1, 2) * BLOCK_CELLS, self._join, row, column
 
 
-def axis_metres(pages: Sequence[TimedPage]) -> tuple[AnyArray, AnyArray]:
+def axis_metres(pages: TimedPages) -> tuple[AnyArray, AnyArray]:
     """Where in a block machines drove: cell * AXES + axis (n,), and metres (n,) in 1/4096 m, of all pages."""
-    if isinstance(pages, TimedPages) and axis_metres in pages.derived:
+    if axis_metres in pages.derived:
         known: tuple[AnyArray, AnyArray] = pages.derived[axis_metres]
         return known
-    codes, metres = _driven(plane_counts(pages, HEADING))
+    codes, metres = _driven(pages.plane_counts(HEADING))
     small = np.uint32 if metres.max(initial=0) < 2**32 else np.int64
     driven = codes.astype(np.uint16), metres.astype(small)
-    if isinstance(pages, TimedPages):
-        pages.derived[axis_metres] = driven  # few cells of a block are on a road; all, where nothing is a road
+    pages.derived[axis_metres] = driven  # few cells of a block are on a road; all, where nothing is a road
     return driven
 
 

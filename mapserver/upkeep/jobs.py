@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Protocol
@@ -21,7 +21,7 @@ from mapserver.change import change_log
 from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
 from mapserver.change.validity import around
-from mapserver.evidence.timeline import Block, TimedPage
+from mapserver.evidence.timeline import Block, TimedPages
 from mapserver.ingest.decisions import calibrations
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
@@ -130,7 +130,7 @@ class ChangeSearch:
     def _keep(self, change: GroundChange) -> None:
         self._writer.run(lambda store: store.journal.append_event(change_log.KIND, change.last_ns, asdict(change)))
 
-    def _touched(self, store: Store) -> tuple[list[Block], dict[Block, Sequence[TimedPage]]]:
+    def _touched(self, store: Store) -> tuple[list[Block], dict[Block, TimedPages]]:
         """Some of the blocks in which something was folded since they were looked at, and pages of them and around."""
         blocks = store.grid.take_touched(LOOK_BLOCKS)
         wide = sorted({near for block in blocks for near in around(block, self._reach)})

@@ -27,7 +27,7 @@ from mapserver.calibration.correction import SampleCorrections
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridState
-from mapserver.evidence.pages import CompactPages
+from mapserver.evidence.pages import Record
 from mapserver.journal.archive import READABLE, ArchiveWriter
 from mapserver.journal.archive_file import seal
 from mapserver.journal.history import PIECE, fold_samples
@@ -42,7 +42,7 @@ from sitegrid.refold.parts import Interval, Part, chosen
 
 TILES = 64  # at most, and at least 4, as no tile lies across an axis: that many processes can merge
 LEAST_TILE = 8  # blocks: 128 cells
-MERGED_AT_ONCE = 8  # evidence of so many tasks waits for the next sum: it is five times as large meanwhile
+MERGED_AT_ONCE = 8  # evidence of so many tasks waits for the next sum
 STORE_FILE = "store-id"  # beside them: which store they are for
 
 
@@ -173,7 +173,7 @@ def merged_state(evidence: Sequence[Path], parts: Sequence[Path]) -> GridState:
     for path in evidence:
         with opened(path) as checkpoint:
             headers.append(checkpoint.header)
-    blocks: list[tuple[int, int, CompactPages]] = []
+    blocks: list[tuple[int, int, Record]] = []
     for path in parts:
         with opened(path) as checkpoint:
             blocks += checkpoint.blocks(checkpoint.numbers_in(None))

@@ -17,7 +17,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import LIVE_ROWS, Grid
 from mapserver.evidence.grid_state import GridState, PlacedPage
-from mapserver.evidence.pages import CompactPages, Page
+from mapserver.evidence.pages import Pages
 from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.journal import Journal
@@ -148,26 +148,17 @@ def same_evidence(one: Grid, other: Grid) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("counts", "bitmaps", "newest_ns"))
 
 
-def same_page(one: Page, other: Page) -> bool:
-    """Equal to the bit."""
-    return _bits_of(one) == _bits_of(other)
-
-
 def _bits(at: PlacedPage) -> tuple[object, ...]:
-    return at.x, at.y, at.tier, at.index, *_bits_of(at.page)
-
-
-def _bits_of(page: Page) -> tuple[object, ...]:
-    return page.votes.dtype, page.votes.tobytes(), page.cells.tobytes()
+    return at.x, at.y, at.tier, at.index, at.page.votes.dtype, at.page.votes.tobytes(), at.page.cells.tobytes()
 
 
 def filled_to(state: GridState, count: int) -> GridState:
     """The same state with every count that is not zero set to this one."""
     blocks = []
-    for x, y, pages in state.blocks:
-        packed = pages.expanded()
-        votes = packed.votes & np.uint64(0xFFFF) | np.uint64(count) << np.uint64(16)
-        blocks.append((x, y, CompactPages.from_packed(packed.table, votes, packed.cells)))
+    for x, y, record in state.blocks:
+        pages = Pages.unpacked(record)
+        votes = pages.votes & np.uint64(0xFFFF) | np.uint64(count) << np.uint64(16)
+        blocks.append((x, y, pages._replace(votes=votes).record))
     return replace(state, blocks=tuple(blocks))
 
 

@@ -19,7 +19,7 @@ from mapserver.error_model import MACHINE_SHARE
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.timeline import TimedPage
+from mapserver.evidence.timeline import NO_PAGES, TimedPages
 from protocol.arrays import Bools, Floats, Ints
 from protocol.site.geometry import BLOCK_CELLS
 from tests.unit.mapserver.data import NOW_NS, samples
@@ -30,7 +30,7 @@ CENTRES = np.arange(16) + 0.5
 BIN = float(np.log(ev.RESISTANCE_CENTRES[1] / ev.RESISTANCE_CENTRES[0]))
 
 
-def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise: float = 0.0) -> list[TimedPage]:
+def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise: float = 0.0) -> TimedPages:
     """Pages of one block that is driven all over once an hour, with the ground as given."""
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     grid, draw = Grid(1.0, FoldConfig(keep_buckets=100)), np.random.default_rng(1)
@@ -41,7 +41,7 @@ def passes(*grounds: float, column: str = "c_rr", distance_m: float = 1.0, noise
     return grid.pages([(0, 0)])[0]
 
 
-def firsts(pages: list[TimedPage], config: ChangeConfig = CONFIG) -> Ints:
+def firsts(pages: TimedPages, config: ChangeConfig = CONFIG) -> Ints:
     return np.unique(cuts(pages, config).first)
 
 
@@ -87,7 +87,7 @@ def test_a_cell_is_known_before_and_after_a_change_where_each_side_has_votes_for
         begins = np.array([timed.first_ns for timed in pages], float)
         for value, index in ((cells.from_ns, first), (cells.until_ns, last)):
             assert np.array_equal(value, np.full(256, begins[index] if index == index else np.nan), equal_nan=True)
-    assert np.isnan(known([]).from_ns).all()
+    assert np.isnan(known(NO_PAGES).from_ns).all()
 
 
 def test_medians_nearer_than_bins_are_no_change():
@@ -119,7 +119,7 @@ def test_a_change_is_more_than_its_samples_state_by_machines_and_by_passes(machi
         assert firsts(grid.pages([(0, 0)])[0]) == [change * passes_each]
 
 
-def two_passes(*grounds: dict[float, float]) -> list[TimedPage]:
+def two_passes(*grounds: dict[float, float]) -> TimedPages:
     """Pages of one block that is driven all over twice; for each pass the metres on each kind of ground."""
     x, y = (axis.ravel() for axis in np.meshgrid(CENTRES, CENTRES))
     grid = Grid(1.0, FoldConfig())

@@ -5,6 +5,7 @@ from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig, is_foldable
 from mapserver.evidence.grid import Grid
 from mapserver.evidence.grid_state import GridCounts
+from mapserver.evidence.pages import Pages
 from protocol.site.geometry import CellWindow
 from tests.unit.mapserver.data import NOW_NS, filled_to, folded, random_samples, same, samples
 
@@ -42,7 +43,7 @@ def test_counts_are_kept_while_folding_and_fold_nothing(monkeypatch):
         timelines = each._timelines
         xs, ys = zip(*timelines, strict=True)
         bounds = (16 * min(xs), 16 * min(ys), 16 * max(xs) + 16, 16 * max(ys) + 16)
-        cells = sum(timeline.known_cells for timeline in timelines.values())
+        cells = sum(timeline.known.bit_count() for timeline in timelines.values())
         sure = sum(int(is_foldable(part, grid.config).sum()) for part in rows)
         assert each.counts() == GridCounts(sure, 90 * len(rows) - sure, cells, bounds)
 
@@ -149,5 +150,5 @@ def test_a_cell_and_bucket_that_machines_drive_take_few_bytes():
         grade_e=draw.normal(0.03, 0.02, n),
         grade_n=draw.normal(-0.02, 0.02, n),
     )
-    blocks = [pages for _, _, pages in folded(rows, keep_buckets=1000).state().blocks]
-    assert sum(pages.nbytes for pages in blocks) / sum(len(pages.marks) for pages in blocks) <= 55
+    blocks = [record for _, _, record in folded(rows, keep_buckets=1000).state().blocks]
+    assert sum(map(len, blocks)) / sum(len(Pages.unpacked(record).cells) for record in blocks) <= 55

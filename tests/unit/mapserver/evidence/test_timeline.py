@@ -5,10 +5,9 @@ from hypothesis import strategies as st
 
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
-from mapserver.evidence.pages import CELL, CompactPages, PackedPages, Page, pick
+from mapserver.evidence.pages import CELL, Page, Pages, Record, is_sound
 from mapserver.evidence.settling import DAY_S, HOUR_S, Space, Tiers
-from mapserver.evidence.timeline import Timeline, plane_counts, settle_all
-from tests.unit.mapserver.data import same_page
+from mapserver.evidence.timeline import NO_PAGES, TimedPages, Timeline, evidence, settle_all, timed
 
 S = 10**9
 BUCKET_S = 300
@@ -19,34 +18,37 @@ START = 1_767_225_600 // BUCKET_S  # midnight
 SPACE = Space()
 
 
-def page(bucket: int, weight: int = 1, cells: tuple[int, ...] = (5,)) -> PackedPages:
+def page(bucket: int, weight: int = 1, cells: tuple[int, ...] = (5,)) -> Record:
     """A page of these cells, with the bucket's own stamp and a vote of this weight in each."""
     numbers = np.array(sorted(cells), np.uint64)
     known = np.zeros(len(cells), CELL)
     known["cell"], known["visits"], known["machines"], known["newest_ns"] = numbers, 1, 1, bucket * BUCKET_S * S + 7
     votes = np.uint64(weight) << np.uint64(16) | np.uint64(bucket % ev.COUNTS * ev.CELLS) | numbers
-    return PackedPages(np.array([(0, bucket, 0, len(votes), 0, len(known))]), votes, known)
+    return Pages(np.array([(0, bucket, 0, len(votes), 0, len(known))]), votes, known).record
 
 
-def empty_timeline(config: FoldConfig) -> Timeline:
-    return Timeline(Tiers.from_config(config), SPACE)
+FEW = Tiers.from_config(FoldConfig(keep_buckets=2, keep_hours=2, keep_days=2))
 
 
-def timeline(buckets, **keeps: int) -> Timeline:
-    usual = {"keep_buckets": 2, "keep_hours": 2, "keep_days": 2}
-    line = empty_timeline(FoldConfig(**usual | keeps))
+def timeline(buckets) -> Timeline:
+    line = Timeline()
     for bucket in buckets:
         line.add(page(bucket))
     return line
 
 
-def places(line: Timeline) -> list[tuple[int, int]]:
-    return [(tier, index) for tier, index, _ in line.items()]
+def pages_in(line: Timeline, tiers: Tiers = FEW) -> TimedPages:
+    (pages,) = timed([line], tiers, SPACE)
+    return pages
 
 
-def same(one: Timeline, other: Timeline) -> bool:
-    a, b = list(one.items()), list(other.items())
-    return places(one) == places(other) and all(same_page(p[2], q[2]) for p, q in zip(a, b, strict=True))
+def items(line: Timeline, tiers: Tiers = FEW) -> list[tuple[int, int, Page]]:
+    settle_all([line], tiers, SPACE)
+    return list(Pages.unpacked(line.records[0]).items())
+
+
+def places(line: Timeline, tiers: Tiers = FEW) -> list[tuple[int, int]]:
+    return [(tier, index) for tier, index, _ in items(line, tiers)]
 
 
 def by_definition(buckets, keeps: tuple[int, int, int]) -> set[tuple[int, int]]:
@@ -71,79 +73,79 @@ keep = st.integers(1, 4)
     st.randoms(use_true_random=False),
 )
 def test_what_stays_apart_is_decided_cell_by_cell(driven, keeps, random):
-    named = dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True))
-    line = empty_timeline(FoldConfig(**named))
-    for bucket_, cells in driven:
-        line.add(page(bucket_, cells=cells))
+    tiers = Tiers.from_config(FoldConfig(**dict(zip(("keep_buckets", "keep_hours", "keep_days"), keeps, strict=True))))
+    line, again = Timeline(), Timeline()
+    more = [line.add(page(bucket_, cells=cells)) for bucket_, cells in driven]
+    assert sum(more) == line.known.bit_count() == len({cell for _, cells in driven for cell in cells})
     for cell in range(4):
-        in_cell = {(tier, index) for tier, index, one in line.items() if cell in one.cells["cell"]}
+        in_cell = {(tier, index) for tier, index, one in items(line, tiers) if cell in one.cells["cell"]}
         assert in_cell == by_definition([b for b, cells in driven if cell in cells], keeps)
-    again = empty_timeline(FoldConfig(**named))
     random.shuffle(driven)
     for bucket_, cells in driven:
         again.add(page(bucket_, cells=cells))
-    assert same(line, again)
+    settle_all([again], tiers, SPACE)
+    assert line.records == again.records
 
 
 def test_many_timelines_are_settled_as_each_by_itself():
     spans = [range(1), range(3), range(0, 500, 7), range(2), range(40, 0, -1)]
     alone, together = ([timeline(START + np.array(buckets)) for buckets in spans] for _ in range(2))
     for _ in range(2):  # first from nothing, then beside what is kept
-        settle_all(together[:-1], least=3)
+        settle_all(together[:-1], FEW, SPACE, least=3)
         assert [line.waiting for line in together] == [1, 0, 0, 2, 40]
-        settle_all(together)
+        settle_all(together, FEW, SPACE)
         assert not any(line.waiting for line in together)
-        assert all(same(one, other) for one, other in zip(alone, together, strict=True))
+        for one, other in zip(alone, together, strict=True):
+            settle_all([one], FEW, SPACE)
+            assert one.records == other.records
         for line, buckets in zip([*alone, *together], 2 * spans, strict=True):
             for bucket_ in START + 600 + np.array(buckets):
                 line.add(page(bucket_, cells=(5, 9)))
 
 
 def test_blocks_of_wide_counts_are_settled_beside_others():
-    lines = [empty_timeline(FoldConfig()) for _ in range(3)]
-    for line, weight in zip(lines, (1, 2**16, 2), strict=True):
-        line.add(page(START, weight))
-    settle_all(lines)
-    assert [len(line.kept.high) for line in lines] == [0, 1, 0]
+    lines = [Timeline() for _ in range(3)]
+    for _ in range(2):
+        for line, weight in zip(lines, (1, 2**15, 2), strict=True):
+            line.add(page(START, weight))
+    settle_all(lines, FEW, SPACE)
+    assert len({len(line.records[0]) for line in lines}) == 1, "2 bytes more for large counts fill up the last 8"
+    assert [items(line)[0][2].votes["count"].tolist() for line in lines] == [[2], [2**16], [4]]
     for line in lines:
         line.add(page(START))
-    assert [next(line.items())[2].votes["count"].tolist() for line in lines] == [[2], [2**16 + 1], [3]]
+    assert [items(line)[0][2].votes["count"].tolist() for line in lines] == [[3], [2**16 + 1], [5]]
 
 
 @pytest.mark.parametrize("offset", [0, PER_HOUR - 1])
 def test_spans_are_whole_buckets_hours_and_days(offset):
     buckets = [START + offset + i * PER_HOUR for i in range(4 * 24)]
-    timed = timeline(buckets).timed()
-    lengths = [(one.end_ns - one.first_ns) // S for one in timed]
+    pages = list(pages_in(timeline(buckets)))
+    lengths = [(one.end_ns - one.first_ns) // S for one in pages]
     assert lengths[1:] == [DAY_S, DAY_S, HOUR_S, HOUR_S, BUCKET_S, BUCKET_S]
-    assert timed[0].first_ns == 0
-    assert timed[0].end_ns == timed[0].page.cells["newest_ns"].max() + 1
-    assert all(one.first_ns % (length * S) == 0 for one, length in zip(timed[1:], lengths[1:], strict=True))
-    assert timed[-1].first_ns == buckets[-1] * BUCKET_S * S
+    assert pages[0].first_ns == 0
+    assert pages[0].end_ns == pages[0].page.cells["newest_ns"].max() + 1
+    assert all(one.first_ns % (length * S) == 0 for one, length in zip(pages[1:], lengths[1:], strict=True))
+    assert pages[-1].first_ns == buckets[-1] * BUCKET_S * S
 
 
 def test_buckets_of_an_hour_are_not_cut_by_it():
-    config = FoldConfig(bucket_s=3600.0, keep_buckets=1, keep_hours=1, keep_days=1)
-    line = empty_timeline(config)
-    for bucket in range(500_000, 500_005):
-        line.add(page(bucket))
-    assert places(line) == [(0, 500_004), (1, 500_003), (2, 500_002 // 24)]
+    tiers = Tiers.from_config(FoldConfig(bucket_s=3600.0, keep_buckets=1, keep_hours=1, keep_days=1))
+    assert places(timeline(range(500_000, 500_005)), tiers) == [(0, 500_004), (1, 500_003), (2, 500_002 // 24)]
 
 
 @pytest.mark.parametrize("weight", [3, 2**16 + 5])
 def test_planes_are_summed_as_all_pages_are(weight):
-    line = empty_timeline(FoldConfig(keep_buckets=2))
+    line = Timeline()
     for i, bucket_ in enumerate(range(START, START + 40)):
         line.add(page(bucket_, weight + i, cells=(5, 9, 255)))
-    pages = line.timed()
+    pages = pages_in(line)
     whole = np.zeros((ev.COUNTS, ev.CELLS), np.int64)
-    for timed in pages:
-        np.add.at(whole.reshape(-1), timed.page.votes["place"], timed.page.votes["count"].astype(np.int64))
+    for one in pages:
+        np.add.at(whole.reshape(-1), one.page.votes["place"], one.page.votes["count"].astype(np.int64))
     assert whole.any(axis=1).sum() == 40
     for part in (ev.HEADING, slice(0, 1), slice(0, ev.COUNTS)):
-        np.testing.assert_array_equal(plane_counts(pages, part), whole[part])
-        np.testing.assert_array_equal(plane_counts(list(pages), part), whole[part])
-    assert not plane_counts((), ev.HEADING).any()
+        np.testing.assert_array_equal(pages.plane_counts(part), whole[part])
+    assert not NO_PAGES.plane_counts(ev.HEADING).any()
 
 
 PLACES = ev.COUNTS * ev.CELLS
@@ -155,53 +157,66 @@ cells = st.dictionaries(
 drawn = st.tuples(votes, cells)
 
 
-def packed(drawn_pages: list[tuple[dict[int, int], dict[int, tuple[int, int]]]]) -> PackedPages:
+def packed(drawn_pages: list[tuple[dict[int, int], dict[int, tuple[int, int]]]]) -> Pages:
     table, all_votes, all_cells = [], [], []
     for index, (places, stamps) in enumerate(drawn_pages):
         starts = len(all_votes), len(all_cells)
         all_votes += [count << 16 | place for place, count in sorted(places.items())]
         all_cells += [(cell, bits, bits // 2, stamp_ns) for cell, (bits, stamp_ns) in sorted(stamps.items())]
         table.append((0, index, starts[0], len(all_votes), starts[1], len(all_cells)))
-    return PackedPages(
-        np.array(table, np.int64).reshape(-1, 6), np.array(all_votes, np.uint64), np.array(all_cells, CELL)
-    )
-
-
-def compact(pages: PackedPages) -> CompactPages:
-    return CompactPages.from_packed(pages.table.copy(), pages.votes, pages.cells)
-
-
-def page_of(places: dict[int, int], stamps: dict[int, tuple[int, int]] | None = None) -> Page:
-    ((_, _, one),) = packed([(places, stamps or {})]).items()
-    return one
-
-
-def unpacked(one: Page) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    counts, bitmaps = np.zeros(PLACES, np.uint64), np.zeros((ev.CELLS, 2), np.uint64)
-    newest_ns = np.zeros(ev.CELLS, np.int64)
-    one.add_to(counts, bitmaps, newest_ns)
-    return counts, bitmaps, newest_ns
+    return Pages(np.array(table, np.int64).reshape(-1, 6), np.array(all_votes, np.uint64), np.array(all_cells, CELL))
 
 
 @settings(max_examples=15)
 @given(st.lists(drawn, max_size=5))
-def test_compact_pages_come_back_to_the_bit(drawn_pages):
+def test_pages_come_back_from_their_record_to_the_bit(drawn_pages):
     before = packed(drawn_pages)
-    kept = compact(before)
-    after = kept.expanded()
+    record = before.record
+    after = Pages.unpacked(record)
     assert np.array_equal(after.table, before.table)
     assert np.array_equal(after.votes, before.votes)
     assert after.cells.tobytes() == before.cells.tobytes()
-    assert kept.is_sound
+    assert is_sound(record)
 
 
-@given(drawn, st.sets(st.integers(0, 255)))
-def test_a_part_of_the_cells_and_the_rest_are_the_page(drawn_page, chosen):
-    one, inside = page_of(*drawn_page), np.zeros(ev.CELLS, np.bool_)
-    inside[list(chosen)] = True
-    part, rest = pick(one, inside), pick(one, ~inside)
-    assert set(part.cells["cell"].tolist()) <= chosen
-    assert not set((part.votes["place"] % ev.CELLS).tolist()) - chosen
-    together = unpacked(part)
-    rest.add_to(*together)
-    assert all(map(np.array_equal, together, unpacked(one)))
+def summed(pages: TimedPages, start: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Counts, bitmaps and newest stamps of a block, page by page, as `evidence` has them."""
+    counts, bitmaps = np.zeros((256, ev.COUNTS), np.uint64), np.zeros((256, 2), np.uint64)
+    newest_ns = np.zeros(256, np.int64)
+    for index, one in enumerate(pages):
+        plane, cell = np.divmod(one.page.votes["place"].astype(int), 256)
+        holds = start[cell] <= index
+        np.add.at(counts, (cell[holds], plane[holds]), one.page.votes["count"][holds].astype(np.uint64))
+        cells = one.page.cells[start[one.page.cells["cell"]] <= index]
+        bitmaps[cells["cell"]] |= np.stack([cells["visits"], cells["machines"]], axis=1)
+        newest_ns[cells["cell"]] = np.maximum(newest_ns[cells["cell"]], cells["newest_ns"])
+    return counts, bitmaps, newest_ns
+
+
+@settings(max_examples=15)
+@given(st.lists(st.lists(drawn, max_size=6), min_size=1, max_size=3), st.randoms(use_true_random=False))
+def test_evidence_is_the_sum_of_the_pages_that_hold(drawn_blocks, random):
+    draw = np.random.default_rng(random.getrandbits(32))
+    blocks = []
+    for drawn_pages in drawn_blocks:
+        pages = packed(drawn_pages)
+        tiers = np.sort(draw.integers(0, 4, len(drawn_pages)))
+        pages.table[:, 0] = tiers
+        blocks.append(TimedPages(pages.record, FEW))
+    start = [draw.integers(0, 1 + len(pages), 256) for pages in blocks]
+    sums = evidence(blocks, start)
+    for i, pages in enumerate(blocks):
+        assert all(map(np.array_equal, (sums.counts[i], sums.bitmaps[i], sums.newest_ns[i]), summed(pages, start[i])))
+        votes, ends = pages.packed_votes()
+        parts = np.split(votes, ends[:-1]) if len(ends) else []
+        for part, one in zip(parts, pages, strict=True):
+            assert (part & np.uint64(0xFFFF)).tolist() == one.page.votes["place"].tolist()
+            assert (part >> np.uint64(16)).tolist() == one.page.votes["count"].tolist()
+        for count in range(len(pages) + 1):
+            some = zip(pages.older(count), pages, strict=False)
+            assert len(pages.older(count)) == count
+            assert all(bits(a.page) == bits(b.page) for a, b in some)
+
+
+def bits(one: Page) -> tuple[list, list, bytes]:
+    return one.votes["place"].tolist(), one.votes["count"].tolist(), one.cells.tobytes()

@@ -306,7 +306,7 @@ def test_memory_goes_with_what_was_driven(known: list[tuple[int, int]], every_s:
         with contextlib.suppress(MessageError):
             credit.spend(f"machine-{k % names}", rows[k : k + 1])
             taken_rows.append(rows[k : k + 1])
-    bytes_of_pages = sum(pages.nbytes for *_, pages in folded(np.concatenate(taken_rows)).state().blocks)
+    bytes_of_pages = sum(len(record) for *_, record in folded(np.concatenate(taken_rows)).state().blocks)
     assert 10**5 < bytes_of_pages < (10**7 if names == 1 else 3 * 10**8)
 
 

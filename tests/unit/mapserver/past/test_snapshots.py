@@ -12,10 +12,11 @@ import pytest
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
 from mapserver.evidence.grid import Grid
-from mapserver.evidence.pages import CompactPages
+from mapserver.evidence.pages import as_numbers
+from mapserver.evidence.record_kernels import parts
 from mapserver.journal.facts import NO_FACTS, Facts
 from mapserver.past import past
-from mapserver.past.checkpoint_file import OPEN_END_NS, PARTS, Checkpoint, CheckpointWriter, DamagedError, Header
+from mapserver.past.checkpoint_file import OPEN_END_NS, Checkpoint, CheckpointWriter, DamagedError, Header
 from mapserver.past.checkpoints import remove_beyond, save_snapshot, snapshot_path, snapshot_rows
 from mapserver.past.past import StorePast
 from tests.unit.mapserver.data import folded, random_samples, same, samples
@@ -47,7 +48,7 @@ def test_a_snapshot_reads_back_to_the_bit(store):
     grid = folded(np.concatenate([rows, samples(30, distance_m=100.0)]))
     assert grid.skipped
     assert {at.tier for at in grid.state().pages} >= {0, 2}
-    assert {len(pages.high) > 0 for _, _, pages in grid.state().blocks} == {False, True}
+    assert {len(parts(as_numbers(record), 0)[4]) > 0 for *_, record in grid.state().blocks} == {False, True}
     save(store, 8, grid)
     row, again = newest(store)
     assert row == 8
@@ -127,7 +128,11 @@ def test_a_snapshot_under_another_name_is_not_what_its_name_says(store):
 
 
 # Pages that no grid has, behind a right checksum: reads of them would fail later, or the map have less in it.
+PARTS = ("header", "known", "table", "marks", "words", "counts", "high", "places", "runs")
 CHANGES = {
+    **{f"header {c} {v}": ("header", (c,), v) for c in range(6) for v in (-1, 2**31 - 1)},
+    "counts of two kinds": ("header", (4,), 2),
+    "another known cell": ("known", (0,), 1),
     **{f"table {c} {v}": ("table", (0, c), v) for c in (0, 2, 3, 4, 5) for v in (-1, 10**6)},
     **{f"table {c} 0": ("table", (0, c), 0) for c in (2, 3, 5)},
     "an index before the first": ("table", (0, 1), -1),
@@ -138,19 +143,21 @@ CHANGES = {
     **{f"mark {c}": ("marks", (0, c), 255) for c in (1, 2, 3)},
     "a word that is too large": ("words", (0,), 2**63),
     "a word of nothing": ("words", (0,), 0),
-    "cells out of order": ("cells", (0,), 255),
+    "a word of more than three lists": ("words", (0,), 2**27),
+    "cells out of order": ("places", (0,), 255),
 }
 
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_pages_that_cannot_be_are_damage(tmp_path, change):
     part, place, value = CHANGES[change]
-    x, y, pages = folded(samples(2, x_m=[8.0, 24.0])).state().blocks[0]
-    parts = {name: getattr(pages, name).copy() for name in PARTS}
-    parts[part][place] = value
+    x, y, record = folded(samples(2, x_m=[8.0, 24.0])).state().blocks[0]
+    changed = np.frombuffer(record, np.uint8).copy()
+    views = changed[:24].view(np.int32), changed[24:56].view(np.uint64), *parts(as_numbers(changed), 0)
+    views[PARTS.index(part)][place] = value
     with (tmp_path / "one").open("wb") as file:
         writer = CheckpointWriter(file)
-        writer.add(x, y, CompactPages(**parts))
+        writer.add(x, y, changed.tobytes())
         writer.finish(Header(0, 0, {}))
     with Checkpoint(tmp_path / "one") as checkpoint, pytest.raises(DamagedError):
         list(checkpoint.blocks(checkpoint.numbers_in(None)))
