@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 
 from mapserver.change import change_log
 from mapserver.follower import follower as edge
-from mapserver.follower import following as module
 from mapserver.follower.follower import Follower
-from mapserver.follower.following import Following
-from mapserver.follower.replica import Replica
+from mapserver.ingest import following as module
+from mapserver.ingest.following import Following
+from mapserver.ingest.replica import Replica
 from mapserver.ingest.writer import Writer
+from mapserver.journal import tail
 from mapserver.journal.archive import archive
 from mapserver.journal.location import JournalLocation
 from mapserver.journal.rows import LAST
@@ -132,7 +133,7 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
         monkeypatch.setattr(Replica, "adopt", noted)
         for trusted in (False, True):
             writer.run(lambda store, t=trusted: store.decide(TrustDecision("b", t, PERSON, "drawn", NOW_NS)))
-            wait_for(lambda n=1 + trusted: one.run(lambda replica: replica.event) == n)
+            wait_for(lambda n=1 + trusted: one._replica.tail.event == n)
             wait_for(lambda: folds == [1])
         assert version(one).fact == 2  # the map has what decisions come to
         may_go_on.set()
@@ -282,7 +283,7 @@ def test_a_journal_damaged_beneath_a_follower_takes_no_map_away_and_gives_none_t
     tmp_path, monkeypatch, caplog, damage
 ):
     monkeypatch.setattr(module, "OPEN_S", 0.2)
-    monkeypatch.setattr(module, "RETRY_S", 0.1)
+    monkeypatch.setattr(module, "MOST_PAUSE_S", 0.1)
     path = tmp_path / "journal.db"
     with closing(open_writer(tmp_path)) as writer:
         for seed in (1, 2, 3):
@@ -358,7 +359,7 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
 
 
 def test_a_follower_that_cannot_keep_up_is_hidden_until_it_has_caught_up(tmp_path, monkeypatch, caplog):
-    may_read, read = threading.Event(), module.read_history
+    may_read, read = threading.Event(), tail.read_history
 
     def slowly(*words):
         for rows in read(*words):
@@ -366,7 +367,7 @@ def test_a_follower_that_cannot_keep_up_is_hidden_until_it_has_caught_up(tmp_pat
             yield rows
 
     monkeypatch.setattr(edge, "SHOWN_S", 1.5)  # for ten seconds
-    monkeypatch.setattr(module, "read_history", slowly)
+    monkeypatch.setattr(tail, "read_history", slowly)
     may_read.set()
     with routed() as (_, session), closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(random_samples(20, 1), 1, "a")])
