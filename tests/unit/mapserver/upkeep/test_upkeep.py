@@ -22,7 +22,7 @@ from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.judgement import Reason
 from mapserver.upkeep import refolding, upkeep
-from mapserver.upkeep.jobs import Archiving, Audit
+from mapserver.upkeep.jobs import MOST_TURNS, REST_TURNS, Archiving, Audit, ChangeSearch
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import QueryError
 from protocol.queries.answers import GroundChange
@@ -189,6 +189,18 @@ def test_a_change_is_published_listed_and_kept(opened):
         wait_for(lambda: not site.writer.run(lambda store: store.grid.take_touched(1)))
         assert site.published == []
         assert site.upkeep.changes(after=change.id) == []
+
+
+def test_a_block_is_looked_at_once_it_was_left_or_every_so_many_turns(store, monkeypatch):
+    writer, reader = store
+    search, look, looked = ChangeSearch(writer, reader, print, threading.Event()), ChangeSearch._look, list[Any]()
+    monkeypatch.setattr(ChangeSearch, "_look", lambda self, some: looked.append((turn, some)) or look(self, some))
+    for turn in range(1, MOST_TURNS + 10):
+        if turn <= MOST_TURNS + 2:
+            send(writer, [incoming(samples(1, x_m=1.0, y_m=1.0), turn)])
+        search.run()
+    assert {block for _, some in looked for block in some} >= {(0, 0)}
+    assert [turn for turn, _ in looked] == [1 + MOST_TURNS, MOST_TURNS + 2 + REST_TURNS]
 
 
 def archiving(writer: Writer, reader: SqliteReader, after_h: float, hours_later: float = 3.0) -> Archiving:
