@@ -1,4 +1,4 @@
-"""The upkeep: a thread beside the writer that runs five jobs in turn, and one that folds the map again."""
+"""The upkeep: a thread beside the writer that runs six jobs in turn, and one that folds the map again."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from mapserver.upkeep.calibrating import Calibrating
 from mapserver.upkeep.checkpointing import Checkpointing
 from mapserver.upkeep.jobs import Archiving, Audit, ChangeSearch, Job, Publish
 from mapserver.upkeep.refolding import Refolding
+from mapserver.upkeep.snapshots import Snapshots
 from protocol.errors import QueryError, Refusal, SitegridError, StoreError
 from protocol.queries.answers import GroundChange
 from protocol.queries.calibration import CalibrationAnswer
@@ -49,7 +50,14 @@ class Upkeep:
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
         archiving = Archiving(writer, reader, self._ending)
-        jobs = self._audit, self._changes, archiving, self._checkpointing, self._calibrating
+        jobs = (
+            self._audit,
+            self._changes,
+            Snapshots(writer),
+            archiving,
+            self._checkpointing,
+            self._calibrating,
+        )
         self._thread = threading.Thread(target=self._run, args=(jobs,), name="upkeep", daemon=True)
         self._thread.start()
 
