@@ -9,7 +9,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Protocol
@@ -31,6 +31,7 @@ from mapserver.journal.journal import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
 from protocol.queries.answers import GroundChange
 
+PIECE_S = 0.3  # of a turn, while other jobs wait: with ten machines, an hour's checkpoint takes a second in all
 LOOK_BLOCKS = 256  # for changes, at a time: the writer copies their pages, and batches wait meanwhile
 # A block is looked at once nobody has driven on it for so many turns, or every so many: a pass folds into it again and
 # again, and each time all of its evidence would be compared.
@@ -67,6 +68,7 @@ class Audit:
         self.verdicts: Mapping[str, Verdict] = {}
         self._writer, self._reader, self._report, self._known, self._ending = writer, reader, report, known, ending
         self._corrections = UNCORRECTED
+        self._judging: Iterator[dict[str, Verdict] | None] | None = None
         self._begin()
         self._due_s = 0.0
 
@@ -82,8 +84,19 @@ class Audit:
         finally:  # a row that cannot be read must not keep the machines from being judged by the others
             if time.monotonic() >= self._due_s:
                 self._due_s = time.monotonic() + self._writer.config.trust.judge_s
-                self.verdicts = self._auditor.verdicts(self._known()[1])
-                self._report(self.verdicts, self._writer.run(lambda store: store.newest_ns))
+                self._judging = self._judging or self._auditor.judging(self._known()[1])
+            self._judge()
+
+    def _judge(self) -> None:
+        """Go on with judging for a while: pairs of a large fleet take minutes."""
+        until_s, judging, self._judging = time.thread_time() + PIECE_S, self._judging, None
+        for verdicts in judging or ():
+            if verdicts is not None:
+                self.verdicts = verdicts
+                self._report(verdicts, self._writer.run(lambda store: store.newest_ns))
+            elif time.thread_time() >= until_s or self._ending.is_set():
+                self._judging = judging
+                return
 
     def _follow(self) -> None:
         corrections, _ = self._known()

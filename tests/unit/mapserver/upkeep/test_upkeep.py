@@ -21,7 +21,7 @@ from mapserver.journal.archive import FOLDER
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.judgement import Reason
-from mapserver.upkeep import refolding, upkeep
+from mapserver.upkeep import jobs, refolding, upkeep
 from mapserver.upkeep.jobs import MOST_TURNS, REST_TURNS, Archiving, Audit, ChangeSearch
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import QueryError
@@ -270,6 +270,20 @@ def audit_of(
 ) -> Audit:
     writer.config = ServerConfig(trust=TrustConfig(judge_s))
     return Audit(writer, reader, report, known, threading.Event())
+
+
+def test_a_fleet_that_takes_long_to_judge_is_judged_a_piece_in_every_turn(store, monkeypatch):
+    writer, reader = store
+    monkeypatch.setattr(jobs, "PIECE_S", 0.0)
+    for name, rows in fleet({"c": 1.5}, size=24).items():
+        send(writer, [incoming(np.concatenate(rows), 1, name)])
+    reports: list[Any] = []
+    audit = audit_of(writer, reader, lambda verdicts, _: reports.append(verdicts))
+    for pairs in range(6):
+        audit.run()
+        assert (reports, audit.verdicts) == ([], {}), pairs
+    audit.run()
+    assert [audit.verdicts] == reports == [audit._auditor.verdicts()]
 
 
 def test_corrected_samples_are_judged_also_those_that_came_before_the_correction(store):
