@@ -78,15 +78,17 @@ class Calibrating:
 
     def run(self) -> None:
         """Follow the journal; where that is done and it is time, solve the next group, and have it decided."""
-        with self._turn:
-            began_s = time.thread_time()
-            if time.monotonic() < self._due_s or not self._follow(TURN_SAMPLES):
-                return
-            try:
-                if self._clock.passed_ns(self._doubtful()) >= EVERY_NS:
-                    self._solve_next()
-            finally:
-                self._due_s = time.monotonic() + REST * (time.thread_time() - began_s)
+        if time.monotonic() < self._due_s or not self._turn.acquire(blocking=False):  # as while somebody has it solved
+            return
+        began_s, rest = time.thread_time(), REST
+        try:
+            if not self._follow(TURN_SAMPLES):
+                rest = 0.0
+            elif self._clock.passed_ns(self._doubtful()) >= EVERY_NS:
+                self._solve_next()
+        finally:
+            self._due_s = time.monotonic() + rest * (time.thread_time() - began_s)
+            self._turn.release()
 
     def solve(self) -> tuple[Solution, int]:
         """Solve with all that is journalled by now; what came out, and the site's now [ns]. For any thread."""
@@ -99,9 +101,9 @@ class Calibrating:
                     self._solve(some, together, now_ns)
             return self.solved
 
-    def close(self, wait_s: float = 0.0) -> None:
-        """Close the journal. A solve that takes longer ends with the process: what it says is of no use any more."""
-        if self._turn.acquire(timeout=wait_s):
+    def close(self) -> None:
+        """Close the journal, unless a solve goes on: that ends with the process, and is of no use any more."""
+        if self._turn.acquire(blocking=False):
             self._reader.close()  # and keep the turn: nothing runs any more
 
     def _begun(self) -> tuple[int, list[Group]]:
