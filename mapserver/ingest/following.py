@@ -161,6 +161,8 @@ class Following:
             self._forget()
         self._replica = replica = self._replica or self._begun(reader)
         self._hear(reader, replica)
+        if not self._is_whole and replica.wanted != replica.facts:  # nobody has it yet
+            self._replica = replica = self._begun(reader)
         self._fold(reader, replica, state.row)
         self._correct(reader, replica)
         if replica.merged >= state.row:

@@ -453,6 +453,21 @@ def test_before_a_damaged_row_it_waits_and_folds_nothing_twice(location, standby
         assert is_fold(standby, store.journal)
 
 
+def test_what_is_decided_while_a_row_is_damaged_counts_in_the_rows_before_it(location, standby, database):
+    with closing(store_at(location)) as store:
+        send(store, 1, 2)
+        send(store, 1, 1, machine="b")
+        send(store, 3, 4)
+        database.sql("UPDATE sitegrid.journal SET record = '\\x00' WHERE row = 4")
+        standby.follow(0.1)
+        assert is_fold(standby, store.journal)
+        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        for _ in range(3):
+            standby.follow(0.1)
+            assert (row_of(standby), standby._replica.facts, standby._anew) == (3, facts, None)
+            assert is_fold(standby, store.journal, facts.excluded)
+
+
 def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
     with closing(store_at(location)) as store:
         send(store, 1, 2)
