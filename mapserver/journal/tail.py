@@ -27,7 +27,7 @@ class Tail:
     def __init__(self, reader: JournalReader, archive: Archive) -> None:
         self.store, self._archive, self._epoch = reader.identity().id, archive, reader.state().epoch
         self.row = self.event = 0
-        self.problem: StoreError | None = None
+        self.problem: StoreError | OSError | None = None
         self._checksum: int | None = None  # that the last row was written with, None where that is not known
         self._event_checksum: int | None = None
         self._compared: object = None  # where the last row was in the archive when it was compared
@@ -39,7 +39,7 @@ class Tail:
             for rows in read_history(History(reader, self._archive), self.row, until):
                 self.row, self._checksum = int(rows.numbers[-1]), last_checksum(rows)
                 yield rows
-        except StoreError as error:
+        except (StoreError, OSError) as error:
             self.problem = error
 
     def skip_to(self, reader: JournalReader, row: int) -> None:

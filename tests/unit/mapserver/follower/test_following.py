@@ -23,7 +23,7 @@ from mapserver.ingest.writer import Writer
 from mapserver.journal import tail
 from mapserver.journal.archive import archive
 from mapserver.journal.location import JournalLocation
-from mapserver.journal.rows import LAST
+from mapserver.journal.rows import LAST, JournalRows
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.journal.table_writer import meta_line
 from mapserver.past.making import make
@@ -332,6 +332,30 @@ def test_a_fold_beside_that_fails_is_done_again(tmp_path, monkeypatch):
         writer.run(lambda store: store.decide(TrustDecision("b", False, PERSON, "drifts", NOW_NS)))
         wait_for(lambda: one.run(lambda replica: replica.facts.excluded) == {"b"})
         assert folds == [1, 1]
+
+
+@pytest.mark.parametrize("error", [StoreError("the journal", "cannot be read"), OSError(5, "Input/output error")])
+def test_rows_that_cannot_be_read_for_a_while_are_in_the_map_once(tmp_path, monkeypatch, error):
+    read, failures = tail.read_history, iter(range(4))
+
+    def failing(*words):
+        rows = [JournalRows.joined([row]) for rows in read(*words) for row in rows]
+        yield rows.pop(0)
+        if rows and next(failures, None) is not None:
+            raise error
+        yield from rows
+
+    monkeypatch.setattr(tail, "read_history", failing)
+    with closing(open_writer(tmp_path)) as writer:
+        for seed in range(4):
+            deliver(writer, seed)
+        with following(tmp_path) as one:
+            catches_up(one, writer)
+            with one._lock:  # it sees all of them at once
+                for seed in range(4, 8):
+                    deliver(writer, seed, machine="b")
+            catches_up(one, writer)
+    assert next(failures, None) is None
 
 
 def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_path, database):
