@@ -28,7 +28,7 @@ from mapserver.ingest.store import Incoming, Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal.location import JournalLocation
 from mapserver.trust.auditor import Auditor
-from mapserver.upkeep.jobs import Audit, ChangeSearch
+from mapserver.upkeep.jobs import REST_TURNS, Audit, ChangeSearch
 from protocol.wire.codec import encode_batch
 from protocol.wire.messages import Ack, Refused, SampleBatch
 from sitegrid.proof.figures import Row
@@ -67,7 +67,8 @@ def _measured(folder: Path, hours: float, seconds: int) -> dict[str, float]:
         audit = Audit(writer, reader, lambda *_: None, lambda: (UNCORRECTED, {}), threading.Event())
         search = ChangeSearch(writer, reader, lambda _: None, threading.Event())
         audit.run()
-        search.run()
+        for _ in range(REST_TURNS + 1):  # all blocks of a start
+            search.run()
         ms = _each_second(link, audit, search, islice(seconds_of(work), seconds))
         ms["audit"] += _own_ms(_judging(before)) / CONFIG.trust.judge_s
         ms["snapshot"] = link.cpu_ms(lambda: _snapshot(writer), own=True) / CONFIG.store.snapshot_s

@@ -20,13 +20,13 @@ from lab.speed.site import SITE, Site, ask, forget_peak_mb, send, session
 from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid, warm_up
 from mapserver.evidence.pages import Pages
-from mapserver.ingest.snapshot_times import RESTART_SAMPLES
 from mapserver.ingest.store import Store
 from mapserver.journal.history import History, fold_history
 from mapserver.journal.location import JOURNAL_FILE, JournalLocation
 from mapserver.past.checkpoint_file import Checkpoint
 from mapserver.past.checkpoints import save_snapshot, snapshot_path
 from mapserver.past.past import StorePast
+from mapserver.upkeep.snapshots import RESTART_SAMPLES
 from protocol.queries.answer_codec import decode_machines
 from protocol.wire import keys
 from protocol.wire.messages import SampleBatch

@@ -50,8 +50,9 @@ class ChangeLog:
 
     def look(self, blocks: Collection[Block], pages: Mapping[Block, TimedPages]) -> list[GroundChange]:
         """Look at blocks, given their pages and those of their neighbours; returns changes that are new or grew."""
-        first = valid_pages(pages, self._cell_m, self._config)
-        changed = [block for block in blocks if block in first and first[block].any()]
+        blocks = [block for block in blocks if block in pages]
+        first = valid_pages(pages, self._cell_m, self._config, only=blocks)
+        changed = [block for block in blocks if first[block].any()]
         if not changed:
             return []
         now = evidence([pages[block] for block in changed], [first[block] for block in changed])

@@ -29,16 +29,21 @@ T = TypeVar("T")
 
 
 def valid_pages(
-    pages: Pages, cell_m: float, config: ChangeConfig, ages: Ages | None = None, tuning: ChangeTuning = TUNING
+    pages: Pages,
+    cell_m: float,
+    config: ChangeConfig,
+    ages: Ages | None = None,
+    tuning: ChangeTuning = TUNING,
+    only: Iterable[Block] | None = None,
 ) -> dict[Block, Ints]:
     """For each block, index (256,) of the first page that holds now in each of its cells, 0 where nothing changed.
 
     Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted. ages: what
-    is known of changes beside that.
+    is known of changes beside that. only: the blocks that are wanted, if not all; the others are around them.
     """
     last = {block: _cuts(block_pages, config, tuning) for block, block_pages in pages.items()}
     first = {block: last[block].first for block in pages}
-    changed = [block for block in first if last[block].has_change]
+    changed = [block for block in (first if only is None else only) if last[block].has_change]
     valid = dict(first)
     reach = reach_blocks(cell_m, config)
     for some in clusters(changed, reach):
@@ -51,6 +56,11 @@ def valid_pages(
     for block in (ages or {}).keys() & pages.keys():
         valid[block] = np.maximum(valid[block], _since(pages[block], ages[block]))  # type: ignore[index]
     return valid
+
+
+def has_change(pages: TimedPages, config: ChangeConfig) -> bool:
+    """Whether a block has a cell that changed, or seems to: its neighbours tell which."""
+    return _cuts(pages, config, TUNING).has_change
 
 
 def _since(pages: TimedPages, age_ns: Ints) -> Ints:

@@ -15,9 +15,9 @@ from typing import Any, NoReturn, TypeVar
 import zenoh
 
 from mapserver.config import ServerConfig
-from mapserver.follower.following import Following
-from mapserver.follower.replica import Replica
+from mapserver.ingest.following import Following
 from mapserver.ingest.map_info import by_machine, map_info
+from mapserver.ingest.replica import Replica
 from mapserver.ingest.store import ACCEPTED
 from mapserver.journal import shortfall
 from mapserver.journal.facts import Facts
@@ -189,7 +189,7 @@ class FollowerSource:
 
     def alive(self) -> ServerAlive:
         """Whether the journal is looked at; QueryError where it has not been for long."""
-        store, merged = self.run(lambda replica: (replica.store, replica.merged))
+        store, merged = self.run(lambda replica: (replica.version.store, replica.merged))
         _, behind_s = self._following.behind()
         if behind_s > HANGS_S:
             problem = f"the map has not had all rows of the journal for {behind_s:.0f} s; look at the follower's log"

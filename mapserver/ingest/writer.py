@@ -8,14 +8,13 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from mapserver.ingest.backlog import Backlog, WorkRate, size_of
 from mapserver.ingest.merge_waits import MergeWaits
-from mapserver.ingest.snapshot_times import SnapshotTimes
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.journal import FencedError
 from protocol.errors import QueryError, Refusal
@@ -63,8 +62,6 @@ class Writer:
         self._committed_s = -math.inf  # when the last commit began
         self.waits = MergeWaits(store.merged)
         self.failed, self._fenced = False, ""
-        self._times = SnapshotTimes(self.config.store.snapshot_s, clock())
-        self._snapshots = ThreadPoolExecutor(1, thread_name_prefix="snapshot")
         self._thread = threading.Thread(target=self._guard, name="writer", daemon=True)
         self._thread.start()
 
@@ -162,17 +159,13 @@ class Writer:
                 self._fenced = self._ended = error.problem
             log.error("fenced problem=%r", error.problem)
             self._refuse_all(Refusal.NOT_WRITER)
-            self._snapshots.shutdown()
         except Exception:
             with self._turn:  # what comes from here on is refused by who hands it in
                 self.failed, self._ended = True, "the server's writer has failed; restart the server"
             log.critical("writer failed", exc_info=True)
             self._refuse_all()
-            self._snapshots.shutdown()
         else:
-            self._snapshots.shutdown()
-            if write := self._store.snapshot():
-                self._written(write)
+            self._save_snapshot()
         finally:
             self._store.close()
 
@@ -192,16 +185,13 @@ class Writer:
                 self._commit()
             for _ in range(len(self._works)):  # those that come meanwhile wait for the next group
                 _answer(self._works.popleft(), self._store)
-            if self._clock() >= self._times.due_s(self._store.samples_behind):
-                self._save_snapshot()
             self._busy_since_s = None
 
     def _next(self) -> bool:
-        """Wait until there are batches, work of others, or a snapshot to take; False to end."""
+        """Wait until there are batches, or work of others; False to end."""
         with self._lent(), self._turn:
             if not (self._backlog or self._works or self._is_closing):
-                wait_s = self._times.due_s(self._store.samples_behind) - self._clock()
-                self._turn.wait(min(max(0.0, wait_s), threading.TIMEOUT_MAX))
+                self._turn.wait()
             is_early = self._backlog and self._gather()
             self._group = [] if is_early else self._backlog.take()
             if self._is_closing and not (self._group or self._works):
@@ -235,25 +225,12 @@ class Writer:
             reply(answer)
 
     def _save_snapshot(self) -> None:
-        """Have a snapshot written beside the work."""
-        self._times.began(self._clock())
-        if write := self._store.snapshot():
-            self._snapshots.submit(self._written, write)
-        else:
-            self._times.ended(self._clock())
-
-    def _written(self, write: Callable[[], None]) -> None:
-        failed = True
         try:
-            write()
-            failed = False
+            self._store.save_snapshot()
         except OSError as error:  # the journal is the truth; a missing snapshot only makes the next start longer
             log.error("snapshot failed error=%r", str(error))
-        except Exception:  # a bug; it must not pass unseen, nor keep the last snapshot from being tried
+        except Exception:  # a bug; it must not pass unseen
             log.exception("snapshot failed")
-        self._times.ended(self._clock(), failed=failed)
-        with self._turn:
-            self._turn.notify()  # who waits for the owner counts the time anew
 
 
 def _answer(item: _Work, store: Store) -> None:

@@ -178,10 +178,10 @@ class FoldedAnew:
 
 def fold_anew(past: StorePast, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> FoldedAnew | None:
     """Fold the map with these facts, up to a row that few are behind; None where `stopped` said so."""
-    begun = _begun(past, reader, facts, stopped)
-    if begun is None:
+    made = begun(past, reader, facts, stopped)
+    if made is None:
         return None
-    (grid, row), history, selection, rounds = begun, History(reader, past.archive), Selection.by(facts), 0
+    (grid, row), history, selection, rounds = made, History(reader, past.archive), Selection.by(facts), 0
     while (last := reader.last_row) - row > FEW_ROWS and rounds < MOST_ROUNDS:
         if not fold_history(grid, history, row, last, selection, stopped):
             return None
@@ -189,9 +189,7 @@ def fold_anew(past: StorePast, reader: JournalReader, facts: Facts, stopped: Cal
     return FoldedAnew(grid, row, rounds)
 
 
-def _begun(
-    past: StorePast, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]
-) -> tuple[Grid, int] | None:
+def begun(past: StorePast, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> tuple[Grid, int] | None:
     """The map up to a journal row that a checkpoint makes quick, or an empty one; None where it is not wanted."""
     last = reader.last_row
     grid, base = past.nearest(reader, LAST, None, facts)

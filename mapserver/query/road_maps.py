@@ -48,6 +48,7 @@ FRESH_S = 10.0
 # Where roads are soon made they are newer: no older than so many times what the last took, 1 % of the time for whoever
 # asks. So a small site, or one that has just begun, is answered of what came in a moment ago.
 CHEAP = 100
+COSTLY = 20  # likewise the least: roads of a large map, which take seconds, are older, and take no more than 5 %
 SPARE = 3  # times the last making: so long before roads are too old the next one begins, its own time twice with it
 ASKED_S = 600.0  # so long after the last question roads are still made for the next one
 PATIENCE_S = 2.0  # how long a picture waits for the first roads before it goes without
@@ -235,7 +236,7 @@ class RoadMaps:
                 log.exception("no road map")
             took_s = self._clock() - began_s
             # as seldom as may be, since all layers near a new sample are derived again; and half of the time at most
-            wait_s = max(FRESH_S - SPARE * took_s, took_s)
+            wait_s = max(max(FRESH_S, COSTLY * took_s) - SPARE * took_s, took_s)
 
     def _lately(self) -> RoadMap:
         """The newest roads, if not too old: who waits for those in the making takes them, if begun in time."""
@@ -257,7 +258,8 @@ class RoadMaps:
             return None
         own, now = newest.roads.version, self._source.run(lambda state: state.version)
         is_of_map = (own.store, own.fact) == (now.store, now.fact) and own.row <= now.row
-        in_time = own == now or asked_s - newest.looked_s <= min(FRESH_S, CHEAP * newest.took_s)
+        oldest_s = max(min(FRESH_S, CHEAP * newest.took_s), COSTLY * newest.took_s)
+        in_time = own == now or asked_s - newest.looked_s <= oldest_s
         return newest.roads if is_of_map and in_time else None
 
     def view(self, window: CellWindow, reach: int, as_of_ns: int | None) -> View:

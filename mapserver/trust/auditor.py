@@ -107,10 +107,18 @@ class Auditor:
 
     def verdicts(self, states: Mapping[str, MachineErrors] | None = None) -> dict[str, Verdict]:
         """Judge every machine. states: what calibration knows of them, by name."""
+        *_, verdicts = self.judging(states)
+        return verdicts or {}
+
+    def judging(self, states: Mapping[str, MachineErrors] | None = None) -> Iterator[dict[str, Verdict] | None]:
+        """As `verdicts`, of what there is at the first step: None after each pair of machines, then all."""
         names = sorted(self._maps)
         surfaces = [self._maps[name].surface() for name in names]
         maps = [ComparedMap(surface, surface.places()) for surface in surfaces]
-        pairs = self._pairs(names, maps)
+        pairs: Pairs = {}
+        for (one, one_map), (other, other_map) in combinations(zip(names, maps, strict=True), 2):
+            pairs |= self._pair(one, one_map, other, other_map)
+            yield None
         votes = {reason: _votes(names, pairs, reason) for reason in VOTED}
         groups = {reason: outvoted(votes[reason]) for reason in VOTED}
         known = [(states or {}).get(name) for name in names]
@@ -127,19 +135,18 @@ class Auditor:
             evidence = _measured(difference) | lead | calibrated | {"excess": excess} | _sides(names, votes, i)
             agrees = frozenset(r for r, j in judgements.items() if j.state == AGREE)
             verdicts[names[i]] = Verdict(names[i], reasons, evidence, bool(reasons), agrees)
-        return verdicts
+        yield verdicts
 
-    def _pairs(self, names: Sequence[str], maps: Sequence[ComparedMap]) -> Pairs:
-        """Judge every machine against every other."""
-        pairs, tuning = Pairs(), self._tuning
-        for (one, one_map), (other, other_map) in combinations(zip(names, maps, strict=True), 2):
-            difference = compare(one_map, other_map, map_cell_m(self._cell_m), tuning)
-            pairs[one, other] = judge(difference, tuning.pair_sigmas, tuning)
-            back = reverse(difference) if difference else None
-            pairs[other, one] = judge(back, tuning.pair_sigmas, tuning)
-        for (one, other), judgements in pairs.items():
-            judgements[Reason.CLOCK] = self._clocks.compare(one, other)[1]
-        return pairs
+    def _pair(self, one: str, one_map: ComparedMap, other: str, other_map: ComparedMap) -> Pairs:
+        """Judge two machines against each other."""
+        sigmas, clocks = self._tuning.pair_sigmas, self._clocks
+        difference = compare(one_map, other_map, map_cell_m(self._cell_m), self._tuning)
+        back = reverse(difference) if difference else None
+        there, here = (judge(each, sigmas, self._tuning) for each in (difference, back))
+        return {
+            (one, other): there | {Reason.CLOCK: clocks.compare(one, other)[1]},
+            (other, one): here | {Reason.CLOCK: clocks.compare(other, one)[1]},
+        }
 
     def _from_pool(self, maps: Sequence[ComparedMap], suspected: Sequence[bool]) -> Iterator[Difference | None]:
         """Differences of each machine from all others in good standing together: more ground than any one has."""

@@ -30,7 +30,7 @@ from protocol.units import DAY_NS
 SPAN_NS = 2 * DAY_NS  # of samples, which hold the hours of driving that a ledger remembers of a machine at work
 AHEAD_NS = 600 * 10**9  # of the site's now: machines' clocks, and what is on its way, differ by less
 EVERY_NS = 60 * 10**9  # of site time, between two solves: a fifth of an epoch
-REST = 50.0  # times as long as a solve took: 2 % of a core, also where a log is replayed
+REST = 50.0  # times as long as a run took: 2 % of a core, also where a log is replayed, or a fleet is large
 TURN_SAMPLES = 200_000  # read in one turn, in about 0.2 s
 Decide = Callable[[Solution, int], object]
 Group = tuple[str, ...]
@@ -78,16 +78,17 @@ class Calibrating:
 
     def run(self) -> None:
         """Follow the journal; where that is done and it is time, solve the next group, and have it decided."""
-        with self._turn:
-            if not self._follow(TURN_SAMPLES) or time.monotonic() < self._due_s:
-                return
-            if self._clock.passed_ns(self._doubtful()) < EVERY_NS:
-                return
-            now_ns, together = self._begun()
-            self._next = (self._next + 1) % len(together)
-            solved = self._solve(together[self._next], together, now_ns)
-            if self._writer.config.calibration.automatic and not self._ending.is_set():
-                self._decide(solved, now_ns)
+        if time.monotonic() < self._due_s or not self._turn.acquire(blocking=False):  # as while somebody has it solved
+            return
+        began_s, rest = time.thread_time(), REST
+        try:
+            if not self._follow(TURN_SAMPLES):
+                rest = 0.0
+            elif self._clock.passed_ns(self._doubtful()) >= EVERY_NS:
+                self._solve_next()
+        finally:
+            self._due_s = time.monotonic() + rest * (time.thread_time() - began_s)
+            self._turn.release()
 
     def solve(self) -> tuple[Solution, int]:
         """Solve with all that is journalled by now; what came out, and the site's now [ns]. For any thread."""
@@ -100,9 +101,9 @@ class Calibrating:
                     self._solve(some, together, now_ns)
             return self.solved
 
-    def close(self, wait_s: float = 0.0) -> None:
-        """Close the journal. A solve that takes longer ends with the process: what it says is of no use any more."""
-        if self._turn.acquire(timeout=wait_s):
+    def close(self) -> None:
+        """Close the journal, unless a solve goes on: that ends with the process, and is of no use any more."""
+        if self._turn.acquire(blocking=False):
             self._reader.close()  # and keep the turn: nothing runs any more
 
     def _begun(self) -> tuple[int, list[Group]]:
@@ -113,22 +114,25 @@ class Calibrating:
         self._share_room()
         return now_ns, groups(self._ledgers)
 
+    def _solve_next(self) -> None:
+        now_ns, together = self._begun()
+        self._next = (self._next + 1) % len(together)
+        solved = self._solve(together[self._next], together, now_ns)
+        if self._writer.config.calibration.automatic and not self._ending.is_set():
+            self._decide(solved, now_ns)
+
     def _solve(self, names: Group, together: Sequence[Group], now_ns: int) -> Solution:
         """Solve one group of machines; what it says. together: all groups."""
-        began_s = time.thread_time()
-        try:
-            stays = {}
-            for name in names:
-                self._ledgers[name].until_ns = now_ns + AHEAD_NS
-                stays[name] = self._ledgers[name].stays(now_ns - SPAN_NS)
-            remembered = remembered_of(self._shown())
-            solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground, remembered)
-            solved = replace(solved, begins_ns={name: self._begins_ns[name] for name in names})
-            self._parts = {some: part for some, part in self._parts.items() if some in together} | {names: solved}
-            self.solved = joined([*self._parts.values()]), now_ns
-        finally:
-            took_s = time.thread_time() - began_s
-            self._due_s = time.monotonic() + REST * took_s
+        began_s, stays = time.thread_time(), {}
+        for name in names:
+            self._ledgers[name].until_ns = now_ns + AHEAD_NS
+            stays[name] = self._ledgers[name].stays(now_ns - SPAN_NS)
+        remembered = remembered_of(self._shown())
+        solved = calibrate(stays, self._doubtful(), self._writer.site.known_ground, remembered)
+        solved = replace(solved, begins_ns={name: self._begins_ns[name] for name in names})
+        self._parts = {some: part for some, part in self._parts.items() if some in together} | {names: solved}
+        self.solved = joined([*self._parts.values()]), now_ns
+        took_s = time.thread_time() - began_s
         values = (len(names), len(self._ledgers), took_s, solved.common.observed, solved.common.reason)
         log.info("calibration solved machines=%d of=%d seconds=%.2f common_scale=%s reason=%s", *values)
         return solved

@@ -18,9 +18,9 @@ from mapserver.past.checkpoints import Entry
 from mapserver.past.making import make, remove_unfinished
 from mapserver.past.past import StorePast
 from mapserver.past.plan import due, surplus, thinned
+from mapserver.upkeep.jobs import PIECE_S
 from protocol.units import MINUTE_NS
 
-PIECE_S = 0.3  # of a turn, while other jobs wait; with ten machines, an hour takes a second in all
 LATE_ROWS = 5000  # so many that came in late are read for a map of the past, in 50 ms, before they are folded in
 RESERVE_BYTES = 2**30  # of the disk: what machines send goes before
 LATER_S = 60.0  # after damage, or without room

@@ -6,9 +6,10 @@ Each has a name for the log, and a `run` that does what is due and returns soon.
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Protocol
@@ -20,10 +21,9 @@ from mapserver.calibration.select import MachineErrors
 from mapserver.change import change_log
 from mapserver.change.change_log import ChangeLog
 from mapserver.change.detection import reach_blocks
-from mapserver.change.validity import around
+from mapserver.change.validity import around, has_change
 from mapserver.evidence.timeline import Block, TimedPages
 from mapserver.ingest.decisions import calibrations
-from mapserver.ingest.store import Store
 from mapserver.ingest.writer import Writer
 from mapserver.journal import archived_decisions
 from mapserver.journal.archive import archive
@@ -31,7 +31,11 @@ from mapserver.journal.journal import JournalReader
 from mapserver.trust.auditor import Auditor, Verdict
 from protocol.queries.answers import GroundChange
 
+PIECE_S = 0.3  # of a turn, while other jobs wait: with ten machines, an hour's checkpoint takes a second in all
 LOOK_BLOCKS = 256  # for changes, at a time: the writer copies their pages, and batches wait meanwhile
+# A block is looked at once nobody has driven on it for so many turns, or every so many: a pass folds into it again and
+# again, and each time all of its evidence would be compared.
+REST_TURNS, MOST_TURNS = 3, 20
 LOOK_S = 60.0  # between two looks for rows that are old enough: files are of whole hours
 KEEP_S = 3600.0  # between two looks for decisions, where no file is new
 Report = Callable[[Mapping[str, Verdict], int], None]
@@ -64,6 +68,7 @@ class Audit:
         self.verdicts: Mapping[str, Verdict] = {}
         self._writer, self._reader, self._report, self._known, self._ending = writer, reader, report, known, ending
         self._corrections = UNCORRECTED
+        self._judging: Iterator[dict[str, Verdict] | None] | None = None
         self._begin()
         self._due_s = 0.0
 
@@ -79,8 +84,19 @@ class Audit:
         finally:  # a row that cannot be read must not keep the machines from being judged by the others
             if time.monotonic() >= self._due_s:
                 self._due_s = time.monotonic() + self._writer.config.trust.judge_s
-                self.verdicts = self._auditor.verdicts(self._known()[1])
-                self._report(self.verdicts, self._writer.run(lambda store: store.newest_ns))
+                self._judging = self._judging or self._auditor.judging(self._known()[1])
+            self._judge()
+
+    def _judge(self) -> None:
+        """Go on with judging for a while: pairs of a large fleet take minutes."""
+        until_s, judging, self._judging = time.thread_time() + PIECE_S, self._judging, None
+        for verdicts in judging or ():
+            if verdicts is not None:
+                self.verdicts = verdicts
+                self._report(verdicts, self._writer.run(lambda store: store.newest_ns))
+            elif time.thread_time() >= until_s or self._ending.is_set():
+                self._judging = judging
+                return
 
     def _follow(self) -> None:
         corrections, _ = self._known()
@@ -108,6 +124,7 @@ class ChangeSearch:
         kept = [event.body for event in reader.events(change_log.KIND)]
         self._log = ChangeLog(cell_m, config.change, config.read, kept)
         self._lock = threading.Lock()
+        self._turn, self._touched = 0, dict[Block, tuple[int, int]]()  # first and last turn since the last look
         writer.run(lambda store: store.grid.touch_all())  # the log knows the changes, but not yet their cells
 
     def changes(self, after: int) -> list[GroundChange]:
@@ -116,25 +133,37 @@ class ChangeSearch:
             return self._log.changes(after)
 
     def run(self) -> None:
-        """Look at all blocks that were folded into; keep and publish each change."""
-        while not self._ending.is_set():
-            blocks, pages = self._writer.run(self._touched)
-            if not blocks:
+        """Look at blocks that were folded into, where it is time; keep and publish each change."""
+        self._turn += 1
+        for block in self._writer.run(lambda store: store.grid.take_touched(sys.maxsize)):
+            self._touched[block] = self._touched.get(block, (self._turn, 0))[0], self._turn
+        rested, most = self._turn - REST_TURNS, self._turn - MOST_TURNS
+        due = sorted(block for block, (first, last) in self._touched.items() if last <= rested or first <= most)
+        for begin in range(0, len(due), LOOK_BLOCKS):
+            if self._ending.is_set():
                 return
-            with self._lock:
-                changes = self._log.look(blocks, pages)
-            for change in changes:
+            for change in self._look(due[begin : begin + LOOK_BLOCKS]):
                 self._keep(change)
                 self._publish(change)
+
+    def _look(self, blocks: list[Block]) -> list[GroundChange]:
+        for block in blocks:
+            del self._touched[block]
+        pages, config = self._pages(blocks), self._writer.config.change
+        blocks = [block for block in blocks if block in pages and has_change(pages[block], config)]
+        if not blocks:
+            return []
+        pages = self._pages(sorted({near for block in blocks for near in around(block, self._reach)}))
+        with self._lock:
+            return self._log.look(blocks, pages)
 
     def _keep(self, change: GroundChange) -> None:
         self._writer.run(lambda store: store.journal.append_event(change_log.KIND, change.last_ns, asdict(change)))
 
-    def _touched(self, store: Store) -> tuple[list[Block], dict[Block, TimedPages]]:
-        """Some of the blocks in which something was folded since they were looked at, and pages of them and around."""
-        blocks = store.grid.take_touched(LOOK_BLOCKS)
-        wide = sorted({near for block in blocks for near in around(block, self._reach)})
-        return blocks, {block: pages for block, pages in zip(wide, store.grid.pages(wide), strict=True) if pages}
+    def _pages(self, blocks: list[Block]) -> dict[Block, TimedPages]:
+        """Pages of those blocks that have any."""
+        pages = self._writer.run(lambda store: store.grid.pages(blocks))
+        return {block: some for block, some in zip(blocks, pages, strict=True) if some}
 
 
 class Archiving:

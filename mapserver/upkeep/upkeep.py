@@ -1,4 +1,4 @@
-"""The upkeep: a thread beside the writer that runs four jobs in turn, one that calibrates, one that folds again."""
+"""The upkeep: a thread beside the writer that runs six jobs in turn, and one that folds the map again."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from mapserver.upkeep.calibrating import Calibrating
 from mapserver.upkeep.checkpointing import Checkpointing
 from mapserver.upkeep.jobs import Archiving, Audit, ChangeSearch, Job, Publish
 from mapserver.upkeep.refolding import Refolding
+from mapserver.upkeep.snapshots import Snapshots
 from protocol.errors import QueryError, Refusal, SitegridError, StoreError
 from protocol.queries.answers import GroundChange
 from protocol.queries.calibration import CalibrationAnswer
 from protocol.queries.commands import CalibrateCommand
 
-# Between two turns, which is how late a change of the ground is published: where a large fleet drives everywhere at
-# once, each turn looks at all of the map again, and no more than a share of one core should go into that.
+# Between two turns: where a large fleet drives everywhere each has much to look at, and no more than a share of one
+# core should go into that.
 TURN_S, LATEST_S = 1.0, 5.0
 SHARE = 0.2
-END_S = 5.0  # a solve may take so long in the end
+END_S = 5.0
 log = logging.getLogger("mapserver.upkeep.upkeep")
 
 
@@ -49,15 +50,16 @@ class Upkeep:
         self._changes = ChangeSearch(writer, reader, publish, self._ending)
         self._checkpointing = Checkpointing(writer, reader, past, self._ending)
         archiving = Archiving(writer, reader, self._ending)
-        jobs = {
-            "upkeep": (self._audit, self._changes, archiving, self._checkpointing),
-            "calibration": (self._calibrating,),  # which may take seconds at a time
-        }
-        self._threads = [
-            threading.Thread(target=self._run, args=(some,), name=name, daemon=True) for name, some in jobs.items()
-        ]
-        for thread in self._threads:
-            thread.start()
+        jobs = (
+            self._audit,
+            self._changes,
+            Snapshots(writer),
+            archiving,
+            self._checkpointing,
+            self._calibrating,
+        )
+        self._thread = threading.Thread(target=self._run, args=(jobs,), name="upkeep", daemon=True)
+        self._thread.start()
 
     def changes(self, after: int = 0) -> list[GroundChange]:
         """Changes of the ground with a number beyond `after`."""
@@ -117,16 +119,14 @@ class Upkeep:
         self._refolding.wait(number, wait_s)
 
     def close(self) -> None:
-        """End the threads."""
+        """End the threads; what takes longer than END_S, as a solve may, ends with the process."""
         self._ending.set()
         self._refolding.close()
-        following, calibrating = self._threads
-        following.join()
-        self._checkpointing.close()
-        end_s = time.monotonic() + END_S
-        calibrating.join(END_S)
-        self._calibrating.close(max(0.0, end_s - time.monotonic()))
-        self._reader.close()
+        self._thread.join(END_S)
+        self._calibrating.close()
+        if not self._thread.is_alive():
+            self._checkpointing.close()
+            self._reader.close()
 
     def _known(self) -> tuple[SampleCorrections, Mapping[str, MachineErrors]]:
         """Corrections that are decided, and what is known of machines: by the last solve, else by an earlier one.

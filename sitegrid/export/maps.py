@@ -65,7 +65,7 @@ def _folder(arguments: Namespace, stack: ExitStack) -> Path:
 
 def _of_store(folder: Path, arguments: Namespace) -> OpenMap:
     from mapserver.follower.follower import FollowerSource
-    from mapserver.follower.following import Following
+    from mapserver.ingest.following import Following
     from mapserver.journal.location import JournalLocation
     from mapserver.query.answering import Answers
     from protocol.site.site_file import load_site

@@ -1,3 +1,4 @@
+import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
@@ -23,6 +24,7 @@ from protocol.site.geometry import Bounds
 from protocol.wire import keys
 from protocol.wire.codec import decode_reply, encode_batch
 from protocol.wire.messages import Ack
+from tests.paths import ROOT
 from tests.patience import PATIENCE_S
 from tests.unit.mapserver.data import CONFIG, NOW_NS, SITE, batch, held, now_ns, routed, samples, wait_for
 
@@ -39,6 +41,17 @@ def served(sessions, tmp_path):
     server = Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)
     yield server, client
     server.close()
+
+
+def test_threads_of_a_server_are_those_that_the_design_lists(sessions, tmp_path):
+    table = (ROOT / "docs" / "design.md").read_text().partition("| thread |")[2].partition("\n\n")[0]
+    listed = {name for line in table.splitlines()[2:] for name in re.findall("`([a-z ]+)`", line.split("|")[1])}
+    before, router = {*threading.enumerate()}, sessions[0]
+    with closing(Server(router, router, JournalLocation(tmp_path), SITE, CONFIG, now_ns)):
+        names = {re.sub(r"-\d+$", "", thread.name) for thread in {*threading.enumerate()} - before}
+    names = {name for name in names if "pyo3-closure" not in name}  # Zenoh's callbacks
+    assert names <= listed
+    assert listed - names <= {"fold", "read", "journal", "journal watch", "metrics"}
 
 
 def get(client: zenoh.Session, key: str, parameters: dict[str, str] | None = None, payload: bytes | None = None):

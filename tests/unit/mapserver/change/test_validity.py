@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mapserver.change.change_log import ChangeLog
-from mapserver.change.detection import ChangeConfig
+from mapserver.change.detection import ChangeConfig, reach_blocks
 from mapserver.change.validity import around, valid_pages
 from mapserver.evidence import cells as ev
 from mapserver.evidence.fold_config import FoldConfig
@@ -176,6 +176,17 @@ def test_an_age_before_a_change_of_the_cells_takes_nothing_back():
     first, _ = firsts(grid, NOW_NS + 1)
     np.testing.assert_array_equal(np.maximum(first, plain), first)
     assert (first[128:] == plain[128:]).all()
+
+
+def test_what_a_block_shows_is_the_same_where_it_alone_is_wanted():
+    grid, reach = repaved(-10, -13, 20), reach_blocks(1.0, CONFIG)
+    blocks = [(x, y) for y in range(-2, 2) for x in range(-2, 2)]
+    pages = dict(zip(blocks, grid.pages(blocks), strict=True))
+    whole = valid_pages(pages, 1.0, CONFIG)
+    assert sum(first.any() for first in whole.values()) >= 4
+    for block in blocks:
+        near = {other: pages[other] for other in around(block, reach) if other in pages}
+        assert (valid_pages(near, 1.0, CONFIG, only=[block])[block] == whole[block]).all()
 
 
 def sweep(west: int, south: int, east: int, north: int, c_rr: float, hour: float, grade: float = 0.0):

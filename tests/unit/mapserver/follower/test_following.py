@@ -15,14 +15,15 @@ from hypothesis import strategies as st
 
 from mapserver.change import change_log
 from mapserver.follower import follower as edge
-from mapserver.follower import following as module
 from mapserver.follower.follower import Follower
-from mapserver.follower.following import Following
-from mapserver.follower.replica import Replica
+from mapserver.ingest import following as module
+from mapserver.ingest.following import Following
+from mapserver.ingest.replica import Replica
 from mapserver.ingest.writer import Writer
+from mapserver.journal import tail
 from mapserver.journal.archive import archive
 from mapserver.journal.location import JournalLocation
-from mapserver.journal.rows import LAST
+from mapserver.journal.rows import LAST, JournalRows
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.journal.table_writer import meta_line
 from mapserver.past.making import make
@@ -132,7 +133,7 @@ def test_a_decision_that_is_taken_back_during_the_fold_never_counts_again(tmp_pa
         monkeypatch.setattr(Replica, "adopt", noted)
         for trusted in (False, True):
             writer.run(lambda store, t=trusted: store.decide(TrustDecision("b", t, PERSON, "drawn", NOW_NS)))
-            wait_for(lambda n=1 + trusted: one.run(lambda replica: replica.event) == n)
+            wait_for(lambda n=1 + trusted: one._replica.tail.event == n)
             wait_for(lambda: folds == [1])
         assert version(one).fact == 2  # the map has what decisions come to
         may_go_on.set()
@@ -282,7 +283,7 @@ def test_a_journal_damaged_beneath_a_follower_takes_no_map_away_and_gives_none_t
     tmp_path, monkeypatch, caplog, damage
 ):
     monkeypatch.setattr(module, "OPEN_S", 0.2)
-    monkeypatch.setattr(module, "RETRY_S", 0.1)
+    monkeypatch.setattr(module, "MOST_PAUSE_S", 0.1)
     path = tmp_path / "journal.db"
     with closing(open_writer(tmp_path)) as writer:
         for seed in (1, 2, 3):
@@ -333,6 +334,30 @@ def test_a_fold_beside_that_fails_is_done_again(tmp_path, monkeypatch):
         assert folds == [1, 1]
 
 
+@pytest.mark.parametrize("error", [StoreError("the journal", "cannot be read"), OSError(5, "Input/output error")])
+def test_rows_that_cannot_be_read_for_a_while_are_in_the_map_once(tmp_path, monkeypatch, error):
+    read, failures = tail.read_history, iter(range(4))
+
+    def failing(*words):
+        rows = [JournalRows.joined([row]) for rows in read(*words) for row in rows]
+        yield rows.pop(0)
+        if rows and next(failures, None) is not None:
+            raise error
+        yield from rows
+
+    monkeypatch.setattr(tail, "read_history", failing)
+    with closing(open_writer(tmp_path)) as writer:
+        for seed in range(4):
+            deliver(writer, seed)
+        with following(tmp_path) as one:
+            catches_up(one, writer)
+            with one._lock:  # it sees all of them at once
+                for seed in range(4, 8):
+                    deliver(writer, seed, machine="b")
+            catches_up(one, writer)
+    assert next(failures, None) is None
+
+
 def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_path, database):
     location = JournalLocation(tmp_path / "store", database.url)
     with closing(store_at(location)) as store:
@@ -358,7 +383,7 @@ def test_checkpoints_of_rows_that_a_restored_database_has_not_are_not_used(tmp_p
 
 
 def test_a_follower_that_cannot_keep_up_is_hidden_until_it_has_caught_up(tmp_path, monkeypatch, caplog):
-    may_read, read = threading.Event(), module.read_history
+    may_read, read = threading.Event(), tail.read_history
 
     def slowly(*words):
         for rows in read(*words):
@@ -366,7 +391,7 @@ def test_a_follower_that_cannot_keep_up_is_hidden_until_it_has_caught_up(tmp_pat
             yield rows
 
     monkeypatch.setattr(edge, "SHOWN_S", 1.5)  # for ten seconds
-    monkeypatch.setattr(module, "read_history", slowly)
+    monkeypatch.setattr(tail, "read_history", slowly)
     may_read.set()
     with routed() as (_, session), closing(open_writer(tmp_path)) as writer:
         send(writer, [incoming(random_samples(20, 1), 1, "a")])

@@ -14,7 +14,7 @@ import pytest
 
 from mapserver.calibration.correction import LAST_NS, NO_SHARE, Correction
 from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
-from mapserver.ingest import standby as standby_module
+from mapserver.ingest import following
 from mapserver.ingest.decisions import KINDS
 from mapserver.ingest.standby import Standby
 from mapserver.ingest.store import Store
@@ -413,8 +413,8 @@ def standby(tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch)
     """One that reads row by row, and tries again at once."""
     for name in ("ROWS_AT_ONCE", "BYTES_AT_ONCE"):
         monkeypatch.setattr(postgres_reader, name, 1)
-    monkeypatch.setattr(standby_module, "_MOST_PAUSE_S", 0.0)
-    monkeypatch.setattr(standby_module, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(following, "MOST_PAUSE_S", 0.0)
+    monkeypatch.setattr(following, "PAUSE_S", 0.0)
     with closing(Standby(JournalLocation(tmp_path / "two", database.url), SITE, CONFIG, bool)) as made:
         yield made
 
@@ -425,7 +425,12 @@ def send(store: Store, first: int, last: int, machine: str = "a") -> None:
 
 
 def is_fold(standby: Standby, journal: JournalQueries, without: frozenset[str] = frozenset()) -> bool:
-    return same(standby._grid, fold_of(journal.read(until=standby.row), without))
+    replica = standby._replica
+    return same(replica.grid, fold_of(journal.read(until=replica.merged), without))
+
+
+def row_of(standby: Standby) -> int:
+    return standby._replica.merged
 
 
 @pytest.mark.parametrize("warm_rows", [0, 2])
@@ -439,13 +444,28 @@ def test_before_a_damaged_row_it_waits_and_folds_nothing_twice(location, standby
         database.sql("UPDATE sitegrid.journal SET record = '\\x00' WHERE row = 4")
         for _ in range(5):
             standby.follow(0.1)
-            assert standby.row == 3
+            assert row_of(standby) == 3
             assert is_fold(standby, store.journal)
         assert "journal row 4 is damaged" in standby._problem
         database.sql(f"UPDATE sitegrid.journal SET record = '\\x{sound.hex()}' WHERE row = 4")
         standby.follow(0.1)
-        assert (standby.row, standby._problem) == (6, "")
+        assert (row_of(standby), standby._problem) == (6, "")
         assert is_fold(standby, store.journal)
+
+
+def test_what_is_decided_while_a_row_is_damaged_counts_in_the_rows_before_it(location, standby, database):
+    with closing(store_at(location)) as store:
+        send(store, 1, 2)
+        send(store, 1, 1, machine="b")
+        send(store, 3, 4)
+        database.sql("UPDATE sitegrid.journal SET record = '\\x00' WHERE row = 4")
+        standby.follow(0.1)
+        assert is_fold(standby, store.journal)
+        facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
+        for _ in range(3):
+            standby.follow(0.1)
+            assert (row_of(standby), standby._replica.facts, standby._anew) == (3, facts, None)
+            assert is_fold(standby, store.journal, facts.excluded)
 
 
 def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
@@ -456,11 +476,11 @@ def test_rows_of_machines_that_are_left_out_are_passed_once(location, standby):
         assert (row, same(grid, store.grid)) == (2, True)
         facts = store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
         assert standby.grid_for(store.journal, facts) is None, "the grid of other facts"
-        standby.follow(5.0)
+        wait_for(lambda: standby.follow(0.1) or standby.grid_for(store.journal, facts))
         assert standby.grid_for(store.journal, store.facts) is None
         send(store, 1, 3, machine="b")
         standby.follow(5.0)
-        assert standby.row == 5
+        assert row_of(standby) == 5
         assert is_fold(standby, store.journal, facts.excluded)
         send(store, 3, 3)
         standby.follow(5.0)
@@ -487,7 +507,7 @@ def test_a_database_that_is_restored_within_an_epoch_is_folded_again(location, s
         assert not standby.has_checked(store.journal)
         assert standby.grid_for(store.journal, store.facts) is None
         standby.follow(5.0)
-        assert standby.row == 1 + rows_since
+        assert row_of(standby) == 1 + rows_since
         assert is_fold(standby, store.journal)
         standby.follow(0.1)
         assert standby.has_checked(store.journal)
@@ -500,14 +520,14 @@ def test_a_decision_of_another_course_is_not_kept(location, standby, database):
         send(store, 1, 4, machine="b")
         store.decide(TrustDecision("b", False, PERSON, "it lies", NOW_NS))
         standby.follow(5.0)
-        assert standby._facts.excluded == {"b"}
+        assert standby._replica.facts.excluded == {"b"}
     restore(database, 2)
     database.sql("DELETE FROM sitegrid.events; UPDATE sitegrid.head SET last_event = 0")
     with closing(store_at(location)) as store:
         events = store.journal.state().event
         store.decide(TrustDecision("c", False, PERSON, "it lies", NOW_NS))
         assert events == 1, "what is missing is an event"
-    wait_for(lambda: standby.follow(0.1) or standby._facts.excluded == {"c"})
+    wait_for(lambda: standby.follow(0.1) or standby._replica.facts.excluded == {"c"})
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,4 +1,3 @@
-import math
 import threading
 import time
 from collections import Counter
@@ -12,16 +11,14 @@ import numpy as np
 import pytest
 
 from mapserver.config import ServerConfig, StoreConfig
-from mapserver.ingest import backlog, merge_waits, snapshot_times
-from mapserver.ingest import store as store_module
+from mapserver.ingest import backlog, merge_waits
 from mapserver.ingest import writer as writer_module
 from mapserver.ingest.backlog import BATCH_BYTES, GROUP_BATCHES, GROUP_BYTES, MOST_RETRY_S, Backlog, WorkRate
 from mapserver.ingest.merge_waits import MergeWaits
-from mapserver.ingest.snapshot_times import RESTART_SAMPLES, SHARE
 from mapserver.ingest.store import Store
 from mapserver.ingest.writer import HANGS_S, Writer
 from mapserver.journal.sqlite.journal import SqliteJournal
-from mapserver.past.checkpoints import save_snapshot, snapshot_rows
+from mapserver.past.checkpoints import snapshot_rows
 from protocol.errors import QueryError, Refusal
 from protocol.queries.answers import ServerAlive
 from protocol.wire.codec import MAX_BATCH_BYTES, encode_batch
@@ -47,11 +44,10 @@ from tests.unit.mapserver.data import (
 
 
 @pytest.fixture
-def start(tmp_path, monkeypatch):
+def start(tmp_path):
     writers = []
 
-    def start_writer(site=SITE, restart_samples: int = RESTART_SAMPLES, clock=time.monotonic, **options: Any) -> Writer:
-        monkeypatch.setattr(snapshot_times, "RESTART_SAMPLES", restart_samples)
+    def start_writer(site=SITE, clock=time.monotonic, **options: Any) -> Writer:
         writers.append(open_writer(tmp_path, ServerConfig(store=StoreConfig(**options)), site, clock))
         return writers[-1]
 
@@ -197,87 +193,6 @@ class Clock:
 def turn(writer: Writer) -> None:
     for _ in range(2):
         writer.run(lambda _: None)
-
-
-def is_written(writer: Writer) -> bool:
-    return writer._times.due_s(0) < math.inf
-
-
-def test_a_snapshot_is_made_once_a_restart_would_take_long(start, tmp_path):
-    writer = start(restart_samples=3, clock=Clock())
-    expected = {0: [], 3: [3], 6: [6, 3]}
-    for row in range(1, 8):
-        send(writer, [incoming(samples(1), row)])
-        turn(writer)
-        wait_for(lambda row=row: snapshot_rows(tmp_path) == expected[row // 3 * 3] and is_written(writer))
-
-
-def test_a_snapshot_that_takes_long_puts_the_next_off_and_the_work_goes_on(start, tmp_path, monkeypatch):
-    release, entered, real, clock = threading.Event(), threading.Event(), save_snapshot, Clock()
-
-    def slow(*args):
-        entered.set()
-        assert release.wait(PATIENCE_S)
-        return real(*args)
-
-    monkeypatch.setattr(store_module, "save_snapshot", slow)
-    writer = start(restart_samples=2, clock=clock)
-    for row in range(1, 7):
-        assert send(writer, [incoming(samples(1), row)]) == [Ack(row, row, store=writer.store_id)]
-    assert entered.wait(PATIENCE_S)
-    assert snapshot_rows(tmp_path) == []
-    clock.now_s += 3.0
-    release.set()
-    wait_for(lambda: is_written(writer))
-    turn(writer)
-    assert snapshot_rows(tmp_path) == [2]
-    clock.now_s += 3.0 * (1 / SHARE - 1) - 0.01
-    turn(writer)
-    assert snapshot_rows(tmp_path) == [2]  # it took 3 s: nothing for a minute
-    clock.now_s += 0.02
-    turn(writer)
-    wait_for(lambda: snapshot_rows(tmp_path) == [6, 2])
-    writer.close()
-    assert start().info()["snapshot"] == 6
-
-
-def test_a_snapshot_is_made_when_its_time_has_come_even_if_nothing_comes(start, tmp_path):
-    clock = Clock()
-    writer = start(snapshot_s=60.0, clock=clock)
-    send(writer, [incoming(samples(1))])
-    clock.now_s += 59.9
-    turn(writer)
-    assert snapshot_rows(tmp_path) == []
-    clock.now_s += 0.1
-    turn(writer)
-    wait_for(lambda: snapshot_rows(tmp_path) == [1] and is_written(writer))
-    clock.now_s += 60.0
-    turn(writer)
-    assert snapshot_rows(tmp_path) == [1]  # nothing new
-    send(writer, [incoming(samples(1), 2)])
-    turn(writer)
-    assert snapshot_rows(tmp_path) == [1]  # and it was looked at a moment ago
-
-
-def test_a_snapshot_that_fails_is_tried_again_only_after_a_while(start, tmp_path, monkeypatch):
-    tries, clock = [], Clock()
-
-    def full(*args):
-        tries.append(args[1])
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(store_module, "save_snapshot", full)
-    writer = start(restart_samples=3, snapshot_s=60.0, clock=clock)
-    for i in range(7):
-        if i == 5:
-            clock.now_s += 60.0
-        assert isinstance(send(writer, [incoming(samples(1), i + 1)])[0], Ack)
-        turn(writer)
-        wait_for(lambda i=i: len(tries) == (i >= 2) + (i >= 5) and is_written(writer))
-    assert tries == [3, 6]
-    writer.close()
-    assert not writer.failed
-    assert tries == [3, 6, 7]
 
 
 def test_a_probe_waits_for_nobody_and_hears_of_a_writer_that_hangs(start):

@@ -65,7 +65,7 @@ def test_a_session_that_is_lost_while_it_waits_is_closed_and_fences_nobody(tmp_p
     send(first, 1)
     mine = f"application_name = 'sitegrid writer' AND pid <> {first.journal._session._db.info.backend_pid}"
     with closing(StandsBy(tmp_path / "two", database)) as second:
-        wait_for(lambda: second.standby.row == 1)
+        wait_for(lambda: second.standby.journalled == 1)
         waiting = database.sql(f"SELECT pid FROM pg_stat_activity WHERE {mine}")
 
         def lose() -> None:
@@ -86,7 +86,7 @@ def test_a_standby_whose_take_over_is_cut_waits_again(tmp_path, database, monkey
     first = open_store(tmp_path / "one", database)
     send(first, 1)
     with closing(StandsBy(tmp_path / "two", database)) as second:
-        wait_for(lambda: second.standby.row == 1)
+        wait_for(lambda: second.standby.journalled == 1)
         real, cut = WriterSession.run, []
 
         def run(self: WriterSession, query: Any) -> Any:
@@ -110,7 +110,7 @@ def test_a_standby_of_a_database_that_is_made_anew_ends_and_leaves_it_empty(tmp_
     cluster.sql(f"CREATE DATABASE backup_{name} TEMPLATE {name}")
     first = open_store(tmp_path / "one", database)
     with closing(StandsBy(tmp_path / "two", database)) as second:
-        wait_for(lambda: second.standby.row == 1)
+        wait_for(lambda: second.standby.journalled == 1)
         first.close()
         cluster.sql(f"DROP DATABASE {name} WITH (FORCE)")
         cluster.sql(f"CREATE DATABASE {name}")

@@ -126,6 +126,17 @@ def test_it_solves_in_site_time(tmp_path):
     assert EVERY_NS == 60 * S
 
 
+def test_while_somebody_has_it_solved_other_jobs_do_not_wait(writer):
+    job, decided = calibrating(writer)
+    deliver(writer)
+    with closing(job):
+        with job._turn:
+            job.run()
+        assert (decided, job._followed) == ([], 0)
+        job.run()
+        assert job._followed == writer.run(lambda store: store.journalled)
+
+
 def folded(upkeep: Upkeep, writer: Writer) -> Grid:
     each = writer.run(lambda store: store.facts.corrections).each
     grid = Grid(SITE.cell_m, writer.config.fold)
@@ -159,7 +170,7 @@ def test_asked_for_the_map_has_what_is_known_at_once(writer):
 def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
     deliver(writer)
     with closing(Upkeep(writer, lambda _: None, past_of(writer))) as site:
-        site.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=PATIENCE_S))
+        site.correct(CalibrateCommand("a", zero=0.0081234, reason="levelled", wait_s=60.0))
         state = site.calibration().machines[0]
         assert (state.by, state.reason, state.spans[0].zero, state.spans[0].from_ns) == (
             "person",
@@ -171,7 +182,7 @@ def test_a_person_corrects_a_machine_until_it_is_left_to_the_server(writer):
         assert site.calibration().machines[0].spans == state.spans, "a person is not overruled"
         assert site.calibration().machines[1].by == "solver"
         assert same(writer.run(grid_copy), folded(site, writer))
-        site.correct(CalibrateCommand("a", auto=True, wait_s=PATIENCE_S))
+        site.correct(CalibrateCommand("a", auto=True, wait_s=60.0))
         assert site.calibration().machines[0].spans == ()
         site.calibrate(PATIENCE_S)
         assert site.calibration().machines[0].by == "solver"

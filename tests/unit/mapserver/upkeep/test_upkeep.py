@@ -21,8 +21,8 @@ from mapserver.journal.archive import FOLDER
 from mapserver.journal.location import JOURNAL_FILE
 from mapserver.journal.sqlite.reader import SqliteReader
 from mapserver.trust.judgement import Reason
-from mapserver.upkeep import refolding, upkeep
-from mapserver.upkeep.jobs import Archiving, Audit
+from mapserver.upkeep import jobs, refolding, upkeep
+from mapserver.upkeep.jobs import MOST_TURNS, REST_TURNS, Archiving, Audit, ChangeSearch
 from mapserver.upkeep.upkeep import Upkeep
 from protocol.errors import QueryError
 from protocol.queries.answers import GroundChange
@@ -191,6 +191,18 @@ def test_a_change_is_published_listed_and_kept(opened):
         assert site.upkeep.changes(after=change.id) == []
 
 
+def test_a_block_is_looked_at_once_it_was_left_or_every_so_many_turns(store, monkeypatch):
+    writer, reader = store
+    search, look, looked = ChangeSearch(writer, reader, print, threading.Event()), ChangeSearch._look, list[Any]()
+    monkeypatch.setattr(ChangeSearch, "_look", lambda self, some: looked.append((turn, some)) or look(self, some))
+    for turn in range(1, MOST_TURNS + 10):
+        if turn <= MOST_TURNS + 2:
+            send(writer, [incoming(samples(1, x_m=1.0, y_m=1.0), turn)])
+        search.run()
+    assert {block for _, some in looked for block in some} >= {(0, 0)}
+    assert [turn for turn, _ in looked] == [1 + MOST_TURNS, MOST_TURNS + 2 + REST_TURNS]
+
+
 def archiving(writer: Writer, reader: SqliteReader, after_h: float, hours_later: float = 3.0) -> Archiving:
     writer = copy(writer)
     writer.now_ns = lambda: NOW_NS + round(hours_later * HOUR_NS)
@@ -258,6 +270,20 @@ def audit_of(
 ) -> Audit:
     writer.config = ServerConfig(trust=TrustConfig(judge_s))
     return Audit(writer, reader, report, known, threading.Event())
+
+
+def test_a_fleet_that_takes_long_to_judge_is_judged_a_piece_in_every_turn(store, monkeypatch):
+    writer, reader = store
+    monkeypatch.setattr(jobs, "PIECE_S", 0.0)
+    for name, rows in fleet({"c": 1.5}, size=24).items():
+        send(writer, [incoming(np.concatenate(rows), 1, name)])
+    reports: list[Any] = []
+    audit = audit_of(writer, reader, lambda verdicts, _: reports.append(verdicts))
+    for pairs in range(6):
+        audit.run()
+        assert (reports, audit.verdicts) == ([], {}), pairs
+    audit.run()
+    assert [audit.verdicts] == reports == [audit._auditor.verdicts()]
 
 
 def test_corrected_samples_are_judged_also_those_that_came_before_the_correction(store):

@@ -5,7 +5,7 @@ No clock, thread or file: what was read is handed in. On equal rows and facts it
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -14,25 +14,19 @@ from mapserver.config import ServerConfig
 from mapserver.evidence.grid import Grid
 from mapserver.ingest.decisions import Decisions
 from mapserver.journal.facts import Facts
-from mapserver.journal.records import last_checksum
 from mapserver.journal.rows import Event, JournalRows, Selection
+from mapserver.journal.tail import Tail
 from protocol.queries.answers import GroundChange, MapVersion
 from protocol.site.site_config import SiteConfig
 
 
 class Replica:
-    """See `MapState`. store: its id. merged: the last row that is in the grid; event: the number of the last event.
+    """See `MapState`. tail: how far the journal was read. merged: the last row in the grid. changes: by number."""
 
-    changes: of the ground, by number. checksum, event_checksum: those that this row and this event were written with,
-    None where that is not known.
-    """
-
-    def __init__(self, site: SiteConfig, config: ServerConfig, store: str) -> None:
-        self.site, self.config, self.store = site, config, store
+    def __init__(self, site: SiteConfig, config: ServerConfig, tail: Tail) -> None:
+        self.site, self.config, self.tail = site, config, tail
         self.grid, self.facts = Grid(site.cell_m, config.fold), Facts()
-        self.merged = self.event = 0
-        self.checksum: int | None = None
-        self.event_checksum: int | None = None
+        self.merged = 0
         self.changes: dict[int, GroundChange] = {}
         self._decisions = Decisions()
         self._newest_ns: dict[str, int] = {}
@@ -40,7 +34,7 @@ class Replica:
     @property
     def version(self) -> MapVersion:
         """The version that the map is."""
-        return MapVersion(self.store, self.merged, self.facts.number)
+        return MapVersion(self.tail.store, self.merged, self.facts.number)
 
     @property
     def newest_ns(self) -> int:
@@ -57,15 +51,14 @@ class Replica:
         """What all decisions come to: the grid has to be folded again where these are not its facts."""
         return self._decisions.facts
 
-    def hear(self, events: Iterable[Event], where: str) -> None:
+    def hear(self, events: Sequence[Event], where: str) -> None:
         """Take further events in their order. StoreError for a decision that another program wrote."""
-        heard = list(events)
-        self._decisions.hear(heard, where)
-        for event in heard:
+        self._decisions.hear(events, where)
+        for event in events:
             if event.kind == change_log.KIND:
                 change = change_log.change_of(event.body)
                 self.changes[change.id] = change
-            self.event, self.event_checksum = event.id, event.checksum
+        self.tail.heard(events)
         if self.wanted == self.facts:
             self.facts = self.wanted  # of a higher number
 
@@ -76,7 +69,7 @@ class Replica:
         newest_ns = np.maximum.reduceat(stamps, ends - rows.lengths)
         names = (rows.machines[machine] for machine in rows.machine.tolist())
         self.reach(zip(names, newest_ns.tolist(), strict=True))
-        self.merged, self.checksum = int(rows.numbers[-1]), last_checksum(rows)
+        self.merged = int(rows.numbers[-1])
 
     def reach(self, newest_ns: Iterable[tuple[str, int]]) -> None:
         """Know stamps of machines that are in the map, or would be if these were not excluded."""

@@ -1,0 +1,36 @@
+"""The job that has snapshots written: often enough that a restart is quick, seldom enough that they cost little."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from mapserver.ingest.store import Store
+from mapserver.ingest.writer import Writer
+
+RESTART_SAMPLES = 500_000  # more than so many that a restart would have to fold, about a second, bring one forward
+SHARE = 0.05  # of the time that is spent on snapshots at most
+
+
+class Snapshots:
+    """Has the writer take a snapshot, where one is due, and writes it."""
+
+    name = "snapshots"
+
+    def __init__(self, writer: Writer, clock: Callable[[], float] = time.monotonic) -> None:
+        """clock: steady, in seconds."""
+        self._writer, self._clock, self._every_s = writer, clock, writer.config.store.snapshot_s
+        self._began_s = self._earliest_s = clock()
+
+    def run(self) -> None:
+        """Write one where it is time. What keeps one from the disk, an OSError, will not go at once."""
+        began_s = self._clock()
+        samples = self._writer.run(lambda store: store.samples_behind)
+        wait_s = 0.0 if samples >= RESTART_SAMPLES else self._every_s
+        if began_s < max(self._began_s + wait_s, self._earliest_s):
+            return
+        self._began_s, self._earliest_s = began_s, began_s + self._every_s
+        if write := self._writer.run(Store.snapshot):
+            write()
+        ended_s = self._clock()
+        self._earliest_s = ended_s + (ended_s - began_s) * (1 / SHARE - 1)
