@@ -28,7 +28,7 @@ class BusDrive(RoadDrive):
     def scenario_toml(self) -> str:
         """The scenario file of this drive."""
         scenario = load_scenario(self.setup.scenario)
-        fleets = [asdict(replace(fleet, can=self.can)) for fleet in scenario.fleet]
+        fleets = [asdict(replace(fleet, can=self.can, preset=self.preset)) for fleet in scenario.fleet]
         top = {"world": WORLD, "fleet": fleets}
         if self.reference != 1.0:
             top["fault"] = [{"machine": scenario.machine_names[0], "torque_scale": self.reference}]
@@ -39,8 +39,10 @@ class BusDrive(RoadDrive):
         return Agent(index, closed_tours=True, blind=self.blind)
 
 
-def planned(scenario: str, seed: int, seconds: float, *, can: bool, reference: float, blind: bool) -> BusDrive:
-    """A drive of a scenario with the sensors that its file has."""
-    preset = load_scenario(scenario).fleet[0].preset
+def planned(
+    scenario: str, seed: int, seconds: float, *, can: bool, reference: float, blind: bool, preset: str
+) -> BusDrive:
+    """A drive of a scenario with the sensors of a preset, or with those that its file has."""
     setup = Setup(scenario, (), (), ())
+    preset = preset or load_scenario(scenario).fleet[0].preset
     return BusDrive(seed, seconds, preset, setup, can=can, reference=reference, blind=blind)

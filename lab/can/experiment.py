@@ -30,22 +30,24 @@ LEAST_SHARE = 0.5  # of the driving with fuel, for a segment's litres to be judg
 
 @dataclass(frozen=True)
 class BusCase:
-    """What a row shows; see `BusDrive`."""
+    """What a row shows; see `BusDrive`. preset: in place of the scenario's."""
 
     name: str
     scenario: str
     can: bool = True
     reference: float = 1.0
     blind: bool = False
+    preset: str = ""
 
     def drive(self, seed: int, seconds: float) -> BusDrive:
         """The recording of a seed."""
         how = {"can": self.can, "blind": self.blind}
-        return planned(self.scenario, seed, seconds, reference=self.reference, **how)
+        return planned(self.scenario, seed, seconds, reference=self.reference, preset=self.preset, **how)
 
 
 CASES = (
     BusCase("trucks_wheels", "haul_road", can=False),
+    BusCase("trucks_switch", "haul_road", can=False, preset="brake_switch"),
     BusCase("trucks_bus", "haul_road"),
     BusCase("trucks_reference", "haul_road", reference=1.1),
     BusCase("loaders_wheels", "loading", can=False),
