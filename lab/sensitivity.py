@@ -112,13 +112,15 @@ def moved(stage: Stage, constant: str, whole: Row, both: tuple[Row, Row]) -> Row
 
 
 def _ground(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
-    rows = [VariedGround("kalman", "calibrated", variant=variant) for variant in some]
-    return ground.run(runner, seeds, seconds, rows)[0]["rows"]
+    varied_rows = [VariedGround("kalman", "calibrated", variant=variant) for variant in some]
+    rows: list[Row] = ground.run(runner, seeds, seconds, varied_rows)[0]["rows"]
+    return rows
 
 
 def _positions(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
-    rows = [VariedPositions("ukf", 2, 1, "default", variant=variant) for variant in some]
-    return positions.run(runner, seeds, seconds, rows, FAST)[0]["rows"]
+    varied_rows = [VariedPositions("ukf", 2, 1, "default", variant=variant) for variant in some]
+    rows: list[Row] = positions.run(runner, seeds, seconds, varied_rows, FAST)[0]["rows"]
+    return rows
 
 
 def _calibration(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
