@@ -11,7 +11,7 @@ from agents.estimation.tuning import EstimationTuning
 from agents.localisation.tuning import TUNING as LOCALISATION
 from agents.localisation.tuning import LocalisationTuning
 from lab.calibration import experiment as calibration
-from lab.calibration.cases import CASES
+from lab.calibration.cases import CASES, FleetCase
 from lab.campaign.experiment import Runner
 from lab.campaign.recordings import PAPER
 from lab.ground import experiment as ground
@@ -19,6 +19,7 @@ from lab.ground.experiment import GroundConfiguration
 from lab.positions import experiment as positions
 from lab.positions.configurations import Configuration
 from mapserver.calibration.tuning import TUNING as CALIBRATION
+from mapserver.trust.tuning import TUNING as TRUST
 from sitegrid.proof.figures import Report, Row, rounded
 
 BY = 0.3  # of a constant, both ways
@@ -107,26 +108,39 @@ def moved(stage: Stage, constant: str, whole: Row, both: tuple[Row, Row]) -> Row
     by = {name: [row[name] - whole[name] for row in both] for name in stage.intervals}
     beyond = [name for name, steps in by.items() if not max(map(abs, steps)) <= stage.intervals[name]]
     value = getattr(stage.tuning, constant)
-    return rounded({"constant": constant, "value": value, **by, "moves": " ".join(beyond)}, 3, value=6)
+    return {"constant": constant, "value": value, **rounded(by, 4), "moves": " ".join(beyond)}
 
 
 def _ground(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
-    rows = [VariedGround("kalman", "calibrated", variant=variant) for variant in some]
-    return ground.run(runner, seeds, seconds, rows)[0]["rows"]
+    varied_rows = [VariedGround("kalman", "calibrated", variant=variant) for variant in some]
+    rows: list[Row] = ground.run(runner, seeds, seconds, varied_rows)[0]["rows"]
+    return rows
 
 
 def _positions(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
-    rows = [VariedPositions("ukf", 2, 1, "default", variant=variant) for variant in some]
-    return positions.run(runner, seeds, seconds, rows, FAST)[0]["rows"]
+    varied_rows = [VariedPositions("ukf", 2, 1, "default", variant=variant) for variant in some]
+    rows: list[Row] = positions.run(runner, seeds, seconds, varied_rows, FAST)[0]["rows"]
+    return rows
 
 
 def _calibration(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
     """The map after calibration of three machines, whose samples are made once."""
-    cases = [case for case in CASES if case.name == "machines_3"]
-    reports = [calibration.run(runner, seeds, seconds, cases, varied(CALIBRATION, each))[0] for each in some]
+    reports = [calibration.run(runner, seeds, seconds, _cases("machines_3"), varied(CALIBRATION, v))[0] for v in some]
     return [row for report in reports for row in report["rows"] if row["map"] == "after"]
 
 
+def _trust(runner: Runner, seeds: Sequence[int], seconds: float, some: Sequence[Variant]) -> Sequence[Row]:
+    """How many machines are excluded: of four sound ones, and where one is bad or has a gain."""
+    cases = _cases(*EXCLUDED)
+    runs = [calibration.run(runner, seeds, seconds, cases, trust=varied(TRUST, variant))[1] for variant in some]
+    return [{case.name: sum(len(one.distrusted) for one in by_case[case]) for case in cases} for by_case in runs]
+
+
+def _cases(*names: str) -> list[FleetCase]:
+    return [case for case in CASES if case.name in names]
+
+
+EXCLUDED = ("machines_4", "bad_machine", "gain_1.6")
 STAGES = {
     "estimation": Stage(
         ESTIMATION,
@@ -145,4 +159,5 @@ STAGES = {
     "calibration": Stage(
         CALIBRATION, _calibration, {"wrong_pct": 0.3, "rms_zero": 1e-4, "rms_scale": 0.003, "normalised": 0.1}
     ),
+    "trust": Stage(TRUST, _trust, dict.fromkeys(EXCLUDED, 0.5)),
 }

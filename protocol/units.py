@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 GRAVITY_MPS2 = 9.80665  # standard gravity (ISO 80000-3)
 DIESEL_J_PER_L = 35.8e6  # lower heating value
+JOULE_PER_KWH = 3.6e6
 MINUTE_NS = 60 * 10**9
 HOUR_NS = 60 * MINUTE_NS
 DAY_NS = 24 * HOUR_NS

@@ -15,10 +15,11 @@ import numpy as np
 
 from protocol.arrays import Floats
 from protocol.errors import MessageError
+from protocol.units import HOUR_NS
 from protocol.wire.codec import decode_offer
 from protocol.wire.messages import CalibrationOffer
 
-TOO_OLD_NS = 3600 * 10**9  # by then a zero has moved by as much as it is unsure at first
+TOO_OLD_NS = HOUR_NS  # by then a zero has moved by as much as it is unsure at first
 AHEAD_NS = 600 * 10**9  # of the machine's clock: others may be ahead of it, but not by more than the server decides in
 WEIGHTS = np.linspace(0.0, 1.0, 101)
 

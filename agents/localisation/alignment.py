@@ -25,7 +25,6 @@ MAX_MISFIT = 2.5  # mean square of residuals over their variance; more, and a fi
 MIN_SCALE, MAX_SCALE = 0.8, 1.25  # of dead reckoning: wheels of another radius, and slow errors of GPS on a short way
 GIVEN_STD_M, GIVEN_STD_RAD = 0.5, 0.02  # of a start that is configured
 TO_COMPLEX = np.array([1.0, 1.0j])
-TINY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -71,13 +70,13 @@ def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Ali
     total, squares, sum_d, sum_f, product, d_d, f_f = (np.cumsum(c[::-1])[::-1] for c in columns)  # from each fix on
     product = product - sum_d.conj() * sum_f / total
     d_d, f_f = (d_d - abs(sum_d) ** 2 / total).real, (f_f - abs(sum_f) ** 2 / total).real
-    scale = np.clip(abs(product) / np.maximum(d_d, TINY), MIN_SCALE, MAX_SCALE)
+    scale = np.clip(abs(product) / np.maximum(d_d, 1e-9), MIN_SCALE, MAX_SCALE)
     residuals = np.maximum(f_f + scale**2 * d_d - 2 * scale * abs(product), 0.0)
     misfit = residuals / np.maximum(2.0 * np.arange(n, 0, -1) - 4, 1.0)
     fix_std_m, spread_m = np.sqrt(total / squares), np.sqrt(np.maximum(d_d, 0.0) / total)
     inflation = np.sqrt(np.where(misfit > MAX_MISFIT, misfit, 1.0))
-    std_rad = fix_std_m * inflation / (2 * np.maximum(spread_m, TINY))
-    shows = (spread_m >= SPREAD_M) & (total**2 / squares >= MIN_FIXES * (1 - TINY)) & (std_rad <= MAX_STD_RAD)
+    std_rad = fix_std_m * inflation / (2 * np.maximum(spread_m, 1e-9))
+    shows = (spread_m >= SPREAD_M) & (total**2 / squares >= MIN_FIXES * (1 - 1e-9)) & (std_rad <= MAX_STD_RAD)
     if misfit[0] <= MAX_MISFIT:
         shows[1:] = False
     if not shows.any():
@@ -87,7 +86,7 @@ def align(reckoned_m: Floats, fixes_m: Floats, variance_m2: Floats) -> tuple[Ali
     mean_d, mean_f = sum_d[first] / total[first], sum_f[first] / total[first]
     from_d, to_f = complex(*about_d) + mean_d, complex(*about_f) + mean_f
     origin = to_f - from_d * complex(math.cos(rotation), math.sin(rotation))
-    wheel_scale = float(d_d[first] / max(abs(product[first]), TINY)) - 1
+    wheel_scale = float(d_d[first] / max(abs(product[first]), 1e-9)) - 1
     place = (origin.real, origin.imag)
     return Alignment(rotation, float(std_rad[first]), place, float(fix_std_m[first]), wheel_scale), first
 

@@ -20,6 +20,8 @@ from lab.campaign.figures import judge
 from lab.campaign.goals import goals
 from lab.campaign.summary import column, mean, median, summary
 from mapserver.calibration.tuning import TUNING, CalibrationTuning
+from mapserver.trust.tuning import TUNING as TRUST
+from mapserver.trust.tuning import TrustTuning
 from sitegrid.proof.figures import Report, Row, root_mean_square, rounded
 
 LOADERS = 4  # of a drive of the paper's site with the usual sensors
@@ -32,6 +34,7 @@ def run(
     seconds: float,
     cases: Sequence[FleetCase] = CASES,
     tuning: CalibrationTuning = TUNING,
+    trust: TrustTuning = TRUST,
 ) -> tuple[Report, dict[FleetCase, list[CaseResult]]]:
     """Record, replay, calibrate and judge all cases with all seeds; a row per case and map, means over the seeds."""
     wanted = {
@@ -49,7 +52,7 @@ def run(
             true = scene(drive, runner.cache)
             names = sorted(true.tracks)
             rows = {names[agent.index]: samples[drive, agent].samples for agent in _agents(case, drive)}
-            results[case].append(solved(case, rows, true, tuning))
+            results[case].append(solved(case, rows, true, tuning, trust))
     table = [row_of(case.name, name, of_case) for case, of_case in results.items() for name in MAPS]
     known = [goal for goal in goals("calibration") if goal.row["case"] in {case.name for case in cases}]
     return {"seeds": list(seeds), "seconds": seconds, "rows": table, "goals": judge(known, table)}, results

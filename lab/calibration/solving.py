@@ -21,6 +21,8 @@ from mapserver.calibration.tuning import TUNING, CalibrationTuning
 from mapserver.config import ServerConfig
 from mapserver.evidence.fold_config import is_foldable
 from mapserver.trust.auditor import Auditor
+from mapserver.trust.tuning import TUNING as TRUST
+from mapserver.trust.tuning import TrustTuning
 from protocol.arrays import AnyArray, Bools, Floats, Floats32, Ints, Table
 from protocol.machine.samples import SCALE_STD, ZERO_STD
 from protocol.site.ground_classes import SLOPE, UNKNOWN, resistance_class, slope_class, wrong_percent
@@ -60,11 +62,17 @@ class CaseResult:
     distrusted: Mapping[str, str]
 
 
-def solved(case: FleetCase, recorded: Rows, true: Scene, tuning: CalibrationTuning = TUNING) -> CaseResult:
+def solved(
+    case: FleetCase,
+    recorded: Rows,
+    true: Scene,
+    tuning: CalibrationTuning = TUNING,
+    trust: TrustTuning = TRUST,
+) -> CaseResult:
     """Calibrate a case's samples, and judge its maps."""
     data = tampered(case, recorded, true)
     names = sorted(data.rows)
-    distrusted = accused(data.rows, calibrated(data.rows, tuning=tuning))
+    distrusted = accused(data.rows, calibrated(data.rows, tuning=tuning), trust)
     result = calibrated(data.rows, set(distrusted), tuning)
     let_in = {names[index] for index in case.let_in}
     shown = [name for name in names if name in let_in or name not in distrusted]
@@ -96,9 +104,9 @@ def of_machine(result: Solution, name: str) -> list[Correction]:
     return [each for each in result.corrections if each.machine == name]
 
 
-def accused(rows: Rows, result: Solution) -> dict[str, str]:
+def accused(rows: Rows, result: Solution, tuning: TrustTuning = TRUST) -> dict[str, str]:
     """Machines that the server's trust excludes, and why: it judges corrected samples, which come in turn."""
-    auditor = Auditor(CELL_M)
+    auditor = Auditor(CELL_M, tuning=tuning)
     right = {name: corrected(table, of_machine(result, name)) for name, table in rows.items()}
     for first in range(0, max(map(len, right.values())), BATCH):
         for name, table in sorted(right.items()):

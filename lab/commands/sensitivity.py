@@ -14,7 +14,7 @@ EXTRA = "lab"
 def add_options(parser: ArgumentParser) -> None:
     """Options of the command."""
     add_runs(parser, 600.0)
-    stages = ("estimation", "localisation", "calibration")
+    stages = ("estimation", "localisation", "calibration", "trust")
     parser.add_argument("--stage", choices=stages, default=stages[0], help="whose constants (default %(default)s)")
 
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from agents.localisation.lanes.lane_map import DAY_NS, LaneMap
+from agents.localisation.lanes.lane_map import LaneMap
 from lab.fedback.days import free_ways
 from lab.fedback.rerun import Maps
 from mapserver.config import ServerConfig
@@ -18,6 +18,7 @@ from mapserver.query.views import read_lanes, view_of
 from protocol.arrays import Floats, Table
 from protocol.machine.samples import empty
 from protocol.site.geometry import CellWindow
+from protocol.units import DAY_NS
 from sim.operators.routes import tour
 
 Rows = Sequence[tuple[str, Table]]  # samples by machine

@@ -31,15 +31,16 @@ from mapserver.calibration.decision import PERSON, SOLVER, CalibrationDecision
 from mapserver.calibration.ledger import EPOCH_NS, NOTHING_STATED, Stated
 from mapserver.calibration.select import FAULT_SIGMAS, state_of
 from mapserver.calibration.tuning import TUNING
+from protocol.units import HOUR_NS, MINUTE_NS
 
 # Between two decisions of the solver, each of which folds samples again; in a machine's first minutes, when there is
-EVERY_NS = 600 * 10**9  # little to fold, as soon as it has driven twice as long as at the last decision
+EVERY_NS = 10 * MINUTE_NS  # little to fold, as soon as it has driven twice as long as at the last decision
 IN_A_ROW = 2  # solves that have to differ from what counts; one, of a new machine of which nothing counts
 LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better
 LEAST_ROLLS, TYPICAL_C_RR = 0.04, 0.04  # two deviations at best of how a machine rolls, and the ground it is judged on
-FIRST_NS = 600 * 10**9  # so long after it was first seen, a machine's map is new
-FROZEN_NS = 4 * 3600 * 10**9  # so long after it was first seen, an epoch keeps its zero
-MOST_STEP_NS = 600 * 10**9  # of site time between two judgements: more is a jump, of a wrong clock or at night
+FIRST_NS = 10 * MINUTE_NS  # so long after it was first seen, a machine's map is new
+FROZEN_NS = 4 * HOUR_NS  # so long after it was first seen, an epoch keeps its zero
+MOST_STEP_NS = 10 * MINUTE_NS  # of site time between two judgements: more is a jump, of a wrong clock or at night
 
 
 class CalibrationDecisions:

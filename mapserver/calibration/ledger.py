@@ -15,11 +15,11 @@ from mapserver.calibration.stays import SLOT_NS, SLOT_SHIFT, STAY, VALUE_UNITS, 
 from protocol.arrays import Ints, Table
 from protocol.machine.samples import APPLIED, SAMPLE_DTYPE
 
-CELL_M = 2.0  # about one standard deviation of a position
+CELL_M = 2.0  # about one standard deviation of a position: finer cells would compare single samples
 EPOCH_SLOTS = 30  # 300 s, the length of the map's time buckets
 EPOCH_NS = EPOCH_SLOTS * SLOT_NS
 EPOCHS = 48  # that are remembered: 4 h of driving; older corrections stay as they were decided
-_PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
+PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
 
 
 class StayLedger:
@@ -46,7 +46,7 @@ class StayLedger:
         new = stays(rows, self._cell_m)
         self._pending.append(new)
         self._waiting += len(new)
-        if self._waiting > max(_PENDING_ROWS, len(self._stays) // 4):
+        if self._waiting > max(PENDING_ROWS, len(self._stays) // 4):
             self._merge()
 
     @property

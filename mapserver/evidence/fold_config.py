@@ -13,8 +13,9 @@ import numpy as np
 
 from mapserver.evidence import cells as ev
 from protocol.arrays import Bools, Floats, Ints, Table
+from protocol.units import MINUTE_NS
 
-VISIT_NS = 60_000_000_000  # one machine's passes within a minute are one visit
+VISIT_NS = MINUTE_NS  # one machine's passes within a minute are one visit
 HASH = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: multiplied by it, the top bits of a number are well mixed
 
 # exp(-d2 / 2) in 1/65536 over squared Mahalanobis distance, up to 3 sigma, and 0 beyond: a table is 3.7 times faster

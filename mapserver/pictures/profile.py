@@ -12,12 +12,12 @@ from mapserver.pictures.plotter import DrawnTrack, draw_resistance
 from protocol.arrays import Floats
 from protocol.queries.answers import Region
 from protocol.queries.routing import RouteAnswer, RouteTotals
+from protocol.units import JOULE_PER_KWH
 
 CHART_PX, GAP_PX, LEAST_WIDTH_PX = 110, 34, 640
 GRID: Colour = (225, 225, 225)
 UNKNOWN: Colour = (228, 228, 228)  # as on the map
 LINE: Colour = (180, 90, 20)
-JOULE_PER_KWH = 3.6e6
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,13 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries.places import Place
 from protocol.site.geometry import CellWindow
 
-SLACK = 1e-9  # as a share: a resolution in floating point that is a multiple of the cell's is one
-
 
 def cells_to_a_side(resolution_m: float | None, cell_m: float) -> int:
     """How many cells of the map a larger one has to a side; QueryError where they do not divide it."""
     if resolution_m is None:
         return 1
     count = round(resolution_m / cell_m)
-    if count < 1 or abs(resolution_m - count * cell_m) > SLACK * resolution_m:
+    if count < 1 or abs(resolution_m - count * cell_m) > 1e-9 * resolution_m:
         problem = f"parameter `resolution`: {resolution_m:g} m is no multiple of the cell's {cell_m:g} m"
         raise QueryError(Refusal.OUT_OF_RANGE, problem)
     return count

@@ -16,9 +16,10 @@ from protocol.arrays import Table
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.queries.routing import LOADER, MACHINES, NamedMachine, RouteMachine
+from protocol.units import HOUR_NS, MINUTE_NS
 
-LOOK_BACK_NS = 3600 * 10**9  # before the time that is asked about: what a machine weighed earlier says nothing
-SLOT_NS = 600 * 10**9  # a machine's fastest sample is remembered for so long a time each
+LOOK_BACK_NS = HOUR_NS  # before the time that is asked about: what a machine weighed earlier says nothing
+SLOT_NS = 10 * MINUTE_NS  # a machine's fastest sample is remembered for so long a time each
 PACE_MPS = 1.0  # who drove no faster in an hour stood about: that is not how it drives
 MOST_SHOWN = 8  # names in a refusal
 

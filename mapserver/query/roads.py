@@ -21,12 +21,11 @@ from protocol.errors import QueryError, Refusal
 from protocol.queries import roads as answers
 from protocol.queries.roads import RoadQuery, SegmentsQuery, WorklistQuery
 from protocol.site.geometry import Bounds
-from protocol.units import DAY_NS, HOUR_NS
+from protocol.units import DAY_NS, HOUR_NS, JOULE_PER_KWH
 
 MOST_SEGMENTS = 10_000  # of one answer: 250 km of roads, 3 MB
 MOST_CHANGES = 1000  # of one worklist, the newest
 LINE_POINTS = 5  # a point of a line is a metre from the next; one in so many is told
-KWH = 3.6e6  # J
 Read = Callable[[int | None, str], RoadMap]  # as of a time, with the traffic of one machine: as `RoadMaps.read`
 
 
@@ -45,7 +44,7 @@ def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
     """Where work pays."""
     roads, traffic, hours = _read(read, query)
     lost, saved_j = _lost(roads, traffic, query.target), _saved_j(roads, traffic, query.target)
-    saved_kwh_ph = {change: joules / max(hours, 1e-9) / KWH for change, joules in saved_j.items()}
+    saved_kwh_ph = {change: joules / max(hours, 1e-9) / JOULE_PER_KWH for change, joules in saved_j.items()}
     rows = _Rows(_Records(roads, traffic, lost, hours), roads, daily(traffic), saved_kwh_ph, query.efficiency)
     listed, inside = ranked(lost), _inside(roads.segments, query.bounds)
     ranks = [(i, rank) for i, rank in zip(listed.order.tolist(), listed.rank.tolist(), strict=True) if i in inside]
@@ -54,7 +53,7 @@ def worklist(read: Read, query: WorklistQuery) -> answers.Worklist:
         *_version(roads),
         hours,
         query.target,
-        float(lost.work_j[sorted(inside)].sum() / max(hours, 1e-9) / KWH),
+        float(lost.work_j[sorted(inside)].sum() / max(hours, 1e-9) / JOULE_PER_KWH),
         tuple(rows.row(i, rank) for i, rank in ranks[: query.limit]),
         tuple(map(rows.change, changes[:MOST_CHANGES])),
     )
@@ -174,7 +173,7 @@ class _Rows:
     def row(self, i: int, rank: int) -> answers.WorklistRow:
         """A row of this rank."""
         work, change = self._work[:, i], self._last.get(i)
-        kwh, of_diesel, of_driving = work / KWH, litres(work, self._efficiency), seconds(work, self._kg[i])
+        kwh, of_diesel, of_driving = work / JOULE_PER_KWH, litres(work, self._efficiency), seconds(work, self._kg[i])
         days = slice(*np.searchsorted(self._days.segment, [i, i + 1]).tolist())
         return answers.WorklistRow(
             rank,

@@ -14,9 +14,9 @@ from functools import cached_property
 
 import numpy as np
 
+from mapserver.calibration.ledger import CELL_M, PENDING_ROWS
 from protocol.arrays import Floats, Ints, Table
 
-CELL_M = 2.0  # about one standard deviation of a position: finer cells would compare single samples
 PERIOD_S = 1800.0  # only cells driven in the same period are compared: rain and repaving are no contradiction
 PERIODS = 16  # that are remembered; a repaired machine is cleared when most of them are good
 UNITS_PER_M = 1024
@@ -30,7 +30,6 @@ _HALF = 1 << (_AXIS_BITS - 1)
 ROW = 1 << _AXIS_BITS  # one cell further north, in codes; one cell further east is 1
 _PERIOD_SHIFT = 2 * _AXIS_BITS
 _VARIANCE_UNITS = 1024  # per m2
-_PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
 _METRES, _LEVEL = 0, 1
 
 
@@ -125,7 +124,7 @@ class CoarseMap:
         self._metres += int(metres.sum())
         self._pending.append(((rows["stamp_ns"] // round(PERIOD_S * 1e9) << _PERIOD_SHIFT) + row * ROW + column, sums))
         self._waiting += len(rows)
-        if self._waiting > max(_PENDING_ROWS, len(self._codes) // 4):
+        if self._waiting > max(PENDING_ROWS, len(self._codes) // 4):
             self._merge()
 
     def surface(self) -> Surface:

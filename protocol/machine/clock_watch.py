@@ -8,10 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from protocol.units import HOUR_NS
+
 GAP_NS = 5_000_000_000  # a stamp that is further ahead is a pause, a clock that was set, or astray
 STEADY_NS = 1_000_000_000  # stamps ahead that go on for longer, with none of before among them, are no error of one row
 LATE_LIMIT = 200  # so many more stamps behind than in order are a clock that was set back, not a late sensor
-LONG_NS = 12 * 3600 * 10**9  # no recording pauses for longer: the rows at one side of such a break are astray
+LONG_NS = 12 * HOUR_NS  # no recording pauses for longer: the rows at one side of such a break are astray
 MOST_RUNS = 8  # that are weighed at a time: a file without any order has no end of them
 
 Item = TypeVar("Item")

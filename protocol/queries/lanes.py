@@ -25,7 +25,6 @@ SCALE_M = Scale("log", 0.1, 100.0)  # metres driven in 8 bits: a step is 2.8 %
 MOST_TILES = 16_384  # of one answer: 4 km2 of driven ground with cells of 1 m
 MAX_LANES_BYTES = 2**26
 MOST = 2**31 - 1  # of a place, and of passes
-LEVEL = 6  # of deflate
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ def encode_lanes(answer: LanesAnswer) -> bytes:
     metres = b"".join(tile.metres.tobytes() for tile in tiles)
     table = {"store": version.store, "row": version.row, "fact": version.fact, "stamp_ns": answer.stamp_ns}
     head = {"cell_m": answer.cell_m, "n": len(tiles), "cols": columns}
-    return pack({**table, **head, "metres": zlib.compress(metres, LEVEL)})
+    return pack({**table, **head, "metres": zlib.compress(metres)})
 
 
 def decode_lanes(data: bytes) -> LanesAnswer:

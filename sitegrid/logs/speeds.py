@@ -10,13 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from agents.clock_offsets import DRIVES_MPS
 from protocol.arrays import Floats
 from protocol.machine.machine_config import MachineConfig
 from protocol.machine.readings import Encoder, Gps, Odometry, Reading
 from protocol.site.site_config import Projection, SiteConfig
 
 STEP_S, WINDOW_S = 0.2, 3.0
-STANDS_MPS, DRIVES_MPS = 0.05, 0.7  # wheels that stand; fixes that move by more than their noise
+STANDS_MPS = 0.05  # of wheels
 
 
 def wheel_share(fixes: tuple[Floats, Floats], wheels: tuple[Floats, Floats]) -> float:

@@ -12,6 +12,7 @@ from typing import Any
 
 import zenoh
 
+from agents.drivers.replay import SPAN_NS
 from protocol.errors import LinkError, MessageError, QueryError, Refusal
 from protocol.machine.readings import Reading
 from protocol.machine.recorded_readings import RecordedReading
@@ -23,7 +24,6 @@ from protocol.wire.codec import decode_batch, decode_health, decode_reply, encod
 from protocol.wire.messages import Ack, Refused
 from sitegrid.health import number_of
 
-SPAN_NS = 50_000_000  # of a bundle, as the simulator sends them
 MOST_READINGS = 1000  # of a bundle: 100 kB
 MOST_AHEAD = 2000  # bundles that an agent has not taken yet; half of what it keeps in its queue
 SILENT_S = 30.0  # without an agent, or with one that takes nothing

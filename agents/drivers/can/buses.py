@@ -8,9 +8,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from agents.drivers.transports import TOGETHER_S
+
 SOCKETCAN, VIRTUAL, MULTICAST = "socketcan", "virtual", "udp_multicast"  # as python-can calls its interfaces
 RECORDINGS = (".candump", ".log", ".asc", ".blf", ".mf4", ".trc")
-TOGETHER_S = 0.02  # frames of so long are read at once: to wake up costs more than a frame; each has its own time
 MOST_FRAMES = 2000  # read at once: a full bus of 500 kbit/s has 80 in that time
 BUS_OFF = 0x40  # class of an error frame of SocketCAN
 MOST_LATE_S = 1.0  # from a frame's stamp to its reading: more is another clock, or one that was set

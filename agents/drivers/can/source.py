@@ -9,12 +9,11 @@ from itertools import islice
 
 from agents.drivers import Observed
 from agents.drivers.can.buses import Bus, CanFrame, read_recording, why_shut
-from agents.drivers.can.line import CanLine
+from agents.drivers.can.line import SILENT_NS, CanLine
 
 log = logging.getLogger("agents.drivers")
 
 RETRY_NS = 10**9  # between two tries to open
-SILENT_NS = 5 * 10**9  # without a frame
 SILENT = "the bus is silent: is the ignition on, the cable in, the bit rate right?"
 TOGETHER = 500  # frames of a recording that are handed on at once
 

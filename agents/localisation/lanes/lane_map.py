@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from protocol.arrays import Floats, Ints
 from protocol.queries.lanes import SCALE_M, SECTORS, LaneTile
 from protocol.site.geometry import BLOCK_CELLS
+from protocol.units import DAY_NS
 
 METRES = np.nan_to_num(SCALE_M.values())  # of all steps
-DAY_NS = 86_400 * 10**9
 BESIDE = 0.7  # how much a pass in a neighbouring sector of heading counts
 
 

@@ -18,7 +18,6 @@ STANDS = 0.1  # of the way by fixes: wheels that roll less stand
 HALF = 0.625  # ratio of ways, or its inverse, beyond which they differ by more than slip and tyres make
 OPPOSED = 0.5  # cosine of an angle: beyond its negative, directions are opposite
 LEARNS = 0.2  # share of a stretch in the usual ratio
-TINY = 1e-9
 HEADED_NS = 60 * 10**9  # for so long a gyro keeps a direction to half a radian, even one off by 0.5 degrees per second
 
 
@@ -81,7 +80,7 @@ class Run:
             return Kind.STANDS
         if self.along_m2 < -OPPOSED * self.fixes_m * self.wheels_m / self.count:
             return Kind.OPPOSITE
-        ratio = self.fixes_m / max(self.wheels_m, TINY)
+        ratio = self.fixes_m / max(self.wheels_m, 1e-9)
         return Kind.SLIPS if ratio < HALF else Kind.LAGS if ratio > 1 / HALF else Kind.UNCLEAR
 
 

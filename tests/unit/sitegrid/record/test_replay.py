@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from agents.drivers.replay import SPAN_NS
 from protocol.errors import LinkError
 from protocol.machine.readings import Reading, parse_reading
 from protocol.machine.recorded_readings import RecordedReading
@@ -16,7 +17,7 @@ from protocol.wire.codec import decode_bundle, encode_batch, encode_bundle
 from protocol.wire.messages import SampleBatch, SensorBundle
 from protocol.wire.session import SessionConfig, free_endpoint, open_session
 from sitegrid.record import replay
-from sitegrid.record.replay import MOST_READINGS, SPAN_NS, Agents, SampleSender, bundles
+from sitegrid.record.replay import MOST_READINGS, Agents, SampleSender, bundles
 
 SEED = 11
 SENSORS = {"imu": ("torque", 1), "wheels": ("encoder", 2), "pole": ("articulation", 1)}
