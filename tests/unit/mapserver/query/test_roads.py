@@ -14,6 +14,7 @@ from mapserver.journal.facts import Facts
 from mapserver.journal.location import JournalLocation
 from mapserver.query import road_maps
 from mapserver.query.answering import ROADS_MADE, Answers
+from mapserver.query.block_layers import BlockLayers
 from mapserver.query.map_tiles import Tiles
 from mapserver.query.road_maps import ASKED_S, FRESH_S, RoadMaps
 from protocol.errors import QueryError, Refusal, StoreError
@@ -293,10 +294,14 @@ def test_a_route_is_of_the_road_as_it_is_since_its_repair(repaired):
     assert cheapest.totals.energy_j == pytest.approx(since.totals.energy_j, rel=0.05)
 
 
+def layers_of(source):
+    return BlockLayers(source.site.cell_m, source.config)
+
+
 def test_tiles_show_a_repair_with_the_next_row(repaired):
     opened, _ = repaired
     source, ages = source_of(opened), {}
-    tiles = Tiles(source, lambda: dict(ages))
+    tiles = Tiles(source, layers_of(source), lambda: dict(ages))
     first = tiles.answer(TilesQuery())
     ages |= RoadMaps(source).read().ages
     assert tiles.answer(TilesQuery(first.version)).tiles == (), "who has this row would not ask for it"
@@ -307,7 +312,7 @@ def test_tiles_show_a_repair_with_the_next_row(repaired):
     resistance = PLANES["resistance"].values()
     assert resistance[before[0, 0].unpacked()["resistance"]][row].max() > 0.03
     assert resistance[later[0, 0].unpacked()["resistance"]][row] == pytest.approx(0.02, rel=0.2)
-    fresh = Tiles(source, lambda: dict(ages)).answer(TilesQuery())
+    fresh = Tiles(source, layers_of(source), lambda: dict(ages)).answer(TilesQuery())
     assert {(tile.x, tile.y): tile.planes for tile in fresh.tiles}[0, 0] == later[0, 0].planes
 
 
