@@ -31,7 +31,7 @@ def run(arguments: Namespace) -> int:
         raise ConfigError("--picture", "is of the case driven-lost: add it to --cases")
 
     def work(runner: Runner) -> tuple[Report, Any]:
-        report, courses = experiment.run(runner, seeds, arguments.seconds, cases)
+        report, courses = experiment.run(runner, seeds=seeds, seconds=arguments.seconds, cases=cases)
         if arguments.picture:
             from lab.fedback.picture import draw  # imported here: only pictures need matplotlib
 
