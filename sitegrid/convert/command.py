@@ -136,9 +136,9 @@ def open_recording(file: Path) -> Recording:
     is_folder = (file / "metadata.yaml").is_file()
     if not is_folder and not file.is_file():
         raise LogFolderError(file, "is neither a file nor the folder of a bag of ROS 2, with metadata.yaml")
-    if is_recording(file.name):
-        return BusRecording(file)
     head = b"" if is_folder else _head(file)
+    if is_recording(file.name) and (file.suffix != ".log" or head.startswith(b"(")):  # receivers have .log, too
+        return BusRecording(file)
     if head.startswith(MCAP) and b"ros2" not in head[:40]:
         raise LogFolderError(file, "is an MCAP file, but not of ROS 2")
     if is_folder or head.startswith((BAG, MCAP, SQLITE)):

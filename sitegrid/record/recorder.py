@@ -122,6 +122,7 @@ class SiteRecorder:
                 if time.monotonic() >= due_s:
                     due_s = time.monotonic() + SECOND_S
                     self._tend()
+            self._tend()  # samples that came since
 
     def counts(self) -> dict[str, int]:
         """Messages by what they are."""

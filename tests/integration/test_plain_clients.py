@@ -34,7 +34,8 @@ pytestmark = pytest.mark.processes
 SENDER = ROOT / "tests" / "clients" / "plain_sender.py"
 SITE, SAMPLES, KILLS = "lot", 1200, 5
 MACHINES = ("digger-1", "digger-2")
-SAMPLE = struct.Struct(f"{plain_sender.ROW}fff")  # and a calibration, none, and a mass, NaN, as nothing is stated
+# And what is not stated: no calibration, mass NaN, no aid of lanes, fuel NaN.
+SAMPLE = struct.Struct(f"{plain_sender.ROW}fffff")
 HEAD = struct.Struct("<qqQqB")
 
 
@@ -120,8 +121,10 @@ def journal(store: Path) -> Counter[tuple[str, int, int, int]]:
             machine = record[HEAD.size : begin].decode()
             for i, sample in enumerate(SAMPLE.iter_unpack(record[begin:-4])):
                 counts[machine, run, first + i, sample[0]] += 1
-                assert sample[-3:-1] == (0.0, 0.0)
-                assert math.isnan(sample[-1])
+                applied_zero, applied_scale, mass_kg, aid_share, fuel_l = sample[-5:]
+                assert (applied_zero, applied_scale, aid_share) == (0.0, 0.0, 0.0)
+                assert math.isnan(mass_kg)
+                assert math.isnan(fuel_l)
     return counts
 
 

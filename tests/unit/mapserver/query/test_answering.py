@@ -88,7 +88,7 @@ TOO_MUCH = [
 @pytest.mark.parametrize("query", TOO_MUCH)
 def test_what_reads_too_much_known_ground_is_refused_before_it_is_read(answers, query, monkeypatch):
     monkeypatch.setattr("mapserver.query.views.MOST_BLOCKS", 3)
-    monkeypatch.setattr("mapserver.query.block_layers.BlockLayers._cells_of", None)
+    monkeypatch.setattr("mapserver.query.block_layers.BlockLayers.blocks", None)
     monkeypatch.setattr("mapserver.past.past.StorePast.grid_as_of", None)
     with refused(Refusal.TOO_LARGE, "blocks .* of known ground, over 3: .*ask for"):
         answers.answer(query)

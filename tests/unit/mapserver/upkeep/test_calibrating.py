@@ -287,7 +287,7 @@ def test_one_clock_that_was_ahead_does_not_stop_the_calibration_of_the_site(tmp_
 def test_what_a_clock_stamped_that_was_ahead_has_no_part_in_a_solve(tmp_path, monkeypatch):
     """A machine drives with a clock that is 20 h ahead, and then with one that is right, in both for some epochs."""
     monkeypatch.setattr(solving, "MOST_EPOCHS", 1)
-    monkeypatch.setattr("mapserver.calibration.ledger._PENDING_ROWS", 10)
+    monkeypatch.setattr("mapserver.calibration.ledger.PENDING_ROWS", 10)
     with closing(open_writer(tmp_path)) as writer:
         job, _ = calibrating(writer)
         with closing(job):

@@ -23,6 +23,7 @@ from agents.delivery.spool import Spool, SpoolConfig
 from mapserver.config import ServerConfig
 from mapserver.ingest.store import Incoming, Store
 from mapserver.journal.location import JournalLocation
+from mapserver.journal.sqlite.reader import SCHEMA
 from mapserver.server import Server
 from protocol.errors import Refusal, StoreError
 from protocol.machine.samples import empty
@@ -308,7 +309,7 @@ def test_a_store_is_read_also_while_a_server_uses_it(tmp_path: Path):
     filled_store(tmp_path)
     with closing(Store(JournalLocation(tmp_path), SITE, ServerConfig(), time.time_ns)):
         state = disk.read_store(tmp_path, time.time() + 100)
-    assert state == StoreState("pit", SITE.frame, 6, 2, 0, 1, 1, state.snapshot_age_s)
+    assert state == StoreState("pit", SITE.frame, SCHEMA, 2, 0, 1, 1, state.snapshot_age_s)
     assert 99 < state.snapshot_age_s < 160
 
 
