@@ -26,6 +26,7 @@ def test_each_name_resolves_to_this_project(name: str, root: Path):
 def test_it_is_never_uploaded_and_the_readme_names_its_extras(root: Path):
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
     assert "Private :: Do Not Upload" in project["classifiers"]
+    assert f"\nversion: {project['version']}\n" in (root / "CITATION.cff").read_text()
     readme = (root / "README.md").read_text()
     assert all(f"`.[{extra}]`" in readme for extra in project["optional-dependencies"])
     assert all(project["optional-dependencies"].values()), "none is empty"
