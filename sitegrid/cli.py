@@ -21,7 +21,9 @@ def main(words: Sequence[str] | None = None) -> int:
     # Linear algebra here is small, or in the background of something that must not wait: it gets no more than one core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is loaded
     from sitegrid.command_line import run
+    from sitegrid.process.kernels import drop_stale
 
+    drop_stale()
     return run(sys.argv[1:] if words is None else words)
 
 

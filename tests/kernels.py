@@ -19,6 +19,7 @@ from mapserver.ingest import batches, block_credit
 from mapserver.journal import records
 from mapserver.query import road_maps, routes
 from sim.worlds import fast
+from sitegrid.process.kernels import drop_stale
 from tests.unit.mapserver.data import NOW_NS, folded, samples
 from tests.unit.sim.planes import LOADER, idle, placed, plane
 
@@ -53,6 +54,7 @@ PARTS: tuple[tuple[ModuleType, bool, Callable[[], object]], ...] = (
 
 def compile_all(*, from_the_end: bool) -> None:
     """Compile all kernels that a process of tests calls, or read them."""
+    drop_stale()
     for module, folds, compile_part in reversed(PARTS) if from_the_end else PARTS:
         if folds:
             _alone(fold_kernels, pages)
