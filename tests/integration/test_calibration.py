@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -152,26 +151,6 @@ def test_after_an_accident_the_next_start_has_the_fact_in_its_map(
     server.stop()
     with stored(site.folder / "store", site) as store:
         assert same(store.grid, folded(site, by_person("a"), DRIVES))
-
-
-@pytest.mark.nightly
-def test_a_fact_of_another_version_keeps_the_server_from_starting_in_one_line(site: SiteRun):
-    server = serve(site)
-    with site.connect() as client:
-        client.info(after=Senders(site, client).send(DRIVES))
-    server.stop()
-    config, path = load_site(site.site_file), site.folder / "store" / JOURNAL_FILE
-    decision = CalibrationDecision("a", PERSON, "why", 1, by_person("a").each)
-    with closing(SqliteJournal(path, config.name, config.frame)) as journal:
-        journal.append_event("calibration", 1, decision.body() | {"version": 2})
-    words = ("--site-file", site.site_file, "--store", site.folder / "store")
-    refused = said("server", "--endpoint", site.endpoint, *words)
-    assert refused.code == 1
-    (line,) = refused.err.strip().splitlines()
-    assert "has a correction of version 2, this program knows 1" in line
-    assert said("fold", site.folder / "store", "--out", site.folder / "new").code == 1
-    with closing(sqlite3.connect(path)) as database:
-        assert database.execute("SELECT COUNT(*) FROM events").fetchone() == (1,), "it is still there"
 
 
 @pytest.mark.nightly
