@@ -237,8 +237,7 @@ def test_a_link_opens_the_same_drive(tab: Tab, browser, cheapest: bool):
         tab.until(f"sitegrid.route.cost === 'time' && {QUIET}")
     tab.page.locator("#machine").select_option("empty_truck")
     set_places(tab, (20, 10), (120, 10))
-    tab.until("location.search.includes('line=')")
-    tab.drawn()
+    tab.until("new URLSearchParams(location.search).get('line')?.includes(';')")  # the address follows, at rest
     other = Tab(browser, tab.page.url).loaded()
     other.until(f"sitegrid.panel.name === 'route' && {QUIET} && sitegrid.route.answer !== null")
     assert other.page.locator("#panel .totals").inner_text() == panel.locator(".totals").inner_text()
