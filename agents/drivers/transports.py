@@ -69,7 +69,7 @@ def open_transport(address: str, baud: int) -> Transport:
     try:
         import serial  # of the extra `receivers`
     except ImportError:
-        raise OSError(errno.ENOPKG, "pyserial is not installed: pip install 'sitegrid[receivers]'") from None
+        raise OSError(errno.ENOPKG, "pyserial is not installed: pip install '.[receivers]'") from None
     port = serial.Serial(address, baud, timeout=0, exclusive=True)
     return Transport(port, byte_ns=BITS * 1e9 / baud if WIRED.search(str(path.resolve())) else 0.0)
 

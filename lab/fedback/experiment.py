@@ -14,7 +14,7 @@ import numpy as np
 from lab.campaign.experiment import Runner, replay_task
 from lab.campaign.figures import judge
 from lab.campaign.goals import goals
-from lab.fedback.blackout import AT_S, Courses, courses_of, row_of
+from lab.fedback.blackout import AT_S, INSIDE, Courses, courses_of, row_of
 from lab.fedback.days import day
 from lab.fedback.maps import GROWING, MAPS, READ_S, Rows, Scene, days_ago, lane_map
 from lab.fedback.nodes import EXPERIMENT, Machine, Nodes
@@ -24,7 +24,6 @@ from protocol.errors import ConfigError
 from sitegrid.proof.figures import Report, Row, rounded
 
 SETTLED_S = 60.0  # judged is what comes after
-INSIDE = 5.991  # normalised error squared of the 95 % ellipse
 REPEATED = ("loading", "haul", "two", "both", "crossings", "free")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -10,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 
 from agents.localisation.lanes.lane_map import METRES, LaneMap
-from lab.fedback.blackout import LASTS_S, Errors
+from lab.fedback.blackout import INSIDE, LASTS_S, Errors
 from protocol.arrays import Floats
 from protocol.site.geometry import BLOCK_CELLS
 
-SIGMAS_95 = 2.448  # of an ellipse that holds 95 % of a normal distribution in the plane
+SIGMAS_95 = math.sqrt(INSIDE)  # half axes of the 95 % ellipse
 EVERY_S = 20  # an ellipse so often
 MARGIN_M, DARK_M = 12.0, 4.0  # around the way; metres driven that are drawn black
 WITH, WITHOUT = "#0072b2", "#d55e00"

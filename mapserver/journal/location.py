@@ -126,6 +126,6 @@ def _postgres() -> Any:
         from mapserver.journal import postgres
         from mapserver.journal.postgres import connection, journal, mark, reader  # noqa: F401
     except ImportError as error:
-        advice = "a journal in PostgreSQL needs psycopg: pip install 'sitegrid[postgres]'"
+        advice = "a journal in PostgreSQL needs psycopg: pip install '.[postgres]'"
         raise ConfigError("--journal", f"{advice} ({one_line(str(error))})") from None
     return postgres

@@ -99,5 +99,5 @@ class Tail:
 
 
 def _is_other(there: int | None, known: int | None) -> bool:
-    """Whether two checksums of one number are known, and differ: the journal went another course."""
+    """Whether two checksums of one number are known, and differ: the journal has diverged."""
     return None not in (there, known) and there != known

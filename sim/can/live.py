@@ -29,7 +29,7 @@ class Buses:
         try:
             import can  # of the extra `can`
         except ImportError:
-            raise ConfigError(first, "python-can is not installed: pip install 'sitegrid[can]'") from None
+            raise ConfigError(first, "python-can is not installed: pip install '.[can]'") from None
         self._can: Any = can
         for index, machine in enumerate(machines):
             address = address_of(first, index)

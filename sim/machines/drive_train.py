@@ -25,7 +25,7 @@ SHIFT_STEPS = round(0.6 / STEP_S)  # a change of gears under load
 HELD_STEPS = round(2.0 / STEP_S)  # from one change to the next
 STANDS_RADPS = 0.03  # wheels that turn slower show no direction
 LOCKS = 1.25  # times the idle speed: the converter is locked from there on
-BRAKES_FROM = 0.02  # of the weight that brakes are built for: less is not felt at the pedal
+BRAKES_FROM = 0.02  # of the engine's full torque at the wheels: less is not felt at the pedal; assumed
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ def _can() -> Any:
     try:
         import can  # of the extra `can`
     except ImportError:
-        raise OSError(errno.ENOPKG, "python-can is not installed: pip install 'sitegrid[can]'") from None
+        raise OSError(errno.ENOPKG, "python-can is not installed: pip install '.[can]'") from None
     return can
 
 

@@ -92,7 +92,7 @@ def _load(path: str) -> tuple[Any, type[Exception]]:
     try:
         import cantools  # of the extra `can`
     except ImportError:
-        raise ValueError("dbc: cantools is not installed: pip install 'sitegrid[can]'") from None
+        raise ValueError("dbc: cantools is not installed: pip install '.[can]'") from None
     try:
         return cantools.database.load_file(Path(path), strict=False), cantools.Error
     except (OSError, ValueError, cantools.Error) as error:
