@@ -85,7 +85,7 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "psycopg", None)
     for name in ("connection", "journal", "mark", "reader"):
         monkeypatch.delattr(f"mapserver.journal.postgres.{name}", raising=False)
-    with pytest.raises(ConfigError, match=r"pip install 'sitegrid\[postgres\]'"):
+    with pytest.raises(ConfigError, match=r"pip install '\.\[postgres\]'"):
         JournalLocation(tmp_path, "postgresql://localhost/x").exists()
 
 
