@@ -72,7 +72,7 @@ class Suite:
 
     @cached_property
     def seconds(self) -> dict[str, float]:
-        """How long each test takes that passes, by its id."""
+        """How long each test takes that passes, by its id, where pytest finds it by that."""
         times = {}
         for case in ET.parse(self.times_file).getroot().iter("testcase"):
             if not [child for child in case if child.tag in ("failure", "error", "skipped")]:
@@ -80,12 +80,16 @@ class Suite:
                 inner = str(case.get("classname")).removeprefix(".".join(module.with_suffix("").parts)).strip(".")
                 names = [module.as_posix(), *filter(None, inner.split(".")), str(case.get("name"))]
                 times["::".join(names)] = float(case.get("time", 0.0))
-        return times
+        known = self._collected()
+        return {test: seconds for test, seconds in times.items() if test in known}
 
     @cached_property
     def nightly(self) -> set[str]:
         """Ids of the tests that `make nightly` alone runs."""
-        shown = _pytest(self.copy(0), ["--collect-only", "--quiet", "-m", NIGHTLY, *self.tests], {}).stdout
+        return self._collected("-m", NIGHTLY)
+
+    def _collected(self, *words: str) -> set[str]:
+        shown = _pytest(self.copy(0), ["--collect-only", "--quiet", *words, *self.tests], {}).stdout
         return {line for line in shown.splitlines() if "::" in line}
 
     @cached_property
