@@ -1,7 +1,4 @@
-"""Lines of roads smoothed and cut where they enter another cell of the lattice, compiled.
-
-Every edge by itself: what is cut elsewhere has no influence.
-"""
+"""Smooths road lines and cuts them at the lattice, each edge by itself (compiled)."""
 
 from __future__ import annotations
 
@@ -13,16 +10,16 @@ import numpy as np
 from protocol.arrays import Bools, Floats, Ints
 
 LATTICE_M = 25.0
-SLIVER_M = 9.0  # shorter pieces join a neighbour
-LEAST_M = 3.0  # an edge that is shorter is no segment
-SMOOTH = 4  # points to each side that a point of a line is the mean of: cells are a metre wide
+SLIVER_M = 9.0  # shorter pieces join a neighbour [m]
+LEAST_M = 3.0  # shorter edges are no segments [m]
+SMOOTH = 4  # points on each side in the moving average; cells are 1 m wide
 
 
 def cut(points: Floats, ends: Ints, nodes: Ints) -> tuple[Floats, Ints]:
-    """Smooth edges and cut them; arrays as in Network.
+    """Smooth and cut edges; arrays as in Network.
 
-    Returns their points, and pieces (m, 4): first and last point, which neighbouring pieces share, and the nodes at
-    either end, -1 where the edge goes on.
+    Returns points, and pieces (m, 4): first and last point (shared with neighbours), nodes at both ends (-1: the edge
+    continues).
     """
     line, pieces = np.empty_like(points), np.empty((len(points), 4), np.int64)
     return line, pieces[: _cut(points, ends, nodes, line, pieces)].copy()
@@ -30,7 +27,7 @@ def cut(points: Floats, ends: Ints, nodes: Ints) -> tuple[Floats, Ints]:
 
 @numba.njit(cache=True, nogil=True)
 def _cut(points: Any, ends: Any, nodes: Any, line: Any, pieces: Any) -> int:
-    """Fill line and pieces; returns how many pieces there are."""
+    """Returns the number of pieces."""
     bounds = np.empty(len(points) + 2, np.int64)
     along = np.empty(len(points))
     used = 0
@@ -64,7 +61,7 @@ def _distance(one: Any, other: Any) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _smooth(points: Any, closed: bool, out: Any) -> None:  # noqa: FBT001
-    """Moving average of a line; its ends stay, and a ring has none."""
+    """Moving average; the ends of an open line stay fixed."""
     last = len(points) - 1
     k = min(SMOOTH, last - 1)
     for i in range(last + 1):
@@ -83,20 +80,18 @@ def _smooth(points: Any, closed: bool, out: Any) -> None:  # noqa: FBT001
             out[i, axis] = total / (2 * k + 1) if k > 0 else points[i, axis]
     if closed:
         out[last] = out[0]
-    else:  # to the last bit, since others end there too
+    else:  # bit-identical, because other edges end here too
         out[0], out[last] = points[0], points[last]
 
 
 @numba.njit(cache=True, nogil=True)
 def _is_cut(line: Any, i: int) -> bool:
-    """Whether a line enters another cell of the lattice at point i."""
     column, row = np.floor(line[i] / LATTICE_M) != np.floor(line[i - 1] / LATTICE_M)
     return bool(column or row)
 
 
 @numba.njit(cache=True, nogil=True)
 def _begin_at_cut(line: Any) -> None:
-    """Turn a ring so that it begins where it is cut."""
     for start in range(1, len(line)):
         if _is_cut(line, start):
             turned = np.concatenate((line[start:-1], line[: start + 1]))
@@ -106,7 +101,7 @@ def _begin_at_cut(line: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _bounds(line: Any, bounds: Any) -> int:
-    """Fill in the first points of pieces, and the last point of all; returns how many."""
+    """Fill in first points of pieces and the last point of all; returns the number of bounds."""
     bounds[0], count = 0, 1
     for i in range(1, len(line) - 1):
         if _is_cut(line, i):
@@ -118,7 +113,7 @@ def _bounds(line: Any, bounds: Any) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _without_slivers(bounds: Any, count: int, along: Any) -> int:
-    """Join the shortest piece to the shorter of its neighbours, as long as it is a sliver; returns how many bounds."""
+    """Join slivers to their shorter neighbours, shortest first; returns the number of bounds."""
     while count > 2:
         shortest = 0
         for i in range(1, count - 1):
@@ -139,7 +134,7 @@ def _without_slivers(bounds: Any, count: int, along: Any) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def gathered(points: Floats, first: Ints, last: Ints, back: Bools) -> tuple[Floats, Ints, Floats]:
-    """Lines end to end, turned round where `back` says so: points (n, 2), where each begins (k + 1,), lengths (k,)."""
+    """Concatenate lines, reversed where `back`: points (n, 2), first point of each (k + 1,), lengths (k,) [m]."""
     ends = np.zeros(len(first) + 1, np.int64)
     for k in range(len(first)):
         ends[k + 1] = ends[k] + last[k] - first[k] + 1

@@ -1,13 +1,11 @@
-"""Litres that machines burned on segments, beside those that the map predicts for the same drives.
+"""Litres burned on segments, beside the map's prediction for the same drives.
 
-Per slice of a segment and direction, of passes whose fuel is known, with masses and speeds as stated, the force at the
-wheels and the fuel by Willans' line are
+For each slice and direction, from stated masses and speeds (Willans line):
 
     F = m g (c + s) + (m k / 2) d(v^2)/dx        litres = max(0, a F L + b t)
 
-where a, the litres for work at the margin, and b, those for time, are one pair for all segments, fitted to what was
-burned. So the sum is as burned, and how it is spread over the segments is what the map says. Where the hill drives the
-engine, it burns nothing.
+The marginal rate a and the idle rate b are fitted to all burned litres, so the total is measured and the map only
+distributes it. An engine driven by the hill burns nothing.
 """
 
 from __future__ import annotations
@@ -26,18 +24,19 @@ from mapserver.roads.tally import PER_L, PER_M, PER_V2
 from protocol.arrays import Floats, Ints
 from protocol.units import GRAVITY_MPS2
 
-ROTATING = 1.1  # mass that speeds up over mass: wheels, gears and engine of a hauler
-BURNED_SHARE = 0.03  # standard deviation of what an engine's controller states, by data sheets
-LEAST_M = 100.0  # with fuel, on all segments together, for a fit
-JOULES = 1e6  # so that columns of the fit are about as large
-LEAST_L = 0.001  # of a segment, for a weight of its own: less are a second of idling
-ROUNDS = 4  # of the fit: where engines burn nothing hardly changes after two
+ROTATING = 1.1  # effective over real mass of a hauler with rotating parts
+BURNED_SHARE = 0.03  # relative standard deviation of an engine controller's fuel, by data sheets
+LEAST_M = 100.0  # metres with known fuel that a fit needs
+JOULES = 1e6  # joules per unit of the fit, to balance its columns
+LEAST_L = 0.001  # litres; a lower bound for weights, a second of idling
+ROUNDS = 4  # iterations of the fit, which settles after two
 
 
 class Litres(NamedTuple):
-    """Litres of segments (k,), 0 where nothing is known. share: of all metres, those whose fuel is known.
+    """Litres of segments (k,), 0 where unknown.
 
-    burned_std: of what engines state. low, high: of predicted, 90 %, by the resistance's own.
+    burned_std: of the engines' figures. low, high: 90 % limits of predicted, from c_rr. share: of metres with known
+    fuel.
     """
 
     burned: Floats
@@ -49,7 +48,7 @@ class Litres(NamedTuple):
 
 
 def litres_of(ledger: Ledger, segments: SegmentTable, lost: Losses) -> Litres | None:
-    """Burned and predicted litres; None where too little fuel is known. lost: of the same ledger and segments."""
+    """Litres of segments; None if too little fuel is known. lost: of the same ledger and segments."""
     fuelled, fuel, ms = (ledger.of_slices(name).astype(np.float64) for name in ("fuelled", "fuel", "ms"))
     if fuelled.sum() < LEAST_M * PER_M or not fuel.any():
         return None
@@ -74,9 +73,9 @@ def litres_of(ledger: Ledger, segments: SegmentTable, lost: Losses) -> Litres | 
 
 
 def _price(work: Floats, hours: Floats, burned: Floats, ledger: Ledger) -> tuple[float, float]:
-    """Litres for a joule and for an hour, by least squares over segments and directions; of slices (s, 2).
+    """Litres per joule and per hour by least squares; inputs of slices (s, 2).
 
-    What a segment is off by grows with the root of what is burned there, as passes differ by themselves.
+    A segment's residual grows with the root of its litres, because passes vary independently.
     """
     price, active = (0.0, 0.0), np.ones(work.shape, np.bool_)
     litres = by_segment(burned, ledger.ends).ravel()
@@ -90,7 +89,7 @@ def _price(work: Floats, hours: Floats, burned: Floats, ledger: Ledger) -> tuple
 
 
 def _accelerations(ledger: Ledger, segments: SegmentTable, owner: Ints) -> Floats:
-    """d(v^2 / 2)/dx of slices (s, 2) in either direction of travel [m/s2], by the mean squares of the slices around."""
+    """d(v^2 / 2)/dx [m/s2] of slices (s, 2) in the direction of travel."""
     fuelled = ledger.of_slices("fuelled").astype(np.float64)
     length_m = (segments.length_m / np.diff(ledger.ends))[owner]
     out = np.zeros(fuelled.shape)

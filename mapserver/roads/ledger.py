@@ -1,10 +1,8 @@
-"""The ledger of segments: what drove on each, by hour and direction, and what the ground was like there.
+"""The ledger of segments: traffic and ground by hour and direction, summed from a tally.
 
-A tally is summed up for the segments that there are now. Beside the rows of the ledger it has the same sums slice by
-slice: machines measure c_rr on parts of a segment only, and its mean is over places, not over what was measured.
-
-A place and a direction of travel belong to the nearest segment in place and axis together (`Placing`): where roads
-cross, or run beside each other, the direction tells them apart.
+It also keeps sums by slice: machines measure parts of a segment, and its mean c_rr is over places, not measurements. A
+place belongs to the segment nearest in position and axis together (`Placing`), which separates crossing and parallel
+roads.
 """
 
 from __future__ import annotations
@@ -22,21 +20,20 @@ from mapserver.roads.tally import CELL_M, PER_C, PER_M, SUMS, between, corner_m,
 from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 
 DIRECTIONS = 2
-PLACED = SUMS[:-2]  # those that are no place in a cell
+PLACED = SUMS[:-2]  # all but the position in the cell
 KEYS = ("segment", "slot", "direction")
 LEDGER = np.dtype([*((name, "<i8") for name in (*KEYS, *PLACED)), ("machines", "<u8")])
-REACH_M = 8.0  # so far from a road's line its traffic drives
-TURN_M = 6.0  # so far away is a road at right angles, beside one that is not
-SLICE_M = 5.0  # about: patches of bad ground are longer, and a slice has the samples of several passes
+REACH_M = 8.0  # metres from a road's line that count as on it
+TURN_M = 6.0  # metres that a right angle between axes counts as
+SLICE_M = 5.0  # approximate [m]: below the length of bad patches, and several passes leave samples in one
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """What drove on segments in some time.
+    """Traffic of segments.
 
-    rows: of LEDGER, by segment, slot and direction. slices: sums of PLACED (names in PLACED's order, s, 2) by slice and
-    direction; ends: (k + 1,) first slice of each segment. slot_ns: length of a slot. placed: share of all metres that
-    lie on a segment.
+    rows: of LEDGER, by segment, slot, direction. slices: (PLACED, s, 2) sums; ends: (k + 1,) first slice of each
+    segment. placed: share of all metres on segments.
     """
 
     rows: Table
@@ -46,12 +43,12 @@ class Ledger:
     placed: float
 
     def of_slices(self, name: str) -> Ints:
-        """One sum of slices (s, 2)."""
+        """One sum (s, 2)."""
         sums: Ints = self.slices[PLACED.index(name)]
         return sums
 
     def totals(self) -> Table:
-        """Sums of each segment and direction, (k, 2) of LEDGER."""
+        """Sums (k, 2) of segments by direction."""
         out = np.zeros((len(self.ends) - 1) * DIRECTIONS, LEDGER)
         at = self.rows["segment"] * DIRECTIONS + self.rows["direction"]
         for name in PLACED:
@@ -61,10 +58,7 @@ class Ledger:
 
 
 class Ledgers:
-    """Makes ledgers of the same segments. A place belongs to the same segment in all of them.
-
-    slices, place: as of `Placing`.
-    """
+    """Makes ledgers of the same segments, places assigned alike. slices, place: as in `Placing`."""
 
     def __init__(self, segments: SegmentTable) -> None:
         self.segments = segments
@@ -74,23 +68,23 @@ class Ledgers:
     def ledger(
         self, tally: Table, slot_ns: int, from_ns: int = 0, to_ns: int = 2**62, cell_m: float = CELL_M
     ) -> Ledger:
-        """Sum up rows of TALLY, by their keys, of slots that begin in from_ns <= time < to_ns."""
+        """Sum rows of TALLY, sorted by key, of slots that begin in from_ns <= time < to_ns."""
         tally = between(tally, -(-from_ns // slot_ns), -(-to_ns // slot_ns))
         which, placed = self._placed(tally, cell_m)
-        out: Table = np.empty(len(tally), LEDGER)  # of which few are ever touched
+        out: Table = np.empty(len(tally), LEDGER)  # few rows are ever touched
         slices = np.zeros((int(self.slices[-1]), DIRECTIONS, len(PLACED)), np.int64)
         used, metres = _sum_up(tally, which, *placed, len(self.segments.ids), slices, out)
-        rows = out[np.argsort(out["segment"][:used], kind="stable")]  # they are by slot, segment and direction
+        rows = out[np.argsort(out["segment"][:used], kind="stable")]  # so far by slot, segment and direction
         share = int(rows["metres"].sum()) / metres if metres else 1.0
         return Ledger(rows, np.ascontiguousarray(np.moveaxis(slices, 2, 0)), self.slices, slot_ns, share)
 
     def placed(self, tally: Table, cell_m: float) -> Placed:
-        """Where rows of TALLY lie: what was driven in one cell and sector is at one place, the mean of it."""
+        """Assign rows of TALLY; those of one cell and sector lie at their mean place."""
         which, placed = self._placed(tally, cell_m)
         return Placed(*(part[which] for part in placed))
 
     def _placed(self, tally: Table, cell_m: float) -> tuple[Ints, Placed]:
-        """Number (n,) of each row's cell and sector, and where these lie."""
+        """Index (n,) of each row's cell and sector, and where these lie."""
         which, numbers, sums = _places(tally)
         inside_m = sums[:, 1:] / (np.maximum(sums[:, :1], 1) * float(PER_M))
         return which, self.place(corner_m(numbers, cell_m) + inside_m, heading_rad(numbers))
@@ -98,9 +92,9 @@ class Ledgers:
 
 @numba.njit(cache=True, nogil=True)
 def _places(tally: Any) -> tuple[Any, Any, Any]:
-    """Number (n,) of each row's cell and sector among all, their numbers (u,) sorted, and their sums of metres, x, y.
+    """Index (n,) of each row's cell and sector, sorted numbers (u,) of these, sums (u, 3) of metres, x, y.
 
-    By a hash table: rows of a day have few places, and are not in the order of these.
+    A hash table, because a day's rows cover few places, unsorted.
     """
     capacity, used = 1 << 12, 0
     table = np.full(2 * capacity, -1, np.int64)
@@ -134,7 +128,7 @@ def _places(tally: Any) -> tuple[Any, Any, Any]:
 
 @numba.njit(cache=True, nogil=True)
 def _slot_of(table: Any, numbers: Any, number: int) -> Any:
-    """Where a number stands in a hash table of indices into numbers, or would."""
+    """Index where a number stands or belongs."""
     last = len(table) - 1
     at = np.int64((np.uint64(number) * np.uint64(HASH)) >> np.uint64(32)) & last
     while table[at] >= 0 and numbers[table[at]] != number:
@@ -146,9 +140,9 @@ def _slot_of(table: Any, numbers: Any, number: int) -> Any:
 def _sum_up(
     tally: Any, which: Any, segment: Any, inner: Any, direction: Any, segments: int, slices: Any, out: Any
 ) -> tuple[int, int]:
-    """Sum rows by slice, and by slot, segment and direction, in the order of these; returns how many, and all metres.
+    """Sum rows by slice, and by slot, segment and direction; returns the row count and all metres.
 
-    which (n,): the place of each row; segment, inner, direction (u,): of places. slices (s, 2, PLACED); out: of LEDGER.
+    which (n,): place of each row. segment, inner, direction (u,): of places. slices (s, 2, PLACED).
     """
     used, metres, begin = 0, 0, 0
     last: Any = np.full(segments * DIRECTIONS, -1, np.int64)  # row of each segment and direction in this slot
@@ -181,7 +175,7 @@ def _sum_up(
 
 @numba.njit(cache=True, nogil=True)
 def _add(row: Any, total: Any, of_slice: Any) -> None:
-    """Add a row of TALLY to one of LEDGER, and to the sums of a slice in the order of PLACED."""
+    """of_slice: in PLACED's order."""
     total.metres += row.metres
     total.weighed += row.weighed
     total.measured += row.measured
@@ -212,14 +206,14 @@ def _add(row: Any, total: Any, of_slice: Any) -> None:
 
 
 def resistance(ledger: Ledger) -> Floats:
-    """c_rr (s,) of slices, both directions; gaps of a segment between its neighbours, NaN where it has none at all."""
+    """c_rr (s,) of slices; gaps interpolated, NaN where a segment has no value."""
     known = ledger.of_slices("measured").sum(axis=1)
     c = np.where(known > 0, ledger.of_slices("c").sum(axis=1) / np.maximum(known, 1) / PER_C, np.nan)
     return filled(c, ledger.ends)
 
 
 def filled(values: Floats, ends: Ints) -> Floats:
-    """Values of slices, gaps within a segment interpolated and its ends continued."""
+    """Interpolate gaps within each segment, and extend its ends."""
     out = values.copy()
     missing = np.isnan(values)
     owner = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
@@ -232,14 +226,14 @@ def filled(values: Floats, ends: Ints) -> Floats:
 
 
 def mean(values: AnyArray, ends: Ints) -> Floats:
-    """Mean (k,) over the slices of each segment; NaN where any is."""
+    """Mean (k,) over each segment's slices; NaN where any is."""
     if not len(values):
         return np.zeros(0)
     return np.asarray(np.add.reduceat(values, ends[:-1]) / np.diff(ends), np.float64)
 
 
 class Placed(NamedTuple):
-    """Where things lie, all (n,). segment: -1 for no road; direction: 0 from its beginning to its end, 1 back."""
+    """Segments of places, all (n,). segment: -1 off road; direction: 0 ahead, 1 back."""
 
     segment: Ints
     slice: Ints
@@ -247,7 +241,7 @@ class Placed(NamedTuple):
 
 
 class Placing:
-    """Finds segments. slices: (k + 1,) number of the first slice of each segment, one behind the other."""
+    """Assigns places to segments. slices: (k + 1,) first slice of each segment."""
 
     def __init__(self, segments: SegmentTable) -> None:
         counts = np.maximum(1, np.rint(segments.length_m / SLICE_M)).astype(np.int64)
@@ -267,7 +261,7 @@ class Placing:
         self._tree = cKDTree(points) if len(points) else None
 
     def place(self, places_m: Floats, heading_rad: Floats) -> Placed:
-        """Segments of places (n, 2) with directions of travel (n,) [rad]; of each line the nearest point counts."""
+        """Nearest segments of places (n, 2) with directions of travel (n,) [rad]."""
         if self._tree is None or not len(places_m):
             nothing = np.zeros(len(places_m), np.int64)
             return Placed(nothing - 1, nothing - 1, nothing)
@@ -281,6 +275,6 @@ class Placing:
 
 
 def _embedded(places_m: Floats, heading_rad: Floats) -> Floats:
-    """Place and axis (n, 4) as places: those of axes at right angles are TURN_M apart."""
+    """Position and axis as points (n, 4); a right angle is TURN_M."""
     axis = np.stack([np.cos(2 * heading_rad), np.sin(2 * heading_rad)], axis=1)
     return np.asarray(np.concatenate([places_m, TURN_M / 2 * axis], axis=1), np.float64)

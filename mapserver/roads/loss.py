@@ -1,7 +1,7 @@
-"""What bad ground costs: the work of all that drove on a segment, over what it would have been on the target's ground.
+"""What bad ground costs: the work of all passes over a segment, less their work at the target c_rr.
 
-Per pass over a slice of length L in a direction with slope s: m g L (max(0, c + s) - max(0, target + s)), and nothing
-where the ground is better than the target. Where the brakes would have taken the difference, nothing is lost.
+A pass over a slice of length L and slope s loses m g L (max(0, c + s) - max(0, target + s)), at least 0. What brakes
+would have absorbed is no loss.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from mapserver.roads.tally import PER_C, PER_M, squares_of
 from protocol.arrays import Bools, Floats, Ints
 from protocol.units import GRAVITY_MPS2
 
-GUESSED_KG = 30_000.0  # of a machine where no sample states a mass: between a loader and a loaded truck
+GUESSED_KG = 30_000.0  # assumed if no sample states a mass [kg]: between a loader and a loaded truck
 
 
 @dataclass(frozen=True)
 class Losses:
-    """Of segments (k,). c_rr, c_std; grade along, from beginning to end; work_j: lost in all, low and high of 90 %.
+    """Losses of segments (k,).
 
-    kg: mean mass (k, 2) by direction; guessed: whether no sample of it states one. unmeasured: share of the slices.
-    passes: (k, 2) by direction.
+    grade: from beginning to end; work_j: with 90 % limits. kg, passes: (k, 2) by direction; guessed: no mass was
+    stated; unmeasured: share of slices.
     """
 
     c_rr: Floats
@@ -41,10 +41,7 @@ class Losses:
 
 
 def losses(ledger: Ledger, segments: SegmentTable, target: float, level: Floats | None = None) -> Losses:
-    """What was lost on each segment against ground of a target c_rr.
-
-    level (k,): c_rr of segments in place of what was measured, which was before or after a repair; NaN for the others.
-    """
+    """Losses against a target c_rr. level (k,): replaces c_rr from the wrong side of a repair; NaN keeps it."""
     owner = np.repeat(np.arange(len(segments.ids)), np.diff(ledger.ends))
     metres, weighed, kg_m = (ledger.of_slices(name).astype(np.float64) / PER_M for name in ("metres", "weighed", "kg"))
     known_kg = kg_m.sum() / weighed.sum() if weighed.any() else GUESSED_KG
@@ -56,7 +53,7 @@ def losses(ledger: Ledger, segments: SegmentTable, target: float, level: Floats 
     if level is not None:
         share = level / mean(c, ledger.ends)
         c = c * np.where(np.isfinite(share) & (share > 0), share, 1.0)[owner]
-    load = kg * metres * GRAVITY_MPS2  # of all passes, newton metres per unit of c_rr
+    load = kg * metres * GRAVITY_MPS2  # newton metres per unit of c_rr, all passes
     std = _std(ledger)
     slopes = np.stack([slope, -slope], axis=1)
 
@@ -82,14 +79,14 @@ def losses(ledger: Ledger, segments: SegmentTable, target: float, level: Floats 
 
 
 def by_segment(values: Floats, ends: Ints) -> Floats:
-    """Sum the slices of each segment, (k, ...)."""
+    """Sums (k, ...) over each segment's slices."""
     if not len(values):
         return np.zeros((0, *values.shape[1:]))
     return np.asarray(np.add.reduceat(values, ends[:-1], axis=0), np.float64)
 
 
 def slope_of(ledger: Ledger, segments: SegmentTable, owner: Ints) -> Floats:
-    """Rise over run of slices (s,) from beginning to end, 0 where it is not known."""
+    """Slopes (s,) [m/m] from beginning to end, 0 where unknown."""
     graded = ledger.of_slices("graded").sum(axis=1)
     east, north = (ledger.of_slices(name).sum(axis=1) / np.maximum(graded, 1) / PER_C for name in ("east", "north"))
     along = east * segments.ahead[owner, 0] + north * segments.ahead[owner, 1]
@@ -97,9 +94,9 @@ def slope_of(ledger: Ledger, segments: SegmentTable, owner: Ints) -> Floats:
 
 
 def _std(ledger: Ledger) -> Floats:
-    """Standard deviation (k,) of the mean c_rr of segments; NaN where nothing was measured.
+    """(k,), of the mean c_rr; NaN if unmeasured.
 
-    Noise of single passes, as slices repeat it; what all passes err in alike; and slices that nobody measured.
+    Noise of single passes, common error of all passes, and unmeasured slices.
     """
     measured = ledger.of_slices("measured").sum(axis=1)
     known = measured > 0

@@ -1,10 +1,8 @@
-"""The graph of roads: what is no road goes (spurs, bridges that nobody drove along, overlong ends), junctions join.
+"""The graph of roads, from lines of cells (compiled): ends, junctions, and the chains between them.
 
-All rules look at places and metres alone, never at what was there before.
-
-Lines of cells as a graph: ends and junctions, and the chains of cells between them, compiled.
-
-A diagonal step counts only where no two straight ones lead the same way, so that the corners of lines are no junctions.
+Pruning removes spurs, undriven bridges and overlong ends; close junctions are joined. All depends on places and metres,
+never on an earlier graph. A diagonal step counts only if no two straight steps lead the same way, so corners are no
+junctions.
 """
 
 from __future__ import annotations
@@ -20,27 +18,24 @@ from mapserver.roads.ridges import AXES
 from mapserver.roads.skeleton import Skeleton
 from protocol.arrays import AnyArray, Floats, Ints
 
-SPUR_M = 10.0  # shorter dead ends at a junction are the width of a road, not a road
-LEAST_ROAD_M = 15.0  # a road by itself is no shorter than a machine and its position error
-JOIN_M = 6.0  # junctions nearer to each other are one: two lines that cross share a few cells
-ROUNDS = 8  # of pruning: what it leaves after that is drawn as it is
-# A cell of a line was driven along where the 5 x 5 cells around it have so many metres along it: a fifth of one pass.
+SPUR_M = 10.0  # shorter dead ends are the width of a road [m]
+LEAST_ROAD_M = 15.0  # least length of an isolated road: a machine and its position error [m]
+JOIN_M = 6.0  # closer junctions are one, because crossing lines share cells [m]
+ROUNDS = 8  # most rounds of pruning
+# metres along a line in the 5 x 5 cells around a driven cell: a fifth of a pass
 DRIVEN_M = 1.0
-DRIVEN_SHARE = 0.7  # of an edge's cells, for the edge to be one
-# A road ends where there is so much of what was driven so many cells farther in: half of the 5 x 5 cells is beyond.
+DRIVEN_SHARE = 0.7  # of an edge's cells must be driven
+# A road ends where metres fall to this share of those so many cells farther in: half of the 5 x 5 cells lies beyond.
 END_SHARE, INWARD = 0.45, 8
-TANGENT = 4  # cells to each side that the direction of a line is taken from
-# Four straight steps, and four diagonal ones, each between the straight ones beside it in their order: row, column.
+TANGENT = 4  # cells on each side that set a line's direction
+# (row, column): straight steps, then diagonals, each between the straight ones of the same index
 _STEPS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)])
 _ROW_BITS = 32
 
 
 @dataclass(frozen=True)
 class Network:
-    """Edges as lines. points: (n, 2) x, y [m] of all edges; ends: (k + 1,) where each begins; nodes: (k, 2) numbers.
-
-    The nodes of an edge are what its two ends join; a ring by itself has the same one twice.
-    """
+    """Edges as lines. points: (n, 2) [m]; ends: (k + 1,) first points; nodes: (k, 2) at both ends, equal for a ring."""
 
     points: Floats
     ends: Ints
@@ -48,7 +43,7 @@ class Network:
 
 
 def network(skeleton: Skeleton) -> Network:
-    """The graph of roads of a skeleton."""
+    """Prune a skeleton and trace its graph."""
     places, metres = skeleton.places, skeleton.metres
     traced = chains(places)
     for _ in range(ROUNDS):
@@ -64,7 +59,7 @@ def network(skeleton: Skeleton) -> Network:
 def _superfluous(
     places: AnyArray, metres: AnyArray, cells: AnyArray, ends: AnyArray, degree: AnyArray, raster_m: float
 ) -> Any:
-    """Which cells (n,) are no road; cells, ends, degree: as in Chains."""
+    """Which cells (n,) are no road; arguments as in Chains."""
     gone = degree == 0
     along = np.empty(len(cells), np.int64)
     for chain in range(len(ends) - 1):
@@ -85,7 +80,7 @@ def _superfluous(
         for at in range(first, last + 1):
             if out and degree[cells[at]] <= 2:
                 gone[cells[at]] = True
-        # Ends that nobody drove: the blur makes lines longer than they are.
+        # undriven ends: the blur extends lines
         if loose_first:
             _trim(along, cells, first, last, 1, gone)
         if loose_last:
@@ -95,13 +90,12 @@ def _superfluous(
 
 @numba.njit(cache=True, nogil=True)
 def _step(one: AnyArray, other: AnyArray) -> float:
-    """Cells from one to the next one of a chain."""
     return 1.4142135623730951 if abs(one[0] - other[0]) + abs(one[1] - other[1]) == 2 else 1.0
 
 
 @numba.njit(cache=True, nogil=True)
 def _trim(along: AnyArray, cells: AnyArray, first: int, last: int, step: int, gone: AnyArray) -> None:
-    """Take cells off a dead end of a chain, until there is about half of what is driven farther in."""
+    """Shorten a dead end, until its metres reach about half of those farther in."""
     at = first if step > 0 else last
     while first <= at + INWARD * step <= last and along[at] < END_SHARE * along[at + INWARD * step]:
         gone[cells[at]] = True
@@ -110,7 +104,7 @@ def _trim(along: AnyArray, cells: AnyArray, first: int, last: int, step: int, go
 
 @numba.njit(cache=True, nogil=True)
 def _along(places: AnyArray, metres: AnyArray, cells: AnyArray, first: int, last: int, at: int) -> int:
-    """Metres driven along a chain around one of its cells, in 1/4096 m."""
+    """Metres along a chain near one cell, in 1/4096 m."""
     before, after = places[cells[max(at - TANGENT, first)]], places[cells[min(at + TANGENT, last)]]
     turn = np.arctan2(float(after[0] - before[0]), float(after[1] - before[1]))
     axis = int(np.rint(turn * AXES / np.pi))
@@ -119,7 +113,6 @@ def _along(places: AnyArray, metres: AnyArray, cells: AnyArray, first: int, last
 
 
 def _lengths(places: Ints, cells: Ints, ends: Ints, raster_m: float) -> Floats:
-    """Length of each chain [m]."""
     steps = np.abs(np.diff(places[cells], axis=0, prepend=places[cells[:1]]))
     step = np.where(steps.sum(axis=1) == 2, np.sqrt(2.0), 1.0)
     step[ends[:-1]] = 0.0
@@ -127,7 +120,7 @@ def _lengths(places: Ints, cells: Ints, ends: Ints, raster_m: float) -> Floats:
 
 
 def _lines(places: Ints, traced: Chains, raster_m: float) -> Network:
-    """Chains as lines, with junctions that are near to each other joined."""
+    """Join close junctions."""
     cells, ends, degree = traced
     if not len(cells):
         return Network(np.zeros((0, 2)), np.zeros(1, np.int64), np.zeros((0, 2), np.int64))
@@ -150,7 +143,7 @@ def _lines(places: Ints, traced: Chains, raster_m: float) -> Network:
 
 @numba.njit(cache=True, nogil=True)
 def _joined(count: int, one: AnyArray, other: AnyArray) -> AnyArray:
-    """Lowest number of those that are joined by pairs, for each number."""
+    """Lowest number (n,) of each connected group."""
     group = np.arange(count)
     for i in range(len(one)):
         a, b = one[i], other[i]
@@ -159,16 +152,15 @@ def _joined(count: int, one: AnyArray, other: AnyArray) -> AnyArray:
         while group[b] != b:
             b = group[b]
         group[max(a, b)] = min(a, b)
-    for i in range(count):  # lower ones first, so that each takes one step
+    for i in range(count):  # ascending: one step is enough
         group[i] = group[group[i]]
     return group
 
 
 class Chains(NamedTuple):
-    """Chains of cells. cells: their numbers, one chain behind the other; ends: (k + 1,) where each begins.
+    """Chains of cells: their numbers, chain after chain. ends: (k + 1,) first of each; degree: (n,) neighbours.
 
-    A chain runs from the cell of lower number to that of the higher one; a ring without a junction begins and ends with
-    its lowest cell. degree: (n,) neighbours of each cell.
+    A chain begins at its lower end; an isolated ring begins and ends at its lowest cell.
     """
 
     cells: Ints
@@ -177,7 +169,7 @@ class Chains(NamedTuple):
 
 
 def chains(places: Ints) -> Chains:
-    """Chains of cells (n, 2), rows and columns, sorted by these."""
+    """Trace the chains of sorted cells (n, 2) [row, column]."""
     links, degree = neighbours(places)
     cells, ends, used, count = np.empty(2 * len(places) + 16, np.int64), np.zeros(len(places) * 4 + 2, np.int64), 0, 0
     while True:
@@ -190,14 +182,14 @@ def chains(places: Ints) -> Chains:
 
 @numba.njit(cache=True, nogil=True)
 def neighbours(places: Any) -> tuple[Any, Any]:
-    """Numbers (n, 8) of the cells beside each cell (n, 2) [row, column], sorted by these, -1 for none; and how many."""
+    """Neighbours (n, 8) of sorted cells (n, 2) [row, column], -1 for none; and their count (n,)."""
     count = len(places)
     keys = (places[:, 0] << _ROW_BITS) + places[:, 1]
     links = np.full((count, 8), -1, np.int64)
     for k in range(8):
         dy, dx = _STEPS[k, 0], _STEPS[k, 1]
         offset, at = (dy << _ROW_BITS) + dx, 0
-        for i in range(count):  # what is sought grows as i does, so that one run through all is enough
+        for i in range(count):  # sought grows with i, so one pass is enough
             sought = keys[i] + offset
             while at < count and keys[at] < sought:
                 at += 1
@@ -216,7 +208,7 @@ def neighbours(places: Any) -> tuple[Any, Any]:
 
 @numba.njit(cache=True, nogil=True)
 def _trace(links: Any, degree: Any, cells: Any, ends: Any) -> tuple[int, int]:
-    """Fill cells and ends; returns how many cells there are, whether or not they had room, and how many chains."""
+    """Returns the number of cells, even beyond capacity, and of chains."""
     seen = degree != 2
     used, count = _trace_between(links, degree, seen, cells, ends)
     return _trace_rings(links, degree, seen, cells, ends, used, count)
@@ -224,7 +216,7 @@ def _trace(links: Any, degree: Any, cells: Any, ends: Any) -> tuple[int, int]:
 
 @numba.njit(cache=True, nogil=True)
 def _trace_between(links: Any, degree: Any, seen: Any, cells: Any, ends: Any) -> tuple[int, int]:
-    """Chains between ends and junctions, each from the end of lower number; marks as seen what is in them."""
+    """Between ends and junctions; marks cells as seen."""
     used, count = 0, 0
     for place in range(8 * len(links)):
         start, second = place // 8, links[place // 8, place % 8]
@@ -235,7 +227,7 @@ def _trace_between(links: Any, degree: Any, seen: Any, cells: Any, ends: Any) ->
             continue
         last, before = cells[used - 1], cells[used - 2]
         if last < start or (last == start and before < second):
-            used = first  # it is followed from its other end
+            used = first  # traced from its other end
             continue
         for i in range(first, used):
             seen[cells[i]] = True
@@ -246,7 +238,7 @@ def _trace_between(links: Any, degree: Any, seen: Any, cells: Any, ends: Any) ->
 
 @numba.njit(cache=True, nogil=True)
 def _trace_rings(links: Any, degree: Any, seen: Any, cells: Any, ends: Any, used: int, count: int) -> tuple[int, int]:
-    """Chains that meet no end and no junction, from their lowest cell to its first neighbour."""
+    """Isolated rings, from the lowest cell to its first neighbour."""
     for start in range(len(links)):
         if seen[start]:
             continue
@@ -264,7 +256,7 @@ def _trace_rings(links: Any, degree: Any, seen: Any, cells: Any, ends: Any, used
 
 @numba.njit(cache=True, nogil=True)
 def _follow(links: Any, degree: Any, start: int, second: int, cells: Any, used: int) -> int:
-    """Note a chain from `start` on by way of `second`, up to the next cell that is no part of a line, or to `start`."""
+    """Up to the next end or junction, or back to `start`."""
     before, here = start, second
     if used < len(cells):
         cells[used] = start

@@ -1,7 +1,6 @@
-"""Passes over segments, one by one: what a machine drove on a segment, in one direction, within a minute.
+"""Passes: what one machine drove on a segment in one direction within a minute.
 
-Kept by place as the tally is, but for each machine apart, minute by minute and in cells of half a segment: few rows,
-from which any segments have their passes.
+Kept by machine, minute and half segments: few rows, which give the passes of any segments.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from mapserver.roads.tally import PER_C, PER_M, TALLY, Tally, slot
 from protocol.arrays import Floats, Ints, Table
 
 MINUTE_NS, CELL_M = VISIT_NS, LATTICE_M / 2
-MINUTES = 3 * 24 * 60  # with driving, of each machine, that are remembered
-ONE_PASS = 1.3  # of a segment's length: more in two minutes are two passes
-LEAST_M = 5.0  # measured on a segment, for a pass to say what its c_rr is: half of the shortest segments
+MINUTES = 3 * 24 * 60  # driven minutes kept per machine
+ONE_PASS = 1.3  # segment lengths; more in two minutes are two passes
+LEAST_M = 5.0  # measured metres a pass needs: half of the shortest segments
 
 
 class Passes(NamedTuple):
-    """Passes (n,) by segment, then time. minute: since 1970; machine: its number among all; c_rr: mean."""
+    """Passes (n,) by segment, then time. minute: since 1970; machine: index."""
 
     segment: Ints
     minute: Ints
@@ -35,7 +34,7 @@ class Passes(NamedTuple):
 
 
 class PassTally:
-    """Follows what each machine drives."""
+    """Tallies of single machines."""
 
     def __init__(self) -> None:
         self._machines: dict[int, Tally] = {}
@@ -47,7 +46,7 @@ class PassTally:
             own.add(rows[names == name], names[names == name])
 
     def passes(self, ledgers: Ledgers, from_ns: int = 0) -> Passes:
-        """All passes over these segments, from a time on, of which c_rr is known."""
+        """Passes with known c_rr."""
         tables = [tally.table() for _, tally in sorted(self._machines.items())]
         rows: Table = np.concatenate([np.zeros(0, TALLY), *tables])
         machine = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
@@ -66,9 +65,9 @@ class PassTally:
 
 
 def _joined(keys: Ints, sums: Ints, length_m: Floats) -> tuple[Ints, Ints]:
-    """Sum what has the same keys (4, n): segment, machine, direction, minute; sorted by these.
+    """Sum columns of equal keys (segment, machine, direction, minute), sorted.
 
-    One pass that reaches from a minute into the next is one, of the first.
+    A pass that reaches into the next minute belongs to the first.
     """
     for most in (0, 1):
         same = (np.diff(keys[:3], axis=1) == 0).all(axis=0) & (np.diff(keys[3]) == most)

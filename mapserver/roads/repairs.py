@@ -1,9 +1,8 @@
-"""Repairs, and ground that became worse: where the passes over a segment differ from those before.
+"""Repairs and damage: where the passes over a segment differ from earlier ones.
 
-On a haul road the driven strip is narrower than what a change of cells must be, to be none of position errors. A
-segment has all of a pass, so two or three passes tell. Each is compared with what this machine found in this direction
-before. A new calibration of one machine is no repair, since passes are of samples that are corrected as is known now,
-and since two machines must agree wherever more than one drives.
+A driven strip is too narrow for the detection of changed cells, which must exceed position errors. A segment takes in
+whole passes, so two or three are enough, compared with the same machine in the same direction. A new calibration is no
+repair: passes come from samples as corrected today, and two machines must agree where several drive.
 """
 
 from __future__ import annotations
@@ -23,16 +22,15 @@ from mapserver.roads.segments import SegmentTable
 from protocol.arrays import Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-HALF_WIDTH_M = 3.0  # of the strip that is driven, with the errors of positions; half the distance of two lanes
+HALF_WIDTH_M = 3.0  # metres: the driven strip with position errors, half a lane distance
 
 
 class RepairTuning(NamedTuple):
-    """What a repair is; a tuple, as kernels take it.
+    """When a change is a repair; a tuple, for kernels.
 
-    least_known, most_known: passes before, of which the newest count, as ground wears. least_agree, most_agree: passes
-    in a row that show a change. sigmas, sigmas_each: how far they are from what is expected, together and each; share:
-    of what is expected, on average. place_std, place_share: of passes before any were seen, and how many passes that
-    counts as, prior.
+    least_known, most_known: earlier passes; only the newest count, because ground wears. least_agree, most_agree:
+    successive passes that show a change. sigmas, sigmas_each: their deviation, together and each; share: its mean,
+    relative. place_std, place_share: prior deviation, worth `prior` passes.
     """
 
     least_known: int = 6
@@ -54,7 +52,7 @@ TUNING = RepairTuning()
 class Repair:
     """A change of a segment's ground.
 
-    minute, seen: of the first pass that saw it, and of the one that showed it; before, after: medians of c_rr.
+    minute, seen: first pass after it, and the pass that proved it. before, after: median c_rr.
     """
 
     segment: int
@@ -65,17 +63,17 @@ class Repair:
 
     @property
     def first_ns(self) -> int:
-        """When the first pass that saw it began, to the minute."""
+        """First pass after the change, to the minute."""
         return self.minute * MINUTE_NS
 
     @property
     def seen_ns(self) -> int:
-        """When it was sure."""
+        """When it was proved."""
         return (self.seen + 1) * MINUTE_NS
 
 
 def repairs(passes: Passes, tuning: RepairTuning = TUNING) -> tuple[list[Repair], int]:
-    """All changes, and how many passes were looked at. After one, a segment is known by later passes alone."""
+    """All changes, and the number of passes examined. After a change, only later passes count."""
     out: list[Repair] = []
     bounds = np.flatnonzero(np.diff(passes.segment, prepend=-1, append=-1))
     cuts, looks = _cuts(passes.c_rr, passes.machine, 2 * passes.machine + passes.direction, bounds, tuning)
@@ -88,10 +86,9 @@ def repairs(passes: Passes, tuning: RepairTuning = TUNING) -> tuple[list[Repair]
 
 @numba.njit(cache=True, nogil=True)
 def _cuts(c_rr: Any, machine: Any, group: Any, bounds: Any, tuning: Any) -> tuple[Any, int]:
-    """Of each change (n, 4): first pass before it, first after it, the one that showed it, end of all after.
+    """Changes (n, 4): first pass before, first after, the proof, end; and the number of passes examined.
 
-    group: of passes that err alike, a machine in one direction. bounds: where the passes of each segment begin, and the
-    end of all. Also how many passes were looked at.
+    group: passes with a common error (machine and direction). bounds: first pass of each segment, and the end.
     """
     cuts, count, looks = np.empty((len(c_rr), 4), np.int64), 0, 0
     groups, means = np.empty((2, tuning.most_known), np.int64), np.empty(tuning.most_known)
@@ -117,12 +114,10 @@ def _cuts(c_rr: Any, machine: Any, group: Any, bounds: Any, tuning: Any) -> tupl
 
 @numba.njit(cache=True, nogil=True)
 def _expected(c_rr: Any, group: Any, groups: Any, means: Any, tuning: Any) -> tuple[int, float, float, float]:
-    """What passes (n,) say of later ones: number of groups, level, and variances within groups and between them.
+    """Predict later passes from passes (n,): number of groups, level, variance within and between groups.
 
-    Errors repeat: a machine has a zero of its own, and its estimate settles from the same side wherever ground changes
-    within a segment. So passes are compared with those of the same machine in the same direction first. A model with
-    random effects: pass = level + what its group is off + noise. groups, means: filled with numbers of groups, how many
-    passes each has, and their means.
+    Each machine has a bias, and settles from the same side where ground changes. Random effects: pass = level + group +
+    noise. Fills groups (numbers, pass counts) and means.
     """
     count, level, within, between = 0, c_rr.mean(), 0.0, 0.0
     for i in range(len(c_rr)):
@@ -145,7 +140,7 @@ def _expected(c_rr: Any, group: Any, groups: Any, means: Any, tuning: Any) -> tu
 
 @numba.njit(cache=True, nogil=True)
 def _differing(c_rr: Any, group: Any, expected: Any, groups: Any, means: Any, tuning: Any) -> Any:
-    """How many of these passes, from the first on, differ alike from what is expected, beyond noise and by enough."""
+    """Numbers of leading passes that deviate alike, significantly and by enough."""
     count, level, within, between = expected
     out, side, sigmas, share = np.zeros(len(c_rr), np.bool_), 0.0, 0.0, 0.0
     for i in range(len(c_rr)):
@@ -160,7 +155,7 @@ def _differing(c_rr: Any, group: Any, expected: Any, groups: Any, means: Any, tu
         apart = off / np.sqrt(within + 1.0 / weight)
         if apart < tuning.sigmas_each:
             break
-        sigmas, share = sigmas + apart, share + off / max(own, 0.001)  # c_rr of no ground is less
+        sigmas, share = sigmas + apart, share + off / max(own, 0.001)  # no ground has less
         passes = i + 1
         out[i] = (
             passes >= tuning.least_agree and sigmas > tuning.sigmas * np.sqrt(passes) and share > tuning.share * passes
@@ -170,14 +165,14 @@ def _differing(c_rr: Any, group: Any, expected: Any, groups: Any, means: Any, tu
 
 @numba.njit(cache=True, nogil=True)
 def _agree(before: Any, after: Any) -> bool:
-    """Whether the passes after are of several machines, where several drove before."""
+    """Several machines after the change, or only one before."""
     return bool((after != after[0]).any() or (before == before[0]).all())
 
 
 def ages(segments: SegmentTable, changes: Iterable[Repair], cell_m: float) -> dict[Block, Ints]:
-    """Since when (256,) [ns] the ground of cells is as it is, 0 for ever, in the blocks of segments that changed.
+    """Start [ns] of each cell's present ground (256,), 0 if unchanged, in blocks of changed segments.
 
-    Of those cells whose centres are nearest to a changed segment, and within HALF_WIDTH_M of its line.
+    Covers cells nearest to a changed segment and within HALF_WIDTH_M of its line.
     """
     newest: dict[int, int] = {}
     for change in changes:

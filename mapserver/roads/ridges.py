@@ -1,8 +1,7 @@
-"""Where roads run: ridges of the metres driven, in each of the eight axes of the sixteen heading sectors.
+"""Ridges of the metres driven, along each of eight axes: where roads run.
 
-The metres of an axis are blurred along it and hardly across it, so that gaps close along a road and never between two
-lanes. A cell lies on a road where the response of some axis stands out among the axes and across its own line. Sums of
-integers, and only what lies near counts: a window of cells gives the same ridges as any other that reaches far enough.
+The blur runs along an axis and little across it: it closes gaps, but never joins two lanes. A cell is road if some axis
+stands out among axes and across its line. Integer sums of nearby cells only, so any window gives the same ridges.
 """
 
 from __future__ import annotations
@@ -16,17 +15,17 @@ from mapserver.evidence import cells as ev
 from protocol.arrays import Bools, Floats, Ints
 
 AXES = ev.SECTORS // 2
-ALONG_M, ACROSS_M = 4.0, 1.0  # standard deviations of the blur
-SIDE_M = 3.0  # half the distance of two lanes that stay apart
+ALONG_M, ACROSS_M = 4.0, 1.0  # standard deviations of the blur [m]
+SIDE_M = 3.0  # half the least lane distance [m]
 SHARE = 0.55  # of the highest response across the line
-LEAST_M = 0.05  # response, in metres per square metre: less than one pass gives in a bend between two axes
-_UNITS = 1 << 10  # of the blur's weights
-_LEAST_WEIGHT = 20  # in these units
-SCALE = 1 << 6  # of 1/4096 m: what the blur sums up, so that any sum is a whole number that a float64 holds
+LEAST_M = 0.05  # least response [m/m2]: below one pass in a bend between two axes
+_UNITS = 1 << 10  # per unit of weight
+_LEAST_WEIGHT = 20  # smallest weight, in units
+SCALE = 1 << 6  # of 1/4096 m per unit: sums stay integers that a float64 holds
 
 
 class Blur:
-    """The blur of each axis as runs of weights along rows, for cells of one size. reach: how far it looks, in cells."""
+    """Weights of each axis as runs along rows, for one cell size. reach: radius in cells."""
 
     def __init__(self, cell_m: float) -> None:
         self.reach = int(np.ceil(2.9 * ALONG_M / cell_m))
@@ -40,30 +39,27 @@ class Blur:
             weight = np.rint(_UNITS * np.exp(-((along / ALONG_M) ** 2 + (across / ACROSS_M) ** 2) / 2))
             weight[weight < _LEAST_WEIGHT] = 0.0
             for row in np.flatnonzero(weight.any(axis=1)).tolist():
-                columns = np.flatnonzero(weight[row])  # without a gap: an ellipse
+                columns = np.flatnonzero(weight[row])  # contiguous: an ellipse
                 runs.append((row - self.reach, int(columns[0]) - self.reach, len(columns), used))
                 weights.append(weight[row, columns])
                 used += len(columns)
             self.ends[axis + 1] = len(runs)
             self._sums.append(int(weight.sum()))
-        self.runs: Ints = np.array(runs)  # of each: row and first column from the cell, length, first weight
+        self.runs: Ints = np.array(runs)  # row and first column from the cell, length, first weight
         self.weights: Floats = np.concatenate(weights)
         per_m2 = ev.WEIGHT_UNITS_PER_M // SCALE * cell_m**2
         self.least: Floats = np.array([float(round(LEAST_M * total * per_m2)) for total in self._sums])
         self.side = max(1, round(SIDE_M / cell_m))
         steps = np.array([step for step in range(-self.side, self.side + 1) if step])
         turns = np.pi * np.arange(AXES) / AXES
-        # Cells across each axis: (AXES, steps, 2) rows and columns.
+        # (AXES, steps, 2) [row, column]
         self.across: Ints = np.stack(
             [np.rint(np.outer(np.cos(turns), steps)), np.rint(np.outer(-np.sin(turns), steps))], axis=-1
         ).astype(np.int64)
 
 
 def ridges(axes: Ints, blur: Blur) -> Bools:
-    """Which cells lie on a road. axes: (rows, columns, AXES) in 1/4096 m, driven along each.
-
-    (rows - 2 m, columns - 2 m), without a margin of m = reach + side cells, which decide but are not decided.
-    """
+    """Which cells are road. axes: (rows, columns, AXES) in 1/4096 m; the result lacks reach + side cells per edge."""
     margin = blur.reach + blur.side
     rows, columns = (size - 2 * margin for size in axes.shape[:2])
     response = np.zeros((AXES, rows + 2 * blur.side, columns + 2 * blur.side))
@@ -75,7 +71,7 @@ def ridges(axes: Ints, blur: Blur) -> Bools:
 
 @numba.njit(cache=True, nogil=True)
 def _blurred(axes: Any, reach: int, runs: Any, weights: Any, ends: Any, out: Any) -> None:
-    """Blur the metres of each axis along it. Whole numbers as floats: processors multiply many of these at once."""
+    """Whole numbers as floats, which vectorise well."""
     rows, columns = out.shape[1:]
     for row in range(axes.shape[0]):
         for column in range(axes.shape[1]):
@@ -99,9 +95,9 @@ def _blurred(axes: Any, reach: int, runs: Any, weights: Any, ends: Any, out: Any
 
 @numba.njit(cache=True, nogil=True)
 def _outstanding(response: Any, side: int, least: Any, across: Any, out: Any) -> None:
-    """Mark cells whose response in some axis is no less than its neighbour axes', nor than a share of those beside.
+    """Mark cells that stand out among neighbouring axes and across their own.
 
-    response: (AXES, rows, columns), `side` cells more on each side than out.
+    response: (AXES, rows, columns), `side` cells wider on each side than out.
     """
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
@@ -119,10 +115,7 @@ def _outstanding(response: Any, side: int, least: Any, across: Any, out: Any) ->
 
 @numba.njit(cache=True, nogil=True)
 def _highest(response: Any, row: int, column: int, axis: int, across: Any) -> float:
-    """Highest response on a line across an axis, of it and its neighbours.
-
-    Between two lanes, an axis askew takes a little of both, and would stand out.
-    """
+    """Of an axis and its neighbours: between two lanes an oblique axis collects a little of both."""
     highest = response[axis, row, column]
     for step in range(across.shape[1]):
         y, x = row + across[axis, step, 0], column + across[axis, step, 1]

@@ -1,7 +1,6 @@
-"""Segments: roads cut at a fixed lattice, with names that are places, so that they last as long as the road does.
+"""Segments: roads cut at a fixed lattice and named by place, so that names last as long as roads.
 
-The name of a segment is the lattice cell in which its middle lies and the axis along which it runs there. Two of one
-cell and axis are told apart by the fifth of the cell in which they lie across.
+A name is the lattice cell of the middle and the axis there, numbered by fifths of the cell if several share both.
 """
 
 from __future__ import annotations
@@ -15,17 +14,16 @@ from mapserver.roads.cutting import LATTICE_M, cut, gathered
 from mapserver.roads.network import Network
 from protocol.arrays import AnyArray, Floats, Ints
 
-AXES = ("e", "n")  # a third or fourth one would rename more roads, as one is always near the border of two
+AXES = ("e", "n")  # more axes would rename more roads, near a border of two
 FIFTHS = 5
 
 
 @dataclass(frozen=True)
 class SegmentTable:
-    """All segments of a map, in the order of their names' places.
+    """All segments, sorted by cell and axis.
 
-    ids: (k,) names. points: (n, 2) x, y [m] of all lines, each from its beginning to its end; ends: (k + 1,) where
-    each begins. ahead: (k, 2) unit vector from beginning to end, which points to the axis of the name. length_m: (k,).
-    nodes: (k, 2) the graph's nodes that it touches at either end, -1 where it goes on in the next segment.
+    ids: (k,). points: (n, 2) x, y [m]; ends: (k + 1,) first point of each. ahead: (k, 2) unit vector along the axis.
+    length_m: (k,). nodes: (k, 2) of the graph, -1 where the road continues.
     """
 
     ids: tuple[str, ...]
@@ -36,16 +34,16 @@ class SegmentTable:
     nodes: Ints
 
     def line(self, index: int) -> Floats:
-        """The line (m, 2) of one segment."""
+        """The line (m, 2) of a segment."""
         return self.points[self.ends[index] : self.ends[index + 1]]
 
 
 def segments(graph: Network) -> SegmentTable:
-    """Cut a graph of roads, turn all pieces into the directions of their axes, and name them."""
+    """Cut, orient and name all edges."""
     points, pieces = cut(graph.points, graph.ends, graph.nodes)
     first, last, nodes = pieces[:, 0], pieces[:, 1], pieces[:, 2:]
     run, half = points[last] - points[first], (last - first + 1) // 2
-    small = ~run.any(axis=1)  # a small ring: from its beginning to its middle
+    small = ~run.any(axis=1)  # small rings: from beginning to middle
     run[small] = points[first + half][small] - points[first][small]
     axis = np.rint(np.arctan2(run[:, 1], run[:, 0]) * len(AXES) / np.pi).astype(np.int64) % (2 * len(AXES))
     back = axis >= len(AXES)
@@ -55,7 +53,7 @@ def segments(graph: Network) -> SegmentTable:
     cell = np.floor(middle / LATTICE_M).astype(np.int64)
     turn = np.pi * axis / len(AXES)
     place = middle - (cell + 0.5) * LATTICE_M
-    beside = place[:, 1] * np.cos(turn) - place[:, 0] * np.sin(turn)  # to the left of the cell's middle
+    beside = place[:, 1] * np.cos(turn) - place[:, 0] * np.sin(turn)  # to the left of the cell's middle [m]
     order = np.lexsort((*run.T, *middle.T[::-1], beside, axis, cell[:, 1], cell[:, 0]))
     lines, ends, length_m = gathered(points, first[order], last[order], back[order])
     return SegmentTable(
@@ -69,7 +67,7 @@ def segments(graph: Network) -> SegmentTable:
 
 
 def _ids(cell: Ints, axis: Ints, beside: Floats) -> tuple[str, ...]:
-    """Names of segments, sorted. Of several in one cell and axis, the one nearest to its middle has the plain name."""
+    """Sorted. The segment nearest to a cell's middle has the plain name."""
     names = [f"{column}_{row}_{AXES[own]}" for (column, row), own in zip(cell.tolist(), axis.tolist(), strict=True)]
     key = np.concatenate([cell, axis[:, None]], axis=1)
     bounds = [*np.flatnonzero((np.diff(key, axis=0, prepend=key[:1] - 1) != 0).any(axis=1)).tolist(), len(names)]
@@ -80,11 +78,10 @@ def _ids(cell: Ints, axis: Ints, beside: Floats) -> tuple[str, ...]:
 
 
 def _distinct(name: str, beside: AnyArray) -> list[str]:
-    """Names of several segments of one cell and axis, which lie so far to the left of its middle."""
     nearest, used, names = int(np.argmin(np.abs(beside))), {name}, []
     for i, off in enumerate(beside.tolist()):
         other = f"{name}.{int(np.floor(off * FIFTHS / LATTICE_M + FIFTHS / 2))}"
-        while other in used:  # two in one fifth: a knot, whose parts have no name of their own that lasts
+        while other in used:  # two in one fifth, in a knot; such names may change
             other += "'"
         names.append(name if i == nearest else other)
         used.add(names[-1])

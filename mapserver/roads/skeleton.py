@@ -1,12 +1,9 @@
-"""The lines along which machines drove, as single cells, tile by tile: a tile is made again only where it changed.
+"""Centre lines of driven roads as single cells; only changed tiles are recomputed.
 
-Ridges of a tile depend on the evidence in it and near it, its lines on the ridges of it and of the tiles around. More
-passes on a road seldom move its ridges, so that most tiles into which samples come keep their lines.
-
-Thinning: a mask of roads becomes lines of single cells, 8-connected, with the same topology.
-
-Algorithm A1 of Guo and Hall, "Parallel thinning with two-subiteration algorithms", Communications of the ACM 32 (1989).
-The number of rounds is fixed, so that a cell depends on nothing farther than `REACH` cells; what is wider stays thick.
+A tile's ridges depend on nearby evidence, its lines on the ridges of 3 x 3 tiles. More passes rarely move ridges.
+Thinning keeps the topology (8-connected): algorithm A1 of Guo and Hall, "Parallel thinning with two-subiteration
+algorithms", Communications of the ACM 32 (1989). A fixed number of rounds limits its reach to `REACH` cells; wider
+areas stay thick.
 """
 
 from __future__ import annotations
@@ -25,12 +22,12 @@ from mapserver.roads.ridges import AXES, Blur, ridges
 from protocol.arrays import AnyArray, Bools, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
-ROUNDS = 8  # ridges are five cells wide, and where several cross some more
+ROUNDS = 8  # ridges are five cells wide, crossings more
 REACH = 2 * ROUNDS + 1
 
 
 def thinned(mask: Bools) -> Bools:
-    """The lines (rows, columns) of a mask; nothing lies outside of it. Small holes are closed first."""
+    """Lines (rows, columns) of a mask, empty outside. Holes of one cell are closed first, or they become rings."""
     padded = np.pad(mask, 1).astype(np.uint8)
     _close_holes(padded)
     _thin(padded)
@@ -39,7 +36,6 @@ def thinned(mask: Bools) -> Bools:
 
 @numba.njit(cache=True, nogil=True)
 def _close_holes(image: Any) -> None:
-    """Set cells whose four neighbours are set: a hole of one cell would become a ring."""
     rows, columns = image.shape
     before = image.copy()
     for y in range(1, rows - 1):
@@ -52,7 +48,7 @@ def _close_holes(image: Any) -> None:
 def _thin(image: Any) -> None:
     places = np.argwhere(image)
     removed = np.empty(len(places), np.int64)
-    last = 0  # half that removed any
+    last = 0  # last subiteration that removed cells
     for turn in range(2 * ROUNDS):
         gone = 0
         for i in range(len(places)):
@@ -65,13 +61,13 @@ def _thin(image: Any) -> None:
             image[y, x] = 0
         if gone:
             last = turn
-        elif turn > last:  # both halves of a round changed nothing, so nothing ever will
+        elif turn > last:  # converged
             break
 
 
 @numba.njit(cache=True, nogil=True)
 def _is_removable(image: Any, y: int, x: int, turn: int) -> bool:
-    """Whether a cell may go in this half of a round; neighbours p2 ... p9 clockwise from above."""
+    """Whether this subiteration removes a cell. Neighbours p2 ... p9, clockwise from above."""
     p2, p3, p4, p5 = image[y - 1, x], image[y - 1, x + 1], image[y, x + 1], image[y + 1, x + 1]
     p6, p7, p8, p9 = image[y + 1, x], image[y + 1, x - 1], image[y, x - 1], image[y - 1, x - 1]
     crossings = ((1 - p2) & (p3 | p4)) + ((1 - p4) & (p5 | p6)) + ((1 - p6) & (p7 | p8)) + ((1 - p8) & (p9 | p2))
@@ -88,11 +84,11 @@ def _is_removable(image: Any, y: int, x: int, turn: int) -> bool:
     return bool(((p6 | p7 | (1 - p9)) & p8) == 0)
 
 
-TILE = 128  # cells of the raster to a side
-RASTER_M = 1.0  # smaller cells are joined to about this size: positions are not known any better
-NEAR = 2  # cells to each side of a line whose metres are told beside it
-EDGE = REACH + 1  # cells of ridges around a tile that its lines depend on
-# Of a tile and EDGE cells around: where the tiles before it, itself and those after it lie, and which of their cells.
+TILE = 128  # raster cells to a side
+RASTER_M = 1.0  # metres; smaller cells are joined, as positions are no better
+NEAR = 2  # cells on each side of a line that count for it
+EDGE = REACH + 1  # ridge cells around a tile that its lines depend on
+# of a window (a tile and EDGE cells around), and of the tiles before, at and after it
 _OF_WINDOW = {-1: slice(0, EDGE), 0: slice(EDGE, EDGE + TILE), 1: slice(EDGE + TILE, None)}
 _OF_TILE = {-1: slice(TILE - EDGE, None), 0: slice(None), 1: slice(0, EDGE)}
 
@@ -102,10 +98,9 @@ Tile = tuple[int, int]  # column and row
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Cells of lines, sorted by row and column.
+    """Cells of lines, sorted.
 
-    places: (n, 2) row and column, in cells of raster_m from the origin. metres: (n, AXES) driven along each axis in the
-    5 x 5 cells around, in 1/4096 m.
+    places: (n, 2) row and column in cells of raster_m. metres: (n, AXES) in the 5 x 5 cells around, in 1/4096 m.
     """
 
     places: Ints
@@ -115,17 +110,12 @@ class Skeleton:
 
 @dataclass
 class _Lines:
-    """Those of one tile, as in Skeleton."""
-
     places: Ints
     metres: Ints
 
 
 class Skeletons:
-    """Makes skeletons of one map, and keeps what the pages that are still the same objects show.
-
-    made: tiles whose ridges were looked for so far. For one thread at a time.
-    """
+    """Makes skeletons of one map; caches tiles by identity of their pages. Single-threaded. made: tiles computed."""
 
     def __init__(self, cell_m: float) -> None:
         self._join = max(1, int(RASTER_M / cell_m + 1e-9))
@@ -133,12 +123,12 @@ class Skeletons:
         self._blur = Blur(self._raster_m)
         self._margin = self._blur.reach + self._blur.side
         self._pages: dict[Block, TimedPages] = {}
-        self._ridges: dict[Tile, Bools] = {}  # of tiles that have any
+        self._ridges: dict[Tile, Bools] = {}  # only tiles with ridges
         self._lines: dict[Tile, _Lines] = {}
         self.made = 0
 
     def skeleton(self, pages: Pages) -> Skeleton:
-        """The skeleton of a whole map."""
+        """Centre lines of a whole map."""
         known, self._pages = self._pages, dict(pages)
         changed = [block for block, own in pages.items() if known.get(block) is not own]
         changed += [block for block in known if block not in pages]
@@ -154,7 +144,6 @@ class Skeletons:
         return Skeleton(places[order], metres[order], self._raster_m)
 
     def _near(self, blocks: Iterable[Block]) -> set[Tile]:
-        """Tiles whose ridges depend on these blocks."""
         corner = np.array(list(blocks), np.int64).reshape(-1, 2) * BLOCK_CELLS
         first = (corner // self._join - self._margin) // TILE
         last = ((corner + BLOCK_CELLS - 1) // self._join + self._margin) // TILE
@@ -166,7 +155,7 @@ class Skeletons:
         }
 
     def _look(self, tile: Tile) -> bool:
-        """Look for the ridges of a tile again; returns whether they are others."""
+        """Returns whether the ridges of a tile changed."""
         self.made += 1
         now, known = ridges(self._axes(tile, self._margin), self._blur), self._ridges.get(tile)
         if not now.any():
@@ -177,10 +166,7 @@ class Skeletons:
         return True
 
     def _draw(self, tile: Tile, *, moved: bool, stale: bool) -> None:
-        """Make the lines of a tile again.
-
-        moved: ridges of it or beside it have moved; stale: evidence in it or near it is another.
-        """
+        """moved: ridges here or next to it changed; stale: nearby evidence changed."""
         known = self._lines.get(tile)
         places = self._thinned(tile) if moved or known is None else known.places
         if not len(places):
@@ -200,14 +186,14 @@ class Skeletons:
         return np.asarray(np.argwhere(lines) + np.array(tile[::-1]) * TILE, np.int64)
 
     def _axes(self, tile: Tile, margin: int) -> Ints:
-        """Metres (rows, columns, AXES) driven along each axis in a tile and so many cells around it."""
+        """(rows, columns, AXES), of a tile and its margin."""
         size = TILE + 2 * margin
         out = np.zeros((size, size, AXES), np.int64)
         _fill(*self._parts(tile, margin), out)
         return out
 
     def _around(self, tile: Tile, places: Ints) -> Ints:
-        """Metres (n, AXES) along each axis in the 5 x 5 cells around cells (n, 2) of a tile."""
+        """(n, AXES), of the 5 x 5 cells around cells (n, 2)."""
         numbers = np.full((TILE + 2 * NEAR, TILE + 2 * NEAR), -1, np.int64)
         own = places - np.array(tile[::-1]) * TILE + NEAR
         numbers[own[:, 0], own[:, 1]] = np.arange(len(own))
@@ -216,7 +202,7 @@ class Skeletons:
         return out
 
     def _parts(self, tile: Tile, margin: int) -> tuple[Ints, Ints, Ints, Ints, int, int, int]:
-        """What was driven in a tile and so many cells around it, as `_fill` takes it."""
+        """Arguments of `_fill`."""
         column, row = (TILE * index - margin for index in tile)
         size = TILE + 2 * margin
         spans = (
@@ -232,20 +218,20 @@ class Skeletons:
 
 
 def axis_metres(pages: TimedPages) -> tuple[AnyArray, AnyArray]:
-    """Where in a block machines drove: cell * AXES + axis (n,), and metres (n,) in 1/4096 m, of all pages."""
+    """Driven cells of a block: cell * AXES + axis (n,), and metres (n,) in 1/4096 m."""
     if axis_metres in pages.derived:
         known: tuple[AnyArray, AnyArray] = pages.derived[axis_metres]
         return known
     codes, metres = _driven(pages.plane_counts(HEADING))
     small = np.uint32 if metres.max(initial=0) < 2**32 else np.int64
     driven = codes.astype(np.uint16), metres.astype(small)
-    pages.derived[axis_metres] = driven  # few cells of a block are on a road; all, where nothing is a road
+    pages.derived[axis_metres] = driven  # few cells of a block are driven
     return driven
 
 
 @numba.njit(cache=True, nogil=True)
 def _driven(sectors: Any) -> tuple[Any, Any]:
-    """Codes and metres, as of `axis_metres`, of counts (sectors, cells)."""
+    """counts: (sectors, cells)."""
     codes, metres, used = np.empty(CELLS * AXES, np.int64), np.empty(CELLS * AXES, np.int64), 0
     for cell in range(CELLS):
         for axis in range(AXES):
@@ -258,7 +244,7 @@ def _driven(sectors: Any) -> tuple[Any, Any]:
 
 @numba.njit(cache=True, nogil=True)
 def _fill(codes: Any, metres: Any, ends: Any, corners: Any, join: int, row: int, column: int, out: Any) -> None:
-    """Add the metres of blocks, whose first cells are at corners (x, y), to a raster that begins at row, column."""
+    """Rasterise blocks with first cells at corners (x, y); the raster begins at row, column."""
     rows, columns = out.shape[:2]
     first = 0
     for b in range(len(ends)):
@@ -275,7 +261,7 @@ def _fill(codes: Any, metres: Any, ends: Any, corners: Any, join: int, row: int,
 def _add_around(
     codes: Any, metres: Any, ends: Any, corners: Any, join: int, row: int, column: int, numbers: Any, out: Any
 ) -> None:
-    """Add the metres of blocks, as of `_fill`, to out (n, AXES) of those cells that are near; numbers: -1 for none."""
+    """Add metres, as in `_fill`, to out (n, AXES) of nearby cells; numbers: index into out, or -1."""
     rows, columns = numbers.shape
     first = 0
     for b in range(len(ends)):

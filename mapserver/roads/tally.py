@@ -1,7 +1,7 @@
-"""What was driven, by span of time, place and direction: sums of integers, from which any segment has its traffic.
+"""The tally: traffic by time, place and direction as integer sums, from which any segment gets its traffic.
 
-Places are cells that do not depend on where roads run, so that samples which move a road move no traffic: it is summed
-up for the segments when it is read. Any order and any batching of the samples give the same tally, bit for bit.
+Places are cells independent of roads, so a road that moves does not move traffic. Order and batching of samples do not
+matter, bit for bit.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ from mapserver.roads.cutting import LATTICE_M
 from protocol.arrays import Floats, Ints, Table
 from protocol.units import HOUR_NS
 
-CELL_M = LATTICE_M / 10  # so that cells end where segments do
-HOURS = 120  # with driving that are remembered; what is older is read from the journal
-SECTORS = 16  # of the direction of travel, the first one centred on east
-PER_M = 1000  # metres, and places in the cell
-PER_C = 100_000  # c_rr and gradient
-SLOWEST_MPS = 0.1  # a slower machine is taken to drive so fast: it would take for ever
-_C2_SHIFT = 100  # squares are in units of this over PER_C squared, so that sums of any hour fit
+CELL_M = LATTICE_M / 10  # metres; divides the lattice's cell
+HOURS = 120  # driven hours kept; the journal has older ones
+SECTORS = 16  # of the direction of travel, the first centred on east
+PER_M = 1000  # units per metre, also of positions
+PER_C = 100_000  # units of c_rr and gradient
+SLOWEST_MPS = 0.1  # lower bound [m/s]: standing would take for ever
+_C2_SHIFT = 100  # units of squares over PER_C squared, so that hourly sums fit
 _AXIS_BITS, _SECTOR_BITS = 17, 4  # sites reach 100 km from their origin
-_HALF = 1 << (_AXIS_BITS - 1)  # with 25 bits left for slots, of a minute or more
+_HALF = 1 << (_AXIS_BITS - 1)  # 25 bits remain for slots of a minute or more
 _SLOT_SHIFT = 2 * _AXIS_BITS + _SECTOR_BITS
-_PENDING_ROWS = 16_384  # merged at once: merging costs a sort of everything
+_PENDING_ROWS = 16_384  # rows merged at once, because merging sorts everything
 
-# metres driven; of these weighed, where the mass is known, measured, where c_rr is, graded, and fuelled, where the
-# burned litres are. Sums over metres: kg, c_rr and its square, gradient east and north, place from the corner. Of
-# what is fuelled: litres, milliseconds, and the square of the speed over metres.
+# Metres driven, and those with known mass (weighed), c_rr (measured), gradient (graded), litres (fuelled). Times
+# metres: kg, c_rr and its square, gradient, position from the corner. Of fuelled: litres, milliseconds, squared speed
+# times metres.
 SUMS = (
     *("metres", "weighed", "measured", "graded", "kg", "c", "c2", "east", "north"),
     *("fuelled", "fuel", "ms", "v2", "x", "y"),
 )
-PER_L, PER_V2 = 1_000_000, 100  # litres; squares of speeds
+PER_L, PER_V2 = 1_000_000, 100  # units of litres and of squared speeds
 TALLY = np.dtype([("key", "<i8"), *((name, "<i8") for name in SUMS), ("machines", "<u8")])
 _SECTOR_RAD = 2 * np.pi / SECTORS
 
 
 class Tally:
-    """Sums of some machines over spans of time. slots: how many spans with driving it remembers, the newest ones."""
+    """Sums by span of time; `slots` driven spans are kept, newest first."""
 
     def __init__(self, slot_ns: int = HOUR_NS, slots: int = HOURS, cell_m: float = CELL_M) -> None:
-        """cell_m: edge of the cells, a whole part of the lattice's."""
+        """cell_m: divides the lattice's cell."""
         self.slot_ns, self.cell_m, self._slots = slot_ns, cell_m, slots
         self._table: Table = np.zeros(0, TALLY)
         self._pending: list[Table] = []
         self._waiting = 0
 
     def add(self, rows: Table, names: NDArray[np.uint64]) -> None:
-        """Add samples (n,), corrected, whose position is sure enough to vote; names (n,): hashes of their machines'."""
+        """Add corrected samples (n,) that may vote by position; names (n,): hashes of machine names."""
         new = tally(rows, names, self.slot_ns, self.cell_m)
         self._pending.append(new)
         self._waiting += len(new)
@@ -60,10 +60,7 @@ class Tally:
             self.table()
 
     def table(self) -> Table:
-        """All rows, by their keys.
-
-        A span that is forgotten can never come back among the newest ones, so that when this runs has no influence.
-        """
+        """All rows, sorted by key. A forgotten span never returns, so it does not matter when this is called."""
         if self._pending:
             whole = summed(np.concatenate([self._table, *self._pending]))
             self._pending, self._waiting = [], 0
@@ -74,14 +71,14 @@ class Tally:
 
 
 def tally(rows: Table, names: NDArray[np.uint64], slot_ns: int, cell_m: float = CELL_M) -> Table:
-    """The tally of samples (n,) of machines whose names have these hashes (n,)."""
+    """Tally of samples (n,); names (n,): hashes of machine names."""
     out = np.zeros(len(rows), TALLY)
     return summed(out[: _measure(rows, names, cell_m, slot_ns, out)])
 
 
 def summed(rows: Table) -> Table:
-    """Sum what has the same key; sorted by it."""
-    order = np.argsort(rows["key"], kind="stable")  # mostly sorted runs already
+    """Sum rows of equal key; sorted by it."""
+    order = np.argsort(rows["key"], kind="stable")  # fast, as most runs are sorted
     rows = rows[order]
     first = np.flatnonzero(np.diff(rows["key"], prepend=-1))
     out = np.zeros(len(first), TALLY)
@@ -94,43 +91,43 @@ def summed(rows: Table) -> Table:
 
 
 def between(table: Table, first: int, end: int) -> Table:
-    """Those rows of a table, by their keys, that are of slots first <= slot < end; no copy."""
+    """Rows of slots first <= slot < end; a view."""
     bounds = (bisect_left(table["key"], slots << _SLOT_SHIFT) for slots in (first, end))
     return table[slice(*bounds)]
 
 
 @numba.njit(cache=True, nogil=True)
 def slot(keys: Any) -> Any:
-    """Which span of time, counted since 1970."""
+    """Number of the time span since 1970."""
     return keys >> _SLOT_SHIFT
 
 
 @numba.njit(cache=True, nogil=True)
 def place(keys: Any) -> Any:
-    """A number of cell and sector."""
+    """Number of cell and sector."""
     return keys & ((1 << _SLOT_SHIFT) - 1)
 
 
 def corner_m(keys: Ints, cell_m: float) -> Floats:
-    """South-west corner (n, 2) of cells of this size [m]."""
+    """South-west corners (n, 2)."""
     column = ((keys >> _SECTOR_BITS) & ((1 << _AXIS_BITS) - 1)) - _HALF
     row = ((keys >> (_SECTOR_BITS + _AXIS_BITS)) & ((1 << _AXIS_BITS) - 1)) - _HALF
     return np.asarray(np.stack([column, row], axis=1) * cell_m, np.float64)
 
 
 def heading_rad(keys: Ints) -> Floats:
-    """Direction of travel, the middle of the sector."""
+    """Direction of travel [rad]: the middle of the sector."""
     return np.asarray((keys & ((1 << _SECTOR_BITS) - 1)) * _SECTOR_RAD, np.float64)
 
 
 def squares_of(c2: Ints) -> Floats:
-    """Sums of squares as c_rr squared over metres."""
+    """c_rr squared times metres."""
     return np.asarray(c2 * (_C2_SHIFT / PER_C**2 / PER_M), np.float64)
 
 
 @numba.njit(cache=True, nogil=True)
 def _measure(rows: Any, names: Any, cell_m: float, slot_ns: int, out: Any) -> int:
-    """Rows of single samples; returns how many there are: one that did not move drove nothing."""
+    """Returns the number of samples that moved."""
     used = 0
     for i in range(len(rows)):
         row = rows[i]

@@ -1,4 +1,4 @@
-"""The worklist: where work on roads pays, the stretch that costs most first; and whether a stretch gets worse."""
+"""The worklist: road sections worth grading, most expensive first; and trends of c_rr."""
 
 from __future__ import annotations
 
@@ -13,25 +13,21 @@ from mapserver.roads.tally import PER_C
 from protocol.arrays import Floats, Ints
 from protocol.units import DAY_NS, DIESEL_J_PER_L
 
-# Of a hauler at full power, over its mass: what work takes longer costs at this rate. Assumed; a loaded truck has 5, an
-# empty one 11.
+# Full power over mass [W/kg], which turns work into time. Assumed; loaded trucks have 5, empty ones 11.
 ENGINE_W_PER_KG = 6.0
-TIE_SHARE = 0.05  # of the highest loss: stretches that differ by less have the same rank
-TREND_DAYS = 3  # with measurements; fewer are weather
+TIE_SHARE = 0.05  # of the highest loss; smaller differences tie
+TREND_DAYS = 3  # days a trend needs; fewer are weather
 
 
 class Ranked(NamedTuple):
-    """Segments by what they cost. order: (k,) their numbers, first what costs most; rank: (k,) of these, from 1."""
+    """order: (k,) segments, most expensive first; rank: (k,), from 1."""
 
     order: Ints
     rank: Ints
 
 
 def ranked(losses: Losses) -> Ranked:
-    """Segments where anything is lost for sure, by work lost; those that differ by less than the noise tie.
-
-    What is not beyond its noise (low is 0) comes not at all.
-    """
+    """Rank segments by lost work, without losses inside their noise."""
     sure = np.flatnonzero(losses.low_j > 0)
     order = sure[np.argsort(-losses.work_j[sure], kind="stable")]
     work = losses.work_j[order]
@@ -50,12 +46,12 @@ def litres(work_j: Floats, efficiency: float) -> Floats:
 
 
 def seconds(work_j: Floats, kg: Floats) -> Floats:
-    """How long machines of a mass take for work."""
+    """Time that machines of these masses take for work."""
     return np.asarray(work_j / (ENGINE_W_PER_KG * kg), np.float64)
 
 
 class Daily(NamedTuple):
-    """Mean c_rr of segments by day, (n,) each, by segment and day, of days with measurements. day: since 1970."""
+    """Daily mean c_rr (n,) by segment and day since 1970."""
 
     segment: Ints
     day: Ints
@@ -63,7 +59,7 @@ class Daily(NamedTuple):
 
 
 def daily(ledger: Ledger) -> Daily:
-    """What was measured on each day."""
+    """Daily means; days without measurements are missing."""
     rows = ledger.rows[ledger.rows["measured"] > 0]
     day = rows["slot"] * ledger.slot_ns // DAY_NS
     first = np.flatnonzero(np.append(len(day) > 0, (np.diff(rows["segment"]) != 0) | (np.diff(day) != 0)))
@@ -74,10 +70,7 @@ def daily(ledger: Ledger) -> Daily:
 
 
 def trends(ledger: Ledger) -> Floats:
-    """Change of c_rr per day (k,), by Theil and Sen over days with measurements; NaN where there are less than three.
-
-    The median of the slopes between all pairs of days: one day of rain is no trend.
-    """
+    """Change of c_rr per day (k,) by Theil and Sen (one day of rain is no trend); NaN for less than three days."""
     out, days = np.full(len(ledger.ends) - 1, np.nan), daily(ledger)
     bounds = [*np.flatnonzero(np.diff(days.segment, prepend=-1)).tolist(), len(days.segment)]
     for first, end in pairwise(bounds):
