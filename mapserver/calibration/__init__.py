@@ -1,1 +1,1 @@
-"""Calibration of all machines of a site by each other and by the ground: zero, scale and lateral zero of each."""
+"""Calibration of a site's machines by each other and the ground."""

@@ -1,7 +1,6 @@
-"""From ledgers to corrections: machines in the map together, and each of the others against the ground of these.
+"""From ledgers to corrections: machines in the map are solved together, others against their ground.
 
-What trust excludes has no say in the common ground, but has a correction of its own: a machine whose only fault is its
-gain may then be let in again.
+A machine excluded by trust has no influence, but gets a correction: with it, it may return.
 """
 
 from __future__ import annotations
@@ -34,23 +33,22 @@ from protocol.arrays import Floats, Table
 from protocol.machine.samples import SCALE_STD
 from protocol.site.site_config import KnownGround
 
-KNOWN = CommonScale(True, 0.0, "")  # of machines that are solved together: what their estimate says is all there is
-# A sensor that measures less than half or more than twice of the drive force has no gain: it is stuck, or on its head.
+KNOWN = CommonScale(True, 0.0, "")  # of machines solved together
+# Beyond half to twice the drive force there is no gain: the sensor is stuck or upside down.
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
-# A solve takes so many epochs of all machines together, the newest, and no more machines than that: time and memory
-# grow with the cube and the square of what is unknown (100 machines: 6 s and 0.5 GB).
+# Newest epochs and machines per solve: time grows with the cube and memory with the square of unknowns (100 machines: 6
+# s, 0.5 GB).
 MOST_EPOCHS, MOST_MACHINES = 1000, 100
-# Machines at fault are taken out one by one, or by this share of the machines, so that a large fleet is not solved
-# dozens of times.
+# Share of the machines removed at once for faults, to limit the solves of a large fleet.
 AT_ONCE = 0.1
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What a solve says: corrections in the order of stamps, states of all machines, and their common scale.
+    """Corrections by stamp, states of all machines, and their common scale.
 
-    stated: by machine and number of the epoch, what the machine applied itself. remembered: machines whose scale is no
-    evidence of now. begins_ns: by machine, from when on there may be samples of it.
+    stated: by machine and epoch, what it applied itself. remembered: machines with scales from earlier evidence.
+    begins_ns: earliest sample of each machine.
     """
 
     corrections: tuple[Correction, ...]
@@ -70,9 +68,8 @@ def calibrate(
 ) -> Solution:
     """Solve for all machines.
 
-    ledgers: stays by machine, as `Ledger.stays` has them, MOST_MACHINES at most. excluded: machines without a say,
-    beside those that are at fault. areas: whose c_rr the site states. remembered: what evidence showed of machines
-    before; it counts for those whose scale these stays do not show as surely.
+    ledgers: stays by machine, MOST_MACHINES at most. excluded: without influence, as are those at fault. areas: of
+    stated c_rr. remembered: earlier scales, used where these stays are less certain.
     """
     sane = {name: stays for name, table in ledgers.items() if len(stays := sound(table))}
     known = {name: newest(table, epochs_of_each(len(sane))) for name, table in sane.items()}
@@ -88,19 +85,19 @@ def calibrate(
 
 
 def epochs_of_each(machines: int) -> int:
-    """How many epochs of each of so many machines a solve takes."""
+    """Epochs per machine in a solve."""
     return min(EPOCHS, MOST_EPOCHS // max(min(machines, MOST_MACHINES), 1))
 
 
 def groups(machines: Iterable[str]) -> list[tuple[str, ...]]:
-    """Machines that are solved together: all, or as few groups as it takes. These know nothing of each other."""
+    """As few groups as needed, each solved alone."""
     names = sorted(machines)
     count = max(1, math.ceil(len(names) / MOST_MACHINES))
     return [tuple(names[first::count]) for first in range(count)]
 
 
 def joined(parts: Sequence[Solution]) -> Solution:
-    """What the solves of several groups say together; the common scale is the least known of theirs."""
+    """Join the solves of groups; the common scale is the least certain."""
     states = {name: state for part in parts for name, state in part.machines.items()}
     applied = {name: of_machine for part in parts for name, of_machine in part.stated.items()}
     corrections = tuple(one for part in parts for one in part.corrections)
@@ -117,7 +114,6 @@ def _solved(
     priors: Mapping[str, Prior],
     tuning: CalibrationTuning,
 ) -> Solution:
-    """What a solve with these priors says."""
     trusted = {name: table for name, table in known.items() if name not in excluded}
     pb, result, unlike = _with_rolling(*_common_ground(trusted, areas, priors, tuning))
     observed = observe(pb, result)
@@ -137,10 +133,10 @@ def _common_ground(
     priors: Mapping[str, Prior],
     tuning: CalibrationTuning,
 ) -> tuple[FleetProblem, Estimate]:
-    """The ground of all machines but those that are at fault: one alone can put the slopes of a whole site in doubt.
+    """The ground of all machines except those at fault: one alone can discredit all slopes.
 
-    Where slopes are in doubt, less is odd. But if nobody's absence ends the doubt, the ground itself is the reason, and
-    only those are left out that are at fault for sure; nobody where most seem to be.
+    While slopes are in doubt, limits are lower. If no removal ends the doubt, the ground is the cause, and only clear
+    faults count; none if most machines seem at fault.
     """
 
     def solved(some: Mapping[str, Table]) -> tuple[FleetProblem, Estimate]:
@@ -155,9 +151,9 @@ def _common_ground(
 
 
 def _with_rolling(pb: FleetProblem, result: Estimate) -> tuple[FleetProblem, Estimate, Mapping[int, Rolling]]:
-    """Solved again with machines that roll unlike the others as such, which pull on no other one's scale then.
+    """Solve again with machines that roll differently modelled, so they do not pull other scales.
 
-    Where nobody can be named all are: then slopes alone show scales, which are the less sure for it.
+    If they cannot be named, all are modelled; then only slopes show scales.
     """
     unlike, on_slopes = rolling(pb, result)
     while new := unlike.keys() & set(on_slopes) - set(pb.unlike):
@@ -174,10 +170,10 @@ def _without_odd(
     in_doubt: float,
     solved: Callable[[Mapping[str, Table]], tuple[FleetProblem, Estimate]],
 ) -> tuple[FleetProblem, Estimate]:
-    """Solved without the oddest machine, and the next, as long as there is one; the first where not most would remain.
+    """Remove the oddest machines step by step; `first` if no majority would remain.
 
-    trusted: all machines. first: as solved with those that have a say still. in_doubt: standard deviations of a scale
-    that is odd while slopes are in doubt.
+    trusted: all machines. first: solved so far. in_doubt: limit of a scale [data-sheet sigmas] while slopes are in
+    doubt.
     """
     now = first
     while odd := _odd(*now, (FAULT_SIGMAS[0], in_doubt if now[1].edges else FAULT_SIGMAS[1]))[
@@ -191,7 +187,7 @@ def _without_odd(
 
 
 def _odd(pb: FleetProblem, result: Estimate, sigmas: tuple[float, float]) -> list[str]:
-    """Machines whose zero or scale is off by more standard deviations of the data sheet, the furthest first."""
+    """Machines whose bias or scale exceeds data-sheet sigmas, worst first."""
     far = (beyond_data_sheet(pb, result) / sigmas).max(axis=1)
     return [pb.names[index] for index in np.argsort(-far, kind="stable").tolist() if far[index] > 1]
 
@@ -203,13 +199,13 @@ def _said(
     unlike: Mapping[int, Rolling],
     others: CommonScale = KNOWN,
 ) -> tuple[list[Correction], dict[str, MachineErrors]]:
-    """Corrections and states of the machines of a problem. others: of those whose ground it was solved against."""
+    """others: common scale of the ground it was solved against."""
     applied = applied_part(pb, result, observed, others)
     return _corrections(pb, applied, unlike), _states(pb, applied, observed.by)
 
 
 def _corrections(pb: FleetProblem, applied: AppliedPart, unlike: Mapping[int, Rolling]) -> list[Correction]:
-    """One correction for each epoch; the newest of a machine holds on. What measures no force has no scale."""
+    """One per epoch, the newest open-ended. A sensor that measures no force has no scale."""
     layout, epochs = pb.layout, pb.epochs
     both = zip(applied.x[layout.rolls], applied.x[layout.drags], strict=True)
     rolls = {i: each for i, each in zip(pb.unlike, both, strict=True) if i in unlike and unlike[i].is_named}
@@ -240,7 +236,7 @@ def _corrections(pb: FleetProblem, applied: AppliedPart, unlike: Mapping[int, Ro
 
 
 def _covariance(covariance: Floats, tuning: CalibrationTuning) -> tuple[tuple[float, ...], ...]:
-    """With the floors of zero, scale and lateral zero, rounded to what a fact keeps."""
+    """Add floors; round as facts are."""
     floored = covariance + np.diag(np.square([tuning.zero_floor, tuning.scale_floor, tuning.zero_floor]))
     return tuple(tuple(float(f"{value:.4g}") for value in row) for row in floored.tolist())
 
@@ -248,7 +244,7 @@ def _covariance(covariance: Floats, tuning: CalibrationTuning) -> tuple[tuple[fl
 def _states(
     pb: FleetProblem, applied: AppliedPart, shown: Mapping[str, Mapping[str, tuple[str, ...]]]
 ) -> dict[str, MachineErrors]:
-    """States of the machines of a problem. shown: by which sources."""
+    """shown: sources by machine and value."""
     layout, tuning = pb.layout, pb.tuning
     x, std = applied.x, np.sqrt(np.diag(applied.covariance))
     out = {}

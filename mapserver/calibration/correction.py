@@ -1,20 +1,18 @@
-"""What a machine's samples are off by, and the samples without it: one function for every map.
+"""Errors of a machine's samples and their removal, the same for every map.
 
-A sample of direction d (+1 ahead, -1 in reverse) on ground c with slope s ahead has, for a zero z and a scale error k,
+A sample in direction d (+1 ahead, -1 reverse), on ground c with slope s ahead, bias z and scale error k, has
 
     c_rr = c + d z + d k (d c + s),    slope ahead = s - z,    slope to the left = t + a
 
-and d c_rr + slope ahead is the drive force over weight as it was measured, (1 + k) (d c + s): in it the zero cancels.
-So with scale = k / (1 + k) nothing but the sample itself is needed to undo all three. Of a machine that rolls unlike
-the others what is left then is c (1 + m) + b (`mapserver.calibration.rolling`), which m and b undo.
+The sum d c_rr + slope ahead is the measured drive force over weight, (1 + k) (d c + s), without the bias. So scale = k
+/ (1 + k) corrects a sample from its own values. Of a machine that rolls differently c (1 + m) + b remains
+(`mapserver.calibration.rolling`), which m and b correct.
 
-A machine that calibrates itself has taken a zero and a scale off already, and states them in each sample. Then the sum
-above is (1 - applied scale) of the drive force over weight, so that what was measured follows (`measured`), and a
-correction takes off the difference alone: it does not matter who calibrated when.
+A machine that calibrates itself states the bias and scale it removed; its sum is (1 - applied scale) times the force
+over weight. `measured` restores the measurement. Corrections remove only the difference, so it does not matter who
+calibrated when.
 
-Only + - * / and a table of headings: kernels and machines would differ in the last bit of a sine, and so would maps.
-
-SampleCorrections of one machine in the order of time: what covers what, and what lies at a time.
+Only + - * / and a heading table: processors differ in the last bit of a sine, and maps must not.
 """
 
 from __future__ import annotations
@@ -32,19 +30,17 @@ from protocol.arrays import Floats, Ints, Table
 from protocol.machine.readings import MAX_STAMP_NS
 from protocol.machine.samples import LIMITS
 
-HEADINGS = 4096  # of the table: 0.8e-3 rad off at most, which on 15 degrees is 0.2e-3 of a slope across
-_UNIT = 1 << 20  # sines are rounded to this: the last bits of a library's sine are not the same everywhere
+HEADINGS = 4096  # of the table: 0.8e-3 rad off, 0.2e-3 of lateral slope on 15 degrees
+_UNIT = 1 << 20  # sines are rounded to 1 / _UNIT, as libraries differ in their last bits
 _TURNS = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
 HEADING_TABLE: Ints = np.rint(_UNIT * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1)).astype(np.int64)
 UNIT_VECTORS: Floats = HEADING_TABLE / _UNIT  # exact: a power of two
 _PER_RAD = HEADINGS / (2 * np.pi)
-# Where a machine's scale is not known, its share of drive force times that error is the larger part of a sample's error
-# from this share on (data sheets: 0.0045 of zero, 0.045 of scale). To take the zero alone off there would exchange one
-# wrong value for another, so that samples on slopes stay as they are. NO_SHARE: of a sensor that measures no force no
-# resistance is corrected at all.
+# Share of drive force up to which samples are corrected without a known scale; beyond, the scale error exceeds the bias
+# (data sheets: 0.045, 0.0045), and removing the bias alone does not help. NO_SHARE: for sensors without a force.
 NO_SHARE, LEVEL_SHARE, ANY_SHARE = 0.0, 0.1, 100.0
-LAST_NS = 2**62  # a correction without an end ends then
-DIGITS = 5  # a correction is rounded to 1e-5 before it is used: it is a fact, not a solver's floats
+LAST_NS = 2**62  # end of an open correction [ns]
+DIGITS = 5  # decimals of a correction, which is a fact, not a solver's float
 _C_LOW, _C_HIGH = LIMITS["c_rr"]
 _GRADE_LOW, _GRADE_HIGH = LIMITS["grade_e"]
 VALUES = ("zero", "scale", "across", "most_share", "rolls", "drags")
@@ -52,13 +48,11 @@ VALUES = ("zero", "scale", "across", "most_share", "rolls", "drags")
 
 @dataclass(frozen=True)
 class Correction:
-    """What is taken off the samples of one machine, from_ns <= stamp_ns < to_ns.
+    """What is removed from a machine's samples, from_ns <= stamp_ns < to_ns.
 
-    zero of the balance [-], which is also how much too low the slope ahead is; scale: k / (1 + k) of the drive force;
-    across: how much too high the slope to the left is. All rounded to DIGITS. covariance (3, 3): of what is left, in
-    this order. most_share: c_rr of a sample with a larger share of drive force over weight stays as it was; less than
-    ANY_SHARE where the scale is not known, and then what the machine itself applied of a scale stays applied. rolls,
-    drags: m and b.
+    zero: bias [-], added to the slope ahead. scale: k / (1 + k). across: excess of the slope to the left. covariance
+    (3, 3): of their errors. most_share: samples with a larger share of drive force keep their c_rr; below ANY_SHARE the
+    scale is unknown, and the machine's own stays applied. rolls, drags: m and b.
     """
 
     machine: str
@@ -74,7 +68,7 @@ class Correction:
 
 
 class _Spans:
-    """Corrections of one machine, in order of time, and the same in numbers: spans (k, 2) and values (k, 6)."""
+    """Sorted corrections of one machine, also as spans (k, 2) and values (k, 6)."""
 
     def __init__(self, each: Iterable[Correction]) -> None:
         self.each = tuple(sorted(each, key=lambda one: one.from_ns))
@@ -83,10 +77,9 @@ class _Spans:
 
 
 class SampleCorrections:
-    """Corrections of all machines as one value: equal ones change every sample alike.
+    """Corrections of all machines as a value: equal ones change samples alike.
 
-    The spans of one machine do not overlap. There may be many: what is changed for one machine costs nothing for the
-    others.
+    Spans of one machine do not overlap. A change costs only its machines.
     """
 
     def __init__(self, each: Iterable[Correction] = ()) -> None:
@@ -96,11 +89,11 @@ class SampleCorrections:
         self._take({machine: _Spans(own) for machine, own in by_machine.items()})
 
     def replaced(self, machines: Mapping[str, Sequence[Correction]]) -> SampleCorrections:
-        """The same but for all corrections of some machines."""
+        """Replace all corrections of machines."""
         return self._with(self._machines | {name: _Spans(each) for name, each in machines.items()})
 
     def without(self, machines: Collection[str]) -> SampleCorrections:
-        """Those of the other machines."""
+        """Drop the corrections of machines."""
         return self._with({name: own for name, own in self._machines.items() if name not in machines})
 
     def _with(self, machines: Mapping[str, _Spans]) -> SampleCorrections:
@@ -113,7 +106,7 @@ class SampleCorrections:
         parts, first = [*self._machines.values()], 0
         self._spans = np.concatenate([np.zeros((0, 2), np.int64), *(own.spans for own in parts)])
         self._values = np.concatenate([np.zeros((0, len(VALUES))), *(own.values for own in parts)])
-        self._places: dict[str, tuple[int, int]] = {}  # of each machine's: the first, and the end
+        self._places: dict[str, tuple[int, int]] = {}  # of each machine: first and end
         for name, own in self._machines.items():
             self._places[name] = first, (first := first + len(own.each))
         self._key = self.digest()
@@ -133,9 +126,9 @@ class SampleCorrections:
         return hash(self._key)
 
     def digest(self, before_ns: int = MAX_STAMP_NS) -> str:
-        """A word for what they do to samples stamped before a time, which no others have; "" for nothing.
+        """Hash of the effect on samples stamped before a time; "" for none.
 
-        Where a span is cut in two, it is another word, which does no harm: it says when evidence may be used again.
+        It changes when a span is split, which only costs a reuse of evidence.
         """
         hashed, some = hashlib.blake2b(digest_size=8), False
         for name, own in self._machines.items():
@@ -146,21 +139,20 @@ class SampleCorrections:
         return hashed.hexdigest() if some else ""
 
     def spans_of(self, machine: str) -> tuple[Correction, ...]:
-        """Those of one machine, in order of time."""
+        """A machine's corrections by time."""
         own = self._machines.get(machine)
         return own.each if own else ()
 
     def newest(self, machine: str) -> Correction | None:
-        """The last one of a machine; None for none."""
+        """A machine's last correction, or None."""
         own = self._machines.get(machine)
         return own.each[-1] if own else None
 
     def applied(self, rows: Table, machines: Sequence[str], machine: Ints) -> Table:
-        """Samples (n,) without their machines' errors; those that no correction covers stay bytes as they were.
+        """Correct samples (n,); those outside all spans keep their bytes.
 
-        machines: names; machine (n,): index of each sample's in them. Corrections count from what was measured, so of
-        them only what a sample does not state as applied is taken off; where the machine knows a scale and the
-        correction does not, the machine's counts. Values leave the limits of a sample by nothing: they end there.
+        machine (n,): index into machines. A correction counts from the measurement: what a sample states as applied is
+        not removed again. Results are clipped to LIMITS.
         """
         if not any(name in self._places for name in machines) or not len(rows):
             return rows
@@ -174,16 +166,16 @@ UNCORRECTED = SampleCorrections()
 
 
 def corrected(rows: Table, corrections: Iterable[Correction]) -> Table:
-    """Samples (n,) of one machine without its errors. corrections: of this machine; see `SampleCorrections.applied`."""
+    """Correct a machine's samples (n,); see `SampleCorrections.applied`."""
     own = SampleCorrections(corrections)
     names = [one.machine for one in own.each[:1]]
     return own.applied(rows, names, np.zeros(len(rows), np.int64))
 
 
 def measured(rows: Table) -> Table:
-    """Samples (n,) as their machines measured them, without the calibrations that these applied; the same where none.
+    """Samples (n,) without their machines' own calibration; the same object if there is none.
 
-    Ledgers are made of these: the zero of a machine that calibrates itself would seem to step at every standstill.
+    Ledgers use these, or a self-calibrating machine's bias would step at every standstill.
     """
     applied = (rows["applied_zero"] != 0.0) | (rows["applied_scale"] != 0.0)
     if not applied.any():
@@ -195,15 +187,15 @@ def measured(rows: Table) -> Table:
 
 @numba.njit(cache=True, nogil=True)
 def heading_index(heading_rad: float) -> int:
-    """Which line of the table a heading has."""
+    """Row of the heading table."""
     return int(np.floor(heading_rad * _PER_RAD + 0.5)) % HEADINGS
 
 
 @numba.njit(cache=True, nogil=True)
 def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, units: Any) -> None:
-    """Correct rows in place. machine (n,): index in places (m, 2), each one's first and end in the corrections.
+    """In place. machine (n,): index into places (m, 2), first and end of its corrections.
 
-    spans (k, 2): by machine, in order of time; values (k, 6): by VALUES.
+    spans (k, 2), values (k, 6 as VALUES): by machine and time.
     """
     for i in range(len(rows)):
         row = rows[i]
@@ -231,14 +223,14 @@ def _correct(rows: Any, machine: Any, places: Any, spans: Any, values: Any, unit
 
 
 def values(one: Correction) -> tuple[float, ...]:
-    """What a correction does to a sample, by VALUES."""
+    """As VALUES."""
     return one.zero, one.scale, one.across, one.most_share, one.rolls, one.drags
 
 
 def paint(spans: list[Correction], one: Correction) -> None:
-    """Put a correction over those of one machine, which are in order of time; what it covers of them goes.
+    """Insert a correction into a machine's sorted ones, over what it covers.
 
-    Neighbours that do the same become one, as sure as the later: else they would grow without an end.
+    Neighbours of equal effect merge, with the later covariance, or they would grow without end.
     """
     first = bisect_right(spans, one.from_ns, key=lambda other: other.to_ns)
     end = first
@@ -257,6 +249,6 @@ def paint(spans: list[Correction], one: Correction) -> None:
 
 
 def at(spans: Sequence[Correction], stamp_ns: int) -> Correction | None:
-    """The correction that a time has, of those of one machine in order of time."""
+    """The correction at a time, or None; spans sorted by time."""
     index = bisect_right(spans, stamp_ns, key=lambda one: one.from_ns) - 1
     return spans[index] if index >= 0 and stamp_ns < spans[index].to_ns else None

@@ -1,12 +1,11 @@
-"""Which corrections count, and why: what a person decided, else what the solver decided, else what was sent.
+"""Which corrections count: a person's, else the solver's, else none.
 
-A person's decision about a machine stands until a person takes it back. The solver changes its mind with every sample,
-and old maps are to stay as people know them. So hysteresis: its correction replaces the one that counts if two solves
-in a row differ from that by more than their standard deviation, of all machines at once and seldom, since the map is
-folded again then. In the first minutes of a machine of which nothing counts one solve is enough: nobody knows that map.
+A person's decision stands until withdrawn. Solves change with every sample, but maps should be stable. Hysteresis: a
+correction is replaced only if two solves in a row differ from it by more than their standard deviation; all machines at
+once and rarely, because the map is rebuilt. A new machine without corrections needs one solve.
 
-A machine has one scale and one lateral bias: if they become known late, they count for all its older samples of which
-nothing was known. A bias is that of its epoch. All times are site time.
+A machine has one scale and one lateral bias; once known, they count for older samples that had none. A bias belongs to
+its epoch. All times are site time.
 """
 
 from __future__ import annotations
@@ -33,32 +32,33 @@ from mapserver.calibration.select import FAULT_SIGMAS, state_of
 from mapserver.calibration.tuning import TUNING
 from protocol.units import HOUR_NS, MINUTE_NS
 
-# Between two decisions of the solver, each of which folds samples again; in a machine's first minutes, when there is
-EVERY_NS = 10 * MINUTE_NS  # little to fold, as soon as it has driven twice as long as at the last decision
-IN_A_ROW = 2  # solves that have to differ from what counts; one, of a new machine of which nothing counts
-LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # by less than this no map gets better
-LEAST_ROLLS, TYPICAL_C_RR = 0.04, 0.04  # two deviations at best of how a machine rolls, and the ground it is judged on
-FIRST_NS = 10 * MINUTE_NS  # so long after it was first seen, a machine's map is new
-FROZEN_NS = 4 * HOUR_NS  # so long after it was first seen, an epoch keeps its zero
-MOST_STEP_NS = 10 * MINUTE_NS  # of site time between two judgements: more is a jump, of a wrong clock or at night
+# Between the solver's decisions, each of which folds samples again; a new machine has few, and decides again whenever
+# its driving time has doubled.
+EVERY_NS = 10 * MINUTE_NS
+IN_A_ROW = 2  # differing solves; one for a new machine without corrections
+LEAST_ZERO, LEAST_SCALE = 0.0005, 0.005  # smaller differences do not improve maps
+LEAST_ROLLS, TYPICAL_C_RR = 0.04, 0.04  # of rolling (two deviations at best), at this c_rr
+FIRST_NS = 10 * MINUTE_NS  # age of a machine up to which its map is new
+FROZEN_NS = 4 * HOUR_NS  # age of an epoch at which its bias is final
+MOST_STEP_NS = 10 * MINUTE_NS  # between judgements; longer jumps come from wrong clocks or nights
 
 
 class CalibrationDecisions:
     """The corrections that count.
 
-    decided_ns: the site's now when the solver decided last, None for never. confirmed: machines of whose newest samples
-    the solver says what counts, in the last judgement, and as of when [ns].
+    decided_ns: site time of the solver's last decision, or None. confirmed: machines confirmed by the last judgement,
+    and as of when [ns].
     """
 
     def __init__(self, decisions: Iterable[CalibrationDecision] = ()) -> None:
-        self._spans: dict[str, dict[str, list[Correction]]] = {SOLVER: {}, PERSON: {}}  # by machine, in order of time
+        self._spans: dict[str, dict[str, list[Correction]]] = {SOLVER: {}, PERSON: {}}  # by machine, sorted by time
         self._newest: dict[tuple[str, str], CalibrationDecision] = {}
         self._corrections = UNCORRECTED
-        self._changed: set[str] = set()  # machines whose corrections are not the ones above any more
+        self._changed: set[str] = set()  # machines with stale corrections above
         self._hysteresis = Hysteresis()
-        self._waiting: dict[str, CalibrationDecision] = {}  # by machine, what the solver wants until it may decide
-        self._shown: dict[str, Correction] = {}  # by machine, the last one whose scale evidence showed
-        self._as_of_ns: dict[str, int] = {}  # see `as_of_ns`, of what the solver says
+        self._waiting: dict[str, CalibrationDecision] = {}  # by machine: wanted, but too early
+        self._shown: dict[str, Correction] = {}  # by machine: last correction with a scale from evidence
+        self._as_of_ns: dict[str, int] = {}  # by machine; see `as_of_ns`
         self.decided_ns: int | None = None
         self.confirmed: Mapping[str, int] = {}
         for decision in decisions:
@@ -66,39 +66,39 @@ class CalibrationDecisions:
 
     @property
     def corrections(self) -> SampleCorrections:
-        """All that count."""
+        """All corrections that count."""
         if self._changed:
             self._corrections = self._corrections.replaced({name: self._of(name) for name in self._changed})
             self._changed.clear()
         return self._corrections
 
     def of_solver(self) -> list[Correction]:
-        """The newest correction of each machine that the solver decided, whatever people did."""
+        """Newest correction of each machine by the solver, even if overridden."""
         return [spans[-1] for spans in self._spans[SOLVER].values() if spans]
 
     def shown(self) -> list[Correction]:
-        """The last correction of each machine whose scale evidence showed, whatever was decided since."""
+        """Last correction of each machine with a scale from evidence."""
         return list(self._shown.values())
 
     def newest(self, machine: str) -> CalibrationDecision | None:
-        """The decision that a machine's newest correction comes from, None where it has none."""
+        """The decision behind a machine's newest correction, or None."""
         by = PERSON if self._spans[PERSON].get(machine) else SOLVER
         return self._newest.get((by, machine)) if self._spans[by].get(machine) else None
 
     def as_of_ns(self, machine: str) -> int:
-        """As of when that counts what is taken off a machine's newest samples.
+        """As of when a machine's newest correction holds.
 
-        The site's now when it was decided or last confirmed; but of a machine that stands, the end of its last epoch.
+        Its decision or last confirmation, but at most the end of the machine's last epoch (site time).
         """
         by_person = self._newest[PERSON, machine] if self._spans[PERSON].get(machine) else None
         return by_person.stamp_ns if by_person else self._as_of_ns.get(machine, 0)
 
     def confirm(self, confirmed: Mapping[str, int]) -> None:
-        """Note that the solver says of the newest samples of machines what counts already, as of when [ns]."""
+        """Confirm machines' newest corrections, as of these times [ns]."""
         self._as_of_ns |= confirmed
 
     def add(self, decision: CalibrationDecision) -> None:
-        """Have a decision count."""
+        """Make a decision count."""
         machine = decision.machine
         spans = self._spans[decision.by].setdefault(machine, [])
         if not decision.corrections:
@@ -118,10 +118,9 @@ class CalibrationDecisions:
         self._changed.add(machine)
 
     def judge(self, calibration: Solution, now_ns: int, *, asked: bool = False) -> list[CalibrationDecision]:
-        """What the solver decides; the caller keeps it, then calls `add`, or the same waits for the next judgement.
+        """The solver's decisions; the caller stores each, then calls `add`. Others wait for the next judgement.
 
-        calibration: of some machines; what is wanted of others waits as well. asked: by a person, who wants the best
-        that is known: all that differs at all, whatever its age.
+        calibration: may lack machines. asked: by a person, who gets every difference.
         """
         self._hysteresis.watch(now_ns)
         confirmed = {}
@@ -147,14 +146,14 @@ class CalibrationDecisions:
         return [replace(each, stamp_ns=now_ns) for each in wanted]
 
     def _due_ns(self, calibration: Solution, now_ns: int) -> int:
-        """The site's now from which on the solver may decide again what it says of some machines."""
+        """Site time from which the solver may decide again."""
         assert self.decided_ns is not None
         first_ns = min(calibration.begins_ns.values(), default=0)
-        driven_ns = max(0, self.decided_ns - first_ns) if first_ns <= now_ns else EVERY_NS  # else a clock is ahead
+        driven_ns = max(0, self.decided_ns - first_ns) if first_ns <= now_ns else EVERY_NS  # otherwise a clock is ahead
         return self.decided_ns + min(driven_ns, EVERY_NS)
 
     def _of(self, machine: str) -> list[Correction]:
-        """Those of one machine: people's above the solver's."""
+        """A machine's corrections, people's over the solver's."""
         spans = list(self._spans[SOLVER].get(machine, ()))
         for one in self._spans[PERSON].get(machine, ()):
             paint(spans, one)
@@ -162,7 +161,7 @@ class CalibrationDecisions:
 
 
 def _as_of_ns(newest: Correction, now_ns: int) -> int:
-    """As of when a solver's newest correction of a machine says what it says: a machine that stands shows nothing."""
+    """A standing machine adds no evidence."""
     return min(now_ns, newest.from_ns + EPOCH_NS)
 
 
@@ -173,10 +172,9 @@ def _before(
     stated: Mapping[int, Stated],
     begins_ns: int,
 ) -> list[Correction]:
-    """Where nothing counts before the first correction of a machine, it is that of all samples before: no step in time.
+    """Extend the first correction to earlier samples if none counts there: no step in time.
 
-    first: epoch that was solved for. begins_ns: of the machine's samples. But of a machine that states a zero of its
-    own, samples before were sent with that of then.
+    first: of the first solved epoch. Not for a machine that states its own bias, which earlier samples had too.
     """
     knows = stated.get(first.from_ns // EPOCH_NS, NOTHING_STATED) != NOTHING_STATED
     counts_before = bool(counts) and counts[0].from_ns <= first.from_ns
@@ -186,7 +184,7 @@ def _before(
 
 
 def _filled(counts: Sequence[Correction], changed: Sequence[Correction]) -> list[Correction]:
-    """What counts, with what was unknown then of scale and lateral zero and is known now; what was known stays."""
+    """What counts, with scale and lateral bias that were unknown and are known now."""
     now, out = changed[-1], []
     known = now.most_share >= ANY_SHARE and state_of(now).beyond[1] <= FAULT_SIGMAS[1]
     for one in counts:
@@ -204,7 +202,7 @@ def _filled(counts: Sequence[Correction], changed: Sequence[Correction]) -> list
 
 
 def _by_machine(corrections: Iterable[Correction]) -> dict[str, list[Correction]]:
-    """A solve's corrections by machine, in order of time, each up to the next one."""
+    """A solve's corrections by machine and time, each up to the next."""
     out: dict[str, list[Correction]] = {}
     for one in corrections:
         out.setdefault(one.machine, []).append(one)
@@ -216,22 +214,22 @@ def _by_machine(corrections: Iterable[Correction]) -> dict[str, list[Correction]
 
 @dataclass
 class _Epoch:
-    """One epoch of a machine. seen_ns: when it was first solved for; differs: how often in a row."""
+    """seen_ns: of the first solve; differs: successive differing solves."""
 
     seen_ns: int
     differs: int = 0
 
 
 class Hysteresis:
-    """Judges what a solver says of machines, solve by solve."""
+    """Compares solves with what counts."""
 
     def __init__(self) -> None:
-        self._epochs: dict[str, dict[int, _Epoch]] = {}  # by machine and beginning, of its last solve
-        self._watched_ns = 0  # site time without its jumps, since the first judgement
-        self._judged_ns: int | None = None  # the site's now in the last one
+        self._epochs: dict[str, dict[int, _Epoch]] = {}  # by machine and beginning, from the last solve
+        self._watched_ns = 0  # site time without jumps, since the first judgement
+        self._judged_ns: int | None = None  # site time of the last judgement
 
     def watch(self, now_ns: int) -> None:
-        """Note the site's now at a solve. In what was jumped over nobody learned anything."""
+        """Note a solve's site time; nothing is learnt during jumps."""
         self._watched_ns += min(max(now_ns - (self._judged_ns or now_ns), 0), MOST_STEP_NS)
         self._judged_ns = now_ns
 
@@ -244,13 +242,13 @@ class Hysteresis:
         *,
         asked: bool,
     ) -> list[Correction]:
-        """Those of a machine that are to replace what counts.
+        """Corrections of a machine that replace what counts.
 
-        proposed, counts: in order of time. stated: by epoch, what the machine applied itself. asked: by a person, who
-        wants all that differs at all.
+        proposed, counts: sorted. stated: by epoch, applied by the machine. asked: by a person, who gets every
+        difference.
         """
         known, newest_ns = self._epochs.get(machine), proposed[-1].from_ns
-        # Of what counts since before this server began, an epoch is as old as it is for its machine.
+        # after a restart, corrected epochs are as old as for their machine
         begins = known is None and len(counts) > 0
         own = self._epochs[machine] = {
             one.from_ns: (known or {}).get(one.from_ns)
@@ -271,20 +269,20 @@ class Hysteresis:
         return out
 
     def differs_now(self, machine: str, from_ns: int) -> bool:
-        """Whether the last solve differed from what counts at a beginning."""
+        """Whether the last solve differed from what counts at from_ns."""
         return self._epochs[machine][from_ns].differs > 0
 
     def decided(self, machine: str, corrections: Sequence[Correction]) -> None:
-        """Begin to count anew what was decided."""
+        """Reset the counts of decided epochs."""
         for from_ns, epoch in self._epochs.get(machine, {}).items():
             if any(one.from_ns <= from_ns < one.to_ns for one in corrections):
                 epoch.differs = 0
 
 
 def differs(one: Correction, counts: Correction | None, stated: Stated = NOTHING_STATED) -> bool:
-    """Whether a correction differs from what counts by more than its standard deviation, and by enough to be seen.
+    """Whether a correction differs by more than its standard deviation, and visibly.
 
-    counts: None where samples stay as they were sent, with what the machine applied itself.
+    counts: None if samples stay as sent, with `stated` applied by the machine.
     """
     if counts:
         zero, scale, across = (abs(a - b) for a, b in zip(values(one)[:3], values(counts)[:3], strict=True))

@@ -1,4 +1,4 @@
-"""A decision about a machine's calibration: as the journal keeps it, a person makes it, and an answer tells it."""
+"""A decision about a machine's calibration: in the journal, by people, in answers."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ from protocol.queries.commands import CalibrateCommand
 
 KIND = "calibration"  # of the event
 SOLVER, PERSON = "solver", "person"
-MOST_SPANS = 100  # of an answer: the last day of a machine at work
+MOST_SPANS = 100  # of an answer: a machine's last day
 
 
 @dataclass(frozen=True)
 class CalibrationDecision:
-    """What was decided about the samples of a machine, as an event keeps it.
+    """A decision about a machine, as in its event.
 
-    by: the solver or a person. corrections: each replaces what the same one decided before of its span; none of a
-    person takes all back that people decided of this machine. stamp_ns: the site's now. remembered: the scale is one
-    that was shown earlier, not by the evidence of now.
+    by: solver or person. corrections: replace the same author's in their spans; none of a person withdraws all.
+    stamp_ns: site time. remembered: the scale is from earlier evidence.
     """
 
     machine: str
@@ -35,14 +34,14 @@ class CalibrationDecision:
     remembered: bool = False
 
     def body(self) -> dict[str, Any]:
-        """Plain values."""
+        """As plain values."""
         spans = [_span(one) for one in self.corrections]
         head = {"machine": self.machine, "by": self.by, "reason": self.reason, "stamp_ns": self.stamp_ns}
         return {**head, "remembered": self.remembered, "spans": spans}
 
     @classmethod
     def from_body(cls, body: Mapping[str, Any]) -> CalibrationDecision:
-        """Undo `body`; ValueError, TypeError or LookupError for what no program of this kind wrote."""
+        """Inverse of `body`; ValueError, TypeError or LookupError for foreign content."""
         machine = body["machine"]
         corrections = tuple(
             Correction(machine, from_ns, to_ns, zero, scale, across, tuple(map(tuple, covariance)), most_share, *rolls)
@@ -57,10 +56,7 @@ class CalibrationDecision:
 def calibration_of(
     machine: str, decision: CalibrationDecision | None, state: MachineErrors | None, corrections: SampleCorrections
 ) -> MachineCalibration:
-    """What is known of a machine.
-
-    decision: its newest one. state: of the last solve. corrections: those that count in the map.
-    """
+    """A machine's calibration. decision: its newest; state: of the last solve; corrections: of the map."""
     spans = corrections.spans_of(machine)[-MOST_SPANS:]
     return MachineCalibration(
         name=machine,
@@ -82,7 +78,7 @@ def calibration_of(
 
 
 def decided_by_person(command: CalibrateCommand, stamp_ns: int) -> CalibrationDecision:
-    """What a person decides about all samples of a machine. stamp_ns: the site's now."""
+    """A person's decision about all samples. stamp_ns: site time."""
     given = {name: round(value, DIGITS) for name, value in command.values.items()}
     usual = {"zero": 0.0, "scale": 0.0, "across": 0.0, "most_share": ANY_SHARE}
     whole = Correction(command.machine, 0, LAST_NS, covariance=(), **{**usual, **given})
@@ -91,7 +87,7 @@ def decided_by_person(command: CalibrateCommand, stamp_ns: int) -> CalibrationDe
 
 
 def _span(one: Correction) -> list[Any]:
-    """One correction; how its machine rolls stands last, where it rolls unlike the others."""
+    """A correction in plain values; rolls and drags stand last, if not 0."""
     *first, rolls, drags = values(one)
     rolling = [rolls, drags] if rolls or drags else []
     return [one.from_ns, one.to_ns, *first, one.covariance, *rolling]

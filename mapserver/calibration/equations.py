@@ -1,7 +1,7 @@
-"""Equations of one source of evidence, and what they say of the machines once the ground in them is eliminated.
+"""Equations of one source of evidence, and their information once the ground is eliminated.
 
-An equation is `A x + B y = b` with a standard deviation: x the parameters of the machines, y what this source alone
-does not know of the ground. Sources share no y, so that what they say of x adds up:
+An equation is `A x + B y = b` with a standard deviation: x parameters of machines, y the source's unknowns of the
+ground. Sources share no y, so information about x adds up:
 
     information = A' W A - A' W B (B' W B)^-1 B' W A        (the Schur complement), and likewise its vector.
 """
@@ -17,19 +17,19 @@ from scipy.sparse.linalg import splu
 
 from protocol.arrays import Bools, Floats, Ints
 
-HUBER = 1.5  # standard deviations beyond which an equation counts by its size, not by its square
-FAINT = 1e-9  # share of its own weight by which ground that nothing ties down is kept at 0: it pulls on nothing
-AT_ONCE = 64  # columns that are solved for at a time: 4 MB for 8000 cells
+HUBER = 1.5  # standard deviations from which cost is linear, not square
+FAINT = 1e-9  # relative weight that holds undetermined ground at 0
+AT_ONCE = 64  # columns solved at a time: 4 MB for 8000 cells
 NO_GROUND: Floats = np.zeros(0)
-Column = tuple[Ints | int, Floats | float]  # of each row the column, and the value there
+Column = tuple[Ints | int, Floats | float]  # of each row: column and value
 
 
 @dataclass(frozen=True)
 class Equations:
     """n equations. A: (n, parameters), B: (n, unknowns of the ground), b and std: (n,).
 
-    heavy (n,): those with the heavy tails of Cauchy, which a few far ones do not bend at all; the others have Huber's.
-    blocks: of how many unknowns of the ground are tied together: 1, 2 (k and k + half), or 0 for any.
+    heavy (n,): Cauchy's tails, unbent by outliers, not Huber's. blocks: size of coupled unknowns: 1, 2 (k and k +
+    half), 0 for any.
     """
 
     A: sp.csr_matrix
@@ -45,7 +45,7 @@ class Equations:
         return out
 
     def weights(self, x: Floats, y: Floats | None) -> Floats:
-        """Weights (n,) of the next round of iteratively reweighted least squares; y: None before the first."""
+        """Weights (n,) of iteratively reweighted least squares; y: None at first."""
         if y is None:
             return 1 / self.std**2
         size = np.abs(self.residuals(x, y))
@@ -54,7 +54,7 @@ class Equations:
         return out
 
     def on(self, y: Floats) -> Equations:
-        """The same on ground that is known, without what lies elsewhere (NaN)."""
+        """The same on known ground; drops NaN."""
         b = self.b - self.B @ y
         known = np.flatnonzero(np.isfinite(b))
         return Equations(self.A[known], self.B[known][:, :0], b[known], self.std[known], self.heavy[known], self.blocks)
@@ -62,10 +62,7 @@ class Equations:
 
 @dataclass(frozen=True)
 class Information:
-    """What a source says of the parameters x: matrix (p, p), vector (p,) = matrix @ best x.
-
-    ground: the unknowns of its ground that fit best with any x.
-    """
+    """Information on x: matrix (p, p), vector (p,) = matrix @ best x. ground: best y given x."""
 
     matrix: Floats
     vector: Floats
@@ -86,14 +83,14 @@ def sparse(rows: int, columns: int, *terms: Column) -> sp.csr_matrix:
 
 
 def stacked(*parts: Equations) -> Equations:
-    """Several with the same unknowns as one."""
+    """Stack equations of the same unknowns."""
     A, B = (sp.vstack([getattr(part, name) for part in parts]).tocsr() for name in ("A", "B"))
     b, std, heavy = (np.concatenate([getattr(part, name) for part in parts]) for name in ("b", "std", "heavy"))
     return Equations(A, B, b, std, heavy, parts[0].blocks)
 
 
 def eliminate(eq: Equations, weights: Floats) -> Information:
-    """What equations with these weights (n,) say of the parameters."""
+    """Eliminate the ground; weights (n,)."""
     W = sp.diags(weights)
     WA = W @ eq.A
     AA, Ab = (eq.A.T @ WA).toarray(), WA.T @ eq.b
@@ -114,7 +111,7 @@ def eliminate(eq: Equations, weights: Floats) -> Information:
 
 
 def _block_inverse(matrix: sp.csr_matrix, blocks: int) -> sp.csr_matrix:
-    """Inverse of a symmetric matrix of blocks of one unknown, or of two, which are half the matrix apart."""
+    """Of a symmetric matrix with blocks of one unknown, or two (k and k + half)."""
     if blocks == 1:
         return sp.diags(1 / matrix.diagonal()).tocsr()
     n = matrix.shape[0] // 2

@@ -1,6 +1,6 @@
-"""What calibration remembers of one machine: its stays of the newest spans in which it drove.
+"""A machine's ledger of stays in its newest driven epochs.
 
-Sums of integers, so that any order and any batching of the samples give the same ledger, bit for bit.
+Integer sums: order and batching of samples do not change a bit.
 """
 
 from __future__ import annotations
@@ -15,18 +15,17 @@ from mapserver.calibration.stays import SLOT_NS, SLOT_SHIFT, STAY, VALUE_UNITS, 
 from protocol.arrays import Ints, Table
 from protocol.machine.samples import APPLIED, SAMPLE_DTYPE
 
-CELL_M = 2.0  # about one standard deviation of a position: finer cells would compare single samples
-EPOCH_SLOTS = 30  # 300 s, the length of the map's time buckets
+CELL_M = 2.0  # metres, one deviation of a position: finer cells would compare single samples
+EPOCH_SLOTS = 30  # 300 s, the map's time bucket
 EPOCH_NS = EPOCH_SLOTS * SLOT_NS
-EPOCHS = 48  # that are remembered: 4 h of driving; older corrections stay as they were decided
-PENDING_ROWS = 4096  # merged at once: merging costs a sort of everything
+EPOCHS = 48  # kept, 4 h of driving; older corrections stay as decided
+PENDING_ROWS = 4096  # merged at once, because merging sorts everything
 
 
 class StayLedger:
     """Stays of one machine. cell_m: edge of the cells.
 
-    epochs: how many it remembers. until_ns: what is stamped later was stamped by a clock that was ahead, or will be of
-    interest; as many epochs of it are remembered beside those up to then, and displace none of them.
+    epochs: kept. until_ns: later stamps may come from a fast clock; as many of their epochs are kept apart.
     """
 
     def __init__(self, cell_m: float = CELL_M) -> None:
@@ -38,11 +37,11 @@ class StayLedger:
 
     @property
     def nbytes(self) -> int:
-        """Memory of what is remembered."""
+        """Memory used."""
         return self._stays.nbytes + sum(each.nbytes for each in self._pending)
 
     def add(self, rows: Table) -> None:
-        """Add samples whose position is sure enough to vote."""
+        """Add samples whose position is certain enough to vote."""
         new = stays(rows, self._cell_m)
         self._pending.append(new)
         self._waiting += len(new)
@@ -51,22 +50,19 @@ class StayLedger:
 
     @property
     def newest_ns(self) -> int:
-        """When the newest epoch began, 0 without any."""
+        """Begin of the newest epoch, 0 for none."""
         self._merge()
         return int(epochs_of(self._stays)[-1]) * EPOCH_NS if len(self._stays) else 0
 
     def stays(self, from_ns: int = 0) -> Table:
-        """Stays of the newest epochs that began from a time on and up to `until_ns`, by their keys."""
+        """Stays of the newest epochs from from_ns to `until_ns`, by key."""
         self._merge()
         each = epochs_of(self._stays)
         first, end = np.searchsorted(each, [-(-from_ns // EPOCH_NS), self.until_ns // EPOCH_NS + 1]).tolist()
         return newest(self._stays[first:end], self.epochs)
 
     def _merge(self) -> None:
-        """Sum what waits, and forget the oldest epochs.
-
-        An epoch that is forgotten can never come back among the newest ones, so that when this runs has no influence.
-        """
+        """Dropped epochs never return, so it does not matter when this runs."""
         if not self._pending:
             return
         whole = merged(self._stays, np.concatenate(self._pending))
@@ -76,7 +72,7 @@ class StayLedger:
 
 
 class Stated(NamedTuple):
-    """What a machine applied itself in one epoch: zero and scale; zero_std, scale_std: how much they changed."""
+    """What a machine applied in an epoch, and how much it changed (std)."""
 
     zero: float = 0.0
     scale: float = 0.0
@@ -88,19 +84,19 @@ NOTHING_STATED = Stated()
 
 
 def epochs_of(table: Table) -> Ints:
-    """The epoch of each stay, in EPOCH_NS since 1970."""
+    """Epoch of each stay, in EPOCH_NS since 1970."""
     return np.asarray((table["key"] >> SLOT_SHIFT) // EPOCH_SLOTS, np.int64)
 
 
 def newest(table: Table, epochs: int) -> Table:
-    """The stays of the newest epochs, so many; all are in the order of their keys."""
+    """Stays of the newest epochs; sorted by key."""
     each = epochs_of(table)
     kept = np.unique(each)[-epochs:]
     return table[int(np.searchsorted(each, kept[0])) if len(kept) else 0 :]
 
 
 def stated(table: Table) -> Mapping[int, Stated]:
-    """What was applied by epoch, over all samples."""
+    """Values applied in each epoch, over all samples."""
     numbers, which = np.unique(epochs_of(table), return_inverse=True)
     n = np.bincount(which, table["n"])
     means, spreads = [], []
@@ -113,7 +109,7 @@ def stated(table: Table) -> Mapping[int, Stated]:
 
 
 def warm_up() -> None:
-    """Compile the kernels of ledgers and corrections, or read them from their cache."""
+    """Compile the kernels of ledgers and corrections, or load them."""
     rows = np.zeros(1, SAMPLE_DTYPE)
     rows["applied_zero"] = 0.01
     StayLedger().add(rows)

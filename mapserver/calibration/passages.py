@@ -1,6 +1,6 @@
-"""Stays of a machine in the order of time, and what lies between them: rises from cell to cell, and bends of the slope.
+"""Stays of a machine by time, and what lies between: rises from cell to cell, bends of the slope.
 
-Everything here is measured, nothing estimated: columns of numbers that the sources of evidence weigh.
+Measured values; the sources of evidence weigh them.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from mapserver.calibration import stays as st
 from mapserver.calibration.ledger import CELL_M, EPOCH_SLOTS
 from protocol.arrays import AnyArray, Bools, Floats, Ints, Table
 
-MOST_SAMPLES = 4000  # of a stay: no machine drives so many in 10 s, and the sums of more have overflowed
-MAX_PAUSE_S = 15.0  # a longer one tears the sequence
-GAP_M = 1.5  # driven without samples between two stays: the slope in between is not known
-JUMP_M = 2.0  # of positions against the wheels' distance, beside half of it
+MOST_SAMPLES = 4000  # of a stay: no machine takes more in 10 s, and larger sums overflowed
+MAX_PAUSE_S = 15.0  # a longer pause interrupts the sequence
+GAP_M = 1.5  # metres between stays without samples, of unknown slope
+JUMP_M = 2.0  # metres between positions and odometry, plus half the distance
 
 
 @dataclass(frozen=True)
 class Passages:
-    """Stays (n,) of all machines, one machine behind the other, in the order of their times.
+    """Stays (n,) of all machines, by machine and time.
 
-    epoch: index of the machine's epoch, over all machines. machine, cell: indices. direction: +1, -1. c_rr: NaN where
-    none was known. along, across: slopes ahead and to the left as measured. ahead: unit vector (n, 2). place_m: (n, 2)
-    in `map`. driven_m: that samples stand for. follows: whether it is the one after the stay before.
+    epoch, machine, cell: indices. direction: +1, -1. c_rr: NaN if unknown. along, across: slopes ahead and to the left.
+    ahead: unit vector (n, 2). place_m: (n, 2) in `map`. driven_m: that samples stand for. follows: continues the stay
+    before.
     """
 
     machine: Ints
@@ -50,19 +50,19 @@ class Passages:
 
 @dataclass(frozen=True)
 class Epochs:
-    """Epochs (e,) of all machines, one machine behind the other. number: in EPOCH_NS since 1970."""
+    """Epochs (e,) by machine. number: in EPOCH_NS since 1970."""
 
     machine: Ints
     number: Ints
 
 
 def sound(table: Table) -> Table:
-    """The stays that a machine can have made."""
+    """Drop stays that no machine can have made."""
     return table[(table["n"] <= MOST_SAMPLES) & (table["n"] > 0)]
 
 
 def passages(ledgers: Mapping[str, Table]) -> tuple[Passages, Epochs, Ints]:
-    """Stays of machines by name, the names in order; their epochs; and the numbers of the cells that indices mean."""
+    """Stays by machine (sorted names), epochs, and the cell numbers of indices."""
     parts, epochs, numbers = [], [], []
     count = 0
     for index, name in enumerate(sorted(ledgers)):
@@ -79,7 +79,7 @@ def passages(ledgers: Mapping[str, Table]) -> tuple[Passages, Epochs, Ints]:
 
 
 def _in_order(table: Table, machine: int, epoch: Ints) -> Passages:
-    """Passages of one machine. cell: its number, not yet an index."""
+    """cell: its number, not an index."""
     slot = st.slot(table["key"])
     sums = {name: table[name].astype(np.float64) for name in st.MEASURED}
     start_s = (slot - slot.min(initial=0)) * (st.SLOT_NS * 1e-9)
@@ -87,7 +87,7 @@ def _in_order(table: Table, machine: int, epoch: Ints) -> Passages:
     order = np.lexsort((table["key"], time_s))
     cells, direction = st.cell(table["key"])[order], st.direction(table["key"])[order]
     time_s = time_s[order]
-    begins = np.ones(len(order), np.bool_)  # what the end of a slot cut in two is one stay again
+    begins = np.ones(len(order), np.bool_)  # rejoins stays that the end of a slot cut
     begins[1:] = (np.diff(cells) != 0) | (np.diff(direction) != 0) | (np.diff(time_s) > MAX_PAUSE_S)
     first = np.flatnonzero(begins)
     counted_s = np.add.reduceat(time_s * sums["n"][order], first) if len(first) else time_s
@@ -118,16 +118,15 @@ def _in_order(table: Table, machine: int, epoch: Ints) -> Passages:
 
 
 def _follows(time_s: Floats, direction: Floats) -> Bools:
-    """Whether a stay goes on where the one before it ended: soon after it, and in the same direction."""
     out = np.zeros(len(time_s), np.bool_)
     out[1:] = (np.diff(time_s) < MAX_PAUSE_S) & (direction[1:] == direction[:-1])
     return out
 
 
 class Links(NamedTuple):
-    """Rises (n,) from one cell to the next: measured; per_zero_m: by how much a zero of 1 makes that too low.
+    """Measured rises (n,) from cell to cell. per_zero_m: per bias of 1.
 
-    bend_m: length times change of the slope where samples are missing in between, else 0.
+    bend_m: length times change of slope where samples are missing, else 0.
     """
 
     epoch: Ints
@@ -140,10 +139,9 @@ class Links(NamedTuple):
 
 
 def links(p: Passages) -> Links:
-    """Trapezoids of the slope between the middles of stays that follow each other.
+    """Trapezoids of the slope between successive stays.
 
-    The distance is that of the positions, which is level as the slope's denominator is: wheels count the length of the
-    slope, and slip uphill.
+    By positions, horizontal like a slope's denominator; wheels include slip and slope length.
     """
     j = np.flatnonzero(p.follows)
     j = j[p.cell[j] != p.cell[j - 1]]
@@ -151,7 +149,7 @@ def links(p: Passages) -> Links:
     apart_m = np.hypot(*(p.place_m[j] - p.place_m[i]).T)
     gap = apart_m - (p.driven_m[i] + p.driven_m[j]) / 2 > GAP_M
     by_speed_m = (p.speed_mps[i] + p.speed_mps[j]) / 2 * (p.time_s[j] - p.time_s[i])
-    drove = np.abs(apart_m - by_speed_m) < JUMP_M + by_speed_m / 2  # else the position jumped: nobody drove there
+    drove = np.abs(apart_m - by_speed_m) < JUMP_M + by_speed_m / 2  # otherwise the position jumped
     signed_m = apart_m * p.direction[j]
     slope = (p.along[i] + p.along[j]) / 2
     bend_m = np.where(gap, apart_m * np.abs(p.along[j] - p.along[i]), 0.0)
@@ -160,7 +158,7 @@ def links(p: Passages) -> Links:
 
 
 def grouped(*keys: AnyArray) -> tuple[Ints, Ints, Ints]:
-    """Groups of rows with equal keys, each (n,): the first of each group, the group of every row, and their counts."""
+    """Group rows by equal keys (n,): first rows, group of each row, counts."""
     order = np.lexsort(keys[::-1])
     begins = np.ones(len(order), np.bool_)
     begins[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)

@@ -1,12 +1,12 @@
-"""Machines that roll unlike the others: on the same ground at the same time, with slopes that are right.
+"""Machines that roll differently on the same ground, given correct slopes.
 
-Soft tyres and a brake that drags take force that is neither the ground's nor a sensor's error:
+Soft tyres and dragging brakes take force that is neither ground nor sensor error:
 
     c_i = (1 + m) c + b + d z + d k (d c + s)
 
-A scale k multiplies the force on slopes, too, which tells the two apart; where nothing does, as on the level, the scale
-explains it. Cells are compared within one epoch: rain between two machines is nobody's fault. What all machines roll
-alike is the ground; of two groups nobody can tell which one is right.
+A scale k also multiplies the force on slopes, which separates the two; on level ground it explains all. Cells are
+compared within an epoch: rain is nobody's fault. What all share is the ground; of two groups nobody knows which is
+right.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from protocol.arrays import Floats, Ints
 from protocol.machine.samples import SCALE_STD
 from protocol.units import GRAVITY_MPS2
 
-MET_EPOCHS = 2  # in which a machine has to meet others: in one it may be rain
-ROUNDS = 5  # of weighing anew
+MET_EPOCHS = 2  # in which a machine must meet others; one may be rain
+ROUNDS = 5  # reweighting rounds
 
 
 def rolling(pb: FleetProblem, result: Estimate) -> tuple[dict[int, Rolling], tuple[int, ...]]:
-    """Machines, by their indices, that roll unlike the others beyond doubt; and all that slopes tell scales of.
+    """Machines (indices) that clearly roll differently, and all with scales known from slopes.
 
-    The others' scales are within their data sheets, as far as anybody knows, and stand for how they roll.
+    Other scales are assumed within data sheets.
     """
     tuning, machines = pb.tuning, len(pb.names)
     m = src.means(pb.passages, tuning)
@@ -53,27 +53,27 @@ def rolling(pb: FleetProblem, result: Estimate) -> tuple[dict[int, Rolling], tup
         harder[~on_slopes, layout.scales] = np.eye(machines)[~on_slopes]
         harder[on_slopes, layout.rolls] = np.eye(len(free.unlike))
         harder[on_slopes, layout.drags] = np.eye(len(free.unlike)) / c_rr
-        g = harder[i] - harder  # this one less each
+        g = harder[i] - harder  # this machine minus each
         variance = tuning.rolls_floor**2 + doubt[i] ** 2 + doubt**2
         std = np.sqrt(((g @ covariance) * g).sum(axis=1) + variance)
         unlike = np.abs(g @ x) - SURE * std > tuning.unlike
-        alike = (np.abs(g @ x) < tuning.alike) & (std < tuning.alike)  # with itself
+        alike = (np.abs(g @ x) < tuning.alike) & (std < tuning.alike)  # includes itself
         if unlike.sum() >= alike.sum() and unlike.any():
             mean, against[i] = g[unlike].mean(axis=0), set(np.flatnonzero(unlike).tolist())
             share, off = float(mean @ x), float(np.sqrt(mean @ covariance @ mean + variance[unlike].mean()))
             work_jpkgs = share * c_rr * GRAVITY_MPS2 * float(pb.passages.speed_mps[pb.passages.machine == i].mean())
             out[i] = Rolling(share, off, bool(unlike.sum() > alike.sum()), work_jpkgs)
     named = {i: one for i, one in out.items() if one.is_named}
-    groups = {i: one for i, one in out.items() if against[i] - named.keys()}  # not only against who is named already
+    groups = {i: one for i, one in out.items() if against[i] - named.keys()}  # also against machines not yet named
     return named | groups if len(groups) > 1 else named, free.unlike
 
 
 def _solved(
     free: FleetProblem, on_slopes: Sequence[int], m: src.Means, place: Ints, result: Estimate
 ) -> tuple[Floats, Floats]:
-    """Parameters and their covariance where machines roll as they like, by cells within epochs.
+    """Parameters and covariance with free rolling, by cell within epochs; other sources as in the result.
 
-    Other sources are as the result has them. on_slopes: machines of whose scales data sheets have no say.
+    on_slopes: machines whose scales ignore data sheets.
     """
     layout, prior = free.layout, prior_equations(free)
     own, others = eliminate(prior, prior.weights(np.zeros(layout.size), None)), slice(0, layout.rolls.start)
@@ -93,7 +93,7 @@ def _solved(
 
 
 def _met_epochs(machine: Ints, place: Ints, number: Ints, machines: int) -> Ints:
-    """In how many epochs each machine met any other."""
+    """Number of epochs in which each machine met any other."""
     pairs = np.unique(np.stack([machine, place]), axis=1)
     shared = np.bincount(pairs[1], minlength=place.max(initial=0) + 1)[place] > 1
     each = np.unique(np.stack([machine[shared], number[shared]]), axis=1)

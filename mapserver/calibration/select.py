@@ -1,11 +1,8 @@
-"""What of the parameters the evidence shows, and by what; and the part of an estimate that may be applied.
+"""Which parameters the evidence shows, by which source, and what is applied.
 
-A direction is a sum of parameters, each in units of its prior. Directions whose variance is below a share of the
-prior's are observed. All others stay at the data sheet: there an estimate would be the noise of weak evidence, or what
-the prior shares out among the machines.
-
-`MachineErrors` is what comes of it for one machine, of which a scale is remembered once its evidence is gone;
-`AppliedPart` is the part of an estimate that is applied, and names who is beyond what a data sheet may mean.
+Directions are sums of parameters in units of the prior, observed if their variance is a small share of the prior's.
+Others keep the data sheet: their estimate is noise, or the prior's distribution among machines. `MachineErrors` is the
+result for one machine; `AppliedPart` is applied, and finds machines beyond their data sheets.
 """
 
 from __future__ import annotations
@@ -22,20 +19,19 @@ from mapserver.calibration.solver import Estimate, FleetProblem, Prior, inverse
 from protocol.arrays import Bools, Floats, Ints
 from protocol.machine.samples import SCALE_STD, ZERO_STD
 
-WEAK = 0.01  # of the weight of data sheets: evidence has to do without
-REMEMBERED = "remembered"  # an earlier solve showed it
-# By which a source is named: each alone, beside the ground that all share.
+WEAK = 0.01  # of the data sheet's weight: evidence must be enough
+REMEMBERED = "remembered"  # shown by an earlier solve
+# named alone beside the shared ground
 NAMED = (src.SAME_GROUND, src.CROSSINGS, src.HEIGHTS, src.EDGES, src.KNOWN_GROUND)
-SURE = 2.0  # standard deviations by which an estimate must be beyond a limit
-# Of a scale that was observed once, and is not seen any more: temperature, tyres and oil change it by so much. Surer
-# than what counts as observed, so that it counts until something contradicts it.
+SURE = 2.0  # standard deviations beyond a limit
+# Of a remembered scale: temperature, tyres and oil change it by this. Small enough to count until contradicted.
 REMEMBERED_STD = 0.02
-FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a zero, and a scale of 30 %, that no sensor of its kind has
+FAULT_SIGMAS = 5.0, 0.3 / SCALE_STD  # of the data sheet: a bias, and a scale of 30 %, that no sound sensor has
 
 
 @dataclass(frozen=True)
 class CommonScale:
-    """Whether the mean scale of all machines is observed, its standard deviation, and why it is not, "" if it is."""
+    """Whether the machines' mean scale is observed, its deviation, and why not ("" if it is)."""
 
     observed: bool
     std: float
@@ -44,10 +40,9 @@ class CommonScale:
 
 @dataclass(frozen=True)
 class ObservedPart:
-    """An estimate's part that may be applied: x (p,), and the covariance (p, p) of what is left of the errors then.
+    """The observed part: x (p,), and covariance (p, p) of the remaining errors.
 
-    by: for each machine and each of "zero" and "scale" the sources that show it. absolute (m,): whether the evidence
-    shows a machine's scale, not only that it differs from the others'. common: see CommonScale.
+    by: sources of each machine's "zero" and "scale". absolute (m,): the scale itself is observed, not only differences.
     """
 
     x: Floats
@@ -71,15 +66,15 @@ def observe(pb: FleetProblem, result: Estimate) -> ObservedPart:
 
 
 def observed_part(result: Estimate, share: float) -> tuple[Floats, Floats]:
-    """The estimate projected on observed directions, from what is known beforehand; the covariance of what it leaves.
+    """Project on observed directions; returns x, and covariance of the remaining errors.
 
-    share: of the prior's variance, below which a direction is observed.
-    With L L' the prior's information, directions are eigenvectors of L' P L, whose eigenvalues are ratios of variances.
+    share: of the prior's variance that makes a direction observed. With L L' the prior's information, directions are
+    eigenvectors of L' P L, whose eigenvalues are variance ratios.
     """
     lower = np.linalg.cholesky(result.prior.matrix)
     ratios, directions = np.linalg.eigh(lower.T @ result.covariance() @ lower)
     shown = ratios < share
-    left = np.where(shown, ratios, 1.0)  # of the prior's variance
+    left = np.where(shown, ratios, 1.0)  # relative to the prior's variance
     units = np.linalg.solve(lower.T, directions)
     before = np.linalg.solve(result.prior.matrix, result.prior.vector)
     applied = before + units[:, shown] @ (directions[:, shown].T @ (lower.T @ (result.x - before)))
@@ -87,13 +82,13 @@ def observed_part(result: Estimate, share: float) -> tuple[Floats, Floats]:
 
 
 def _by_evidence(pb: FleetProblem, result: Estimate) -> Floats:
-    """Covariance without the data sheets' word on scales: that of many machines together is no evidence."""
+    """Without data sheets on scales: many together are no evidence."""
     matrix = result.prior.matrix + sum(each.matrix for each in result.information.values())
     return inverse(without_data_sheet(pb, matrix, range(len(pb.names))))
 
 
 def without_data_sheet(pb: FleetProblem, matrix: Floats, machines: Sequence[int]) -> Floats:
-    """An information matrix (p, p), which is changed, without the data sheets' word on the scales of machines."""
+    """Weaken data sheets of these machines' scales in an information matrix (p, p), in place."""
     scales, own = pb.layout.scales, np.array([p.covariance[1][1] for p in pb.priors])
     weak = np.isin(np.arange(len(own)), machines) & (own >= pb.tuning.observed * SCALE_STD**2)
     at = np.arange(scales.start, scales.stop)[weak]
@@ -102,7 +97,7 @@ def without_data_sheet(pb: FleetProblem, matrix: Floats, machines: Sequence[int]
 
 
 def _by(pb: FleetProblem, result: Estimate) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Which sources show zero and scale of each machine, each source alone beside the ground that all share."""
+    """Sources of bias and scale of each machine, each alone beside the shared ground."""
     layout, share = pb.layout, pb.tuning.observed
     present = [name for name in NAMED if name in result.information]
     variances = {name: np.diag(result.covariance(*{name, src.SAME_GROUND})) for name in present}
@@ -121,17 +116,17 @@ def _by(pb: FleetProblem, result: Estimate) -> dict[str, dict[str, tuple[str, ..
 
 
 def _shown(variances: Mapping[str, Floats], before: Floats, at: Ints, share: float) -> Sequence[str]:
-    """Sources by which the variance of these parameters falls enough, on average; what all share needs no other."""
+    """Sources that cut these variances enough; only the shared ground, if it does."""
     names = [name for name, after in variances.items() if np.mean(after[at] / before[at]) < share]
     return [src.SAME_GROUND] if src.SAME_GROUND in names else names
 
 
 @dataclass(frozen=True)
 class Rolling:
-    """How much harder a machine rolls than the others, as a share of the ground's c_rr, and the standard deviation.
+    """Extra rolling of a machine, relative to c_rr, with its deviation.
 
-    is_named: whether most others agree; else two groups differ, or two machines, and either may be the odd one.
-    work_jpkgs: what that costs at the wheels, per kilogram and second of driving.
+    is_named: most others agree, or else either of two groups may be odd. work_jpkgs: at the wheels, per kilogram and
+    second.
     """
 
     share: float
@@ -142,11 +137,10 @@ class Rolling:
 
 @dataclass(frozen=True)
 class MachineErrors:
-    """What is known of one machine: zero of its newest epoch, scale error k, lateral zero, and standard deviations.
+    """Errors of a machine: bias of the newest epoch, scale error k, lateral bias, with deviations.
 
-    zero_by, scale_by: the sources that show them, none where the data sheet has to do; the scale is 0 then. beyond:
-    how many standard deviations of the data sheet the largest zero and the scale are off, for sure. rolling: None of a
-    machine that rolls like the others, as far as anything shows.
+    zero_by, scale_by: sources, none if only the data sheet is known (scale 0). beyond: data-sheet sigmas that the
+    largest bias and the scale surely exceed. rolling: None if normal.
     """
 
     zero: float
@@ -162,12 +156,12 @@ class MachineErrors:
 
 
 def is_surer(prior: Prior, state: MachineErrors | None) -> bool:
-    """Whether what is remembered of a scale is surer than what a solve without it says."""
+    """Whether a remembered scale is more certain than one solved without it."""
     return state is not None and state.scale_std**2 > prior.covariance[1][1]
 
 
 def remembered_of(shown: Iterable[Correction]) -> dict[str, Prior]:
-    """What evidence showed of scales, by the last correction of each machine. A zero wanders, and is not remembered."""
+    """Scales by each machine's last correction. A bias wanders and is not remembered."""
     out = {}
     for one in shown:
         if one.most_share >= ANY_SHARE and one.covariance:
@@ -178,7 +172,7 @@ def remembered_of(shown: Iterable[Correction]) -> dict[str, Prior]:
 
 
 def state_of(correction: Correction) -> MachineErrors:
-    """What a correction by the solver says of its machine, where nothing has been solved yet."""
+    """State by a solver's correction, before the first solve."""
     k = correction.scale / (1 - correction.scale)
     zero_std, scale_std, across_std = np.sqrt(np.diag(correction.covariance)).tolist()
     return MachineErrors(
@@ -199,9 +193,9 @@ def state_of(correction: Correction) -> MachineErrors:
 
 @dataclass(frozen=True)
 class AppliedPart:
-    """The part of an estimate that is applied: x (p,), and the covariance (p, p) of what is left.
+    """What is applied: x (p,), with covariance (p, p) of the remaining errors.
 
-    scaled (m,): whether a machine has a scale of its own. beyond (m, 2): see MachineErrors.
+    scaled (m,): has its own scale. beyond (m, 2): see MachineErrors.
     """
 
     x: Floats
@@ -211,10 +205,10 @@ class AppliedPart:
 
 
 def applied_part(pb: FleetProblem, result: Estimate, observed: ObservedPart, others: CommonScale) -> AppliedPart:
-    """Scales count where the evidence shows them, and where they are so far off that any value is better than none.
+    """Apply scales that are observed, or so far off that any value helps.
 
-    There the estimate itself is taken: what is not observed of it is no more than what the data sheet leaves open. But
-    not where slopes contradict each other, or half of the machines are far off: nobody knows then who is.
+    The latter take the whole estimate; but not if slopes contradict each other or half of the machines are far off,
+    because the odd one is unknown then.
     """
     scales = np.arange(pb.layout.scales.start, pb.layout.scales.stop)
     absolute = observed.absolute & others.observed
@@ -242,10 +236,7 @@ def applied_part(pb: FleetProblem, result: Estimate, observed: ObservedPart, oth
 
 
 def _unnamed(pb: FleetProblem, zero: Floats, variance: Floats) -> Ints:
-    """Machines of which only differences are known, too large ones for sound machines: who is off cannot be said.
-
-    zero, variance: of all epochs (e,).
-    """
+    """Machines known only by differences, too large for sound ones: who is off is unknown. zero, variance: (e,)."""
     machines = len(pb.names)
     known, off = np.zeros(machines, np.bool_), np.zeros(machines)
     np.logical_or.at(known, pb.epochs.machine, variance < pb.tuning.observed * ZERO_STD**2)
@@ -255,10 +246,9 @@ def _unnamed(pb: FleetProblem, zero: Floats, variance: Floats) -> Ints:
 
 
 def moved(epochs: Epochs, zero: Floats, variance: Floats) -> Floats:
-    """Variance (e,) of a zero within its epoch, by how far it is from those of the epochs beside it.
+    """Variance (e,) of a bias within its epoch, from steps to the next ones.
 
-    One that steps is off by the whole difference until it steps, one that drifts by less than half: half is taken, of
-    what is more than the estimates' own noise.
+    A step is wrong by all of it until it occurs, a drift by less than half: half is taken, beyond noise.
     """
     machine, number = epochs.machine, epochs.number
     beside = (np.diff(machine) == 0) & (np.diff(number) == 1)
@@ -268,9 +258,9 @@ def moved(epochs: Epochs, zero: Floats, variance: Floats) -> Floats:
 
 
 def beyond_data_sheet(pb: FleetProblem, result: Estimate, others_std: float = 0.0) -> Floats:
-    """By how many standard deviations of the data sheet the largest zero and the scale (m, 2) are off, for sure.
+    """Data-sheet sigmas (m, 2) that the largest bias and the scale surely exceed.
 
-    others_std: of the scale of those against whose ground the machine was solved.
+    others_std: of the scale behind the ground.
     """
     std = np.sqrt(np.diag(result.covariance()))
     std[pb.layout.scales] = np.hypot(std[pb.layout.scales], others_std)

@@ -1,9 +1,8 @@
-"""Zero, scale and lateral zero of all machines of a site by what they measured on the same ground.
+"""Bias, scale and lateral bias of all machines, by robust least squares on common ground.
 
-Robust least squares over all sources of evidence (`sources.py`) and what data sheets promise. Each round eliminates
-the ground, solves for the parameters of the machines, puts the ground back in, and weighs anew; the shares
-of drive force, which are products of unknowns, follow the ground. No source is a vote: a closed tour shows the zero and
-a foot of a ramp the scale of one machine alone, so that a majority that is off by the same is put right too.
+Each round eliminates the ground, solves for the machines, updates the ground and reweights. Shares of drive force,
+products of unknowns, follow the ground. No source is a vote: a closed loop shows the bias and the foot of a ramp the
+scale of one machine alone, so common errors are corrected too.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from protocol.arrays import Floats, Ints, Table
 from protocol.machine.samples import SCALE_STD, ZERO_STD, ZERO_WALK
 from protocol.site.site_config import KnownGround
 
-ZERO_S = 2 * ZERO_STD**2 / ZERO_WALK**2  # a Gauss-Markov process with this walk stays within the data sheet
+ZERO_S = 2 * ZERO_STD**2 / ZERO_WALK**2  # seconds; with this walk a Gauss-Markov process stays within the data sheet
 MOST_ROUNDS = 20
-SETTLED = 2e-6  # of all parameters: below what a correction is rounded to
+SETTLED = 2e-6  # of any parameter: below the rounding of corrections
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a machine beforehand: zero and scale error k with covariance (2, 2)."""
+    """Prior of a machine: bias and scale error k with covariance (2, 2)."""
 
     zero: float = 0.0
     scale: float = 0.0
@@ -44,10 +43,7 @@ DATA_SHEET = Prior()
 
 @dataclass(frozen=True)
 class FleetProblem:
-    """What is solved. names: in order. cells: their numbers. known (cells,): c_rr that the site states, NaN: none.
-
-    unlike: indices of the machines that roll unlike the others.
-    """
+    """What is solved. names: sorted. cells: numbers. known (cells,): stated c_rr or NaN. unlike: see `Parameters`."""
 
     names: tuple[str, ...]
     passages: Passages
@@ -60,15 +56,15 @@ class FleetProblem:
 
     @property
     def layout(self) -> Parameters:
-        """Of the parameters."""
+        """Positions of the parameters."""
         return Parameters(len(self.epochs.number), len(self.names), self.unlike)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters x (p,), what each source says of them, and the ground.
+    """Parameters x (p,), information by source, and the ground.
 
-    steps: of places where the slope changes [c_rr]. edges: why they do not count, "" if they do.
+    steps: of places where the slope changes [c_rr]. edges: why unused, or "".
     """
 
     x: Floats
@@ -80,7 +76,7 @@ class Estimate:
     rounds: int = 0
 
     def covariance(self, *names: str) -> Floats:
-        """Covariance (p, p) by the prior and these sources, by all without any."""
+        """Covariance (p, p) by the prior and these sources, or all."""
         chosen = names or tuple(self.information)
         return inverse(self.prior.matrix + sum(self.information[name].matrix for name in chosen))
 
@@ -91,7 +87,7 @@ def problem(
     priors: Mapping[str, Prior],
     tuning: CalibrationTuning = TUNING,
 ) -> FleetProblem:
-    """Stays by machine as `Ledger.stays` has them; areas: whose c_rr is stated; priors: where not the data sheet."""
+    """Build a problem. ledgers: stays by machine; areas: of stated c_rr; priors: where not the data sheet."""
     names = tuple(sorted(name for name, table in ledgers.items() if len(table)))
     p, epochs, cells = passages({name: ledgers[name] for name in names})
     known = known_cells(cells, areas, tuning.inside_m)
@@ -101,7 +97,7 @@ def problem(
 
 
 def known_cells(cells: Ints, areas: Sequence[KnownGround], inside_m: float = TUNING.inside_m) -> Floats:
-    """The c_rr (n,) that the site states of cells (n,) well inside of its areas; NaN elsewhere."""
+    """Stated c_rr (n,) of cells (n,) well inside areas, else NaN."""
     out = np.full(len(cells), np.nan)
     centres = (np.stack(stays.column_row(cells), axis=1) + 0.5) * CELL_M
     for area in areas:
@@ -113,16 +109,16 @@ def known_cells(cells: Ints, areas: Sequence[KnownGround], inside_m: float = TUN
 
 
 def estimate(pb: FleetProblem) -> Estimate:
-    """Solve; where the slopes' edges contradict each other, or the ground itself changes there, without them."""
+    """Solve; without edges if they contradict each other or c_rr depends on slope."""
     result = _rounds(pb, with_edges=True)
     reason = _doubt(result, pb)
     return _rounds(pb, with_edges=False, reason=reason) if reason else result
 
 
 def against(pb: FleetProblem, others: FleetProblem, result: Estimate) -> Estimate:
-    """Solve a machine that has no say: against the ground of the others, which stays as it is.
+    """Solve an excluded machine against the others' fixed ground.
 
-    Its edges count where theirs do: with a gain or an antenna that is wrong it may share little of their ground.
+    Edges are used if theirs are; it may share little ground.
     """
     cells = len(pb.cells)
     c_rr, gradient = np.full(cells, np.nan), np.full((cells, 2), np.nan)
@@ -138,7 +134,7 @@ def inverse(information: Floats) -> Floats:
 
 
 def _rounds(pb: FleetProblem, *, with_edges: bool, reason: str = "", frozen: GroundState | None = None) -> Estimate:
-    """Iterate until nothing moves any more. frozen: ground that is known from elsewhere."""
+    """frozen: ground known from elsewhere."""
     layout, cells, tuning = pb.layout, len(pb.cells), pb.tuning
     means, ground = src.means(pb.passages, tuning), src.first_ground(pb.passages, cells)
     prior = prior_equations(pb)
@@ -173,21 +169,20 @@ def _rounds(pb: FleetProblem, *, with_edges: bool, reason: str = "", frozen: Gro
 
 
 def _ground(pb: FleetProblem, unknowns: Mapping[str, Floats], before: GroundState) -> GroundState:
-    """The ground that fits; c_rr where the site states it."""
+    """Best-fitting ground; c_rr as stated where known."""
     c_rr = np.where(np.isfinite(pb.known), pb.known, unknowns[src.SAME_GROUND])
     gradient = unknowns[src.CROSSINGS].reshape(2, -1).T
     return GroundState(np.where(np.isfinite(before.c_rr), c_rr, np.nan), gradient)
 
 
 def _filled(first: GroundState, second: GroundState) -> GroundState:
-    """The first, and where it knows nothing the second."""
     pairs = ((first.c_rr, second.c_rr), (first.gradient, second.gradient))
     c_rr, gradient = (np.where(np.isfinite(one), one, other) for one, other in pairs)
     return GroundState(c_rr, gradient)
 
 
 def prior_equations(pb: FleetProblem) -> Equations:
-    """Data sheets, and zeros that wander from epoch to epoch within them."""
+    """Data sheets, with biases that wander between epochs."""
     layout, tuning, n = pb.layout, pb.tuning, len(pb.epochs.number)
     machine, number = pb.epochs.machine, pb.epochs.number
     follows = np.r_[False, machine[1:] == machine[:-1]]
@@ -207,7 +202,7 @@ def prior_equations(pb: FleetProblem) -> Equations:
 
 
 def _doubt(result: Estimate, pb: FleetProblem) -> str:
-    """Why edges of slopes must not count: a word."""
+    """Why edges must not count, or ""."""
     layout, tuning = pb.layout, pb.tuning
     ramps, std = result.x[layout.ramps], np.sqrt(result.covariance()[layout.ramps, layout.ramps])
     if abs(ramps) > max(tuning.ramps_limit, tuning.ramps_sigmas * std):

@@ -1,13 +1,12 @@
-"""The sources of evidence: what stays of machines say of zero, scale and lateral zero, as equations.
+"""The sources of evidence, as equations of bias, scale and lateral bias.
 
-With the signs of `correction.py`, parameters z of each epoch, k and a of each machine, m and b of those that roll
-unlike the others (`rolling.py`):
+Signs as in `correction.py`; z per epoch, k and a per machine, m and b of those that roll differently (`rolling.py`):
 
-- `same_ground`: c_rr of a cell is the same for all machines and in both directions.
-- `crossings`: so is its gradient, which machines measure in their own frames, each with its zeros.
-- `heights`: a closed tour rises by nothing; cells have heights, and links between them what was measured plus z.
-- `edges`: the ground does not know of the slope. Where the slope changes, c_rr must not, so that what it seems to
-  change by is k ds. All slopes of a site may differ from what is around them: ascents and descents tell that apart.
+- `same_ground`: c_rr of a cell is the same for all machines and directions.
+- `crossings`: so is its gradient, measured in each machine's frame.
+- `heights`: a closed loop climbs nothing; links between cells rise as measured plus z.
+- `edges`: c_rr does not change with slope. An apparent change is k ds, or common to all slopes, which ascents and
+  descents tell apart.
 - `known_ground`: the site states c_rr.
 """
 
@@ -26,16 +25,13 @@ from protocol.arrays import AnyArray, Floats, Ints
 
 SAME_GROUND, CROSSINGS, HEIGHTS, EDGES, KNOWN_GROUND = "same_ground", "crossings", "heights", "edges", "known_ground"
 
-LEAST_C_RR = 0.002  # of ground, for the share of drive force on it
-SECTORS = 8  # of headings that are summed
+LEAST_C_RR = 0.002  # lower bound of c_rr in the share of drive force
+SECTORS = 8  # of headings
 EDGE_SECTORS = 4
 
 
 class Parameters(NamedTuple):
-    """Where parameters lie: z of all epochs, k and a of all machines, what slopes have in common, and rolls.
-
-    unlike: indices of the machines that roll unlike the others, in order.
-    """
+    """Indices of z, k, a, the common effect of slopes, m, b. unlike: sorted, machines that roll differently."""
 
     epochs: int
     machines: int
@@ -43,50 +39,50 @@ class Parameters(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Of all parameters."""
+        """Number of parameters."""
         return self.ramps + 1 + 2 * len(self.unlike)
 
     @property
     def zeros(self) -> slice:
-        """All z."""
+        """Indices of all z."""
         return slice(0, self.epochs)
 
     @property
     def scales(self) -> slice:
-        """All k."""
+        """Indices of all k."""
         return slice(self.epochs, self.epochs + self.machines)
 
     @property
     def lateral(self) -> slice:
-        """All a."""
+        """Indices of all a."""
         return slice(self.epochs + self.machines, self.epochs + 2 * self.machines)
 
     @property
     def ramps(self) -> int:
-        """By how much c_rr grows with the slope, everywhere."""
+        """Index of the growth of c_rr with slope, everywhere."""
         return self.epochs + 2 * self.machines
 
     @property
     def rolls(self) -> slice:
-        """All m: the share by which machines that roll unlike the others roll harder."""
+        """Indices of all m, relative."""
         return slice(self.ramps + 1, self.ramps + 1 + len(self.unlike))
 
     @property
     def drags(self) -> slice:
-        """All b: what they roll harder by on any ground [c_rr]."""
+        """Indices of all b [c_rr]."""
         return slice(self.rolls.stop, self.size)
 
 
 @dataclass(frozen=True)
 class GroundState:
-    """The ground as it is known so far, by cells: c_rr (n,), gradient (n, 2); NaN where nothing is."""
+    """Ground by cell: c_rr (n,), gradient (n, 2); NaN if unknown."""
 
     c_rr: Floats
     gradient: Floats
 
 
 class Means(NamedTuple):
-    """Means over the stays of one epoch in one cell in one direction and sector (n,); std: of c_rr and of slopes."""
+    """Means (n,) by epoch, cell, direction and sector."""
 
     epoch: Ints
     machine: Ints
@@ -101,7 +97,7 @@ class Means(NamedTuple):
 
 
 def first_ground(p: Passages, cells: int) -> GroundState:
-    """The ground by the mean of what was measured, before anything is solved."""
+    """Mean measured ground."""
     known = np.isfinite(p.c_rr)
     with np.errstate(invalid="ignore"):
         count = np.bincount(p.cell[known], minlength=cells)
@@ -112,14 +108,14 @@ def first_ground(p: Passages, cells: int) -> GroundState:
 
 
 def gradients(p: Passages) -> Floats:
-    """Gradients (n, 2) as measured, east and north."""
+    """Measured gradients (n, 2), east and north."""
     left = np.stack([-p.ahead[:, 1], p.ahead[:, 0]], axis=1)
     out: Floats = p.along[:, None] * p.ahead + p.across[:, None] * left
     return out
 
 
 def means(p: Passages, tuning: CalibrationTuning) -> Means:
-    """Sum up stays: what a day holds is bounded by the ground, not by the number of passages."""
+    """Average stays, so that ground, not passages, limits the size."""
     sector = _sector(p.ahead, SECTORS)
     first, group, count = grouped(p.epoch, p.cell, sector * 2 + (p.direction > 0))
     known = np.isfinite(p.c_rr)
@@ -135,28 +131,27 @@ def means(p: Passages, tuning: CalibrationTuning) -> Means:
 
 
 def _sector(ahead: Floats, sectors: int) -> Ints:
-    """Which sector of headings unit vectors (n, 2) lie in."""
     turns = np.arctan2(ahead[:, 1], ahead[:, 0]) / (2 * np.pi)
     return np.floor(turns * sectors + 0.5).astype(np.int64) % sectors
 
 
 def mean(values: Floats, group: Ints, count: Ints) -> Floats:
-    """Mean of the values of each group."""
+    """Mean of each group."""
     return np.asarray(np.bincount(group, values, len(count)) / count, np.float64)
 
 
 def repeated(count: AnyArray, same: float) -> Floats:
-    """Factor of a standard deviation after so many passages, of which a share of the variance is the same."""
+    """Factor of a standard deviation after passages; same: their common share of variance."""
     return np.sqrt((1 - same) / count + same)
 
 
 def same_ground(
     m: Means, layout: Parameters, ground: GroundState, known: Floats, place: Ints | None = None
 ) -> Equations:
-    """c_i = c (1 + m) + b + d z + d k (d c + s), the share d c + s by the ground as it is known so far.
+    """c_i = c (1 + m) + b + d z + d k (d c + s), with d c + s from the ground so far.
 
-    Taken from the same stay, its noise would explain itself by the scale. known (cells,): NaN where the site states no
-    c_rr; cells where it does are another source. place: whose c each mean has, if not its cell's.
+    A stay's own noise would correlate with the scale. known (cells,): NaN without stated c_rr; others are another
+    source. place: group of equal c, if not the cell.
     """
     at = np.flatnonzero(np.isfinite(m.c_rr) & ~np.isfinite(known[m.cell]))
     places, count = (m.cell, len(known)) if place is None else (place, place.max(initial=-1) + 1)
@@ -171,7 +166,7 @@ def same_ground(
 def known_ground(
     m: Means, layout: Parameters, ground: GroundState, known: Floats, tuning: CalibrationTuning
 ) -> Equations:
-    """The same where c is known, but for an error that all cells of the same value share."""
+    """As `same_ground`, with c known but for a common error per value."""
     at = np.flatnonzero(np.isfinite(m.c_rr) & np.isfinite(known[m.cell]))
     c_rr = known[m.cell[at]]
     values, which = np.unique(c_rr, return_inverse=True)
@@ -186,7 +181,7 @@ def known_ground(
 
 
 def _balance(m: Means, at: Ints, layout: Parameters, c_rr: Floats, ground: GroundState) -> sp.csr_matrix:
-    """Columns of z and k, and of m and b, of balances on ground c_rr."""
+    """Coefficients of z, k, m, b."""
     d, slope = m.direction[at], (ground.gradient[m.cell[at]] * m.ahead[at]).sum(axis=1)
     share = d * np.maximum(c_rr, LEAST_C_RR) + slope
     terms = [(m.epoch[at], d), (layout.scales.start + m.machine[at], d * share)]
@@ -198,7 +193,7 @@ def _balance(m: Means, at: Ints, layout: Parameters, c_rr: Floats, ground: Groun
 
 
 def crossings(m: Means, layout: Parameters, cells: int) -> Equations:
-    """A gradient g in the frame of a machine, h ahead and n to the left: g h = along + z, g n = across - a."""
+    """Gradient g in a machine's frame, h ahead and n left: g h = along + z, g n = across - a."""
     n, (east, north) = len(m.cell), m.ahead.T
     ahead = equations(
         sparse(n, layout.size, (m.epoch, -1.0)),
@@ -218,7 +213,7 @@ def crossings(m: Means, layout: Parameters, cells: int) -> Equations:
 
 
 def heights(p: Passages, layout: Parameters, cells: int, tuning: CalibrationTuning) -> Equations:
-    """From cell to cell h_j - h_i = rise + z times the distance, which counts down in reverse."""
+    """From cell to cell h_j - h_i = rise + z times distance, negative in reverse."""
     all_links = links(p)
     first, group, count = grouped(all_links.epoch, all_links.start * cells + all_links.end, all_links.bend_m > 0)
     measured = all_links.rise_m, all_links.per_zero_m, all_links.slope, all_links.bend_m
@@ -232,7 +227,7 @@ def heights(p: Passages, layout: Parameters, cells: int, tuning: CalibrationTuni
 
 
 def edges(p: Passages, layout: Parameters, ground: GroundState, tuning: CalibrationTuning) -> Equations:
-    """Over bends of the slope dc = d k ds + b d|s| + the step of the place itself, which is the ground here."""
+    """Across bends dc = d k ds + b d|s| + a step of the place, the unknown."""
     slope = (ground.gradient[p.cell] * p.ahead).sum(axis=1)
     i, j = _across_bends(p, slope, tuning)
     change, steeper = p.direction[i] * (slope[j] - slope[i]), np.abs(slope[j]) - np.abs(slope[i])
@@ -259,10 +254,10 @@ def edges(p: Passages, layout: Parameters, ground: GroundState, tuning: Calibrat
 
 
 def _across_bends(p: Passages, slope: Floats, tuning: CalibrationTuning) -> tuple[Ints, Ints]:
-    """Stays i and j, edge_m apart, both on settled slopes, which differ."""
+    """Stays i and j, edge_m apart, on steady but different slopes."""
     apart_m = np.hypot(*np.diff(p.place_m, axis=0, prepend=p.place_m[:1]).T)
     run = np.cumsum(~p.follows)
-    driven_m = np.cumsum(np.where(p.follows, apart_m, 0.0)) + run * 1e6  # runs lie far apart
+    driven_m = np.cumsum(np.where(p.follows, apart_m, 0.0)) + run * 1e6  # separates runs
     bends = np.cumsum(p.follows & (np.abs(np.diff(slope, prepend=slope[:1])) > tuning.step))
     before = np.searchsorted(driven_m, driven_m - tuning.settle_m)
     after = np.searchsorted(driven_m, driven_m + tuning.settle_m, side="right") - 1

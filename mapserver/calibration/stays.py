@@ -1,8 +1,7 @@
-"""Stays: what one machine measured while it crossed one coarse cell, as sums of integers.
+"""Stays: integer sums of a machine's crossing of a coarse cell.
 
-A key says which 10 s, which cell of about 2 m, and whether ahead or in reverse, so that a sample alone knows the stay
-that it belongs to: any order and any batching of the samples give the same stays. The few that last beyond the end of
-their 10 s become two, one behind the other.
+A sample alone gives its key (10 s slot, cell, direction), so order and batching do not matter. A stay across a slot's
+end becomes two.
 """
 
 from __future__ import annotations
@@ -17,32 +16,31 @@ from protocol.arrays import Ints, Table
 from protocol.machine.samples import APPLIED
 
 SLOT_NS = 10_000_000_000
-VALUE_UNITS = 100_000  # per unit of c_rr and of slope
-PLACE_UNITS = 1000  # per metre and per second
-_AXIS_BITS = 16  # of columns and rows: 131 km of cells of 2 m
+VALUE_UNITS = 100_000  # per unit of c_rr or slope
+PLACE_UNITS = 1000  # per metre or second
+_AXIS_BITS = 16  # of columns and rows: 131 km of 2 m cells
 _HALF = 1 << (_AXIS_BITS - 1)
 SLOT_SHIFT = 2 * _AXIS_BITS + 1
-_HEADING_SHIFT = 6  # of the table's integers: a stay of 16 000 samples fits
+_HEADING_SHIFT = 6  # of the heading table's integers: sums of 16 000 samples fit
 HEADING_UNITS = 1 << (20 - _HEADING_SHIFT)
 
-# n samples, of which `known` have c_rr. Sums: ms since the slot began; mm from the cell's corner; c_rr, gradient east,
-# gradient north in VALUE_UNITS; cosine and sine of the heading in HEADING_UNITS; speed in mm/s; distance driven in mm.
-# What the machine stated as applied, in VALUE_UNITS, has no part in what was measured.
+# n samples, `known` with c_rr. Sums: ms in the slot; mm in the cell; c_rr and gradient in VALUE_UNITS; heading in
+# HEADING_UNITS; mm/s; mm driven. APPLIED: as stated, in VALUE_UNITS.
 MEASURED = ("n", "known", "time", "x", "y", "c_rr", "east", "north", "cosine", "sine", "speed", "distance")
 SUMS = (*MEASURED, *APPLIED)
 STAY = np.dtype([("key", "<i8"), *((name, "<i4") for name in SUMS)])
 
 
 def stays(rows: Table, cell_m: float) -> Table:
-    """Stays (k,) of samples (n,) of one machine that have a slope, by their keys; of what it measured."""
+    """Stays (k,) by key, as measured, of a machine's samples (n,) with a slope."""
     keys, sums = np.empty(len(rows), np.int64), np.empty((len(rows), len(SUMS)), np.int32)
     used = _measure(measured(rows), rows, cell_m, HEADING_TABLE, keys, sums)
     return summed(keys[:used], sums[:used])
 
 
 def summed(keys: Ints, sums: Any) -> Table:
-    """Sum what has the same key."""
-    order = np.argsort(keys, kind="stable")  # mostly sorted runs already
+    """Sum equal keys."""
+    order = np.argsort(keys, kind="stable")  # fast, as most runs are sorted
     keys = keys[order]
     first = np.flatnonzero(np.diff(keys, prepend=-1))
     out = np.empty(len(first), STAY)
@@ -55,24 +53,24 @@ def summed(keys: Ints, sums: Any) -> Table:
 
 
 def merged(one: Table, other: Table) -> Table:
-    """Stays of both."""
+    """Merge two tables."""
     both = np.concatenate([one, other])
     sums = np.stack([both[name] for name in SUMS], axis=1)
     return summed(both["key"], sums)
 
 
 def slot(keys: Ints) -> Ints:
-    """Which 10 s, in SLOT_NS since 1970."""
+    """In SLOT_NS since 1970."""
     return keys >> SLOT_SHIFT
 
 
 def cell(keys: Ints) -> Ints:
-    """A number of the cell."""
+    """Cell number."""
     return (keys >> 1) & ((1 << (2 * _AXIS_BITS)) - 1)
 
 
 def column_row(cells: Ints) -> tuple[Ints, Ints]:
-    """Column and row of cells, from the site's origin."""
+    """Column and row from the site's origin."""
     return (cells & ((1 << _AXIS_BITS) - 1)) - _HALF, (cells >> _AXIS_BITS) - _HALF
 
 
@@ -83,10 +81,7 @@ def direction(keys: Ints) -> Ints:
 
 @numba.njit(cache=True, nogil=True)
 def _measure(rows: Any, sent: Any, cell_m: float, headings: Any, keys: Any, sums: Any) -> int:
-    """Keys and sums of single samples; returns how many there are: without a slope a sample shows nothing.
-
-    rows: as measured; sent: the same as they came in.
-    """
+    """Returns the number of samples with a slope. rows: as measured; sent: as received."""
     used = 0
     for i in range(len(rows)):
         row = rows[i]

@@ -1,1 +1,1 @@
-"""What a drive over the map costs, and which line between two points costs least."""
+"""Costs of a drive over the map, and the line of least cost."""

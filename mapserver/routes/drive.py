@@ -1,15 +1,13 @@
-"""What a drive along a line costs: speed, energy and time of a machine over ground of known resistance and slope.
+"""Speed, energy and time of a drive along a line over ground of known resistance and slope.
 
-A machine is a point of mass on the line. It keeps below its own speed and below what curves allow, accelerates as far
-as its power goes, and brakes in time. Per step of length d,
+The machine is a point mass. It keeps below its own speed and the limit of curves, accelerates within its power, and
+brakes in time. Per step of length d:
 
-    drive force  F = m g (c + s) + m k a,    a = (v1^2 - v0^2) / 2 d,
+    drive force  F = m g (c + s) + m k a,    a = (v1^2 - v0^2) / 2 d
 
-with the rolling resistance c, the slope s along the line, the acceleration a and the factor k >= 1 of what rotates with
-it. What F > 0 does is work of the engine, what F < 0 does is lost in brakes; nothing is stored but by speed and height.
-
-Nobody holds a speed where the ground changes: a driver answers a change of m g (c + s) LATE_S late. What the machine
-gains or lacks by then is made up for, and half of it, 1/2 v LATE_S |change|, is work that brakes take.
+with rolling resistance c, slope s along the line, acceleration a, and k >= 1 for rotating parts. The engine does the
+work of F > 0; brakes take that of F < 0. A driver answers a change of m g (c + s) after LATE_S and makes up for the
+speed gained or lost; half of it, 1/2 v LATE_S |change|, is lost in brakes.
 """
 
 from __future__ import annotations
@@ -25,17 +23,17 @@ from protocol.arrays import Floats
 from protocol.queries.routing import RouteMachine
 from protocol.units import GRAVITY_MPS2
 
-CREEP_MPS = 0.3  # no machine is driven more slowly: what its power cannot do at this speed, it cannot do
-LATE_S = 0.3  # found on drives of the simulator over patches of soil: without it energies are 3 % too low
-SMOOTH_M = 9.0  # force is smoothed over about the length of a machine, which stands on all of it at once
+CREEP_MPS = 0.3  # slowest driving [m/s]: what the power cannot do at this speed, it cannot do
+LATE_S = 0.3  # seconds; fitted to simulated drives over soil patches: without it energies are 3 % too low
+SMOOTH_M = 9.0  # metres, about a machine's length, because it stands on all of it
 
 
 @dataclass(frozen=True)
 class Drive:
     """A drive of n steps.
 
-    speed_mps (n + 1,): at their ends. energy_j, braked_j (n,): what the engine does, and what the brakes take.
-    time_s (n,). stalls: the first step that the machine's power cannot do, -1 if there is none.
+    speed_mps (n + 1,): at their ends. energy_j, braked_j (n,): of engine and brakes. time_s (n,). stalls: first step
+    beyond the machine's power, or -1.
     """
 
     speed_mps: Floats
@@ -46,7 +44,7 @@ class Drive:
 
 
 def smoothed(values: Floats, step_m: float) -> Floats:
-    """Values (n,) at steps, each the mean of those within half of SMOOTH_M; at the ends of what there is of them."""
+    """Moving average of values (n,) over SMOOTH_M, shorter at the ends."""
     half = min(round(SMOOTH_M / step_m) // 2, max(len(values) - 1, 0))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     at = np.arange(len(values))
@@ -56,9 +54,9 @@ def smoothed(values: Floats, step_m: float) -> Floats:
 
 
 def drive(step_m: Floats, resistance: Floats, slope: Floats, limit_mps: Floats, machine: RouteMachine) -> Drive:
-    """Drive n steps of step_m (n,) over resistance and slope along (n,), as fast as limits and machine allow.
+    """Drive n steps (n,) as fast as limits and machine allow.
 
-    limit_mps (n + 1,): at the ends of steps; where it is 0 the machine stands. Resistance and slope: already smoothed.
+    limit_mps (n + 1,): at the ends of steps, 0 to stop. resistance, slope: along the line, smoothed.
     """
     force_n = machine.mass_kg * GRAVITY_MPS2 * (resistance + slope)
     limit = np.minimum(limit_mps, machine.speed_mps)
@@ -83,11 +81,11 @@ def _drive(
 ) -> int:
     power_w, accelerate, brake, late = limits
     n = len(step_m)
-    # from the end back: no faster than brakes stop in time
+    # backward pass: speeds from which brakes stop in time
     speed[n] = limit[n]
     for i in range(n - 1, -1, -1):
         speed[i] = min(limit[i], math.sqrt(speed[i + 1] ** 2 + 2 * brake * step_m[i]))
-    # from the start on: no faster than the engine brings it to
+    # forward pass: speeds that the engine reaches
     stalls = -1
     for i in range(n):
         v, d = speed[i], step_m[i]
@@ -110,14 +108,11 @@ def _drive(
 
 @numba.njit(cache=True, nogil=True)
 def _reached(v: float, wanted: float, d: float, force_n: float, inertia_kg: float, power_w: float) -> float:
-    """The speed at the end of a step that is wanted, or the highest that the power reaches.
-
-    There its work in the time of the step is the work that is done.
-    """
+    """Speed at the end of a step: as wanted, or as far as the power goes."""
     low, high = 0.0, wanted
     if _spare(v, high, d, force_n, inertia_kg, power_w) >= 0.0:
         return high
-    for _ in range(40):  # the spare work falls with the speed that is reached
+    for _ in range(40):  # spare work falls with the speed reached
         middle = 0.5 * (low + high)
         if _spare(v, middle, d, force_n, inertia_kg, power_w) >= 0.0:
             low = middle
@@ -128,7 +123,7 @@ def _reached(v: float, wanted: float, d: float, force_n: float, inertia_kg: floa
 
 @numba.njit(cache=True, nogil=True)
 def _spare(v: float, reached: float, d: float, force_n: float, inertia_kg: float, power_w: float) -> float:
-    """Work of the engine in the time of a step less the work that is done there, both [J]."""
+    """Work [J] the engine could do in a step, less the work needed."""
     mean = 0.5 * (v + reached)
     if mean <= 0.0:
         return math.inf

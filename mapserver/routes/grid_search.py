@@ -1,6 +1,6 @@
-"""Dijkstra's algorithm over the cells of a window: kernels alone, which hold no lock of Python.
+"""Dijkstra's algorithm over the cells of a window, compiled and without Python's lock.
 
-Edges are costed as they are needed: a graph of a square kilometre in memory would take 300 MB.
+Edge costs are computed on demand: the graph of a square kilometre would take 300 MB.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
-# Negative costs would give silently wrong distances: downhill a metre costs this, not less. As resistance.
+# Cost per metre downhill, as resistance: negative costs would silently give wrong distances.
 LEAST_COST = 0.002
 
 
@@ -29,17 +29,16 @@ def dijkstra(
     distance: Any,
     before: Any,
 ) -> None:
-    """Cost of the cheapest line from one cell to others, and the cell before each on it, until the target is reached.
+    """Search the cheapest line from source to target: distance (n,), and the cell before each on it.
 
-    Cells are numbered row by row, with a border of closed ones that no step leads across. ground (n, 3): resistance,
-    inf where closed, and slopes to the east and north, side by side, as each look at a cell takes all of them. cells,
-    shares: what steps (k, 2) touch, by the difference of numbers. distance (n,): inf, before (n,): -1, where no line
-    leads or none was looked for.
+    Cells are numbered by rows, with a border of closed cells that no step crosses. ground (n, 3): resistance (inf where
+    closed), slope east, slope north, interleaved because each access needs all. cells, shares: what steps (k, 2) touch,
+    by difference of numbers. distance inf and before -1: not reached.
     """
     norms = np.sqrt((steps * steps).sum(axis=1).astype(np.float64))
     east, north, onward = steps[:, 1] / norms, steps[:, 0] / norms, steps[:, 0] * columns + steps[:, 1]
     heap, keys = np.empty(len(ground), np.int32), np.empty(len(ground))
-    place = np.full(len(ground), -1, np.int32)  # -2: settled
+    place = np.full(len(ground), -1, np.int32)  # index in the heap; -2: settled
     distance[source], heap[0], keys[0], place[source], size = 0.0, source, 0.0, 0, 1
     while size > 0:
         node = heap[0]
@@ -67,7 +66,6 @@ def dijkstra(
 
 @numba.njit(cache=True, nogil=True)
 def _sift_up(heap: Any, keys: Any, place: Any, node: int, key: float) -> None:
-    """Bring a node to its place in the heap, which is no later than the one that it has."""
     at = place[node]
     while at > 0:
         parent = (at - 1) // 4
@@ -81,7 +79,6 @@ def _sift_up(heap: Any, keys: Any, place: Any, node: int, key: float) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _sift_down(heap: Any, keys: Any, place: Any, node: int, key: float, size: int) -> None:
-    """Bring a node from the top of the heap to its place."""
     at = 0
     while True:
         least, best = -1, key
@@ -101,9 +98,9 @@ def _there(
     ground: Any, crawl: float, node: int, cells: Any, shares: Any, x: float, y: float, here: float, norm: float,
     cell_m: float, known: float,
 ) -> float:  # fmt: skip
-    """Cost of a line by way of here, one step further in direction x, y: the mean per metre of the cells it touches.
+    """Cost via `here` and one step in direction x, y: the mean of the cells it touches.
 
-    inf where one of these is closed, or the cost at least what is known: what they cost only adds up.
+    inf if any is closed, or as soon as the cost reaches `known`.
     """
     total, there = 0.0, here
     for i in range(len(shares)):

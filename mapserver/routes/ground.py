@@ -1,7 +1,4 @@
-"""Ground as a route reads it: layers of cells between their centres, over those of the four around that are known.
-
-And the line of the route, cut into even steps: where it is, where it leads, how fast its curves may be driven.
-"""
+"""Ground along a route: layers interpolated between cell centres, and the line in even steps."""
 
 from __future__ import annotations
 
@@ -15,17 +12,17 @@ import numpy as np
 
 from protocol.arrays import AnyArray, Floats, Ints
 
-LEAST_SHARE = 0.25  # of the weights of four cells: less is a cell's corner, and no ground under a wheel
+LEAST_SHARE = 0.25  # of the weights of four cells; less is a cell's corner, not ground under a wheel
 HALF = 2**20
-CURVE_M = 7.0  # length over which a direction changes at a corner: about the circle that a machine turns on
-REVERSAL_RAD = math.radians(120.0)  # at sharper corners than this a machine stops and drives on in reverse
+CURVE_M = 7.0  # metres over which a corner changes the direction: about a machine's turning circle
+REVERSAL_RAD = math.radians(120.0)  # at sharper corners a machine stops and reverses
 
 
 @dataclass(frozen=True)
 class Squares:
-    """Layers of square parts of the map, edge cells to a side.
+    """Layers of square parts of the map.
 
-    places (k, 2): column and row of each square; layers: name -> (k, edge, edge), NaN where unknown.
+    places (k, 2): column and row of each; layers: (k, edge, edge), NaN where unknown; edge: in cells.
     """
 
     cell_m: float
@@ -35,14 +32,14 @@ class Squares:
 
     @classmethod
     def stacked(cls, cell_m: float, edge: int, squares: Mapping[tuple[int, int], Mapping[str, AnyArray]]) -> Squares:
-        """Of layers (edge, edge) by the place of their square; at least one of them."""
+        """Stack layers (edge, edge) by place of their square; at least one."""
         places = sorted(squares)
         names = squares[places[0]].keys()
         layers = {name: np.stack([squares[place][name] for place in places]) for name in names}
         return cls(cell_m, edge, np.array(places), layers)
 
     def at(self, position_m: Floats, names: Sequence[str] = ()) -> dict[str, Floats]:
-        """Layers (n,) at places (n, 2), all or some: bilinear over the known of the four cells around; NaN of none."""
+        """Layers (n,) at places (n, 2), bilinear over the known ones of four cells; NaN where none is."""
         column, row = (position_m / self.cell_m - 0.5).T
         out = {name: np.zeros((2, len(position_m))) for name in names or self.layers}
         for right in (0, 1):
@@ -58,11 +55,11 @@ class Squares:
         }
 
     def by_place(self) -> dict[tuple[int, int], int]:
-        """Index of each square by its column and row."""
+        """Index by column and row."""
         return {(x, y): i for i, (x, y) in enumerate(self.places.tolist())}
 
     def _find(self, x: Ints, y: Ints) -> Ints:
-        """Index (n,) of the squares at these places, -1 where there is none."""
+        """Indices (n,) of squares, -1 for none."""
         keys, wanted = _key(*self.places.T), _key(x, y)
         order = np.argsort(keys)
         at = np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)
@@ -71,7 +68,7 @@ class Squares:
 
 @numba.njit(cache=True, nogil=True)
 def _add_known(layer: Any, at: Any, y: Any, x: Any, share: Any, sums: Any) -> None:
-    """Add shares (n,) of the known of these cells of squares, and of their values, to sums (2, n): values, shares."""
+    """Add weighted values of known cells, and their weights (n,), to sums (2, n)."""
     for i in range(len(at)):
         if at[i] >= 0:
             value = np.float64(layer[at[i], y[i], x[i]])
@@ -81,7 +78,7 @@ def _add_known(layer: Any, at: Any, y: Any, x: Any, share: Any, sums: Any) -> No
 
 
 def squares_at(position_m: Floats, cell_m: float, edge: int) -> set[tuple[int, int]]:
-    """Columns and rows of the squares, edge cells to a side, that the four cells around places (n, 2) lie in."""
+    """Squares (column, row) of the four cells around each of places (n, 2)."""
     first = np.floor(position_m / cell_m - 0.5).astype(np.int64)
     corners = [(first + np.array([x, y])) // edge for x in (0, 1) for y in (0, 1)]
     keys = np.unique(np.concatenate([_key(*corner.T) for corner in corners]))
@@ -96,8 +93,8 @@ def _key(x: Ints, y: Ints) -> Ints:
 class Steps:
     """n even steps along a line.
 
-    length_m (n,): of each; position_m (n, 2): of their middles, in `map`; direction (n, 2): unit vectors along;
-    end_m (n + 1,): way from the begin to their ends.
+    length_m (n,); position_m, direction (n, 2): middles and unit vectors, in `map`; end_m (n + 1,): distance from the
+    start.
     """
 
     length_m: Floats
@@ -112,7 +109,7 @@ def lengths(line_m: Floats) -> Floats:
 
 
 def steps(line_m: Floats, step_m: float) -> Steps:
-    """Cut a line (k, 2) of more than one place into steps as near to step_m as divide it evenly."""
+    """Cut a line (k, 2) of at least two places into equal steps of about step_m."""
     distance_m = np.concatenate([[0.0], np.cumsum(lengths(line_m))])
     n = max(1, round(distance_m[-1] / step_m))
     end_m = np.linspace(0.0, distance_m[-1], n + 1)
@@ -123,21 +120,20 @@ def steps(line_m: Floats, step_m: float) -> Steps:
     chord = np.hypot(*along.T)
     piece = np.clip(np.searchsorted(distance_m, middle_m, side="right") - 1, 0, len(line_m) - 2)
     own = np.diff(line_m, axis=0)[piece] / np.maximum(lengths(line_m)[piece], 1e-12)[:, None]
-    # a step that turns back on itself has no chord to speak of: there the piece that it is on says where it leads
+    # a step that turns back has no useful chord: its piece gives the direction
     direction = np.where((chord > 0.5 * np.diff(end_m))[:, None], along / np.maximum(chord, 1e-12)[:, None], own)
     return Steps(np.diff(end_m), position, direction, end_m)
 
 
 def limits(line_m: Floats, end_m: Floats, lateral_mps2: float) -> Floats:
-    """How fast (n + 1,) a line is driven at the ends of steps [m/s]: inf where it is straight, 0 where it turns back.
+    """Speed limits (n + 1,) at the ends of steps [m/s]: inf where straight, 0 where the line reverses.
 
-    On a curve of curvature k the sideways acceleration k v^2 stays below lateral_mps2. A direction changes over
-    CURVE_M: the curvature is the change within half of it on both sides, over it.
+    Curvature k keeps k v^2 below lateral_mps2; it is the change of direction within CURVE_M, divided by CURVE_M.
     """
     distance_m = np.concatenate([[0.0], np.cumsum(lengths(line_m))])
     pieces = np.diff(line_m, axis=0)
     turn = np.diff(np.arctan2(pieces[:, 1], pieces[:, 0]))
-    turn = (turn + np.pi) % (2 * np.pi) - np.pi  # (k - 2,) at the inner corners
+    turn = (turn + np.pi) % (2 * np.pi) - np.pi  # (k - 2,), inner corners
     corner_m, reverses = distance_m[1:-1], np.abs(turn) > REVERSAL_RAD
     turned = np.concatenate([[0.0], np.cumsum(np.where(reverses, 0.0, turn))])
     first, last = (np.searchsorted(corner_m, end_m + side * CURVE_M / 2, side="right") for side in (-1, 1))

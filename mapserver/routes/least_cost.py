@@ -1,9 +1,8 @@
-"""The line between two cells that costs least.
+"""The cheapest line between two cells.
 
-A line from one cell's centre to another's costs, in each cell that it crosses, its length there times the cost per
-metre in its direction, so that up and down differ. First all cells are searched, each with 16 neighbours: that finds
-the passage, but goes in 16 directions, up to 2.75 % too long. Then a band around that line is searched with 64, and
-pieces between places of what comes out, which run in any direction, replace what is dearer.
+In each cell a line costs its length times a cost per metre that depends on direction. A search with 16 neighbours finds
+the passage, up to 2.75 % too long. A second one with 64 neighbours searches a band around it; then straight pieces in
+any direction replace more expensive ones.
 """
 
 from __future__ import annotations
@@ -23,17 +22,16 @@ from protocol.arrays import Bools, Floats, Ints
 
 Cell = tuple[int, int]  # row and column in a window
 
-LOOK_AHEAD = 64  # places of a line that a straight piece may skip at a time; the next pass skips as many of the rest
-BAND = 16  # cells: in one of 8 one drawn map in a hundred has its cheapest line outside, 2 % cheaper; in 24 none more
+LOOK_AHEAD = 64  # places that a straight piece may skip; the next pass skips as many again
+BAND = 16  # cells; with 8 one map in a hundred has its cheapest line outside (by 2 %), with 24 no more
 
 
 @dataclass(frozen=True)
 class CostField:
     """What lines cost over a window of cells.
 
-    resistance, grade_east, grade_north (rows, columns): known wherever is_open, and positive. cell_m: edge of a cell.
-    crawl: resistance and slope beyond which a machine goes slower than it may: its power over weight and highest speed,
-    for lines that cost time; inf for lines that cost energy, whose unit is metres of lift.
+    resistance, grade_east, grade_north (rows, columns): finite where is_open; resistance positive. crawl: resistance
+    plus slope at which power limits the speed, for costs in time; inf for costs in energy.
     """
 
     resistance: Floats
@@ -45,9 +43,9 @@ class CostField:
 
 
 def least_cost_line(terrain: CostField, start: Cell, end: Cell) -> tuple[Ints, float] | None:
-    """Corners (n, 2), as rows and columns, of the cheapest line, and its cost; None where there is none.
+    """Corners (n, 2) [row, column] of the cheapest line, and its cost; None if there is no line.
 
-    Cost: metres of lift, or metres at the highest speed.
+    Unit: metres of lift, or metres at top speed if crawl is finite.
     """
     line = _search(terrain, start, end, moves(2))
     if line is None:
@@ -75,7 +73,7 @@ def _search(terrain: CostField, start: Cell, end: Cell, steps: Ints) -> Ints | N
 
 
 def _bordered(terrain: CostField, border: int) -> Floats:
-    """Resistance and slopes (n, 3) of cells, row by row, with so many closed ones around; inf where closed."""
+    """Resistance and slopes (n, 3) by rows, with a closed border; inf where closed."""
     rows, columns = terrain.is_open.shape
     out = np.zeros((rows + 2 * border, columns + 2 * border, 3))
     out[..., 0] = math.inf
@@ -86,7 +84,6 @@ def _bordered(terrain: CostField, border: int) -> Floats:
 
 
 def _band(shape: tuple[int, int], line: Ints) -> Bools:
-    """Cells within BAND of a line."""
     drawn = np.zeros(shape, np.uint8)
     cv2.polylines(drawn, [line[:, ::-1].astype(np.int32).reshape(-1, 1, 2)], isClosed=False, color=1)
     band: Bools = cv2.dilate(drawn, np.ones((2 * BAND + 1, 2 * BAND + 1), np.uint8)) > 0
@@ -94,18 +91,15 @@ def _band(shape: tuple[int, int], line: Ints) -> Bools:
 
 
 def reaches(terrain: CostField, start: Cell, end: Cell) -> bool:
-    """Whether any line leads from one cell to the other."""
-    # a line goes through a corner only where both cells beside it are open
+    """Whether any line connects two cells."""
+    # a line passes a corner only if both cells beside it are open
     _, part = cv2.connectedComponents(terrain.is_open.astype(np.uint8), connectivity=4)
     return bool(terrain.is_open[start] and terrain.is_open[end] and part[start] == part[end])
 
 
 @lru_cache
 def moves(order: int) -> Ints:
-    """Steps (k, 2) to neighbours, in rows and columns: 8 of order 1, 16 of 2, 32 of 3, 64 of 4.
-
-    Each order puts between two neighbouring directions their sum (a Farey sequence).
-    """
+    """Steps (k, 2) [row, column]: 8 of order 1, 16 of 2, 32 of 3, 64 of 4 (a Farey sequence)."""
     quarter = [(0, 1), (1, 0)]
     for _ in range(order):
         sums = [(a[0] + b[0], a[1] + b[1]) for a, b in pairwise(quarter)]
@@ -119,12 +113,12 @@ def moves(order: int) -> Ints:
 
 
 def cost_of(terrain: CostField, line: Ints) -> float:
-    """Cost of a line (n, 2) of cells; inf where it leaves the open ones."""
+    """Cost of a line (n, 2) of cells; inf outside open cells."""
     return float(sum(_piece(*_arrays(terrain), *a, *b) for a, b in pairwise(line)))
 
 
 def straightened(terrain: CostField, line: Ints) -> tuple[Ints, float]:
-    """A line (n, 2) over some of the places of another one, where straight pieces cost less; and what it costs."""
+    """Drop places of a line (n, 2) where straight pieces cost less; returns line and cost."""
     while True:
         kept = np.zeros(len(line), np.bool_)
         cost = _straighten(*_arrays(terrain), line, kept)
@@ -142,7 +136,7 @@ def _arrays(terrain: CostField) -> tuple[Floats, Floats, Floats, Bools, float, f
 
 
 def _touched(steps: Ints) -> tuple[Ints, Floats]:
-    """Cells that each step (k, 2) touches, (k, m, 2) from its first one, and shares (k, m) of its length; -1: none."""
+    """Cells (k, m, 2) that each step touches, relative, and shares (k, m) of its length; -1 pads."""
     order = int(np.abs(steps).max())
     cells, shares = np.zeros((len(steps), 4 * order, 2), np.int64), np.full((len(steps), 4 * order), -1.0)
     for k, (down, right) in enumerate(steps.tolist()):
@@ -150,7 +144,7 @@ def _touched(steps: Ints) -> tuple[Ints, Floats]:
         ends = sorted(cuts)
         crossed = [((a + b) / 2, b - a) for a, b in pairwise(ends)]
         touched = {(round(down * at), round(right * at)): share for at, share in crossed}
-        for at in ends[1:-1]:  # through a corner it touches the cells beside it
+        for at in ends[1:-1]:  # through a corner it touches both cells beside
             y, x = down * at, right * at
             if abs(y % 1 - 0.5) < 1e-9 and abs(x % 1 - 0.5) < 1e-9:
                 for cell in product((math.floor(y), math.ceil(y)), (math.floor(x), math.ceil(x))):
@@ -163,7 +157,7 @@ def _touched(steps: Ints) -> tuple[Ints, Floats]:
 def _straighten(
     resistance: Any, east: Any, north: Any, is_open: Any, cell_m: float, crawl: float, line: Any, kept: Any
 ) -> float:
-    """Keep the places between which straight pieces cost least; returns what they cost."""
+    """Mark the places between which straight pieces cost least; returns the cost."""
     n = len(line)
     best, before = np.full(n, math.inf), np.full(n, -1, np.int64)
     best[0] = 0.0
@@ -172,7 +166,7 @@ def _straighten(
             cost = best[i] + _piece(
                 resistance, east, north, is_open, cell_m, crawl, line[i, 0], line[i, 1], line[j, 0], line[j, 1]
             )
-            if cost < best[j] * (1 - 1e-9):  # of two as dear the one with fewer places
+            if cost < best[j] * (1 - 1e-9):  # of equal costs the one with fewer places
                 best[j], before[j] = cost, i
     at = n - 1
     while at >= 0:
@@ -194,10 +188,10 @@ def _piece(
     to_row: int,
     to_column: int,
 ) -> float:
-    """Cost of a straight piece between the centres of two cells; inf where it touches one that is not open.
+    """Cost of a straight piece between two cell centres; inf if it touches a closed cell.
 
-    From cell to cell (Amanatides and Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987). Through a corner
-    it touches both cells beside it.
+    Traversal by Amanatides and Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987. A corner touches both
+    cells beside it.
     """
     down, right = to_row - row, to_column - column
     length_m = math.sqrt(down * down + right * right) * cell_m
@@ -205,7 +199,7 @@ def _piece(
         return 0.0
     x, y = right * cell_m / length_m, down * cell_m / length_m
     step_row, step_column = (1 if down > 0 else -1), (1 if right > 0 else -1)
-    # shares of the way at which the next row and column begin
+    # shares of the length where the next row and column begin
     per_row = 1.0 / abs(down) if down else math.inf
     per_column = 1.0 / abs(right) if right else math.inf
     next_row, next_column = 0.5 * per_row, 0.5 * per_column

@@ -1,18 +1,15 @@
-"""What ground costs where nobody was: a rule of the ground around it, so that whoever asks is told the same.
+"""Prices of unknown ground, by a rule on the ground around it, so that every query gets the same.
 
-A square is priced by what was measured in it and in the eight around it. Its unknown ground resists as much as the
-dearest tenth of that does uphill, and rises as the known ground around says that it must. What a layer fills in beside
-driven ground is nobody's knowledge either: it resists as its mean, and as much of what unknown ground costs more as its
-deviation is of the one that filling begins with.
+A square is priced by its own ground and the eight squares around. Unknown cells cost the worst 10 % of the known,
+uphill. Filled cells are estimates: they cost their mean plus a share of the surcharge for unknown ground, in proportion
+to their standard deviation.
 
-Slopes of ground where nobody was, from heights that its surroundings have in common.
+Unknown slopes follow from heights, because a line across has to climb what known ground around climbs. Heights h fit
+measured gradients g best:
 
-No gradient was measured there, but a line through it leads from one place of known slopes to another, and has to climb
-what the known ways between them climb. So heights h over a window are those that agree best with measured gradients g,
+    sum over neighbours  w ((h_j - h_i) / d - g)^2  least,   w = 1 and g measured; w small and g = 0 elsewhere
 
-    sum over neighbours  w ((h_j - h_i) / d - g)^2  least,   w = 1 and g measured; w small and g = 0 where none was,
-
-which makes them harmonic between known ground: as even as it lets them be.
+so they are harmonic between known ground.
 """
 
 from __future__ import annotations
@@ -30,33 +27,33 @@ from mapserver.error_model import RESISTANCE_PRIOR_STD
 from mapserver.routes.ground import Squares
 from protocol.arrays import AnyArray, Bools, Floats, Ints
 
-DEAREST = 0.9  # of what is known is cheaper; at the median, a cheapest line leads through whatever nobody has driven
-LOOSE = 0.25  # as loose sand: what unknown ground costs that has nothing measured in the squares around its own
-BINS = np.geomspace(0.001, 5.0, 257)  # of resistance and slope together, 3 % each
+DEAREST = 0.9  # quantile of known cost; at the median, the cheapest line would cross any unknown ground
+LOOSE = 0.25  # price without known ground nearby, as loose sand
+BINS = np.geomspace(0.001, 5.0, 257)  # of resistance plus slope, 3 % each
 NEEDS = ("resistance_filled", "resistance_filled_std", "grade_east_filled", "grade_north_filled", "visits")
 RESISTANCE, EAST, NORTH = PRICED = ("price", "price_east", "price_north")
 Square = tuple[int, int]
-COARSE = 8  # cells to a side of those that heights are told for: hills are larger
-FAINT = 1e-3  # weight of ground where nobody was: it follows what is measured, and hardly bends it
-HOLD = 1e-9  # of the mean height, which nothing tells
+COARSE = 8  # cells to a side of a coarse cell; hills are larger
+FAINT = 1e-3  # weight of unknown ground, too small to bend what is measured
+HOLD = 1e-9  # regularises the mean height, which nothing measures
 
 
 def around(squares: Iterable[Square]) -> set[Square]:
-    """The squares that prices of these follow from: they, and the eight around each."""
+    """Squares that these prices depend on: themselves and the eight around each."""
     return {(x + right, y + up) for x, y in squares for right, up in product((-1, 0, 1), repeat=2)}
 
 
 def bare(squares: Squares, among: Iterable[Square]) -> set[Square]:
-    """Those that have cells where nobody was, or none could tell the resistance."""
+    """Squares with cells that are unvisited or have no resistance."""
     whole = np.isfinite(squares.layers["visits"] + squares.layers["resistance_filled"]).reshape(len(squares.places), -1)
     return set(among) - {place for place, at in squares.by_place().items() if whole[at].all()}
 
 
 class Prices:
-    """What bare ground costs, square by square, each reckoned once: a way reads them for its search and for its drives.
+    """Prices by square, cached; search and drive read the same.
 
-    squares: NEEDS, of all `around` those that are wanted. given: what unknown ground resists, None: by the rule. For
-    one thread at a time.
+    squares: NEEDS of all `around` the wanted ones. given: resistance of unknown ground, None for the rule.
+    Single-threaded.
     """
 
     def __init__(self, squares: Squares, given: float | None = None) -> None:
@@ -64,9 +61,9 @@ class Prices:
         self._known: dict[Square, dict[str, Floats]] = {}
 
     def squares(self, wanted: Set[Square]) -> Squares:
-        """PRICED of wanted squares: resistance, slopes to the east and north; NaN where machines measured them.
+        """PRICED of squares: resistance, slope east, slope north; NaN where measured.
 
-        Where machines were and measured no resistance, it is that of the nearest place where they did.
+        Visited cells without resistance take that of the nearest measured cell.
         """
         for square in wanted - self._known.keys():
             self._known[square] = self._priced(square)
@@ -76,14 +73,14 @@ class Prices:
 
     @cached_property
     def _layers(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-        """Resistance and its deviation, where machines were, and where they measured slopes (k, n, n)."""
+        """Resistance, its deviation, visited cells, and measured slopes (k, n, n)."""
         resistance, std, east, _, visits = (self._squares.layers[name] for name in NEEDS)
         driven = np.isfinite(visits)
         return resistance, std, driven, driven & np.isfinite(east)
 
     @cached_property
     def _counted(self) -> Ints:
-        """How many known cells of each square are so dear."""
+        """Histogram of known cost in each square."""
         resistance, _, driven, _ = self._layers
         east, north = (self._squares.layers[name] for name in NEEDS[2:4])
         steep = np.hypot(east, north)
@@ -124,13 +121,13 @@ class Prices:
 
 
 def _counts(values: AnyArray, known: Bools) -> Ints:
-    """How many known values (k, n, n) of each square lie in each of BINS."""
+    """Histograms over BINS of known values (k, n, n), by square."""
     bins = np.digitize(values[known], BINS[1:-1]) + (len(BINS) - 1) * np.nonzero(known)[0]
     return np.bincount(bins, minlength=len(known) * (len(BINS) - 1)).reshape(len(known), -1)
 
 
 def _dearest(counts: Ints) -> float:
-    """DEAREST of values that were counted in BINS, even in the logarithm within each; LOOSE of none."""
+    """Quantile DEAREST of counts in BINS, log-linear within a bin; LOOSE if empty."""
     total = np.cumsum(counts)
     if not total[-1]:
         return LOOSE
@@ -141,7 +138,7 @@ def _dearest(counts: Ints) -> float:
 
 
 def _joined(values: AnyArray, near: Sequence[Sequence[int | None]], otherwise: float) -> Floats:
-    """Values (k, n, n) of three by three squares in one array (3 n, 3 n); otherwise: of those that are not there."""
+    """Join 3 x 3 squares of values (k, n, n) into (3 n, 3 n); otherwise: for missing squares."""
     n = values.shape[-1]
     out = np.full((3 * n, 3 * n), otherwise)
     for y, row in enumerate(near):
@@ -152,7 +149,7 @@ def _joined(values: AnyArray, near: Sequence[Sequence[int | None]], otherwise: f
 
 
 def _nearest(values: Floats, known: Bools, otherwise: float) -> Floats:
-    """Values of the nearest known cell (3 n, 3 n), in those in the middle (n, n)."""
+    """Values of the nearest known cell (3 n, 3 n), for the middle (n, n)."""
     n = len(values) // 3
     if not known.any():
         return np.full((n, n), otherwise)
@@ -166,7 +163,7 @@ def _nearest(values: Floats, known: Bools, otherwise: float) -> Floats:
 
 @dataclass(frozen=True)
 class Rises:
-    """Known rises over coarse cells (..., m, m) to the east and north, in cells, and which share of each is known."""
+    """Rises over coarse cells (..., m, m) to the east and north, in cells, and the known share of each."""
 
     east: Floats
     north: Floats
@@ -174,7 +171,7 @@ class Rises:
 
     @classmethod
     def of_slopes(cls, east: Floats, north: Floats, known: Bools) -> Rises:
-        """From slopes (..., n, n) [m/m]; m: coarse cells that cover n."""
+        """From slopes (..., n, n) [m/m]; m coarse cells cover n."""
         number = _sums(known.astype(np.float64))
         east_sum, north_sum = (_sums(np.where(known, grade, 0.0)) for grade in (east, north))
         per_cell = COARSE / np.maximum(number, 1.0)
@@ -182,9 +179,9 @@ class Rises:
 
 
 def heights(rises: Rises) -> Floats:
-    """Heights (m, m) in cells, that fit the known rises (m, m) best."""
+    """Best-fitting heights (m, m), in cells."""
     size = len(rises.share)
-    band = np.zeros((size + 1, size * size))  # of the normal equations: the diagonal, what is to the right, and above
+    band = np.zeros((size + 1, size * size))  # bands of the normal equations: diagonal, right, above
     wanted = np.zeros((size, size))
     diagonal, right, above = (band[row].reshape(size, size) for row in (0, 1, size))
     diagonal += HOLD
@@ -204,7 +201,7 @@ def heights(rises: Rises) -> Floats:
 
 
 def slopes(height: Floats) -> tuple[Floats, Floats]:
-    """Slopes (n, n) to the east and north [m/m] of the cells in all coarse ones (m, m) but the outermost."""
+    """Slopes (n, n) east and north [m/m], inside the outermost coarse cells."""
     fine = cv2.resize(height, None, fx=COARSE, fy=COARSE, interpolation=cv2.INTER_LINEAR)
     inner = slice(COARSE, -COARSE)
     north, east = np.gradient(fine)
@@ -212,7 +209,7 @@ def slopes(height: Floats) -> tuple[Floats, Floats]:
 
 
 def _sums(values: Floats) -> Floats:
-    """Sums (..., m, m) over COARSE x COARSE cells of (..., n, n); the last ones may be cut short."""
+    """Sums (..., m, m) over COARSE x COARSE cells of (..., n, n), padded with 0."""
     short = -values.shape[-1] % COARSE
     whole = np.pad(values, [(0, 0)] * (values.ndim - 2) + [(0, short)] * 2)
     m = whole.shape[-1] // COARSE

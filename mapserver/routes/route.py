@@ -1,4 +1,4 @@
-"""A route: what the ground is like along a line, and what a machine's drive over it costs, with 90 % intervals."""
+"""A route: the ground along a line, and the cost of a machine's drive with 90 % intervals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from protocol.arrays import Bools, Floats
 from protocol.errors import QueryError, Refusal
 from protocol.queries.routing import RouteMachine, RouteSteps, RouteTotals
 
-# What a route reads of the map. Of gaps between known cells it takes what fills them; beyond, ground is unknown.
+# Layers that a route reads: gaps between known cells are filled; beyond, ground is unknown.
 LAYERS = (
     "resistance_filled",
     "grade_east_filled",
@@ -27,19 +27,18 @@ LAYERS = (
     "visits",
     "confidence",
 )
-STEP_M = 1.0  # of the drive; what is answered is of longer ones
-# What drives differ by though ground and machine are the same, as shares: drivers, other machines that cross. Found on
-# three recordings of the simulator, whose drives differed from those over the true map by 2 to 5 %, and by 1 to 2 %.
+STEP_M = 1.0  # of the drive [m]; answers have longer steps
+# Relative spread of drives on equal ground (drivers, crossing traffic), from three simulated recordings: energies
+# differed by 2 to 5 % from drives over the true map, times by 1 to 2 %.
 ENERGY_STD, TIME_STD = 0.03, 0.015
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The ground along n steps.
+    """The ground along n steps, (n,) each.
 
-    resistance, slope (n,): along, with what they are taken for where they are not known; their deviations, and that of
-    their sum; confidence: NaN where unknown; unknown: nobody was there; unmeasured: machines were, and none could tell
-    the resistance.
+    resistance, slope: along the line, assumed where unknown. sum_std: deviation of their sum. confidence: NaN where
+    unknown. unknown: nobody drove there; unmeasured: driven without resistance.
     """
 
     resistance: Floats
@@ -53,10 +52,10 @@ class Ground:
 
 
 def ground_along(squares: Squares, cut: Steps, prices: Prices) -> Ground:
-    """The ground along a line; what is unknown has its price.
+    """Ground along a line; unknown ground has its price.
 
-    What was driven on and not measured lies between what was measured before and behind it, and so does its resistance.
-    QueryError where all is unknown and nothing says what that is to cost.
+    Unmeasured resistance is interpolated between measured neighbours. QueryError if all is unknown and has no given
+    price.
     """
     along = squares.at(cut.position_m)
     east, north = cut.direction.T
@@ -79,7 +78,7 @@ def ground_along(squares: Squares, cut: Steps, prices: Prices) -> Ground:
         std = np.where(unknown, UNKNOWN_SHARE * price, np.where(bare, np.hypot(std, price - resistance), std))
         resistance, slope = np.where(bare, price, resistance), np.where(bare & np.isfinite(even), even, slope)
     slope_std = np.where(flat, UNKNOWN_SLOPE_STD, along["grade_filled_std"])
-    # machines measure the force that both together take: a resistance is wrong by as much as a slope, the other way
+    # machines measure the sum: errors of resistance and slope cancel
     alone = unknown | unmeasured | flat | ~driven
     return Ground(
         resistance=resistance,
@@ -94,7 +93,7 @@ def ground_along(squares: Squares, cut: Steps, prices: Prices) -> Ground:
 
 
 def _between(resistance: Floats, measured: Bools) -> tuple[Floats, Floats]:
-    """Resistance (n,) between the nearest that is measured before and behind, in its logarithm; and how they differ."""
+    """Resistance (n,) log-interpolated between measured steps, and the difference of these."""
     at, known = np.arange(len(resistance)), np.flatnonzero(measured)
     between = np.exp(np.interp(at, known, np.log(resistance[known])))
     after = np.searchsorted(known, at)
@@ -103,7 +102,7 @@ def _between(resistance: Floats, measured: Bools) -> tuple[Floats, Floats]:
 
 
 def line_std(ground: Ground, length_m: Floats) -> float:
-    """Deviation of the mean of resistance and slope along steps; those of two are alike by exp(-way / ALIKE_M)."""
+    """Standard deviation of the mean of resistance plus slope; steps correlate by exp(-distance / ALIKE_M)."""
     weighted = ground.sum_std * length_m / float(length_m.sum())
     of_steps = _correlated(weighted, np.exp(-length_m / ALIKE_M))
     return math.sqrt(of_steps + line_variance(float(ground.resistance.mean())))
@@ -111,7 +110,7 @@ def line_std(ground: Ground, length_m: Floats) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _correlated(std: Any, fade: Any) -> float:
-    """Variance of the sum of values with deviations (n,), each of which correlates by its fade with what is before."""
+    """Variance of a sum; each deviation (n,) correlates with its predecessors by its fade."""
     total, carried = 0.0, 0.0
     for i in range(len(std)):
         total += std[i] * std[i] + 2 * std[i] * carried
@@ -129,10 +128,10 @@ def route(
     prices: Prices | None = None,
     refuse_unknown: bool = False,
 ) -> tuple[RouteSteps, RouteTotals]:
-    """What a drive along a line (k, 2) costs. squares: LAYERS, around all of it. stops: at its begin and its end.
+    """Cost of a drive along a line (k, 2), stopping at its ends or not.
 
-    step_m: of the steps that are answered. prices: of these squares. QueryError where the machine's power does not do
-    it, or nothing is known.
+    squares: LAYERS around the line. step_m: of the answer. prices: of these squares. QueryError if the power is too low
+    or nothing is known.
     """
     cut = steps(line_m, STEP_M)
     ground = ground_along(squares, cut, prices or Prices(squares))
@@ -180,14 +179,13 @@ def _totals(cut: Steps, ground: Ground, machine: RouteMachine, done: Drive, boun
 
 
 def _wider(value: float, bounds: tuple[float, float], share: float) -> tuple[float, float]:
-    """An interval of what the map leaves open, with what drives differ by beside."""
     of_drives = NINETY * share * value
     low, high = (math.hypot(bound - value, of_drives) for bound in bounds)
     return value - low, value + high
 
 
 def _by_step(cut: Steps, ground: Ground, done: Drive, step_m: float) -> RouteSteps:
-    """Steps of the drive summed to those of an answer: as many whole ones, as near to step_m as divide it evenly."""
+    """Sum drive steps to answer steps, whole ones of about step_m."""
     n = max(1, round(cut.end_m[-1] / step_m))
     of_step = np.minimum(((cut.end_m[1:] - cut.length_m / 2) / cut.end_m[-1] * n).astype(int), n - 1)
     first = np.searchsorted(of_step, np.arange(n))

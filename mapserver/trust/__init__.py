@@ -1,4 +1,4 @@
-"""Which machines contradict all others, and which are excluded from the map.
+"""Machines that contradict all others, and their exclusion.
 
-`comparison` measures, `judgement` has the rules, `auditor` votes, `decisions` keeps who is trusted.
+`comparison` measures, `judgement` has rules, `auditor` votes, `decisions` keeps results.
 """

@@ -1,10 +1,8 @@
-"""Trust: which machines contradict all others, why, and by what evidence.
+"""The auditor: which machines contradict all others, why, and by what evidence.
 
-Each machine has a coarse map of its own (coarse_map.py). All pairs of maps are compared (comparison.py), and so are the
-stamps at reception. A machine contradicts all others where it is outvoted by machines that agree among themselves, and
-where its difference from the map of all that are in good standing is beyond doubt (judgement.py). Compared are samples
-without what calibration takes off; what it takes off is a fault of its own where no data sheet allows it, as a torque
-that reads half as much again. Whether and when to exclude a machine is the caller's decision.
+All pairs of coarse maps are compared, and so are stamps at reception. A machine contradicts all others if machines that
+agree among themselves outvote it, and it clearly differs from the map of those in good standing. Samples are compared
+without corrections; a correction beyond the data sheet is a fault in itself. Exclusion is the caller's decision.
 """
 
 from __future__ import annotations
@@ -42,19 +40,18 @@ from protocol.queries.roads import WorklistQuery
 
 _PRINTED = {AGREE: "agrees_with", DISAGREE: "disagrees_with", UNKNOWN: "undecided_with"}
 
-Pairs = dict[tuple[str, str], dict[Reason, Judgement]]  # of the first of two machines
+Pairs = dict[tuple[str, str], dict[Reason, Judgement]]  # of the first machine of each pair
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is known of one machine.
+    """The auditor's result for one machine.
 
-    reasons: empty unless it contradicts all others. agrees: in what it is seen to agree with them. evidence: plain
-    values; what could not be compared is missing. cells, gain, offset_east_m, offset_north_m, offset_std_m,
-    agreement [-], spread and spread_of_others (of the levels) against the map of all others in good standing; clock_s:
-    ahead of the others; zero, torque_gain, their standard deviations and what shows them: of the calibration; rolls,
-    rolls_std, rolls_named, rolls_litres_ph: see `fleet.observability.Rolling`, of driving; excess: by reason, 1 at its
-    limit; agrees_with, disagrees_with, undecided_with: machines.
+    reasons: empty unless it contradicts all others. agrees: reasons in which it agrees. evidence: plain values, without
+    what could not be compared: cells, gain, offset_east_m, offset_north_m, offset_std_m, agreement [-], spread,
+    spread_of_others (of levels) against the pooled map of the others; clock_s: lead; zero, torque_gain, deviations and
+    sources, from calibration; rolls, rolls_std, rolls_named, rolls_litres_ph: see `fleet.observability.Rolling`;
+    excess: by reason, 1 at its limit; agrees_with, disagrees_with, undecided_with.
     """
 
     machine: str
@@ -65,27 +62,27 @@ class Verdict:
 
 
 class Auditor:
-    """Compares all machines of one site. cell_m: of the site's grid; fold: which samples know their place."""
+    """Compares all machines of a site. cell_m: of the grid; fold: which samples know their place."""
 
     def __init__(self, cell_m: float, fold: FoldConfig | None = None, tuning: TrustTuning = TUNING) -> None:
         self._cell_m, self._tuning = cell_m, tuning
         self._fold = fold or FoldConfig()
         self._maps: dict[str, CoarseMap] = {}
         self._clocks = ClockLeads()
-        self._mass_kg: dict[str, float] = {}  # as last known
+        self._mass_kg: dict[str, float] = {}  # last known
 
     def add(self, machine: str, rows: Table) -> None:
-        """Add samples of one machine, corrected; in the order of the journal.
+        """Add corrected samples of one machine, in the journal's order.
 
-        The maps depend on no order. The clocks do: compared is what the machines sent at about the same time, and the
-        order of the journal shows that better than the time of receipt, which steps where the server's clock is set.
+        Only clocks depend on order. The journal's shows what was sent at the same time better than times of receipt,
+        which step with the server's clock.
         """
         if len(rows):
             self._add(machine, rows)
             self._clocks.add(machine, int(rows["stamp_ns"].max()))
 
     def add_all(self, rows: JournalRows) -> None:
-        """Add many journal rows at once, as one by one. Their samples are corrected."""
+        """Add journal rows of corrected samples."""
         machine = np.repeat(rows.machine, rows.lengths)
         for index, name in enumerate(rows.machines):
             self._add(name, rows.samples[machine == index])
@@ -106,12 +103,12 @@ class Auditor:
         self._maps[machine].add(rows if sure.all() else rows[sure])
 
     def verdicts(self, states: Mapping[str, MachineErrors] | None = None) -> dict[str, Verdict]:
-        """Judge every machine. states: what calibration knows of them, by name."""
+        """Judge every machine. states: of calibration, by name."""
         *_, verdicts = self.judging(states)
         return verdicts or {}
 
     def judging(self, states: Mapping[str, MachineErrors] | None = None) -> Iterator[dict[str, Verdict] | None]:
-        """As `verdicts`, of what there is at the first step: None after each pair of machines, then all."""
+        """As `verdicts`, in steps, on the data at the first: None after each pair of machines, then all verdicts."""
         names = sorted(self._maps)
         surfaces = [self._maps[name].surface() for name in names]
         maps = [ComparedMap(surface, surface.places()) for surface in surfaces]
@@ -138,7 +135,6 @@ class Auditor:
         yield verdicts
 
     def _pair(self, one: str, one_map: ComparedMap, other: str, other_map: ComparedMap) -> Pairs:
-        """Judge two machines against each other."""
         sigmas, clocks = self._tuning.pair_sigmas, self._clocks
         difference = compare(one_map, other_map, map_cell_m(self._cell_m), self._tuning)
         back = reverse(difference) if difference else None
@@ -149,7 +145,7 @@ class Auditor:
         }
 
     def _from_pool(self, maps: Sequence[ComparedMap], suspected: Sequence[bool]) -> Iterator[Difference | None]:
-        """Differences of each machine from all others in good standing together: more ground than any one has."""
+        """From all others in good standing, pooled to have the most ground."""
         good = [each for each, bad in zip(maps, suspected, strict=True) if not bad]
         pool = ComparedMap(pooled([each.timed for each in good]), pooled([each.placed for each in good]))
         for own, bad in zip(maps, suspected, strict=True):
@@ -157,7 +153,7 @@ class Auditor:
             yield compare(own, rest, map_cell_m(self._cell_m), self._tuning)
 
     def _clock(self, names: Sequence[str], i: int, group: Sequence[int]) -> tuple[Judgement, dict[str, Any]]:
-        """Typical lead over the machines that outvote this one, or else over all others."""
+        """Median lead over the outvoting machines, or over all others."""
         others = group or [j for j in range(len(names)) if j != i]
         leads = [self._clocks.compare(names[i], names[j]) for j in others]
         leads = [(lead, judgement) for lead, judgement in leads if isfinite(lead)]
@@ -168,7 +164,6 @@ class Auditor:
 
 
 def _votes(names: Sequence[str], pairs: Pairs, reason: Reason) -> Ints:
-    """Matrix of AGREE, UNKNOWN, DISAGREE for one reason."""
     states = np.full((len(names), len(names)), UNKNOWN, np.int64)
     for (one, other), judgements in pairs.items():
         states[names.index(one), names.index(other)] = judgements[reason].state
@@ -176,7 +171,7 @@ def _votes(names: Sequence[str], pairs: Pairs, reason: Reason) -> Ints:
 
 
 def _measured(difference: Difference | None) -> dict[str, Any]:
-    """A comparison in plain values."""
+    """A comparison as plain values."""
     if difference is None:
         return {"cells": 0}
     shift = difference.shift
@@ -189,7 +184,7 @@ def _measured(difference: Difference | None) -> dict[str, Any]:
 
 
 def _calibrated(state: MachineErrors | None, mass_kg: float) -> dict[str, Any]:
-    """What calibration knows of a machine, in plain values. mass_kg: 0 where it is not known."""
+    """mass_kg: 0 if unknown."""
     if state is None:
         return {}
     values = {"zero": state.zero, "zero_std": state.zero_std}
@@ -205,7 +200,7 @@ def _calibrated(state: MachineErrors | None, mass_kg: float) -> dict[str, Any]:
 
 
 def _sides(names: Sequence[str], votes: Mapping[Reason, Ints], i: int) -> dict[str, Any]:
-    """Whom it disagrees with in anything, agrees with in all that is known, and cannot be compared with."""
+    """Disagrees: in anything; agrees: in all that is known."""
     rows = np.stack([of_reason[i] for of_reason in votes.values()])
     worst = np.where((rows == DISAGREE).any(axis=0), DISAGREE, rows.max(axis=0))
     others = [j for j in range(len(names)) if j != i]

@@ -1,9 +1,8 @@
-"""What trust remembers of one machine: a coarse map of its own of the newest periods in which it drove.
+"""A coarse map of one machine over its newest driven periods.
 
-A key is a cell of about 2 m in a period of half an hour, because only values of the same ground at the same time can
-contradict each other: between two times it may have rained, or a zone may have been repaved. Values are sums of
-integers, so that any order and any batching of the rows give the same bits. A machine at 3 m/s enters at most 2700 new
-cells in half an hour: 16 periods are at most 2 MB of it.
+Cells of 2 m by half hours, because only values of the same time can contradict: rain or grading may come between.
+Integer sums, so order and batching do not change a bit. At 3 m/s a machine enters at most 2700 cells per period: 16
+periods take 2 MB.
 """
 
 from __future__ import annotations
@@ -17,33 +16,33 @@ import numpy as np
 from mapserver.calibration.ledger import CELL_M, PENDING_ROWS
 from protocol.arrays import Floats, Ints, Table
 
-PERIOD_S = 1800.0  # only cells driven in the same period are compared: rain and repaving are no contradiction
-PERIODS = 16  # that are remembered; a repaired machine is cleared when most of them are good
+PERIOD_S = 1800.0  # seconds; only cells of the same period are compared
+PERIODS = 16  # periods kept; a repaired machine is cleared when most of them are good
 UNITS_PER_M = 1024
 UNITS_PER_LEVEL = 1024
-# Levels are log(c_rr + 0.01): the noise and the zero error of a balance are additive (0.002 to 0.006), and without the
-# floor they would drown the differences on concrete (0.008). A mean of levels stays symmetric across borders.
+# Levels are log(c_rr + 0.01). The floor keeps a balance's noise and bias (0.002 to 0.006) from drowning differences on
+# concrete (0.008). Logarithms keep means symmetric across borders.
 LEVEL_FLOOR = 0.01
 
 _AXIS_BITS = 20
 _HALF = 1 << (_AXIS_BITS - 1)
-ROW = 1 << _AXIS_BITS  # one cell further north, in codes; one cell further east is 1
+ROW = 1 << _AXIS_BITS  # one cell north, in codes; one cell east is 1
 _PERIOD_SHIFT = 2 * _AXIS_BITS
-_VARIANCE_UNITS = 1024  # per m2
+_VARIANCE_UNITS = 1024  # units per m2
 _METRES, _LEVEL = 0, 1
 
 
 def map_cell_m(cell_m: float) -> float:
-    """Edge of these maps' cells, whole cells of the site's grid."""
+    """Edge of these maps' cells, a multiple of the grid's."""
     return cell_m * max(1, round(CELL_M / cell_m))
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A map of one machine or of several together, sorted by code.
+    """A map of one or several machines, sorted by code.
 
-    codes: (n,) period, row, column; sums: (n, 2) metres driven there, and metres times level, in units.
-    std_m: of the positions, as they say themselves (root mean square over both axes).
+    codes: (n,) period, row, column; sums: (n, 2) metres, and metres times level, in units. std_m: stated deviation of
+    positions (RMS of both axes).
     """
 
     codes: Ints
@@ -52,20 +51,20 @@ class Surface:
 
     @cached_property
     def metres(self) -> Floats:
-        """Metres driven in each cell, (n,)."""
+        """Metres driven (n,)."""
         return self.sums[:, _METRES] / UNITS_PER_M
 
     @cached_property
     def level(self) -> Floats:
-        """Mean of log(c_rr + LEVEL_FLOOR) in each cell, (n,)."""
+        """Mean log(c_rr + LEVEL_FLOOR) (n,)."""
         return self.sums[:, _LEVEL] / self.sums[:, _METRES] / UNITS_PER_LEVEL
 
     def places(self) -> Surface:
-        """Return the same map without periods."""
+        """The same map without periods."""
         return _summed(self.codes & ((1 << _PERIOD_SHIFT) - 1), self.sums, self.std_m)
 
     def without(self, part: Surface) -> Surface:
-        """Take one of the maps out of a pooled one."""
+        """Subtract a map from a pooled one."""
         sums = self.sums.copy()
         sums[np.searchsorted(self.codes, part.codes)] -= part.sums
         left = sums[:, _METRES] > 0
@@ -73,30 +72,30 @@ class Surface:
 
 
 def pooled(surfaces: Sequence[Surface]) -> Surface:
-    """Return the map of several machines together; none of them gives an empty one."""
+    """Sum maps; empty for none."""
     codes = np.concatenate([np.zeros(0, np.int64), *(s.codes for s in surfaces)])
     sums = np.concatenate([np.zeros((0, 2), np.int64), *(s.sums for s in surfaces)])
     return _summed(codes, sums, float(np.sqrt(np.mean([s.std_m**2 for s in surfaces] or [0.0]))))
 
 
 def block_of(codes: Ints, bits: int) -> Ints:
-    """Codes of the squares of 2**bits by 2**bits cells around these cells, per period."""
+    """Codes of squares of 2**bits cells to a side, per period."""
     low = (1 << bits) - 1
     return codes & ~np.int64(low * ROW + low)
 
 
 def _summed(codes: Ints, sums: Ints, std_m: float) -> Surface:
-    """Sort by code, and sum what has the same one."""
+    """Sort by code and sum equal ones."""
     if not len(codes):
         return Surface(codes, sums, std_m)
-    order = np.argsort(codes, kind="stable")  # mostly sorted runs already
+    order = np.argsort(codes, kind="stable")  # fast, as most runs are sorted
     codes = codes[order]
     first = np.flatnonzero(np.diff(codes, prepend=-1))
     return Surface(codes[first], np.add.reduceat(sums[order], first, axis=0), std_m)
 
 
 class CoarseMap:
-    """Sums of one machine, for the newest periods in which it drove."""
+    """Accumulates the coarse map of one machine."""
 
     def __init__(self, cell_m: float) -> None:
         self._cell_m = map_cell_m(cell_m)
@@ -104,11 +103,11 @@ class CoarseMap:
         self._sums: Ints = np.zeros((0, 2), np.int64)
         self._pending: list[tuple[Ints, Ints]] = []
         self._waiting = 0
-        self._variance = 0  # sum of metres times variance of position, and of metres, over all time
+        self._variance = 0  # over all time: metres times position variance, metres
         self._metres = 0
 
     def add(self, rows: Table) -> None:
-        """Add samples; those without resistance, and those of a machine that stands, say nothing about the ground."""
+        """Add samples; those without resistance or movement do not count."""
         metres = np.rint(rows["distance_m"] * np.float64(UNITS_PER_M)).astype(np.int64)
         known = (metres > 0) & ~np.isnan(rows["c_rr"])
         if not known.all():
@@ -128,18 +127,15 @@ class CoarseMap:
             self._merge()
 
     def surface(self) -> Surface:
-        """Return the map as it is now."""
+        """The present map."""
         self._merge()
         return Surface(self._codes, self._sums, float(np.sqrt(self._variance / max(self._metres, 1) / _VARIANCE_UNITS)))
 
     def _merge(self) -> None:
-        """Sum what waits into the map, and forget the oldest periods.
-
-        A period that is forgotten can never come back among the newest ones, so that when this runs has no influence.
-        """
+        """Merge pending sums and drop the oldest periods, which never return, so it does not matter when."""
         waiting = [Surface(codes, sums, 0.0) for codes, sums in self._pending]
         self._pending, self._waiting = [], 0
-        # what waits is small: summed first, it leaves two sorted runs to merge
+        # pending sums first, which leaves two sorted runs
         whole = pooled([Surface(self._codes, self._sums, 0.0), pooled(waiting)])
         newest = np.unique(whole.codes >> _PERIOD_SHIFT)[-PERIODS:]
         start = int(np.searchsorted(whole.codes, newest[0] << _PERIOD_SHIFT)) if len(newest) else 0

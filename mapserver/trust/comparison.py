@@ -1,7 +1,4 @@
-"""Two maps of the same ground at the same time: by how much, and in which way, they differ.
-
-Nothing here knows who is right. A `Difference` is of the first map from the second.
-"""
+"""How two maps of the same ground at the same time differ, whoever is right."""
 
 from __future__ import annotations
 
@@ -15,17 +12,16 @@ from mapserver.trust.shift import Shift, find_shift, near_borders
 from mapserver.trust.tuning import TUNING, TrustTuning
 from protocol.arrays import Floats, Ints
 
-_LOWEST_C_RR = 0.004  # the lowest that the map knows: ratios of less mean nothing
+_LOWEST_C_RR = 0.004  # lower bound: ratios of less mean nothing
 _MOST_CELLS = 8000
-_MEDIAN_ERROR = 1.85  # 1.25 / 0.6745 turns a median absolute deviation into the standard error of a median
+_MEDIAN_ERROR = 1.85  # from a median absolute deviation to a median's standard error: 1.25 / 0.6745
 
 
 @dataclass(frozen=True)
 class Gain:
-    """Ratio of one map's coefficients to the other's.
+    """Ratio of the coefficients of two maps.
 
-    log: its logarithm, std its standard error; share: of the ground that differs in the same direction; c_rr: typical
-    coefficient of the ground compared.
+    log: its logarithm, std its standard error; share: of ground that differs in the same direction; c_rr: typical.
     """
 
     log: float
@@ -36,11 +32,10 @@ class Gain:
 
 @dataclass(frozen=True)
 class Difference:
-    """How one map differs from another.
+    """Difference of the first map from the second.
 
-    cells: compared, of the same period; shift: None where no border shows it; agreement: share of the cells whose
-    levels agree once gain and shift are taken out; spreads: standard deviations of the levels, own and other, on these
-    cells.
+    cells: compared, of the same period; shift: None if no border shows it; agreement: share of cells, after gain and
+    shift; spreads: deviations of levels, own and other.
     """
 
     cells: int
@@ -52,22 +47,21 @@ class Difference:
 
 @dataclass(frozen=True)
 class ComparedMap:
-    """One side of a comparison: its map by periods, and by places alone."""
+    """A map by period, and by place alone."""
 
     timed: Surface
     placed: Surface
 
     @cached_property
     def borders(self) -> Ints:
-        """Indices of the places near borders."""
+        """Indices of places near borders."""
         return near_borders(self.placed)
 
 
 def compare(one: ComparedMap, other: ComparedMap, cell_m: float, tuning: TrustTuning = TUNING) -> Difference | None:
-    """Compare two maps with cells of this edge; None where they have too little ground in common.
+    """Compare two maps; None if they share too little ground.
 
-    Gain and agreement compare cells of the same period, for it may have rained in between. The shift compares places:
-    rain moves no border, and it needs every border that there is.
+    Gain and agreement need the same period. The shift does not, as rain moves no border, and it needs every one.
     """
     a, b = _common(one.timed.codes, other.timed.codes)
     cells = len(a)
@@ -86,13 +80,13 @@ def compare(one: ComparedMap, other: ComparedMap, cell_m: float, tuning: TrustTu
 
 
 def reverse(d: Difference) -> Difference:
-    """The same, of the second map from the first."""
+    """The difference of the second map from the first."""
     shift = replace(d.shift, east_m=-d.shift.east_m, north_m=-d.shift.north_m) if d.shift else None
     return replace(d, gain=replace(d.gain, log=-d.gain.log), shift=shift, spreads=(d.spreads[1], d.spreads[0]))
 
 
 def _common(one: Ints, other: Ints) -> tuple[Ints, Ints]:
-    """Indices into both of the codes that both have."""
+    """Indices of common codes in both."""
     if not len(one):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     place = np.minimum(np.searchsorted(one, other), len(one) - 1)
@@ -101,7 +95,7 @@ def _common(one: Ints, other: Ints) -> tuple[Ints, Ints]:
 
 
 def _gain(one: Surface, other: Surface, a: Ints, b: Ints, cell_m: float, tuning: TrustTuning) -> Gain:
-    """Median of the log ratio; a zero error hides it on concrete, so that each cell weighs by what it can tell."""
+    """Median log ratio; cells weigh less where a bias may hide it."""
     c_one, c_other = _c_rr(one.level[a]), _c_rr(other.level[b])
     c_rr = np.sqrt(c_one * c_other)
     metres = np.minimum(np.minimum(one.metres[a], other.metres[b]), cell_m)
@@ -119,7 +113,7 @@ def _gain(one: Surface, other: Surface, a: Ints, b: Ints, cell_m: float, tuning:
 
 
 def _shift(one: ComparedMap, other: ComparedMap, cell_m: float, tuning: TrustTuning) -> Shift | None:
-    """Displacement of the places, once the gain between them is taken out."""
+    """Displacement of the places, after their gain."""
     a, b = _thinned(*_common(one.placed.codes, other.placed.codes))
     gain = _gain(one.placed, other.placed, a, b, cell_m, tuning)
     expected = _with_gain(other.placed.level[other.borders], gain.log)
@@ -129,7 +123,7 @@ def _shift(one: ComparedMap, other: ComparedMap, cell_m: float, tuning: TrustTun
 def _agreement(
     one: Surface, other: Surface, b: Ints, log_gain: float, shift: Shift | None, cell_m: float, tolerance: float
 ) -> float:
-    """Share of these cells whose levels agree: where the maps lie, or moved by the shift, whichever is better."""
+    """With or without the shift, whichever agrees more."""
     moves = {0}
     if shift:
         moves.add(round(shift.north_m / cell_m) * ROW + round(shift.east_m / cell_m))
@@ -146,12 +140,11 @@ def _c_rr(level: Floats) -> Floats:
 
 
 def _with_gain(level: Floats, log_gain: float) -> Floats:
-    """Levels (n,) of coefficients that are multiplied by the gain."""
     return np.asarray(np.log(_c_rr(level) * np.exp(log_gain) + LEVEL_FLOOR), np.float64)
 
 
 def _thinned(a: Ints, b: Ints) -> tuple[Ints, Ints]:
-    """Every so many of very many pairs: medians and shares gain nothing from more."""
+    """Sample evenly: more pairs do not improve medians."""
     stride = 1 + len(a) // _MOST_CELLS
     return a[::stride], b[::stride]
 

@@ -1,10 +1,9 @@
-"""Which machines the map trusts: decisions by the audit and by people, kept with their reasons as journal events.
+"""Decisions which machines the map trusts, kept with reasons as journal events.
 
-A machine's newest decision counts. One made by a person stands until a person hands it back to the audit; the audit
-waits for the same verdict several times, so that a doubtful machine does not go in and out. To come back, a machine has
-to be seen to agree with the others in all that it was excluded for: that nothing contradicts it is not enough, since
-after a correction all evidence is looked at anew. One beyond its data sheet comes back by a person alone: its corrected
-samples agree, but something in it is broken.
+The newest decision counts. A person's stands until handed back to the audit. The audit waits for repeated verdicts, so
+a doubtful machine does not flicker. To return, a machine must agree in all that it was excluded for; lack of
+contradiction is not enough, because corrections reset all evidence. Only a person readmits a machine beyond its data
+sheet: its corrected samples agree, but it is broken.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from mapserver.trust.judgement import Reason
 
 KIND = "trust"
 AUDIT, PERSON = "audit", "person"
-DISTRUST_AFTER, TRUST_AFTER = 2, 4  # verdicts in a row
+DISTRUST_AFTER, TRUST_AFTER = 2, 4  # successive verdicts
 
 
 @dataclass(frozen=True)
 class TrustDecision:
-    """What was decided about a machine, as an event keeps it. by: the audit or a person; evidence: plain values."""
+    """A decision about a machine, as in its event. by: audit or person; evidence: plain values."""
 
     machine: str
     trusted: bool
@@ -35,7 +34,7 @@ class TrustDecision:
 
 
 class TrustDecisions:
-    """Newest decision about each machine."""
+    """The newest decision about each machine."""
 
     def __init__(self, events: Iterable[Event]) -> None:
         self._newest = {event.body["machine"]: TrustDecision(**event.body) for event in events}
@@ -43,20 +42,20 @@ class TrustDecisions:
 
     @property
     def distrusted(self) -> frozenset[str]:
-        """Machines whose rows are excluded from the map."""
+        """Machines excluded from the map."""
         return frozenset(name for name, decision in self._newest.items() if not decision.trusted)
 
     def newest(self, machine: str) -> TrustDecision | None:
-        """The newest decision about a machine, None where there never was one."""
+        """The newest decision about a machine, or None."""
         return self._newest.get(machine)
 
     def add(self, decision: TrustDecision) -> None:
-        """Make a decision the newest one about its machine."""
+        """Make a decision the newest."""
         self._newest[decision.machine] = decision
         self._in_a_row.pop(decision.machine, None)
 
     def judge(self, verdicts: Mapping[str, Verdict], stamp_ns: int) -> list[TrustDecision]:
-        """What the audit decides on these verdicts; the caller keeps it, then calls `add`."""
+        """Decisions of the audit; the caller stores each, then calls `add`."""
         decisions = (self._judge(verdict, stamp_ns) for verdict in verdicts.values())
         return [decision for decision in decisions if decision]
 
@@ -74,12 +73,12 @@ class TrustDecisions:
 
 
 def _agrees(verdict: Verdict, decision: TrustDecision | None) -> bool:
-    """Whether a machine is seen to agree in what it was excluded for; in anything at all, where that has no name."""
+    """In all that it was excluded for; in anything, if the reason has no name."""
     words = decision.reason.split(", ") if decision else []
     named = {reason for reason in Reason if reason in words}
     return not verdict.contradicts and bool(verdict.agrees) and named <= verdict.agrees
 
 
 def _stands(decision: TrustDecision) -> bool:
-    """Whether the audit leaves a decision alone."""
+    """Whether the audit must leave it."""
     return decision.by == PERSON or (not decision.trusted and Reason.BEYOND_DATA_SHEET in decision.reason.split(", "))

@@ -1,4 +1,4 @@
-"""From a difference to what it means: how far beyond its limit it is, and which machines are outvoted because of it."""
+"""Judges differences by their limits, and which machines are outvoted."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from mapserver.trust.tuning import TUNING, TrustTuning
 from protocol.arrays import Ints
 
 AGREE, UNKNOWN, DISAGREE = 1, 0, -1
-CLOCK_LIMIT_S = 300.0  # lead or lag that batches and links may explain
-# A clock is wrong where its lead stays within so much for so long; the lag of a machine that catches up shrinks faster.
+CLOCK_LIMIT_S = 300.0  # lead or lag [s] that batches and links may explain
+# A clock is wrong if its lead stays in this range for this span [s]; a machine that catches up changes faster.
 CLOCK_STEADY_S, CLOCK_SPAN_S = 60.0, 600.0
-LEADS, LEADS_NEEDED = 16, 8  # leads that are noted in a span, and how many of them tell
+LEADS, LEADS_NEEDED = 16, 8  # leads per span, and how many are needed
 
 
 class Reason(StrEnum):
-    """In which way a machine contradicts the others."""
+    """How a machine contradicts others."""
 
     GAIN = "gain"
     OFFSET = "offset"
     CLOCK = "clock"
     STUCK = "stuck"
     DISAGREES = "disagrees"  # in no way that has a name
-    BEYOND_DATA_SHEET = "beyond_data_sheet"  # zero or scale is a fault, though the map may be right without it
+    BEYOND_DATA_SHEET = "beyond_data_sheet"  # a faulty bias or scale, even if the map is right
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """How far one difference goes (1: at its limit), and what that means: AGREE, UNKNOWN or DISAGREE."""
+    """Excess of a difference (1: at its limit), and AGREE, UNKNOWN or DISAGREE."""
 
     excess: float = 0.0
     state: int = UNKNOWN
@@ -51,10 +51,9 @@ _NO_JUDGEMENT = Judgement()
 
 
 def judge(difference: Difference | None, sigmas: float, tuning: TrustTuning = TUNING) -> dict[Reason, Judgement]:
-    """Judge the first of two maps, for every reason that shows in the ground.
+    """Judge the first of two maps for each reason in GROUND.
 
-    sigmas: so many standard errors are added to each limit. Between maps that have nothing in common, gain and offset
-    mean nothing.
+    sigmas: standard errors added to limits. Gain and offset mean nothing between unrelated maps.
     """
     judgements = dict.fromkeys(GROUND, _NO_JUDGEMENT)
     if difference is None:
@@ -78,7 +77,7 @@ def _stuck(spreads: tuple[float, float], tuning: TrustTuning) -> Judgement:
 
 
 def _disagrees(difference: Difference, sigmas: float, tuning: TrustTuning) -> Judgement:
-    error = 0.5 * sqrt(tuning.cells_per_draw / difference.cells)  # of a share, at most
+    error = 0.5 * sqrt(tuning.cells_per_draw / difference.cells)  # of a share, upper bound
     excess = (1 - difference.agreement) / (1 - tuning.agreement + sigmas * error)
     return Judgement(excess, DISAGREE if excess > 1 else AGREE if excess <= tuning.alike else UNKNOWN)
 
@@ -106,7 +105,7 @@ def _offset(shift: Shift | None, sigmas: float, tuning: TrustTuning) -> Judgemen
 
 
 def beyond_data_sheet(state: MachineErrors | None) -> Judgement:
-    """Judge what calibration says of a machine: None where it says nothing."""
+    """Judge a calibration, None if unknown."""
     if state is None:
         return _NO_JUDGEMENT
     excess = max(sigmas / limit for sigmas, limit in zip(state.beyond, FAULT_SIGMAS, strict=True))
@@ -117,11 +116,10 @@ def beyond_data_sheet(state: MachineErrors | None) -> Judgement:
 
 
 class ClockLeads:
-    """Steady leads of one machine's stamps over those of the others, whenever its samples arrive.
+    """Steady leads of machines' stamps over others'.
 
-    Only stamps are compared with stamps: sites replay old logs, and run faster than real time. A machine that was
-    offline and catches up is behind too, but its lag shrinks; where the others have stopped, the lead of one that works
-    on grows.
+    Stamps are compared with stamps only: sites replay logs, faster than real time. The lag of a machine that catches up
+    shrinks; a lead over stopped machines grows.
     """
 
     def __init__(self) -> None:
@@ -129,14 +127,14 @@ class ClockLeads:
         self._noted: dict[str, deque[tuple[int, dict[str, int]]]] = {}
 
     def add(self, machine: str, newest_ns: int) -> None:
-        """Note the newest stamp of a batch; in order of arrival."""
+        """Note the newest stamp of a batch, by arrival."""
         noted = self._noted.setdefault(machine, deque(maxlen=LEADS + 1))
         if not noted or abs(newest_ns - noted[-1][0]) >= CLOCK_SPAN_S * 1e9 / LEADS:
             noted.append((newest_ns, dict(self._newest)))
         self._newest[machine] = newest_ns
 
     def compare(self, machine: str, other: str) -> tuple[float, Judgement]:
-        """By how much [s] one machine's stamps are ahead of another's, NaN where that is not known; what it means."""
+        """Lead [s] of a machine over another, NaN if unknown, and its judgement."""
         stamps = [(own, newest[other]) for own, newest in self._noted[machine] if other in newest]
         if len(stamps) < LEADS_NEEDED:
             return np.nan, _NO_JUDGEMENT
@@ -154,21 +152,19 @@ class ClockLeads:
 
 
 def outvoted(states: Ints) -> list[tuple[int, ...]]:
-    """For each machine the group of others by which it is outvoted; empty where it is not.
+    """The group that outvotes each machine, or nothing. states: (n, n), row's with column's machine.
 
-    states: (n, n) AGREE, UNKNOWN or DISAGREE of row's machine with column's.
-    A machine is outvoted by a group of at least two that it disagrees with, and that agree among themselves, if the
-    group is larger than the machine's own side, and at least half of all that can be compared with it: of two machines
-    nobody knows which is right, nor when most of a fleet is wrong.
+    At least two machines that it disagrees with and that agree among themselves; more than the machine's own side, and
+    at least half of all comparable machines. Of two, or in a mostly wrong fleet, nobody knows who is right.
     """
     return [_outvoters(states, machine) for machine in range(len(states))]
 
 
 def faulty(judgements: Sequence[Judgement]) -> list[tuple[int, ...]]:
-    """For each machine beyond its data sheet the others that are not, if these are as many or more; else empty.
+    """The sound machines for each one beyond its data sheet, if they are at least half; else nothing.
 
-    A gain is measured, not voted on, but where most machines seem wrong it is more likely the site's doing: and a map
-    of nobody is no map.
+    A gain is measured, not voted on. But if most seem wrong, the site is the likelier cause, and an empty map is no
+    map.
     """
     right = tuple(i for i, judgement in enumerate(judgements) if judgement.state != DISAGREE)
     rest = right if 2 * len(right) >= len(judgements) else ()
@@ -184,7 +180,7 @@ def _outvoters(states: Ints, machine: int) -> tuple[int, ...]:
 
 
 def _group(states: Ints, seed: int, candidates: list[int]) -> tuple[int, ...]:
-    """The seed and those who agree with it, without those who disagree with one already in."""
+    """Those that agree with the seed and not disagree among themselves."""
     group = [seed]
     for other in candidates:
         if states[seed, other] == AGREE and all(states[other, member] != DISAGREE for member in group):

@@ -1,4 +1,4 @@
-"""By how far is one map displaced from another? The shift at which the levels around borders agree best."""
+"""The displacement of one map from another, by the levels around borders."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 from mapserver.trust.coarse_map import ROW, Surface, block_of
 from protocol.arrays import Bools, Floats, Ints
 
-REACH = 3  # cells; shifts up to here each way are tried
+REACH = 3  # cells tried in each direction
 _EDGE = 2 * REACH + 1
 _SHIFTS = _EDGE * _EDGE
-ERROR_LENGTH_M = 200.0  # driven, over which a position error stays the same: twice 30 s at 3 m/s
-_MOST_CELLS = 4000  # more make it slower, not surer
+ERROR_LENGTH_M = 200.0  # metres driven with one position error: twice 30 s at 3 m/s
+_MOST_CELLS = 4000  # more cost time and add nothing
 _FEWEST_CELLS = 50
-_BORDER_BITS, _BORDER_LEVELS = 3, 0.25  # a square of 16 m in which levels differ by so much holds a border
-_CLIP = 1.0  # levels: beyond, a difference counts as this one; else the borders of sand alone would decide
-# Where borders run one way only, nothing shows the shift along them: a shift by one cell must improve the cost by 1 %.
+_BORDER_BITS, _BORDER_LEVELS = 3, 0.25  # a square of 16 m with this range of levels holds a border
+_CLIP = 1.0  # of level differences; borders of sand alone would decide
+# Relative cost per squared cell, because parallel borders do not show shifts along them.
 _PRICE = 0.01
-_GROUPS = 8  # of squares of 32 m, left out in turn (jackknife)
+_GROUPS = 8  # of 32 m squares, left out in turn (jackknife)
 _GROUP_BITS = 4
 
 _STEPS = np.arange(-REACH, REACH + 1)
@@ -28,7 +28,7 @@ _PRICES: Floats = _PRICE * (_STEPS[:, None] ** 2 + _STEPS[None, :] ** 2).ravel()
 
 @dataclass(frozen=True)
 class Shift:
-    """A displacement, its standard deviation, of both axes together, and what share of the borders speaks for it."""
+    """A displacement, its deviation (both axes), and the share of borders that supports it."""
 
     east_m: float
     north_m: float
@@ -37,9 +37,9 @@ class Shift:
 
 
 def find_shift(one: Surface, other: Surface, borders: Ints, expected: Floats, cell_m: float) -> Shift | None:
-    """Displacement of the first map from the other; None where too few borders tell.
+    """Displacement of the first map; None if too few borders show it.
 
-    borders: indices of the other's cells, expected: levels that the first map should have there, both (n,).
+    borders: (n,) cells of the other map; expected: (n,) levels there.
     """
     if not len(borders) or not len(one.codes):
         return None
@@ -60,14 +60,14 @@ def find_shift(one: Surface, other: Surface, borders: Ints, expected: Floats, ce
 
 
 def _share(codes: Ints, gained: Floats) -> float:
-    """Share of what squares gain by the shift in what they gain or lose: a repaved zone misleads only its own."""
+    """Gains over gains and losses of squares: a repaved zone misleads only its own."""
     squares, index = np.unique(block_of(codes, _GROUP_BITS), return_inverse=True)
     gains = np.bincount(index, gained, len(squares))
     return float(gains[gains > 0].sum() / max(np.abs(gains).sum(), 1e-9))
 
 
 def near_borders(surface: Surface) -> Ints:
-    """Indices of the cells in squares that hold a border; where there are very many, evenly thinned."""
+    """Cells in squares with a border, evenly sampled."""
     squares = block_of(surface.codes, _BORDER_BITS)
     order = np.argsort(squares, kind="stable")
     if not len(order):
@@ -80,12 +80,12 @@ def near_borders(surface: Surface) -> Ints:
 
 
 def _errors(codes: Ints, level: Floats, at: Ints, expected: Floats) -> tuple[Floats, Bools]:
-    """Squared differences of levels (n, shifts), clipped, 0 where the shifted cell is not known; and where it is."""
+    """Clipped squared differences (n, shifts), 0 if unknown; and which are known."""
     levels = np.full((len(at), _EDGE, _EDGE), np.nan)
     for i, north in enumerate(_STEPS):
         west = at + north * ROW - REACH
         place = np.searchsorted(codes, west)
-        for step in range(_EDGE):  # at most so many codes lie between the first and the last column
+        for step in range(_EDGE):  # at most this many codes
             index = np.minimum(place + step, len(codes) - 1)
             column = codes[index] - west
             hit = np.flatnonzero((column >= 0) & (column < _EDGE))
@@ -96,14 +96,14 @@ def _errors(codes: Ints, level: Floats, at: Ints, expected: Floats) -> tuple[Flo
 
 
 def _by_group(codes: Ints, values: Floats) -> Floats:
-    """Sums (groups, shifts) over groups of squares."""
+    """Sums (groups, shifts)."""
     group = ((codes >> _GROUP_BITS) * 5 + (codes // ROW >> _GROUP_BITS) * 3) % _GROUPS
-    order = np.argsort(group, kind="stable")  # no matrix product: it would wake the threads of BLAS
+    order = np.argsort(group, kind="stable")  # no matrix product, which would start BLAS threads
     return np.add.reduceat(values[order], np.flatnonzero(np.diff(group[order], prepend=-1)), axis=0)
 
 
 def _best(costs: Floats, counts: Floats) -> tuple[float, float]:
-    """Cells east and north at which the mean cost is least, between cells by parabolas."""
+    """Cells east and north of the least mean cost, refined by parabolas."""
     enough = counts >= counts.max() / 2
     mean = costs / np.maximum(counts, 1)
     cost = np.where(enough, mean + _PRICES * mean[enough].mean(), np.inf).reshape(_EDGE, _EDGE)
@@ -112,7 +112,6 @@ def _best(costs: Floats, counts: Floats) -> tuple[float, float]:
 
 
 def _vertex(cost: Floats, lowest: int) -> float:
-    """Where between its neighbours the lowest cost would lie, -0.5 to 0.5 cells."""
     if not 0 < lowest < _EDGE - 1:
         return 0.0
     below, least, above = cost[lowest - 1 : lowest + 2]
