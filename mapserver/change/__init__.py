@@ -1,1 +1,1 @@
-"""Where recent evidence contradicts older evidence, and the log of such changes."""
+"""Contradictions of recent and older evidence, and their log."""

@@ -1,7 +1,6 @@
-"""A log of changes of the ground: where, when, from what to what; it grows while machines pass.
+"""The log of ground changes: where, when, from what to what; it grows as machines pass.
 
-A change of a larger area is seen piece by piece. What changed next to a change of about the same time is the same
-change, which is then larger.
+Large changes appear piece by piece. A change next to another of about the same time extends it.
 """
 
 from __future__ import annotations
@@ -27,29 +26,30 @@ from protocol.site.geometry import BLOCK_CELLS
 from protocol.units import HOUR_NS
 
 KIND = "change"  # of the journal's events
-SAME_NS = 6 * HOUR_NS  # changes next to each other within this time are one
-SETTLES_NS = 2 * HOUR_NS  # the time of a change moves by the length of its pages as these are summed, and by this
+SAME_NS = 6 * HOUR_NS  # within this time, adjacent changes are one
+# tolerance of a change's time, besides the length of its pages, which grows as they are summed
+SETTLES_NS = 2 * HOUR_NS
 NEAR_CELLS = 8.0
 _BEFORE_AFTER = ("resistance", "grade")
 
 
 class ChangeLog:
-    """Changes of one site. kept: plain values of those from before, the newest of each number last."""
+    """Changes of one site. kept: earlier ones as plain values, the newest of each number last."""
 
     def __init__(
         self, cell_m: float, change: ChangeConfig, read: cell_layers.ReadConfig, kept: Iterable[Mapping[str, Any]] = ()
     ) -> None:
         self._cell_m, self._config, self._read = cell_m, change, read
         self._changes = {change.id: change for change in map(change_of, kept)}
-        self._logged: dict[Block, Ints] = {}  # changed_ns of cells that are part of a change already
+        self._logged: dict[Block, Ints] = {}  # changed_ns of cells already in a change
         self._members: dict[int, set[tuple[int, int]]] = {number: set() for number in self._changes}
 
     def changes(self, after: int = 0) -> list[GroundChange]:
-        """All changes with a number beyond `after`."""
+        """Changes numbered above `after`."""
         return [change for number, change in sorted(self._changes.items()) if number > after]
 
     def look(self, blocks: Collection[Block], pages: Mapping[Block, TimedPages]) -> list[GroundChange]:
-        """Look at blocks, given their pages and those of their neighbours; returns changes that are new or grew."""
+        """Examine blocks, given pages of them and their neighbours; returns new and extended changes."""
         blocks = [block for block in blocks if block in pages]
         first = valid_pages(pages, self._cell_m, self._config, only=blocks)
         changed = [block for block in blocks if first[block].any()]
@@ -76,7 +76,7 @@ class ChangeLog:
         return list(grown.values())
 
     def _fresh(self, block: Block, pages: TimedPages, first: Ints, changed_ns: Ints) -> Bools:
-        """Cells (256,) that changed, and are not part of a change yet."""
+        """Changed cells (256,) not yet in a change."""
         logged = self._logged.setdefault(block, np.zeros(ev.CELLS, np.int64))
         spans_ns = np.array([timed.end_ns - timed.first_ns for timed in pages])
         settled_ns = logged + np.maximum(spans_ns[first], SETTLES_NS)
@@ -87,7 +87,7 @@ class ChangeLog:
     def _add(
         self, row: Ints, column: Ints, changed_ns: Ints, medians: Mapping[str, float | None]
     ) -> GroundChange | None:
-        """Make an area part of a change nearby, or a change of its own; None where that was known before."""
+        """Extend a nearby change by an area, or add a new one; None if known."""
         cells = set(zip(row.tolist(), column.tolist(), strict=True))
         area = GroundChange(
             id=max(self._changes, default=0) + 1,
@@ -105,7 +105,7 @@ class ChangeLog:
             return area
         members = self._members[same.id]
         members |= cells
-        if len(members) <= same.cells:  # the same cells, again after a restart
+        if len(members) <= same.cells:  # known, after a restart
             return None
         boxes = zip(same.bounds, area.bounds, (min, min, max, max), strict=True)
         grown = replace(
@@ -126,24 +126,24 @@ class ChangeLog:
 
 
 def change_of(values: Mapping[str, Any]) -> GroundChange:
-    """A change from the plain values that its event has."""
+    """Inverse of an event's plain values."""
     return GroundChange(**{**values, "bounds": tuple(values["bounds"])})
 
 
 def _of_one_time(area: Bools, changed_ns: Ints) -> tuple[Ints, Ints]:
-    """Rows and columns of an area's cells, without those few whose change of long ago is only seen now."""
+    """Rows and columns of an area, without the few cells that changed long ago and are seen only now."""
     typical_ns = np.median(changed_ns[area])
     row, column = np.nonzero(area & (np.abs(changed_ns - typical_ns) <= SAME_NS))
     return row, column
 
 
 def _older(pages: TimedPages, first: Ints) -> TimedPages:
-    """Pages of a block from before its change; where cells changed at different times, before most of them."""
+    """Pages before a block's change, or most of its changes."""
     return pages.older(int(np.median(first[first > 0])))
 
 
 def _before_and_after(old: ev.Evidence, now: ev.Evidence, config: cell_layers.ReadConfig) -> dict[str, Floats32]:
-    """Layers (blocks, 256) from the evidence before a change, and from what holds now."""
+    """Layers (blocks, 256) before a change and now."""
     layers = {}
     for when, part in (("before", old), ("after", now)):
         for name, values in cell_layers.read(part, _BEFORE_AFTER, config).items():
@@ -157,7 +157,7 @@ def _median(values: Floats32) -> float | None:
 
 
 def warm_up(config: FoldConfig) -> None:
-    """Compile the kernels of changes, or read them from their cache: ground of one kind, then of another."""
+    """Compile the kernels of changes, or load them, with a change of ground."""
     log, grid, n = ChangeLog(1.0, ChangeConfig(), cell_layers.ReadConfig()), Grid(1.0, config), BLOCK_CELLS
     rows = np.zeros(n * n, SAMPLE_DTYPE)
     rows["x_m"], rows["y_m"] = np.arange(n * n) % n + 0.5, np.arange(n * n) // n + 0.5

@@ -1,9 +1,8 @@
-"""Change of the ground: where recent evidence contradicts older evidence, a read of the map skips the older.
+"""Detects ground changes: where recent evidence contradicts older evidence, reads skip the older.
 
-For every cell, evidence is cut in two between two of its pages by time. The cut that explains it best (two kinds of
-ground are more likely than one, by the log-likelihood ratio of their histograms) is a change if the two histograms have
-little in common (total variation) and their medians differ by more than what machines differ by among themselves, and
-by more than what their samples state. What comes after a cut is cut again, so that the last of several changes counts.
+Each cell's evidence is cut between two pages, where two kinds of ground explain it best (log-likelihood ratio of
+histograms). The cut is a change if the histograms have little in common (total variation) and the medians differ by
+more than machines do and samples state. Later evidence is cut again, so the last change counts.
 """
 
 from __future__ import annotations
@@ -25,14 +24,13 @@ from protocol.site.geometry import BLOCK_CELLS
 
 @dataclass(frozen=True)
 class ChangeTuning:
-    """What is a change.
+    """When a cut is a change.
 
-    variation: least total variation of two histograms, 0 to 1. bins: least difference of their medians, in bins (22 %
-    of c_rr, 0.031 of gradient), as medians are no finer than one; c_rr: likewise on concrete, by what machines' zeros
-    are off by (from 0.023 on bins ask for more); sigmas: likewise, in the deviations that samples state, as a site has
-    hundreds of stretches. weight_m: least evidence on either side of a cut, as a sample's vote in a cell beside its own
-    is no pass. most: changes of one cell, in all that its pages remember. share: of a square of size_m that changed,
-    where all else in it is not known. alike_bins: kinds of ground nearer to each other are the same.
+    variation: least total variation of histograms, 0 to 1. bins: least difference of medians, in bins (22 % of c_rr,
+    0.031 of gradient), the resolution of medians; c_rr: the same on concrete, where machines' biases count (from 0.023
+    on bins ask more); sigmas: the same in stated deviations, for sites of hundreds of sections. weight_m: least
+    evidence on each side; a vote from a neighbouring cell is no pass. most: changes of a cell. share: of a square of
+    size_m that must have changed if the rest is unknown. alike_bins: closer kinds of ground are the same.
     """
 
     variation: float = 0.6
@@ -53,8 +51,8 @@ _PARTS = (ev.RESISTANCE, ev.GRADE_EAST, ev.GRADE_NORTH)
 class ChangeConfig:
     """When recent evidence replaces older evidence.
 
-    detect: whether it ever does. size_m: changes narrower than this are position errors at a border, and those narrower
-    than twice this where the new kind of ground is that of the ground beside.
+    detect: on or off. size_m: narrower changes are position errors at a border; so are those below twice this if they
+    look like the ground beside.
     """
 
     detect: bool = True
@@ -66,11 +64,10 @@ class ChangeConfig:
 
 @dataclass(frozen=True)
 class Cuts:
-    """Where the evidence of a block's cells (256,) is cut.
+    """Where a block's cells (256,) are cut.
 
-    first: index of the first page that holds for the ground as it is now, 0 where nothing changed. kind: median of the
-    c_rr votes after the cut, in bins; NaN where c_rr did not change. old_ns, new_ns: when the last page before the cut
-    and the first one after it begin that know the cell, between which the ground changed; NaN where it did not.
+    first: first valid page, 0 for no change. kind: median c_rr after the cut, in bins; NaN if c_rr did not change.
+    old_ns, new_ns: begins of the last page before and the first after the cut with evidence, NaN for no change.
     """
 
     first: Ints
@@ -88,7 +85,7 @@ def _unchanged() -> Cuts:
     return Cuts(np.zeros(ev.CELLS, np.int64), *(np.full(ev.CELLS, np.nan) for _ in range(3)))
 
 
-UNCHANGED = _unchanged()  # one for all blocks without a change, which are most: 8 KB each, kept with their pages
+UNCHANGED = _unchanged()  # shared, because most blocks have no change: 8 KB each
 
 
 def cuts(pages: TimedPages, config: ChangeConfig, tuning: ChangeTuning = TUNING) -> Cuts:
@@ -130,10 +127,10 @@ def cuts(pages: TimedPages, config: ChangeConfig, tuning: ChangeTuning = TUNING)
 
 @dataclass(frozen=True)
 class Known:
-    """What the c_rr votes of cells (n,) say, apart from changes.
+    """c_rr of cells (n,) whatever changed.
 
-    kind: median of all, in bins, NaN where they are too few for both sides of a cut. from_ns, until_ns: when the pages
-    begin up to which, and from which on, there are enough for one side; NaN where there never are.
+    kind: median, in bins, NaN if too weak for two sides of a cut. from_ns, until_ns: begins of pages up to which, or
+    from which, one side has enough; NaN for never.
     """
 
     kind: Floats
@@ -142,7 +139,7 @@ class Known:
 
 
 def known(pages: TimedPages, tuning: ChangeTuning = TUNING) -> Known:
-    """What is known of the cells (256,) of a block."""
+    """Knowledge of a block's cells (256,)."""
     packed, ends = pages.packed_votes()
     span = ev.RESISTANCE.start, ev.RESISTANCE.stop
     weight = weights(packed, ends, *span) / ev.WEIGHT_UNITS_PER_M
@@ -155,14 +152,11 @@ def known(pages: TimedPages, tuning: ChangeTuning = TUNING) -> Known:
 def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig, tuning: ChangeTuning = TUNING) -> Bools:
     """Changed cells (rows, columns) that are no position errors; all values are images.
 
-    A wrong position moves the ground of one side of a border to the other. So a strip of changed cells counts where it
-    is size_m wide and its new kind is not that of the ground around, or twice as wide. Ground tells of such a border
-    that is half as wide and was known before the change, or is as wide: at the edge of a lane, cells are driven for
-    the first time after it.
-
-    Trucks that keep to a lane make a narrower strip known: what is not known beside it, before the change and after,
-    speaks neither for the change nor against it, as long as the strip changed over size_m of its length. Where a part
-    of a change is believed, so are cells of its kind that hang together with it, but not beside those that say no.
+    Wrong positions carry ground across a border. So a strip counts if it is size_m wide and unlike the ground beside,
+    or twice as wide. Ground beside needs half the width if known before the change, else all of it: at a lane's edge,
+    cells may be driven only afterwards. Trucks in one lane show narrower strips: what is unknown beside, before and
+    after, is neutral if the strip changed along size_m. Cells of the same kind connected to a credible part count,
+    except next to contradicting ones.
     """
     edge = _edge(cell_m, config)
     changed, kind = cuts_of.first > 0, cuts_of.kind
@@ -181,16 +175,16 @@ def credible(cuts_of: Cuts, cells: Known, cell_m: float, config: ChangeConfig, t
     for one in np.unique(whole[believed & np.isfinite(whole)]):
         alike = untouched & (np.abs(kind - one) <= tuning.alike_bins)
         part = alike & believed & (whole == one)
-        for _ in range(2 * edge):  # not further: what a cell shows is to depend on blocks near it alone
+        for _ in range(2 * edge):  # bounded, so that a cell depends on near blocks only
             part = alike & _grown(part, 1)
         out |= part
     return out
 
 
 def reach_blocks(cell_m: float, config: ChangeConfig) -> int:
-    """How many blocks away the cells are that `credible` looks at."""
+    """Blocks around one that `credible` looks at."""
     edge = _edge(cell_m, config)
-    # Along what is believed, through a square that is, to ground beside, and through the square that makes it ground.
+    # connected cells, the square of a credible one, ground beside, and its square
     return -(-(2 * edge + (edge - 1) + 2 * edge + (edge - 1)) // BLOCK_CELLS)
 
 
@@ -199,7 +193,7 @@ def _begins_ns(pages: TimedPages) -> Floats:
 
 
 def _reached(weight: Floats, time_ns: Floats, least_m: float) -> Floats:
-    """Time (cells,) of the page at which a cell's votes (pages, cells), summed up, reach what a cut needs; or NaN."""
+    """Begin (cells,) of the page at which summed votes (pages, cells) are enough for a cut; or NaN."""
     if not len(weight):
         return np.full(weight.shape[1], np.nan)
     enough = np.cumsum(weight, axis=0) >= least_m
@@ -207,13 +201,13 @@ def _reached(weight: Floats, time_ns: Floats, least_m: float) -> Floats:
 
 
 def _grown(cells: Bools, reach: int) -> Bools:
-    """Cells (rows, columns) that are, or lie so many cells from one that is, or nearer."""
+    """Dilate by so many cells."""
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.dilate(cells.astype(np.uint8), square, borderValue=0) > 0)
 
 
 def _least(values: Floats, where: Bools, reach: int) -> Floats:
-    """Least value (rows, columns) of the cells that lie so many cells away or nearer; infinite where there is none."""
+    """Least value within so many cells; inf for none."""
     chosen = np.where(where & ~np.isnan(values), values, np.inf)
     return np.asarray(cv2.erode(chosen, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8), borderValue=np.inf))
 
@@ -223,22 +217,19 @@ def _edge(cell_m: float, config: ChangeConfig) -> int:
 
 
 def _opened(cells: Bools, edge: int) -> Bools:
-    """Those that lie in a square of `edge` cells, all of which are set."""
+    """Cells in a fully set square of `edge` cells."""
     square, last = np.ones((edge, edge), np.uint8), edge - 1
-    # not MORPH_OPEN, which moves what it opens by a cell where the edge is even
+    # not MORPH_OPEN, which shifts by a cell if edge is even
     corners = cv2.erode(cells.astype(np.uint8), square, anchor=(0, 0), borderValue=0)
     return np.asarray(cv2.dilate(corners, square, anchor=(last, last), borderValue=0) > 0, np.bool_)
 
 
 def _strips(cells: Bools, unknown: Bools, edge: int, share: float) -> Bools:
-    """Those that lie in a square of `edge` cells which they cross from side to side, and a share of which they are.
-
-    All others in it are unknown, as is what lies outside of the image.
-    """
+    """Cells of a square of `edge` cells that they cross and fill to a share; its rest is unknown, like all outside."""
     n, last, wide = edge, edge - 1, [(edge, edge), (edge, edge)]
     some, free = np.pad(cells, wide).astype(np.uint8), np.pad(cells | unknown, wide, constant_values=True)
     crossed: Bools = np.zeros(some.shape, np.bool_)
-    for along, across in (((n, 1), (1, n)), ((1, n), (n, 1))):  # a cell in each of its rows, or columns
+    for along, across in (((n, 1), (1, n)), ((1, n), (n, 1))):  # a cell in each row, or column
         touched = cv2.dilate(some, np.ones(across, np.uint8), anchor=(0, 0), borderValue=0)
         crossed |= cv2.erode(touched, np.ones(along, np.uint8), anchor=(0, 0), borderValue=0) > 0
     square = np.ones((n, n), np.uint8)
@@ -250,7 +241,7 @@ def _strips(cells: Bools, unknown: Bools, edge: int, share: float) -> Bools:
 
 
 def _histograms(votes: NDArray[np.uint64], ends: Ints, part: slice, cells: Ints) -> Floats:
-    """Votes (pages, bins, cells) of some cells in metres."""
+    """Votes (pages, bins, cells) in metres."""
     columns = np.full(ev.CELLS, -1)
     columns[cells] = np.arange(len(cells))
     counts = np.zeros((len(ends), part.stop - part.start, len(cells)))
@@ -260,10 +251,9 @@ def _histograms(votes: NDArray[np.uint64], ends: Ints, part: slice, cells: Ints)
 
 
 def _best_cut(votes: Floats, first: Ints, part: slice, tuning: ChangeTuning) -> tuple[Ints, Floats, Floats]:
-    """Index of the page (cells,) at which the ground changed, the given first page where it did not.
+    """Page (cells,) of each change, `first` for none; median after it, in bins; and difference of medians.
 
-    votes: (pages, bins, cells); pages before `first` do not count. Also returns the median (cells,) after it, in bins,
-    and by what values the medians differ.
+    votes: (pages, bins, cells); pages before `first` do not count.
     """
     best, variation, before, after = likeliest_cuts(votes, first, tuning.weight_m)
     is_resistance = part == ev.RESISTANCE
@@ -276,10 +266,10 @@ def _best_cut(votes: Floats, first: Ints, part: slice, tuning: ChangeTuning) -> 
 
 
 def _doubt(pages: TimedPages, packed: NDArray[np.uint64], ends: Ints, cells: Ints, first: Ints, cut: Ints) -> Floats:
-    """Standard deviation (cells,) of c_rr after a cut less that before it, by what samples state.
+    """Standard deviation (cells,) of the change of c_rr, as stated by samples.
 
-    packed, ends: as of `packed_votes`. More metres of one pass make a side no surer: they err alike, by how an estimate
-    settles behind a brake or a bend. Nor do more passes of one machine take off its own share: zero, scale and load.
+    packed, ends: as in `packed_votes`. Metres of one pass err alike (settling after a brake or bend), and passes of one
+    machine share its bias, scale and load, so neither adds certainty.
     """
     weight = weights(packed, ends, ev.RESISTANCE.start, ev.RESISTANCE.stop)[:, cells]
     doubt = weights(packed, ends, ev.DOUBT, ev.DOUBT + 1)[:, cells]

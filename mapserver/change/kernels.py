@@ -1,6 +1,6 @@
-"""Histograms of votes per page and cell, compiled.
+"""Histograms of votes by page and cell (compiled).
 
-Votes are packed as in mapserver/evidence/pages.py: the place (bin * 256 + cell) in the lower 16 bits, the count above.
+Votes as in mapserver/evidence/pages.py: place (bin * 256 + cell) in the lower 16 bits, count above.
 """
 
 from __future__ import annotations
@@ -12,15 +12,14 @@ import numpy as np
 
 from mapserver.evidence.cells import CELLS
 
-LEAST = 1e-9  # instead of nothing, where one divides
+LEAST = 1e-9  # instead of a division by 0
 
 
 @numba.njit(cache=True, nogil=True)
 def differ(votes: Any, ends: Any, start: int, stop: int, least: float, most: float) -> Any:
-    """Cells (256,) whose pages differ by more than `most` bins, in the mean of their votes or in its spread.
+    """Cells (256,) whose pages differ by more than `most` bins in mean or spread.
 
-    ends (pages,): of each page's votes. start, stop: the bins of one value. Pages with at most `least` of votes for a
-    cell do not count.
+    ends (pages,): of each page's votes. start, stop: bins of one value. Pages with at most `least` votes do not count.
     """
     low, high = np.full((2, CELLS), np.inf), np.full((2, CELLS), -np.inf)
     sums = np.zeros((3, CELLS))
@@ -47,7 +46,7 @@ def differ(votes: Any, ends: Any, start: int, stop: int, least: float, most: flo
 
 @numba.njit(cache=True, nogil=True)
 def histograms(votes: Any, ends: Any, start: int, stop: int, columns: Any, out: Any) -> None:
-    """Fill out (pages, bins, columns) with the votes of some cells; columns (256,): of each cell, -1 for none."""
+    """Fill out (pages, bins, columns); columns (256,): of each cell, -1 for none."""
     i = 0
     for page in range(len(ends)):
         while i < ends[page]:
@@ -60,7 +59,7 @@ def histograms(votes: Any, ends: Any, start: int, stop: int, columns: Any, out: 
 
 @numba.njit(cache=True, nogil=True)
 def sums(votes: Any, start: int, stop: int) -> Any:
-    """Votes (bins, 256) of all pages together."""
+    """Votes (bins, 256) of all pages."""
     out = np.zeros((stop - start, CELLS))
     for i in range(np.uint64(len(votes))):
         place = votes[i] & np.uint64(0xFFFF)
@@ -72,7 +71,7 @@ def sums(votes: Any, start: int, stop: int) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def weights(votes: Any, ends: Any, start: int, stop: int) -> Any:
-    """Votes (pages, 256) for a value, whose bins are `start` to `stop`; ends (pages,): of each page's votes."""
+    """Votes (pages, 256) of bins start to stop; ends (pages,): of each page's votes."""
     out = np.zeros((len(ends), CELLS))
     i = 0
     for page in range(len(ends)):
@@ -86,7 +85,7 @@ def weights(votes: Any, ends: Any, start: int, stop: int) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def medians(votes: Any) -> Any:
-    """Median (cells,) of histograms (bins, cells), in bins, between two where it lies there; NaN without votes."""
+    """Median (cells,) of histograms (bins, cells), interpolated, in bins; NaN without votes."""
     bins, cells = votes.shape
     out = np.full(cells, np.nan)
     for cell in range(cells):
@@ -100,12 +99,11 @@ def medians(votes: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def likeliest_cuts(votes: Any, first: Any, least: float) -> tuple[Any, Any, Any, Any]:
-    """Page (cells,) before which the votes of each cell are best cut in two kinds of ground; 0 where they cannot be.
+    """Page (cells,) before which votes are best cut in two kinds of ground, 0 for none.
 
-    votes (pages, bins, cells) in metres; pages before first (cells,) do not count. Either side has at least `least`
-    metres. The best cut has the largest log-likelihood ratio: the entropy of all votes, less that of both sides, each
-    times its weight. Also returns, for each cell, the total variation of the histograms before and after it, and their
-    medians.
+    votes (pages, bins, cells) in metres; pages before first (cells,) do not count; each side needs `least` metres.
+    Maximises the log-likelihood ratio: entropy of all votes minus that of both sides, weighted. Also returns total
+    variation and medians of the histograms on both sides.
     """
     pages, bins, cells = votes.shape
     best = np.zeros(cells, np.int64)
@@ -123,7 +121,7 @@ def likeliest_cuts(votes: Any, first: Any, least: float) -> tuple[Any, Any, Any,
             for i in range(bins):
                 old[i] += votes[page - 1, i, cell]
                 is_more |= votes[page - 1, i, cell] > 0
-            if not is_more:  # the same cut as one page earlier
+            if not is_more:  # equal to the previous cut
                 continue
             gain = _both_sides(old, every, least)
             if gain > most:
@@ -161,7 +159,7 @@ def _sum(values: Any) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _both_sides(old: Any, every: Any, least: float) -> Any:
-    """Log-likelihood of a cut, but for what is the same for all cuts of a cell; -inf where a side has too little."""
+    """Log-likelihood of a cut up to a constant of the cell; -inf if a side is too weak."""
     old_m, new_m, logs = 0.0, 0.0, 0.0
     for i in range(len(old)):
         new = every[i] - old[i]

@@ -1,4 +1,4 @@
-"""Which pages of evidence still hold: for every cell, those from its last credible change on."""
+"""Valid pages: for every cell, those since its last credible change."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from protocol.arrays import AnyArray, Ints
 from protocol.site.geometry import BLOCK_CELLS
 
 Pages = Mapping[Block, TimedPages]
-Ages = Mapping[Block, Ints]  # since when (256,) the ground of cells is as it is [ns], 0 for ever; blocks with any
+Ages = Mapping[Block, Ints]  # start [ns] of the present ground of cells (256,), 0 for ever; only blocks with any
 T = TypeVar("T")
 
 
@@ -36,10 +36,10 @@ def valid_pages(
     tuning: ChangeTuning = TUNING,
     only: Iterable[Block] | None = None,
 ) -> dict[Block, Ints]:
-    """For each block, index (256,) of the first page that holds now in each of its cells, 0 where nothing changed.
+    """First valid page (256,) of each block's cells, 0 for no change.
 
-    Cells at the edge of the blocks see no further: give `reach_blocks` more to every side than are wanted. ages: what
-    is known of changes beside that. only: the blocks that are wanted, if not all; the others are around them.
+    Edge cells lack context: pass `reach_blocks` more on every side, and the wanted blocks as `only`. ages: changes
+    known otherwise.
     """
     last = {block: _cuts(block_pages, config, tuning) for block, block_pages in pages.items()}
     first = {block: last[block].first for block in pages}
@@ -59,17 +59,17 @@ def valid_pages(
 
 
 def has_change(pages: TimedPages, config: ChangeConfig) -> bool:
-    """Whether a block has a cell that changed, or seems to: its neighbours tell which."""
+    """Whether a block has a possible change; neighbours decide."""
     return _cuts(pages, config, TUNING).has_change
 
 
 def _since(pages: TimedPages, age_ns: Ints) -> Ints:
-    """Index (256,) of the first page with evidence of a cell that begins in its age.
+    """First page (256,) with evidence that begins within a cell's age.
 
-    Where there is none, of the page that it begins in, which has older evidence as well: better than to know nothing.
+    If there is none, the page in which the age begins: mixed evidence is better than none.
     """
     whole, part = np.zeros((2, len(age_ns)), np.int64)
-    for index, timed in reversed(list(enumerate(pages))):  # packed pages are expanded as a whole, whichever is read
+    for index, timed in reversed(list(enumerate(pages))):  # reading any page expands all
         known = np.zeros(len(age_ns), np.bool_)
         known[timed.page.cells["cell"]] = age_ns[timed.page.cells["cell"]] > 0
         whole[known & (timed.first_ns >= age_ns)] = index
@@ -78,11 +78,11 @@ def _since(pages: TimedPages, age_ns: Ints) -> Ints:
 
 
 def clusters(blocks: Iterable[Block], reach: int) -> list[list[Block]]:
-    """Blocks together with those that are near them, so that each image is small."""
+    """Group blocks with those nearby, to keep images small."""
     left, parts = set(blocks), []
     while left:
         part = [left.pop()]
-        for block in part:  # which grows meanwhile
+        for block in part:  # grows meanwhile
             near = left.intersection(around(block, 2 * reach))
             left -= near
             part += sorted(near)
@@ -91,12 +91,10 @@ def clusters(blocks: Iterable[Block], reach: int) -> list[list[Block]]:
 
 
 def _cuts(pages: TimedPages, config: ChangeConfig, tuning: ChangeTuning) -> Cuts:
-    """As `cuts`, found once for the same pages."""
     return _derived(pages, (config, tuning), lambda: cuts(pages, config, tuning))
 
 
 def _known(pages: TimedPages, tuning: ChangeTuning) -> Known:
-    """As `known`, found once for the same pages."""
     return _derived(pages, tuning, lambda: known(pages, tuning))
 
 
@@ -108,14 +106,14 @@ def _derived(pages: TimedPages, key: object, derive: Callable[[], T]) -> T:
 
 
 def around(block: Block, reach: int) -> list[Block]:
-    """A block and its neighbours, `reach` blocks to every side."""
+    """A block and its neighbours within `reach`."""
     x, y = block
     steps = range(-reach, reach + 1)
     return [(x + dx, y + dy) for dy in steps for dx in steps]
 
 
 def _images(kind: type[T], blocks: Mapping[Block, T]) -> tuple[T, Block]:
-    """Values of blocks as images, field by field: 0 elsewhere, NaN where they are no integers."""
+    """Values of blocks as images by field; 0 or NaN elsewhere."""
     images = {}
     corner = (0, 0)
     for field in fields(kind):  # type: ignore[arg-type]
@@ -126,7 +124,7 @@ def _images(kind: type[T], blocks: Mapping[Block, T]) -> tuple[T, Block]:
 
 
 def image_of(blocks: Mapping[Block, AnyArray], nothing: float) -> tuple[AnyArray, Block]:
-    """Values (256,) of blocks as one image (rows, columns), `nothing` elsewhere; and its first block column and row."""
+    """Values (256,) of blocks as one image (rows, columns), and its first block; `nothing` elsewhere."""
     left, bottom = (min(block[axis] for block in blocks) for axis in (0, 1))
     right, top = (max(block[axis] for block in blocks) for axis in (0, 1))
     n, kind = BLOCK_CELLS, next(iter(blocks.values())).dtype
@@ -137,6 +135,6 @@ def image_of(blocks: Mapping[Block, AnyArray], nothing: float) -> tuple[AnyArray
 
 
 def cells_of(image: AnyArray, corner: Block, block: Block) -> AnyArray:
-    """Undo `image_of` for one block: (256,)."""
+    """Inverse of `image_of` for one block: (256,)."""
     n, x, y = BLOCK_CELLS, block[0] - corner[0], block[1] - corner[1]
     return image[y * n : (y + 1) * n, x * n : (x + 1) * n].ravel()

@@ -1,1 +1,1 @@
-"""What samples become: votes per cell, packed pages of blocks over time, and the grid of all of them."""
+"""Evidence: votes per cell, packed pages of blocks by time, and the grid of them."""

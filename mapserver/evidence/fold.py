@@ -1,4 +1,4 @@
-"""Samples of many machines folded at once: sorted by block and time bucket, each of these summed into one page."""
+"""Folds samples of many machines: sorted by block and bucket, each summed into one page."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from mapserver.evidence.pages import CELL, Record, most_bytes, records
 from mapserver.evidence.sample_kernels import locate, split, weigh
 from protocol.arrays import AnyArray, Ints, Table
 
-MOST_SHARES = 1 << 24  # of stencils that are weighed at once, 64 MB
-MOST_VOTES = 1 << 20  # that are packed at once, 8 MB
-MOST_PAGES = 1 << 14  # likewise
-_VOTES_OF_CELL = 9  # two bins of each of three values, one sector, the doubt, and what is aided
+MOST_SHARES = 1 << 24  # stencil shares per call, 64 MB
+MOST_VOTES = 1 << 20  # votes packed at once, 8 MB
+MOST_PAGES = 1 << 14  # pages packed at once
+_VOTES_OF_CELL = 9  # two bins of three values each, sector, doubt, aided
 
 
 class Scratch(Buffers):
-    """Where one thread folds. block: one block unpacked, where kernels sum, zero between folds."""
+    """Memory of one thread. block: unpacked, zero between folds."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -40,11 +40,10 @@ def fold(
     scratch: Scratch,
     spans: Ints | None = None,
 ) -> Iterator[tuple[tuple[int, int], Record]]:
-    """Fold samples; yields a block and a record of its buckets (tier 0), a block maybe more than once.
+    """Fold samples; yields blocks, repeatedly maybe, with records of their buckets (tier 0).
 
-    names (n,): hashes of the rows' machines. The weight of all samples together stays within COUNT_MAX. Samples that
-    do not know their place well enough have no vote. spans (n,): numbers below 2**BUCKET_BITS of the pages that the
-    rows count in, in place of their buckets.
+    names (n,): hashes of machine names. The total weight stays within COUNT_MAX. Uncertain positions have no vote.
+    spans (n,): pages below 2**BUCKET_BITS in place of buckets.
     """
     limits = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2)
     n = len(rows)
@@ -55,7 +54,7 @@ def fold(
     if pairs > len(keys):
         keys, touching = array("keys", pairs, np.int64), array("touching", pairs, np.int32)
         locate(rows, limits, config.bucket_ns, places, stencils, keys, touching)
-    if area > MOST_SHARES and n > 1:  # tiny cells under unsure positions
+    if area > MOST_SHARES and n > 1:  # tiny cells under uncertain positions
         for part in (slice(n // 2), slice(n // 2, None)):
             yield from fold(
                 rows[part], names[part], cell_m, config, scratch, spans[part] if spans is not None else None
@@ -78,7 +77,7 @@ def fold(
 def _pages(
     keys: Ints, touching: Ints, samples: tuple[Any, ...], area: int, scratch: Scratch
 ) -> Iterator[tuple[tuple[int, int], Record]]:
-    """Fold sorted pairs, as many at a time as there is space for."""
+    """In pieces that fit the working memory."""
     block = ev.COUNTS * ev.CELLS
     pages = scratch.array("pages", min(len(keys), MOST_PAGES), np.int64, 8)
     votes = scratch.array("votes", min(_VOTES_OF_CELL * area, MOST_VOTES) + block, np.uint64)
@@ -92,7 +91,6 @@ def _pages(
 def _by_block(
     pages: Ints, votes: NDArray[np.uint64], cells: Table, scratch: Scratch
 ) -> Iterator[tuple[tuple[int, int], Record]]:
-    """Pack the pages of each block."""
     firsts = np.flatnonzero((np.diff(pages[:, :2], axis=0, prepend=pages[:1, :2] - 1) != 0).any(axis=1))
     ends, table = np.append(firsts[1:], len(pages)), pages[:, 2:].copy()
     space = scratch.array("records", most_bytes(table, votes, cells), np.uint8)

@@ -1,7 +1,6 @@
-"""What the fold depends on: its options, the tables that replace exp and log, and hashes of machines' names.
+"""Options of the fold, tables for exp and log, hashes of machine names.
 
-The fold uses only operations that IEEE 754 rounds in one way (no exp, log or sin: they come from these tables), so that
-every machine computes the same evidence, bit for bit.
+Only operations that IEEE 754 defines to the bit (no exp, log, sin), so all computers get the same evidence.
 """
 
 from __future__ import annotations
@@ -15,11 +14,10 @@ from mapserver.evidence import cells as ev
 from protocol.arrays import Bools, Floats, Ints, Table
 from protocol.units import MINUTE_NS
 
-VISIT_NS = MINUTE_NS  # one machine's passes within a minute are one visit
-HASH = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: multiplied by it, the top bits of a number are well mixed
+VISIT_NS = MINUTE_NS  # a machine's passes within a minute are one visit
+HASH = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: products have well-mixed top bits
 
-# exp(-d2 / 2) in 1/65536 over squared Mahalanobis distance, up to 3 sigma, and 0 beyond: a table is 3.7 times faster
-# than exp.
+# exp(-d2 / 2) in 1/65536 by squared Mahalanobis distance to 3 sigma; 3.7 times faster than exp.
 TABLE_PER_UNIT = 256
 _SIGMAS_2 = 9
 TABLE_LAST = _SIGMAS_2 * TABLE_PER_UNIT + 1
@@ -27,26 +25,25 @@ TABLE: Ints = np.append(
     np.rint(65536 * np.exp(-0.5 * np.arange(TABLE_LAST) / TABLE_PER_UNIT)).astype(np.int64), np.int64(0)
 )
 
-# Least c_rr of each place on the axis of its bins, in 1/SHARE_ONE of a bin; the axis is even in log(c_rr).
+# Lower c_rr of each 1/SHARE_ONE bin; bins are even in log(c_rr).
 RESISTANCE_STEPS: Floats = np.geomspace(
     float(ev.RESISTANCE_CENTRES[0]), float(ev.RESISTANCE_CENTRES[-1]), 2 * (ev.RESISTANCE_BINS - 1) * ev.SHARE_ONE + 1
 )[1::2].copy()
 GRADE_LOW = float(ev.GRADE_CENTRES[0])
 GRADE_STEPS = (ev.GRADE_BINS - 1) * ev.SHARE_ONE / float(ev.GRADE_CENTRES[-1] - ev.GRADE_CENTRES[0])
 
-# Added to every position's standard deviation, in squares: positions that are wrong by the same amount for minutes know
-# less than their covariance says. More of it would blur roads that are two cells wide.
+# Added to positions' deviations, in squares: errors last for minutes, unlike a covariance's. More blurs roads of two
+# cells.
 STD_FLOOR_M = 0.3
-WEIGHT_SHIFT = 32  # shares of a weight are exact to 2**-32 before they are rounded down
+WEIGHT_SHIFT = 32  # shares are exact to 2**-32 before rounding down
 
 
 @dataclass(frozen=True)
 class FoldConfig:
     """How samples become evidence.
 
-    bucket_s: length of a time bucket, a whole part of an hour. keep_buckets, keep_hours, keep_days: so many of the
-    newest buckets, hours and days with evidence stay apart in each cell, older ones are summed.
-    std_cap_m: samples with a larger standard deviation of position are journalled, not folded.
+    bucket_s: divides an hour. keep_buckets, keep_hours, keep_days: newest spans that each cell keeps apart; older ones
+    are summed. std_cap_m: samples of less certain position are not folded.
     """
 
     bucket_s: float = 300.0
@@ -66,12 +63,12 @@ class FoldConfig:
 
     @property
     def bucket_ns(self) -> int:
-        """Length of a time bucket [ns]."""
+        """Length of a bucket [ns]."""
         return round(self.bucket_s * 1e9)
 
 
 def is_foldable(rows: Table, config: FoldConfig) -> Bools:
-    """Which samples have a position that is certain enough to vote: long dead reckoning must not spoil the map."""
+    """Samples of certain enough position; dead reckoning must not spoil the map."""
     xx, xy, yy = (rows[name].astype(np.float64) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
     half = (xx - yy) / 2
     largest = (xx + yy) / 2 + np.sqrt(half * half + xy * xy)
@@ -79,5 +76,5 @@ def is_foldable(rows: Table, config: FoldConfig) -> Bools:
 
 
 def name_hash(machine: str) -> int:
-    """64 bits of a machine's name; the top six choose its bit."""
+    """64 bits of a name; the top six choose the machine's bit."""
     return int.from_bytes(hashlib.blake2b(machine.encode(), digest_size=8).digest(), "little")

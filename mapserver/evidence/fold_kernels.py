@@ -1,10 +1,7 @@
-"""Sorted samples into packed pages, compiled: each block and time bucket is folded once.
+"""Sorted samples to packed pages (compiled); each block and bucket is folded once.
 
-Evidence of one block over one bucket is summed in a scratch block, which lies in memory bin by bin, so that a sample
-adds whole rows of 16 neighbouring cells to each bin that it votes for: additions of 64 bytes, which the compiler turns
-into vector instructions. The scratch block is packed into a page before the next block begins.
-
-A vote is packed in 64 bits: its place (bin * 256 + cell) in the lower 16, its count above them.
+A scratch block, laid out by bin, sums evidence: samples add rows of 16 cells, 64 bytes, which compilers vectorise. Then
+it is packed. A packed vote has its place (bin * 256 + cell) in the lower 16 of 64 bits, its count above.
 """
 
 from __future__ import annotations
@@ -21,8 +18,7 @@ _HEADING, _DOUBT, _AIDED, _COUNTS, _CELLS = ev.HEADING.start, ev.DOUBT, ev.AIDED
 _ONE, _PLANE, _HALF_SHARE = np.uint64(1), np.uint64(ev.CELLS), np.uint32(ev.SHARE_ONE // 2)
 _NONE = np.uint32(0)
 
-# Keys sort by block column, block row and bucket: 18, 18 and 27 bits, enough for 5 cm cells 100 km away, and for
-# minutes until the year 2100.
+# Block column, block row, bucket. 18, 18 and 27 bits allow 5 cm cells 100 km away, and minutes until 2100.
 BLOCK_BITS, BUCKET_BITS = 18, 27
 HALF = 1 << (BLOCK_BITS - 1)
 _BLOCK_MASK, _BUCKET_MASK = (1 << BLOCK_BITS) - 1, (1 << BUCKET_BITS) - 1
@@ -32,14 +28,13 @@ _BLOCK_MASK, _BUCKET_MASK = (1 << BLOCK_BITS) - 1, (1 << BUCKET_BITS) - 1
 def fold_sorted(
     first: int, keys: Any, touching: Any, samples: Any, scratch: Any, out_pages: Any, out_votes: Any, out_cells: Any
 ) -> tuple[int, int, int, int]:
-    """Fold sorted pairs from number `first` on, one page for each key.
+    """Fold sorted pairs from number `first`, a page per key.
 
-    keys, touching: as of `locate`, sorted by key. samples: (stencils of `locate`, starts and shares of `weigh`, bins,
-    shares, bits and stamps of `split`). scratch: (counts (COUNTS * 256,) uint32, lines (COUNTS,) int32 one bit for each
-    row of 16 cells, visits, machines (256,) uint64, newest (256,) int64), zero before and after.
-    Fills pages (m, 8): block column and row, and a row of the table of Pages, whose index is the bucket; votes; cells.
-    Stops where another page might not fit. Returns the number of the next pair, and how many pages, votes and cells
-    were written.
+    keys, touching: of `locate`, sorted. samples: (stencils of `locate`, starts and shares of `weigh`, bins, shares,
+    bits and stamps of `split`). scratch: (counts (COUNTS * 256,) uint32, lines (COUNTS,) int32 with a bit per row of
+    cells, visits, machines (256,) uint64, newest (256,) int64), zero before and after. Fills pages (m, 8): block, then
+    as Pages.table with the bucket as index; votes; cells. Stops when full. Returns the next pair and counts of pages,
+    votes, cells.
     """
     stencils, starts, shares, bins, bin_shares, bits, stamps = samples
     counts, lines, visits, machines, newest = scratch
@@ -54,8 +49,8 @@ def fold_sorted(
         key = keys[at]
         left = ((key >> (BLOCK_BITS + BUCKET_BITS)) - HALF) << 4
         bottom = (((key >> BUCKET_BITS) & _BLOCK_MASK) - HALF) << 4
-        low, high = 16, 0  # rows of cells that were touched
-        run_low, run_high = 16, 0  # and those of a run: rows of one machine and minute, in the order of their stamps
+        low, high = 16, 0  # touched rows of cells
+        run_low, run_high = 16, 0  # of a run: one machine and minute, by stamp
         before = -1
         while at < len(keys) and keys[at] == key:
             k = touching[at]
@@ -89,7 +84,7 @@ def fold_sorted(
 
 @numba.njit(cache=True, nogil=True)
 def _lay_out(shares: Any, first: int, edge: int, width: int, column: int, lane: Any) -> None:
-    """Copy the lines of a stencil that lie in a block into rows of 16 cells, from a column on."""
+    """Copy a stencil's lines inside a block into rows of 16 cells."""
     lane[:] = 0
     source, target = np.uint64(first), np.uint64(column)
     for _ in range(len(lane) // 16):
@@ -99,12 +94,12 @@ def _lay_out(shares: Any, first: int, edge: int, width: int, column: int, lane: 
         target += np.uint64(16)
 
 
-# Indices below are unsigned: the compiler then need not look for negative ones, which count from the end.
+# unsigned indices below avoid checks for negative ones
 
 
 @numba.njit(cache=True, nogil=True)
 def _vote(counts: Any, lines: Any, top: int, end: int, part: Any, bins: Any, bin_shares: Any, k: int) -> None:
-    """Add the votes of one row for some rows of cells, top <= row < end."""
+    """Add a sample's votes to rows of cells top <= row < end."""
     touched = np.int32((1 << end) - (1 << top))
     first, n = np.uint64(top * 16), np.uint64(len(part))
     for value in range(3):
@@ -134,7 +129,7 @@ def _vote(counts: Any, lines: Any, top: int, end: int, part: Any, bins: Any, bin
 
 @numba.njit(cache=True, nogil=True)
 def _touch(last: Any, top: int, part: Any, number: Any) -> None:
-    """Note the number of the row that touched cells last."""
+    """Note the last sample that touched each cell."""
     at = np.uint64(top * 16)
     for i in range(np.uint64(len(part))):
         last[at + i] = number if part[i] else last[at + i]
@@ -142,7 +137,7 @@ def _touch(last: Any, top: int, part: Any, number: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _mark(bits: Any, stamps: Any, last: Any, low: int, high: int, visits: Any, machines: Any, newest: Any) -> None:
-    """Set the bits and the newest stamp of the cells that a run touched, and forget the run."""
+    """Set bits and newest stamp of a run's cells, and clear the run."""
     for i in range(np.uint64(low * 16), np.uint64(high * 16)):
         if last[i]:
             k = np.uint64(last[i]) - _ONE
@@ -154,7 +149,7 @@ def _mark(bits: Any, stamps: Any, last: Any, low: int, high: int, visits: Any, m
 
 @numba.njit(cache=True, nogil=True)
 def _pack_votes(counts: Any, lines: Any, low: int, high: int, out: Any, used: int) -> Any:
-    """Move what is not zero in the scratch block to votes; returns where they end."""
+    """Move counts to votes; returns their end."""
     end = np.uint64(used)
     for plane in range(_COUNTS):
         touched = lines[plane]
@@ -174,7 +169,7 @@ def _pack_votes(counts: Any, lines: Any, low: int, high: int, out: Any, used: in
 
 @numba.njit(cache=True, nogil=True)
 def _pack_cells(visits: Any, machines: Any, newest: Any, low: int, high: int, out: Any, used: int) -> int:
-    """Move bitmaps and stamps of touched cells to cells; returns where they end."""
+    """Move bitmaps and stamps to cells; returns their end."""
     for i in range(low * 16, high * 16):
         if newest[i]:
             out[used].cell, out[used].newest_ns = i, newest[i]

@@ -1,4 +1,4 @@
-"""The grid in memory: 16 x 16 cell blocks, each with its pages by time, where somebody drove. One thread owns it."""
+"""The grid in memory: driven blocks of 16 x 16 cells, their pages by time. Owned by one thread."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from protocol.arrays import AnyArray, Table
 from protocol.machine.samples import RAW_SAMPLE, SAMPLE_DTYPE
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
-# Samples that wait to be folded together: the more, the fewer pages. While machines drive, the map is read every second
-# and a fold must not take long (8 ms); when a journal is folded again, only the sum counts: so many for each worker.
+# Samples folded at once; more make fewer pages. Live, folds must be short (8 ms), because the map is read every second;
+# refolding, only the total counts. Per worker.
 LIVE_ROWS, REFOLD_ROWS = 8192, 131_072
-PIECE = 4096  # samples whose weights together stay far below COUNT_MAX
-READ_BLOCKS = 32  # summed at once: 7 MB, which stays in the processor's cache
+PIECE = 4096  # samples that stay far below COUNT_MAX in total
+READ_BLOCKS = 32  # summed at once: 7 MB, within the processor's cache
 
 
 class Grid:
-    """Evidence of one site. newest_ns, oldest_ns: the newest and the oldest stamp of all samples, 0 for none."""
+    """Evidence of one site. newest_ns, oldest_ns: of all samples, 0 for none."""
 
     def __init__(self, cell_m: float, config: FoldConfig, waiting_rows: int = LIVE_ROWS) -> None:
-        """waiting_rows: so many samples are folded together, LIVE_ROWS or REFOLD_ROWS; the grid is the same."""
+        """waiting_rows: samples folded at once; no influence on the result."""
         self.cell_m = cell_m
         self.config = config
         self.newest_ns = self.oldest_ns = 0
@@ -41,7 +41,7 @@ class Grid:
         self._tiers = Tiers.from_config(config)
         self._timelines: dict[Block, Timeline] = {}
         self._touched: set[Block] = set()
-        self._turn = 0  # how often anything was folded
+        self._turn = 0  # number of folds
         self._workers, self._scratch, self._spaces = ALONE, [Scratch()], [Space()]
         self._rows: AnyArray = np.empty(waiting_rows, RAW_SAMPLE)
         self._names = np.empty(waiting_rows, np.uint64)
@@ -49,30 +49,29 @@ class Grid:
 
     @property
     def folded(self) -> int:
-        """How many samples voted."""
+        """Samples that voted."""
         self._drain()
         return self._folded
 
     @property
     def skipped(self) -> int:
-        """How many samples were too uncertain of their position to vote."""
+        """Samples too uncertain of position to vote."""
         self._drain()
         return self._skipped
 
     def fold(self, rows: Table, machine: str) -> None:
-        """Fold samples of one machine; commutative, not idempotent: exactly-once is decided at the journal."""
+        """Fold samples of one machine; commutative, not idempotent (the journal ensures exactly-once)."""
         self.fold_all(rows, np.full(len(rows), name_hash(machine), np.uint64))
 
     def fold_all(self, rows: Table, names: NDArray[np.uint64]) -> None:
-        """Fold samples of several machines; names (n,): hash of each one's name."""
+        """Fold samples of several machines; names (n,): hashes of their names."""
         for first in range(0, len(rows), PIECE):
             self._take(np.ascontiguousarray(rows[first : first + PIECE]), names[first : first + PIECE])
 
     def merge(self, other: Grid) -> None:
-        """Add the evidence of another grid: the fold of both sets of samples, bit for bit.
+        """Add another grid: bit for bit the fold of both.
 
-        The two share no sample: merging is commutative and associative, not idempotent. Raises ValueError where the
-        other was folded with another cell size or configuration.
+        Commutative and associative, not idempotent. ValueError for another cell size or configuration.
         """
         if (self.cell_m, self.config) != (other.cell_m, other.config):
             raise ValueError(f"folded otherwise: {other.cell_m} m, {other.config}; {self.cell_m} m, {self.config}")
@@ -88,10 +87,10 @@ class Grid:
 
     @contextmanager
     def bulk(self, workers: Workers = ALONE) -> Iterator[None]:
-        """Fold a long history: many samples at a time, by these workers, and settled in the end.
+        """Fold a long history by these workers, and settle it.
 
-        Meanwhile one thread may call `fold`, and nothing else. The grid is the same, bit for bit, for any workers;
-        after an error it is of no use.
+        Only `fold` may be called meanwhile, by one thread. Workers do not change the result; an error makes the grid
+        unusable.
         """
         self._engage(workers, REFOLD_ROWS * workers.count)
         yield
@@ -100,7 +99,7 @@ class Grid:
         self._engage(ALONE, LIVE_ROWS)
 
     def blocks_in(self, window: CellWindow) -> list[Block]:
-        """Block columns and rows with evidence that the window touches."""
+        """Blocks (column, row) with evidence in a window."""
         self._drain()
         first_x, last_x = window.column // BLOCK_CELLS, (window.column + window.columns - 1) // BLOCK_CELLS
         first_y, last_y = window.row // BLOCK_CELLS, (window.row + window.rows - 1) // BLOCK_CELLS
@@ -110,47 +109,47 @@ class Grid:
         return [block for block in inside if block in self._timelines]
 
     def pages(self, blocks: Iterable[Block]) -> list[TimedPages]:
-        """Pages of each of these blocks in the order of time, none for a block without evidence."""
+        """Pages of each block by time; empty without evidence."""
         self._drain()
         return timed([self._timelines.get(block) for block in blocks], self._tiers, self._spaces[0])
 
     def touch_all(self) -> None:
-        """Count all blocks as touched."""
+        """Mark all blocks as touched."""
         self._drain()
         self._touched |= set(self._timelines)
 
     def take_touched(self, most: int) -> list[Block]:
-        """Some of the blocks that were folded into, each once until it is folded into again."""
+        """Take some blocks folded since they were last taken."""
         self._drain()
         return [self._touched.pop() for _ in range(min(most, len(self._touched)))]
 
     def folded_since(self, turn: int) -> tuple[list[Block], int]:
-        """Blocks that were folded into after a turn of this grid, all after turn -1; and the turn that it is now."""
+        """Blocks folded after a turn (-1: all), and the present turn."""
         self._drain()
         return [block for block, timeline in self._timelines.items() if timeline.turn > turn], self._turn
 
     def evidence(self, blocks: Iterable[Block]) -> ev.Evidence:
-        """Everything that was ever seen of these blocks, whether it still holds or not."""
+        """All evidence of blocks, valid or not."""
         return evidence(self.pages(blocks))
 
     def last_turns(self, blocks: Iterable[Block]) -> list[int]:
-        """The last turn of this grid in which each of these blocks was folded into, -1 for one without evidence."""
+        """The last turn in which each block was folded, -1 for none."""
         self._drain()
         timelines = (self._timelines.get(block) for block in blocks)
         return [timeline.turn if timeline else -1 for timeline in timelines]
 
     def bounds(self) -> tuple[int, int, int, int] | None:
-        """First column, first row, end column, end row of all blocks with evidence."""
+        """First column, first row, end column, end row of all evidence."""
         self._drain()
         return self.counts().bounds
 
     def known_cells(self) -> int:
-        """How many cells have any evidence."""
+        """Number of cells with evidence."""
         self._drain()
         return self._cells
 
     def counts(self) -> GridCounts:
-        """What is there, from counters: nothing is folded or looked through for it."""
+        """Counts without folding what waits."""
         waiting = self._rows[: self._waiting].view(SAMPLE_DTYPE)
         voting, n = count_foldable(waiting, self.config.std_cap_m**2), BLOCK_CELLS
         bounds = None
@@ -160,7 +159,7 @@ class Grid:
         return GridCounts(self._folded + voting, self._skipped + len(waiting) - voting, self._cells, bounds)
 
     def state(self) -> GridState:
-        """Everything, in the order of places, so that equal grids have equal states."""
+        """The whole content, sorted, so that equal grids have equal states."""
         self._drain()
         settle_all(self._timelines.values(), self._tiers, self._spaces[0])
         blocks = ((x, y, self._timelines[x, y].records[0]) for x, y in sorted(self._timelines))
@@ -168,7 +167,7 @@ class Grid:
 
     @classmethod
     def from_state(cls, cell_m: float, config: FoldConfig, state: GridState) -> Grid:
-        """Undo `state`."""
+        """Inverse of `state`."""
         grid = cls(cell_m, config)
         grid._extend((x, y) for x, y, _ in state.blocks)
         grid._timelines = {(x, y): Timeline([record]) for x, y, record in state.blocks}
@@ -178,12 +177,12 @@ class Grid:
         return grid
 
     def _widen(self, oldest_ns: int, newest_ns: int) -> None:
-        """Take in the span of stamps of other samples; 0, 0 for none."""
+        """0, 0 for no samples."""
         self.newest_ns = max(self.newest_ns, newest_ns)
         self.oldest_ns = min(self.oldest_ns or oldest_ns, oldest_ns or self.oldest_ns)
 
     def _take(self, rows: Table, names: NDArray[np.uint64]) -> None:
-        """Let rows wait; what waits is folded before its weight could exceed a count."""
+        """Queue rows; fold before their weight exceeds a count."""
         oldest_ns, newest_ns, driven_m = extent(rows)
         self._widen(oldest_ns, newest_ns)
         weight = int(driven_m * ev.WEIGHT_UNITS_PER_M) + len(rows)
@@ -200,22 +199,21 @@ class Grid:
                 self._drain()
 
     def _drain(self) -> None:
-        """Fold what waits."""
+        """Fold the queue."""
         if not self._waiting:
             return
         rows, names = self._rows[: self._waiting].view(SAMPLE_DTYPE), self._names[: self._waiting]
         count = self._workers.count
-        records: list[list[tuple[Block, Record]]] = [[] for _ in range(count)]  # of each worker's blocks
+        records: list[list[tuple[Block, Record]]] = [[] for _ in range(count)]  # by worker of the block
         cells = [0] * count
 
         def fold_share(worker: int) -> None:
-            """Fold a stretch of the samples."""
             share = slice(worker * len(rows) // count, (worker + 1) * len(rows) // count)
             for block, record in fold(rows[share], names[share], self.cell_m, self.config, self._scratch[worker]):
                 records[_worker_of(block, count)].append((block, record))
 
         def add_share(worker: int) -> None:
-            """Add what all have folded to one's own blocks: no timeline is changed by two."""
+            """Add to own blocks only, so no timeline has two writers."""
             cells[worker] = sum(self._add(block, record) for block, record in records[worker])
             own = (self._timelines[block] for block in {block for block, _ in records[worker]})
             settle_all(own, self._tiers, self._spaces[worker], PATIENCE)
@@ -231,7 +229,7 @@ class Grid:
         self._waiting, self._weight = 0, 0
 
     def _add(self, block: Block, record: Record) -> int:
-        """Add evidence of a block in this turn; returns how many cells are new."""
+        """Returns the number of new cells."""
         timeline = self._timelines.get(block)
         if timeline is None:
             timeline = self._timelines[block] = Timeline()
@@ -240,18 +238,17 @@ class Grid:
         return timeline.add(record)
 
     def _extend(self, blocks: Iterable[Block]) -> None:
-        """Keep the bounds of all blocks."""
+        """Extend the bounds."""
         for x, y in blocks:
             west, south, east, north = self._blocks or (x, y, x, y)
             self._blocks = min(west, x), min(south, y), max(east, x), max(north, y)
 
     def _settle(self, worker: int) -> None:
-        """Settle a worker's own blocks."""
         own = [line for block, line in self._timelines.items() if _worker_of(block, self._workers.count) == worker]
         settle_all(own, self._tiers, self._spaces[worker])
 
     def _engage(self, workers: Workers, waiting_rows: int) -> None:
-        """Go on with other workers, each with space of its own."""
+        """Continue with other workers, each with its own memory."""
         self._drain()
         self._workers = workers
         self._rows, self._names = np.empty(waiting_rows, RAW_SAMPLE), np.empty(waiting_rows, np.uint64)
@@ -260,12 +257,12 @@ class Grid:
 
 
 def _worker_of(block: Block, count: int) -> int:
-    """Whose block this is: neighbours, which the same machines drive over, are of different workers."""
+    """Neighbouring blocks, which the same machines drive over, go to different workers."""
     return (block[0] + block[1]) % count
 
 
 def warm_up(config: FoldConfig) -> None:
-    """Compile the kernels, or read them from their cache, before a query or a batch waits for them."""
+    """Compile the kernels, or load them, before a query or batch waits for them."""
     row = np.zeros(1, SAMPLE_DTYPE)
     grid = Grid(1.0, config)
     for stamp_ns in (1, 1, 2 * config.bucket_ns * (config.keep_buckets + 1)):
@@ -279,6 +276,6 @@ def warm_up(config: FoldConfig) -> None:
 
 
 def chunks(blocks: list[Block]) -> Iterator[list[Block]]:
-    """Cut a list of blocks into pieces that are read at once."""
+    """Cut blocks into pieces read at once."""
     for first in range(0, len(blocks), READ_BLOCKS):
         yield blocks[first : first + READ_BLOCKS]

@@ -1,4 +1,4 @@
-"""What a grid holds, as values: all of it for snapshots, and in numbers."""
+"""A grid's content as values: all for snapshots, and in numbers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mapserver.evidence.pages import Page, Pages, Record
 
 @dataclass(frozen=True)
 class PlacedPage:
-    """A page, and where it belongs: the block's column and row, the tier of its timeline and the index there."""
+    """A page with its block's column and row, tier and index."""
 
     x: int
     y: int
@@ -20,9 +20,9 @@ class PlacedPage:
 
 @dataclass(frozen=True)
 class GridState:
-    """Everything that a snapshot keeps; equal grids have equal states.
+    """What a snapshot keeps; equal grids have equal states.
 
-    blocks: column, row and record of each block, in the order of places. newest_ns, oldest_ns: of all samples, or 0.
+    blocks: column, row and record, sorted. newest_ns, oldest_ns: of all samples, or 0.
     """
 
     blocks: tuple[tuple[int, int, Record], ...]
@@ -33,7 +33,7 @@ class GridState:
 
     @property
     def pages(self) -> list[PlacedPage]:
-        """All pages, one by one."""
+        """All pages, unpacked."""
         return [
             PlacedPage(x, y, tier, index, page)
             for x, y, record in self.blocks
@@ -43,10 +43,10 @@ class GridState:
 
 @dataclass(frozen=True)
 class GridCounts:
-    """What a grid holds, in numbers.
+    """A grid in numbers.
 
-    folded: samples that vote; skipped: those too uncertain of their position. cells: how many have evidence; bounds:
-    first column, first row, end column, end row of all blocks with evidence; both without the samples that wait.
+    folded: samples that vote; skipped: too uncertain of position. cells: with evidence; bounds: first column, first
+    row, end column, end row of blocks; both without waiting samples.
     """
 
     folded: int

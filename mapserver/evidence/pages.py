@@ -1,8 +1,7 @@
-"""Pages: the evidence of one block over a span of time, packed and never changed.
+"""Pages: packed, immutable evidence of one block over a span of time.
 
-Of the 108 counts of a cell about ten are not zero. A page keeps those alone, with bitmaps and newest stamp of its
-cells. All pages of a block are one `Record`, a run of bytes, about 45 per cell and page: in memory, in snapshots and in
-checkpoints. As nothing changes it, readers and snapshots take it without a copy.
+They keep only counts other than zero (about ten of 108 per cell), bitmaps and newest stamps. A block's pages form one
+`Record` of bytes, about 45 per cell and page, in memory, snapshots and checkpoints, read without copies.
 """
 
 from __future__ import annotations
@@ -18,29 +17,29 @@ from mapserver.evidence import record_kernels
 from mapserver.evidence.record_writing import write_records
 from protocol.arrays import AnyArray, Ints, Table
 
-# place: bin * 256 + cell. Counts of a few passes fit into 16 bits; where one does not, all of a block are wide.
+# place: bin * 256 + cell. If a count exceeds 16 bits, all of the block are wide.
 TIERS = 4  # of a timeline: buckets, hours, days, all before
 NARROW = np.dtype([("place", "<u2"), ("count", "<u2")])
 WIDE = np.dtype([("place", "<u2"), ("count", "<u4")])
 CELL = np.dtype([("cell", "u1"), ("visits", "<u8"), ("machines", "<u8"), ("newest_ns", "<i8")])
-Record = bytes  # of a block: record_kernels.py says how pages lie in it
+Record = bytes  # of a block; layout in record_kernels.py
 _PAGES, _MARKS, _VOTES = 0, 1, 3  # in its header
 _KNOWN = slice(record_kernels.FIELDS * 4, record_kernels.HEADER_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Votes (m,) NARROW or WIDE in the order of their places, and cells (k,) CELL in the order of their numbers."""
+    """Votes (m,) NARROW or WIDE by place, and cells (k,) CELL by number."""
 
     votes: Table
     cells: Table
 
 
 class Pages(NamedTuple):
-    """Pages of one block end to end, unpacked: few long arrays instead of many short ones.
+    """Unpacked pages of one block, in few arrays.
 
-    table (n, 6): tier, index, first and end of the votes and of the cells of each page. votes (m,) uint64: place in the
-    lower 16 bits, count above; cells (k,) CELL.
+    table (n, 6): tier, index, first and end of votes and of cells. votes (m,) uint64: place in the lower 16 bits, count
+    above; cells (k,) CELL.
     """
 
     table: Ints
@@ -49,7 +48,7 @@ class Pages(NamedTuple):
 
     @classmethod
     def unpacked(cls, record: Record) -> Pages:
-        """Undo `record`."""
+        """Inverse of `record`."""
         header = np.frombuffer(record, np.int32, record_kernels.FIELDS)
         shapes = (int(header[_PAGES]), 6), int(header[_VOTES]), int(header[_MARKS])
         pages = cls(*map(np.empty, shapes, (np.int64, np.uint64, CELL)))  # type: ignore[arg-type]
@@ -63,7 +62,7 @@ class Pages(NamedTuple):
         return record
 
     def items(self) -> Iterator[tuple[int, int, Page]]:
-        """Tier, index on it, and page."""
+        """Tier, index and page."""
         votes: Table = np.empty(len(self.votes), NARROW if int(self.votes.max(initial=0)) < 2**32 else WIDE)
         votes["place"], votes["count"] = self.votes & np.uint64(0xFFFF), self.votes >> np.uint64(16)
         for tier, index, first, end, first_cell, end_cell in self.table.tolist():
@@ -71,36 +70,36 @@ class Pages(NamedTuple):
 
 
 def as_numbers(data: bytes | AnyArray) -> tuple[AnyArray, ...]:
-    """Records as kernels take them: as bytes, and as numbers of 16, 32 and 64 bits."""
+    """Views for kernels: bytes, and numbers of 16, 32 and 64 bits."""
     whole = np.frombuffer(data, np.uint8)
     return whole, whole.view(np.uint16), whole.view(np.int32), whole.view(np.uint64)
 
 
 def page_count(record: Record) -> int:
-    """How many pages a record has."""
+    """Number of pages."""
     return int.from_bytes(record[:4], "little")
 
 
 def vote_count(record: Record) -> int:
-    """How many votes it has."""
+    """Number of votes."""
     return int.from_bytes(record[12:16], "little")
 
 
 def known_cells(record: Record) -> int:
-    """A bit for each cell that has evidence."""
+    """A bit for each cell with evidence."""
     return int.from_bytes(record[_KNOWN], "little")
 
 
 def most_bytes(table: Ints, votes: NDArray[np.uint64], cells: Table) -> int:
-    """Upper bound of the bytes of pages as records, a block for each page at most: 8 are filled up thrice."""
+    """Upper bound for one block per page: three paddings to 8 bytes."""
     fixed = record_kernels.HEADER_BYTES + 24 + 8 + 24
     return (fixed * max(1, len(table)) + 7 * len(votes) + 28 * len(cells) + 7) // 8 * 8
 
 
 def records(ends: Ints, table: Ints, votes: NDArray[np.uint64], cells: Table, space: AnyArray) -> list[Record]:
-    """The record of each block. ends (b,): of the pages of each block; space: bytes to work in, `most_bytes` or more.
+    """The record of each block. ends (b,): end of its pages; space: at least `most_bytes` to work in.
 
-    table (n, 6), votes, cells: as of Pages, of all blocks, in their order.
+    table (n, 6), votes, cells: as in Pages, of all blocks.
     """
     out_ends = np.empty_like(ends)
     write_records(ends, table, votes, cells, as_numbers(space), out_ends)
@@ -108,13 +107,13 @@ def records(ends: Ints, table: Ints, votes: NDArray[np.uint64], cells: Table, sp
 
 
 def cut(space: AnyArray, ends: Ints) -> list[Record]:
-    """Copies of the records that lie end to end in an array of bytes."""
+    """Copies of consecutive records."""
     whole, all_ends = space.data, ends.tolist()
     return [bytes(whole[first:end]) for first, end in zip([0, *all_ends], all_ends, strict=False)]
 
 
 def is_sound(record: bytes) -> bool:
-    """Whether these bytes are the record of a block; nothing else is looked at before they are unpacked."""
+    """Whether bytes are a record: the only check before unpacking."""
     if len(record) < record_kernels.HEADER_BYTES or len(record) % 8:
         return False
     header = np.frombuffer(record, np.int32, record_kernels.FIELDS).tolist()

@@ -1,17 +1,16 @@
-"""Records, compiled: the pages of a block in one run of bytes, each number in as little as it needs.
+"""Records (compiled): a block's pages in one run of bytes.
 
-    header   6 int32: pages, marks, words, votes, wide, runs; 4 uint64, a bit for each cell with evidence
-    table    a row of 6 int32 for each page: tier, index, end of its runs and votes, first and end of its marks
-    marks    4 bytes for each cell of a page: number; where its visits, machines and stamp stand among the page's words
-    words    uint64, for each page: how many of the three there are, 9 bits each; then these, all different
-    counts   uint16 for each vote; where `wide` is 1, uint16 more for the upper bits of each
-    places   1 byte for each vote: its cell
-    runs     2 bytes for each run of votes of one plane: plane, and number of its votes less one
+    header   6 int32: pages, marks, words, votes, wide, runs; 4 uint64, a bit per cell with evidence
+    table    6 int32 per page: tier, index, end of its runs and votes, first and end of its marks
+    marks    4 bytes per cell: number; indices of visits, machines, stamp in the page's words
+    words    uint64, per page: counts of these three, 9 bits each; then distinct values
+    counts   uint16 per vote; if `wide` is 1, then uint16 of upper bits
+    places   1 byte per vote: cell
+    runs     2 bytes per run of votes of one plane: plane, number of votes less one
 
-All begin at whole multiples of what they consist of, and a record fills up its last 8 bytes. Kernels take a run of
-records as four views of it: bytes, uint16, int32, uint64. Between them, a vote is one number: the place (plane * 256 +
-cell) in its lower 16 bits, its count above; a table (n, 6) has tier, index, first and end of the votes and of the cells
-of each page; cells are CELL.
+Parts are aligned, records padded to 8 bytes. Kernels take views of bytes, uint16, int32, uint64. Unpacked votes have
+their place (plane * 256 + cell) in the lower 16 bits, their count above; tables (n, 6) have tier, index, first and end
+of votes and of cells; cells are CELL.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ from mapserver.evidence.cells import CELLS, COUNTS
 FIELDS = 6  # of the header, before the bits
 HEADER_BYTES = FIELDS * 4 + CELLS // 8
 ROW_BYTES, MARK_BYTES, WORD_BYTES = 24, 4, 8
-_ONE = np.uint64(1)  # unsigned, as indices below: the compiler need not look for negative ones
+_ONE = np.uint64(1)  # unsigned, to avoid checks for negative indices
 
 
 @numba.njit(cache=True, nogil=True)
 def record_bytes(pages: int, marks: int, words: int, votes: int, wide: int, runs: int) -> int:
-    """Length of a record, whose header has these numbers."""
+    """Length of a record with this header."""
     before_words = HEADER_BYTES + ROW_BYTES * pages + (MARK_BYTES * marks + 7) // 8 * 8
     return int((before_words + WORD_BYTES * words + (3 + 2 * wide) * votes + 2 * runs + 7) // 8 * 8)
 
 
 @numba.njit(cache=True, nogil=True)
 def parts(data: Any, at: int) -> Any:
-    """Table, marks, words, counts, high, places and runs of the record that begins at a byte."""
+    """Table, marks, words, counts, high, places and runs of the record at a byte."""
     whole, halves, quarters, eighths = data
     pages, marks, words, votes, wide, runs = quarters[at >> 2 : (at >> 2) + FIELDS]
     table = at + HEADER_BYTES
@@ -61,7 +60,7 @@ def parts(data: Any, at: int) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def read_record(data: Any, at: int, table: Any, votes: Any, cells: Any, done: Any) -> tuple[int, int, int]:
-    """Write the pages of a record behind the pages, votes and cells that are done; returns how many are done then."""
+    """Append a record's pages; returns the new numbers of pages, votes, cells."""
     rows, marks, words, counts, high, places, runs = parts(data, at)
     pages, vote, cell = done
     for p in range(len(rows)):
@@ -76,7 +75,7 @@ def read_record(data: Any, at: int, table: Any, votes: Any, cells: Any, done: An
 
 @numba.njit(cache=True, nogil=True)
 def read_votes(runs: Any, places: Any, counts: Any, high: Any, out: Any) -> None:
-    """Put votes together from the parts of a record."""
+    """Assemble votes from parts."""
     at = np.uint64(0)
     for r in range(len(runs)):
         plane = np.uint64(runs[r, 0]) << np.uint64(8)
@@ -90,7 +89,7 @@ def read_votes(runs: Any, places: Any, counts: Any, high: Any, out: Any) -> None
 
 @numba.njit(cache=True, nogil=True)
 def _words_of(words: Any, at: int) -> tuple[int, int, int, int]:
-    """Where visits, machines and stamps of the page begin whose words begin here, and where they end."""
+    """Begins of a page's visits, machines and stamps, and their end."""
     sizes, visits = words[at], at + 1
     machines = visits + int(sizes & np.uint64(511))
     stamps = machines + int(sizes >> np.uint64(9) & np.uint64(511))
@@ -111,7 +110,7 @@ def _read_cells(table: Any, marks: Any, words: Any, out: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def sum_planes(data: Any, first: int, out: Any) -> None:
-    """Add the votes of planes from `first` on of one record to out (planes, 256)."""
+    """Add votes of planes from `first` to out (planes, 256)."""
     _, _, _, counts, high, places, runs = parts(data, 0)
     at = np.int64(0)
     for r in range(len(runs)):
@@ -127,7 +126,7 @@ def sum_planes(data: Any, first: int, out: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def ranks(table: Any) -> Any:
-    """Place (n,) of each page in the order of time: coarser tiers first, as in each cell the finer one is newer."""
+    """Ranks (n,) in time: coarser tiers first, as in each cell the finer is newer."""
     out = np.zeros(len(table), np.int64)
     for p in range(len(table)):
         for q in range(len(table)):
@@ -137,7 +136,7 @@ def ranks(table: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def votes_in_time(data: Any, out: Any, ends: Any) -> None:
-    """Votes of one record, pages in the order of time, and where those of each page end (n,)."""
+    """Votes of a record by pages in time, and the end of each page's (n,)."""
     table, _, _, counts, high, places, runs = parts(data, 0)
     rank, run, vote = ranks(table), 0, 0
     for p in range(len(table)):
@@ -154,10 +153,9 @@ def votes_in_time(data: Any, out: Any, ends: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def sum_records(data: Any, begins: Any, start: Any, counts: Any, bitmaps: Any, newest_ns: Any) -> None:
-    """Add records, each of another block, to counts (b, 256, COUNTS), bitmaps (b, 256, 2) and newest_ns (b, 256).
+    """Add records of different blocks to counts (b, 256, COUNTS), bitmaps (b, 256, 2), newest_ns (b, 256).
 
-    begins (b,): of the records in data. start (b, 256): the place in the order of time of the first page that counts in
-    each cell.
+    start (b, 256): rank of the first page that counts in each cell.
     """
     for block in range(len(begins)):
         table, marks, words, low, high, places, runs = parts(data, begins[block])
@@ -182,7 +180,7 @@ def sum_records(data: Any, begins: Any, start: Any, counts: Any, bitmaps: Any, n
 
 @numba.njit(cache=True, nogil=True)
 def are_votes(table: Any, runs: Any, cells: Any, counts: Any) -> bool:
-    """Whether these can be the votes of pages: what is read from a disk is looked at before it is read."""
+    """Whether data from disk can be votes."""
     run, vote = 0, 0
     for p in range(len(table)):
         plane = -1
@@ -205,7 +203,7 @@ def are_votes(table: Any, runs: Any, cells: Any, counts: Any) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def are_cells(table: Any, marks: Any, words: Any, known: Any) -> bool:
-    """Likewise, whether these can be the cells of pages, and known (4,) their bits."""
+    """Whether these can be cells; known (4,): their bits."""
     at, word, bits = 0, 0, np.zeros(CELLS // 64, np.uint64)
     for p in range(len(table)):
         if not (table[p, 4] == at and at < table[p, 5] <= len(marks) and word < len(words)):

@@ -1,4 +1,4 @@
-"""Records written, compiled; see record_kernels.py."""
+"""Writes records (compiled); layout in record_kernels.py."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from mapserver.evidence.fold_config import HASH
 from mapserver.evidence.record_kernels import FIELDS, HEADER_BYTES, MARK_BYTES, ROW_BYTES, WORD_BYTES
 
 _PLANE, _CELL = np.uint64(0xFF00), np.uint64(CELLS - 1)  # of a place
-_LOW, _NARROW_END = np.uint64(0xFFFF), np.uint64(1 << 32)  # of a count; of a vote whose count has 16 bits
-_ONE, _HASH = np.uint64(1), np.uint64(HASH)  # unsigned, as indices below: the compiler need not look for negative ones
-_SLOTS = 1024  # of a hash table: a list has 256 words at most
+_LOW, _NARROW_END = np.uint64(0xFFFF), np.uint64(1 << 32)  # of a count; of a vote with a 16-bit count
+_ONE, _HASH = np.uint64(1), np.uint64(HASH)  # unsigned, to avoid checks for negative indices
+_SLOTS = 1024  # of a hash table; a list has 256 words at most
 
 
 @numba.njit(cache=True, nogil=True)
 def new_slots() -> Any:
-    """Scratch of `write_record`: a hash table that knows by the number of a list, its last element, what is new."""
+    """Hash table of `write_record`; its last element numbers lists, which saves clearing."""
     return np.zeros(_SLOTS + 1, np.int64)
 
 
 @numba.njit(cache=True, nogil=True)
 def write_record(table: Any, votes: Any, cells: Any, slots: Any, out: Any, at: int) -> Any:
-    """Write pages, whose votes and cells lie end to end, as a record; returns where it ends."""
+    """Write consecutive pages as a record; returns its end."""
     whole, halves, quarters, eighths = out
     pages, vote, cell = len(table), 0, 0
     if pages:
@@ -63,7 +63,7 @@ def write_record(table: Any, votes: Any, cells: Any, slots: Any, out: Any, at: i
 
 @numba.njit(cache=True, nogil=True)
 def _write_votes(table: Any, votes: Any, first: int, rows: Any, counts: Any, high: Any, places: Any, runs: Any) -> int:
-    """Split votes into counts, cells and runs, and write where both end into the rows; returns how many runs."""
+    """Split votes into counts, cells and runs; returns the number of runs."""
     used, i = 0, np.uint64(0)
     for p in range(len(table)):
         end = np.uint64(table[p, 3] - first)
@@ -84,7 +84,7 @@ def _write_votes(table: Any, votes: Any, first: int, rows: Any, counts: Any, hig
 
 @numba.njit(cache=True, nogil=True)
 def _write_cells(table: Any, cells: Any, first: int, slots: Any, known: Any, marks: Any, words: Any) -> Any:
-    """Replace bitmaps and stamps of cells by numbers of words, and set bits of known cells; returns how many words."""
+    """Replace bitmaps and stamps by indices of words, and set the known bits; returns the number of words."""
     used, list_number = np.uint64(0), slots[_SLOTS]
     for p in range(len(table)):
         cells_of_page = range(np.uint64(table[p, 4] - first), np.uint64(table[p, 5] - first))
@@ -121,7 +121,7 @@ def _write_cells(table: Any, cells: Any, first: int, slots: Any, known: Any, mar
 
 @numba.njit(cache=True, nogil=True)
 def write_records(ends: Any, table: Any, votes: Any, cells: Any, out: Any, out_ends: Any) -> None:
-    """A record for each block. ends, out_ends (b,): of the pages of each block, and of its record."""
+    """One record for each block. ends, out_ends (b,): of its pages and its record."""
     slots, first, at = new_slots(), 0, 0
     for block in range(len(ends)):
         at = write_record(table[first : ends[block]], votes, cells, slots, out, at)

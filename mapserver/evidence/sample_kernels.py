@@ -1,4 +1,4 @@
-"""Samples before they are folded, compiled: where they lie, how their weight spreads, and what they vote for."""
+"""Samples before the fold (compiled): positions, spread of their weight, and votes."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ _G_TOP = (ev.GRADE_BINS - 1) * ev.SHARE_ONE
 _SECTOR_RAD, _SECTORS = 2 * np.pi / ev.SECTORS, ev.SECTORS
 _UNITS, _ONE = ev.WEIGHT_UNITS_PER_M, ev.SHARE_ONE
 _HASH = np.uint64(HASH)
-SIGMAS = 3.0  # that a position may be off
-MOST_STEP_M = 2.0  # that one sample counts as driven, whatever its stamp: agents make one every 0.5 m
-MOST_MPS = 30.0  # that a machine drives: what its stamps allow counts as driven, up to NEAR_M
-NEAR_M = 5.0  # what is so near is no jump, whatever the distance: wheels read 5 times a second, at 25 m/s
+SIGMAS = 3.0  # of a position's error
+MOST_STEP_M = 2.0  # metres per sample, whatever its stamp; agents send one every 0.5 m
+MOST_MPS = 30.0  # m/s that stamps allow, up to NEAR_M
+NEAR_M = 5.0  # metres that are no jump: wheels report at 5 Hz, up to 25 m/s
 _TABLE = TABLE.astype(np.uint32)
 
 
 @numba.njit(cache=True, nogil=True)
 def extent(rows: Any) -> tuple[int, int, float]:
-    """Oldest and newest stamp of rows, and how far they were driven [m]."""
+    """Oldest and newest stamp, and metres driven."""
     oldest_ns, newest_ns, driven_m = rows[0].stamp_ns, rows[0].stamp_ns, 0.0
     for k in range(len(rows)):
         oldest_ns = min(oldest_ns, rows[k].stamp_ns)
@@ -49,7 +49,7 @@ def extent(rows: Any) -> tuple[int, int, float]:
 
 @numba.njit(cache=True, nogil=True)
 def count_foldable(rows: Any, cap_m2: float) -> int:
-    """How many rows `is_foldable` lets vote."""
+    """Rows that vote by `is_foldable`."""
     count = 0
     for k in range(len(rows)):
         row = rows[k]
@@ -60,7 +60,7 @@ def count_foldable(rows: Any, cap_m2: float) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _largest(xx: float, xy: float, yy: float) -> float:
-    """Larger eigenvalue of a covariance."""
+    """Larger eigenvalue."""
     half = (xx - yy) / 2
     largest: float = (xx + yy) / 2 + np.sqrt(half * half + xy * xy)
     return largest
@@ -70,12 +70,11 @@ def _largest(xx: float, xy: float, yy: float) -> float:
 def locate(
     rows: Any, limits: tuple[float, float, float], bucket_ns: int, places: Any, stencils: Any, keys: Any, touching: Any
 ) -> tuple[int, int]:
-    """Where rows lie, and which blocks their stencils touch.
+    """Positions of rows and the blocks of their stencils.
 
-    limits: cell size [m], variance added to every position, largest variance of one that votes [m2]. Fills places
-    (n, 5): position in cells, inverse covariance xx, 2 xy, yy; and stencils (n, 3): first column and row, and edge in
-    cells, 0 where a row has no vote; keys and touching with keys and row numbers, one each for every block that a row
-    touches, as long as there is room. Returns how many of these, and the cells of all stencils together.
+    limits: cell [m], variance added to positions, largest that votes [m2]. Fills places (n, 5): position [cells],
+    inverse covariance xx, 2 xy, yy; stencils (n, 3): first column and row, edge [cells], 0 for no vote; keys, touching:
+    key and row per touched block, while they fit. Returns their number, and all stencils' area.
     """
     used, area = 0, 0
     for k in range(len(rows)):
@@ -99,7 +98,7 @@ def locate(
 
 @numba.njit(cache=True, nogil=True)
 def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
-    """Position and inverse covariance of one row in cells; returns its reach in cells, -1 where it has no vote."""
+    """Fill position and inverse covariance in cells; returns the reach, -1 for no vote."""
     cell_m, floor_m2, cap_m2 = limits
     cov_xx, cov_xy, cov_yy = np.float64(row.cov_xx_m2), np.float64(row.cov_xy_m2), np.float64(row.cov_yy_m2)
     if not _largest(cov_xx, cov_xy, cov_yy) <= cap_m2:
@@ -107,7 +106,7 @@ def _place(row: Any, limits: tuple[float, float, float], out: Any) -> int:
     per_m2 = 1 / (cell_m * cell_m)
     most = np.sqrt(cov_xx * cov_yy)
     xx, yy = (cov_xx + floor_m2) * per_m2, (cov_yy + floor_m2) * per_m2
-    xy = min(max(cov_xy, -most), most) * per_m2  # what rounding lets pass must not make the covariance indefinite
+    xy = min(max(cov_xy, -most), most) * per_m2  # rounding must not make the covariance indefinite
     scale = 1 / (xx * yy - xy * xy)
     out[0], out[1] = row.x_m / cell_m, row.y_m / cell_m
     out[2], out[3], out[4] = yy * scale, -2 * xy * scale, xx * scale
@@ -123,16 +122,15 @@ def survey(
     steps: Any,
     entered: Any,
 ) -> tuple[int, bool]:
-    """How far a machine drove, where it jumped, and into which blocks its rows vote where the row before did not.
+    """Metres and jumps of a machine, and blocks where its rows vote anew, also for new buckets.
 
-    A row of another time bucket votes anew. limits: as of `locate`. before: where the machine was, NaN where that is
-    not known, whether it had jumped there, and its stamp.
-    Fills steps (n, 2): metres until each row, and 1 where it jumped and had no vote since; and, as long as there is
-    room, entered: key of each block and number of the row. Returns how many of these, and whether it ends with a jump.
+    limits: of `locate`. before: last position (NaN: unknown), whether it jumped there, stamp. Fills steps (n, 2):
+    metres, and 1 from a jump to a vote; entered: block key and row, while they fit. Returns their number, and whether a
+    jump is open.
     """
     x, y, has_jumped, stamp_ns = before
     used, driven_m, place = 0, 0.0, np.empty(5)
-    west, east, south, north = 0, -1, 0, -1  # blocks of the last row that votes
+    west, east, south, north = 0, -1, 0, -1  # blocks of the last voting row
     for k in range(len(rows)):
         row = rows[k]
         distance_m, shift_m = np.float64(row.distance_m), np.hypot(row.x_m - x, row.y_m - y)
@@ -165,16 +163,16 @@ def survey(
 
 @numba.njit(cache=True, nogil=True)
 def block_key(x: int, y: int) -> int:
-    """One number for a block's column and row."""
+    """A block's column and row as one number."""
     return ((x + HALF) << BLOCK_BITS) | (y + HALF)
 
 
 @numba.njit(cache=True, nogil=True)
 def weigh(rows: Any, places: Any, stencils: Any, starts: Any, shares: Any) -> None:
-    """Spread the weight of each row over its stencil.
+    """Spread weights over stencils.
 
-    Fills shares with the stencils (edge, edge), one behind the other from starts (n,) on. The integer shares of a row
-    sum exactly to its weight: what rounding down leaves over goes to the middle.
+    Fills shares with stencils (edge, edge) from starts (n,). Integer shares sum exactly to a weight; the middle takes
+    the remainder.
     """
     used = 0
     for k in range(len(rows)):
@@ -197,7 +195,7 @@ def weigh(rows: Any, places: Any, stencils: Any, starts: Any, shares: Any) -> No
 
 @numba.njit(cache=True, nogil=True)
 def _weights(place: Any, stencil: Any, shares: Any, used: int) -> int:
-    """Fill a stencil with weights from the table; returns their sum."""
+    """Fill a stencil from the table; returns the sum."""
     n = stencil[2]
     total = 0
     first, px, xx = stencil[0] + 0.5, place[0], place[2]
@@ -205,7 +203,7 @@ def _weights(place: Any, stencil: Any, shares: Any, used: int) -> int:
         y = (stencil[1] + dy + 0.5) - place[1]
         b, c = place[3] * y, place[4] * y * y
         at = np.uint64(used + dy * n)
-        for dx in range(np.uint64(n)):  # unsigned: the compiler need not look for negative indices
+        for dx in range(np.uint64(n)):  # unsigned, to avoid checks for negative indices
             x = (first + np.float64(dx)) - px
             d2 = (xx * x + b) * x + c
             weight = _TABLE[np.uint32(min(d2 * TABLE_PER_UNIT, TABLE_LAST))]
@@ -216,12 +214,11 @@ def _weights(place: Any, stencil: Any, shares: Any, used: int) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def split(rows: Any, names: Any, bins: Any, shares: Any, bits: Any, stamps: Any) -> None:
-    """What rows vote for.
+    """Votes of rows; names (n,): hashes.
 
-    names (n,): hashes of machines. Fills bins (n, 4): of resistance, grade east and grade north, -1 for no vote, and
-    sector of the heading; shares (n, 5): of the bin above, in 1/256, the stated standard deviation of c_rr in 1/256 of
-    DOUBT_MOST, and the share of the place that came from lanes, in 1/256, rounded up; bits (n, 2): one of the visit and
-    one of the machine (a multiplicative hash takes the top six bits); stamps (n,).
+    Fills bins (n, 4): resistance, grade east, grade north (-1: no vote), heading sector; shares (n, 5) in 1/256: of the
+    bin above, then deviation of c_rr over DOUBT_MOST and share of the position from lanes, rounded up; bits (n, 2):
+    visit and machine, by the top six bits of a hash; stamps (n,).
     """
     for k in range(len(rows)):
         row = rows[k]
@@ -238,10 +235,10 @@ def split(rows: Any, names: Any, bins: Any, shares: Any, bits: Any, stamps: Any)
 
 @numba.njit(cache=True, nogil=True)
 def _split_resistance(c_rr: float) -> tuple[int, Any]:
-    """Lower bin and share of the bin above it, linear in log(c_rr); beyond the ends, the end bins; -1 for unknown."""
+    """Lower bin, and share of the bin above, linear in log(c_rr), clipped; -1 for unknown."""
     if np.isnan(c_rr):
         return -1, np.uint32(0)
-    place = int(min(max(np.log(max(c_rr, 1e-9)) * _R_PER_LOG + _R_OFFSET, 0.0), len(RESISTANCE_STEPS)))  # nearly
+    place = int(min(max(np.log(max(c_rr, 1e-9)) * _R_PER_LOG + _R_OFFSET, 0.0), len(RESISTANCE_STEPS)))  # first guess
     while place < len(RESISTANCE_STEPS) and RESISTANCE_STEPS[place] <= c_rr:
         place += 1
     while place > 0 and RESISTANCE_STEPS[place - 1] > c_rr:
@@ -252,13 +249,13 @@ def _split_resistance(c_rr: float) -> tuple[int, Any]:
 
 @numba.njit(cache=True, nogil=True)
 def _doubt(variance: float) -> Any:
-    """Standard deviation in 1/256 of DOUBT_MOST, rounded up, which it is at most; of no variance, all of it."""
+    """Deviation in 1/256 of DOUBT_MOST, rounded up and clipped; all of it without a variance."""
     return np.uint32(np.ceil(np.sqrt(variance) * _DOUBT_PER_UNIT) if variance < ev.DOUBT_MOST**2 else _ONE)
 
 
 @numba.njit(cache=True, nogil=True)
 def _split_grade(grade: float) -> tuple[int, Any]:
-    """Lower bin and share of the bin above it; beyond the ends, the end bins; -1 for unknown."""
+    """Lower bin, and share of the bin above, clipped; -1 for unknown."""
     if np.isnan(grade):
         return -1, np.uint32(0)
     place = int(min(max(np.rint((grade - GRADE_LOW) * GRADE_STEPS), 0), _G_TOP))

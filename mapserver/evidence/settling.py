@@ -1,4 +1,4 @@
-"""Records settled many blocks at a time: all of a block are summed, each cell's newest spans apart."""
+"""Settles the records of many blocks at once, keeping each cell's newest spans apart."""
 
 from __future__ import annotations
 
@@ -16,35 +16,36 @@ from mapserver.evidence.timeline_kernel import settle_blocks
 from protocol.arrays import Ints
 
 HOUR_S, DAY_S = 3600, 86_400
-MOST_BYTES = 1 << 20  # of records that are settled together: they stay in the processor's cache
-# Of a record, at least: bytes of a page, a cell of it, and a vote; and how many times as long their sum may become.
+MOST_BYTES = 1 << 20  # records settled together, to stay in the processor's cache
+# Lower bounds in bytes of a page, cell and vote; upper bound of growth.
 _PAGE, _CELL, _VOTE, _LONGER = 32, 4, 3, 7
 
 
 @dataclass(frozen=True)
 class Tiers:
-    """Spans of growing lengths [ns], of which the newest `keeps` of each cell stay apart; the last one has no end."""
+    """Spans of growing lengths [ns]; each cell keeps the newest `keeps` apart; the last has no end."""
 
     spans_ns: Ints
     keeps: Ints
 
     @classmethod
     def from_config(cls, config: FoldConfig) -> Tiers:
-        """Buckets, hours, days, and everything before them."""
+        """Buckets, hours, days, and all before."""
         spans = (config.bucket_ns, HOUR_S * 10**9, DAY_S * 10**9, 0)
         return cls(np.array(spans), np.array((config.keep_buckets, config.keep_hours, config.keep_days, 0)))
 
 
 class Space(Buffers):
-    """Where one thread settles blocks. counts: of one block, zero in between."""
+    """Working memory of one thread. counts: of one block, zero in between."""
 
     def __init__(self) -> None:
         super().__init__()
         self.counts = np.zeros(ev.COUNTS * ev.CELLS, np.uint64)
 
     def for_block(self, most: int) -> tuple[object, ...]:
-        """Scratch of `settle_blocks`, for blocks whose records have so many bytes at most."""
-        pages, votes, cells = most // _PAGE + 1, most // _VOTE + 1, most // _CELL + 1  # one more: kernels write ahead
+        """Scratch of `settle_blocks`, for records of at most these bytes in a block."""
+        # one more, because kernels write ahead
+        pages, votes, cells = most // _PAGE + 1, most // _VOTE + 1, most // _CELL + 1
         before = self.array("table", pages, np.int64, 6), self.array("votes", votes, np.uint64)
         after = self.array("out table", TIERS * pages, np.int64, 6), self.array("out votes", votes, np.uint64)
         cells_of_both = self.array("cells", cells, CELL), self.array("out cells", cells, CELL)
@@ -53,12 +54,11 @@ class Space(Buffers):
 
 
 def settled(blocks: Sequence[Sequence[Record]], tiers: Tiers, space: Space) -> list[Record]:
-    """One record of each block, its pages in the order of tier and index, for all that there are of it."""
+    """One record for each block, pages by tier and index."""
     return [record for some in _few(blocks) for record in _settled(some, tiers, space)]
 
 
 def _few(blocks: Sequence[Sequence[Record]]) -> Iterator[Sequence[Sequence[Record]]]:
-    """Cut blocks into pieces that are settled together."""
     first, size = 0, 0
     for i, records in enumerate(blocks):
         size += sum(map(len, records))

@@ -1,9 +1,8 @@
-"""The pages of one block by time: the newest buckets apart, older ones summed into hours, days and all before.
+"""The pages of one block by time: newest buckets apart, older ones summed into hours, days and all before.
 
-What is kept apart goes by rank, cell by cell, not by age: ground that is driven once a day keeps its last passes apart
-as well as the haul road beside it, and a cell never takes more than a fixed number of places. The newest buckets of
-a set do not depend on the order in which they came, and summing commutes, so that a timeline is a function of the
-samples alone. That is why it may be settled late, and why the timelines of two sets of samples merge into that of both.
+Each cell keeps by rank, not age: ground driven once a day keeps its last passes apart like a haul road, and memory is
+bounded. The newest buckets of a set do not depend on its order, and sums commute, so a timeline is a function of the
+samples. Hence it can be settled late and merged.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ from mapserver.evidence.record_kernels import ranks, sum_planes, sum_records, vo
 from mapserver.evidence.settling import Space, Tiers, settled
 from protocol.arrays import Ints
 
-PATIENCE = 24  # pages that wait before a timeline is settled: fewer cost time, more cost memory
+PATIENCE = 24  # waiting pages before a timeline is settled: fewer cost time, more memory
 Block = tuple[int, int]  # column and row
 
 
 @dataclass(frozen=True, slots=True)
 class TimedPage:
-    """A page, and the span of time that its samples lie in."""
+    """A page with the time span of its samples."""
 
     first_ns: int
     end_ns: int
@@ -36,11 +35,10 @@ class TimedPage:
 
 
 class TimedPages:
-    """Pages of one block in the order of time, as they were at one moment; expanded anew whenever they are read.
+    """Pages of one block by time, at one moment; expanded on each read.
 
-    A page of a coarser tier may begin before one of a finer tier ends: both have evidence of the same hour. In each
-    cell, the finer one is newer. derived: what readers found out about these pages, by what it depends on; as long as
-    nothing was folded into a block, its pages are this same object.
+    Pages of coarser and finer tiers may overlap; in each cell the finer is newer. derived: readers' cache, by what it
+    depends on. Until a block is folded again, its pages are the same object.
     """
 
     __slots__ = ("_tiers", "derived", "record")
@@ -58,19 +56,19 @@ class TimedPages:
         return (TimedPage(*_time_of(spans[tier], index, page), page) for tier, index, page in pages)
 
     def packed_votes(self) -> tuple[NDArray[np.uint64], Ints]:
-        """Votes as Pages has them, and where those of each page end."""
+        """Votes as in Pages, and the end of each page's."""
         votes, ends = np.empty(vote_count(self.record), np.uint64), np.zeros(len(self), np.int64)
         votes_in_time(as_numbers(self.record), votes, ends)
         return votes, ends
 
     def plane_counts(self, planes: slice) -> Ints:
-        """Counts (planes, 256) of some planes, of all pages together: quicker than all that there is of them."""
+        """Counts (planes, 256) of planes, over all pages; a shortcut."""
         out = np.zeros((planes.stop - planes.start, ev.CELLS), np.int64)
         sum_planes(as_numbers(self.record), planes.start, out)
         return out
 
     def older(self, count: int) -> TimedPages:
-        """The first pages alone."""
+        """The first pages."""
         pages = Pages.unpacked(self.record)
         kept = ranks(pages.table) < count
         lengths = pages.table[:, [3, 5]] - pages.table[:, [2, 4]]
@@ -84,9 +82,9 @@ NO_PAGES = TimedPages(EMPTY, Tiers.from_config(FoldConfig()))
 
 
 class Timeline:
-    """Evidence of one block: a record that is settled, those that came since, and how many pages of them wait.
+    """Evidence of one block: its settled record, later ones, and the number of waiting pages.
 
-    known: a bit for each cell with evidence. turn: of the grid, when it was added to last. timed: its pages, once read.
+    known: a bit for each cell with evidence. turn: of the last addition. timed: its pages, once read.
     """
 
     __slots__ = ("known", "records", "timed", "turn", "waiting")
@@ -98,10 +96,7 @@ class Timeline:
         self.timed: TimedPages | None = None
 
     def add(self, record: Record) -> int:
-        """Add evidence of any tiers and spans, also of those that are there; returns how many cells are new.
-
-        It waits to be settled; see `settle_all`.
-        """
+        """Add evidence of any tiers and spans; returns the number of new cells. It waits for `settle_all`."""
         self.records.append(record)
         self.waiting += page_count(record)
         before = self.known
@@ -110,9 +105,9 @@ class Timeline:
 
 
 def settle_all(timelines: Iterable[Timeline], tiers: Tiers, space: Space, least: int = 1) -> None:
-    """Settle those timelines on which at least so many pages wait: quicker than one by one."""
+    """Settle timelines with at least so many waiting pages, together for speed."""
     some = [timeline for timeline in timelines if timeline.waiting >= least]
-    keep = int(tiers.keeps[0])  # buckets: so few pages of one record, each of another span, are all kept apart
+    keep = int(tiers.keeps[0])  # a single record with no more pages keeps all apart
     sums = [timeline for timeline in some if len(timeline.records) > 1 or page_count(timeline.records[0]) > keep]
     for timeline, record in zip(sums, settled([timeline.records for timeline in sums], tiers, space), strict=True):
         timeline.records = [record]
@@ -121,7 +116,7 @@ def settle_all(timelines: Iterable[Timeline], tiers: Tiers, space: Space, least:
 
 
 def timed(timelines: Iterable[Timeline | None], tiers: Tiers, space: Space) -> list[TimedPages]:
-    """Pages of blocks in the order of time, none of one without evidence; the same object until something is added."""
+    """Pages of blocks by time, empty without evidence; the same object until something is added."""
     lines = list(timelines)
     settle_all(filter(None, lines), tiers, space)
     for line in lines:
@@ -131,14 +126,14 @@ def timed(timelines: Iterable[Timeline | None], tiers: Tiers, space: Space) -> l
 
 
 def _time_of(span_ns: int, index: int, page: Page) -> tuple[int, int]:
-    """First and end time of a page; before all spans, it ends with its newest sample."""
+    """The last tier ends with its newest sample."""
     return index * span_ns, (index + 1) * span_ns if span_ns else int(page.cells["newest_ns"].max()) + 1
 
 
 def evidence(pages: Sequence[TimedPages], first: Sequence[Ints] | None = None) -> ev.Evidence:
-    """Sum the pages of blocks, in the order of time.
+    """Sum the pages of blocks by time.
 
-    first: for each block, index (256,) of the first page that counts in each of its cells; without it all pages count.
+    first: by block, index (256,) of the first page that counts in each cell; None for all pages.
     """
     records = [each.record for each in pages]
     counts = np.zeros((len(pages), ev.CELLS, ev.COUNTS), np.uint64)
@@ -154,7 +149,7 @@ def evidence(pages: Sequence[TimedPages], first: Sequence[Ints] | None = None) -
 
 
 def _changed_ns(pages: TimedPages, start: Ints) -> Ints:
-    """When each cell (256,) changed, 0 where it did not: after its last old sample, and within the first new span."""
+    """Change of each cell (256,), 0 for none: after its last old sample, in the first new span."""
     changed_ns = np.zeros(ev.CELLS, np.int64)
     for index, timed in enumerate(pages):
         begins = start == index

@@ -1,4 +1,4 @@
-"""Timelines compiled: all records of a block at once into one, of the pages that are kept apart."""
+"""Settles timelines (compiled): all records of a block into one."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ from mapserver.evidence.record_kernels import read_record
 from mapserver.evidence.record_writing import new_slots, write_record
 
 _INDEX_BITS = 40  # of a span, below its tier
-# Indices of long loops are unsigned: the compiler then need not look for negative ones, which count from the end.
+# unsigned indices avoid checks for negative ones
 
 
 @numba.njit(cache=True, nogil=True)
 def settle_blocks(
     ends: Any, starts: Any, data: Any, spans: Any, keeps: Any, scratch: Any, out: Any, out_ends: Any
 ) -> None:
-    """Sum the records of blocks, so that each cell keeps its newest spans of each tier apart.
+    """Settle blocks; each cell keeps its newest spans of each tier apart.
 
-    ends (b,): of the records of each block; starts (r,): where each begins in data. spans, keeps: length [ns] and
-    number of the spans of each tier; the last tier is everything before, its span 0. scratch: for the pages of one
-    block, tables, votes and cells before and after, an int8 for each cell before, and counts (COUNTS * 256,) uint64,
-    zero before and after. Fills a record of each block, and where they end.
+    ends (b,): of each block's records; starts (r,): of records. spans, keeps: length [ns] and number by tier; the last
+    has span 0. scratch, for one block: tables, votes, cells before and after, an int8 per cell before, counts (COUNTS *
+    256,) uint64, zero before and after. Fills records and ends.
     """
     before, after, tiers, counts = scratch
     table, votes, cells = before
@@ -41,13 +40,13 @@ def settle_blocks(
 
 @numba.njit(cache=True, nogil=True)
 def _settle(table: Any, votes: Any, cells: Any, spans: Any, keeps: Any, counts: Any, tiers: Any, after: Any) -> int:
-    """Write the pages of one block to tables, votes and cells `after`, in the order of tier and index; how many."""
+    """Write a block's pages to `after`, by tier and index; returns their number."""
     out_table, out_votes, out_cells = after
     pages, used, filled = 0, 0, 0
     indices = _indices(table, spans)
     _find_tiers(table, indices, cells, keeps, tiers)
     held = _held(table, tiers, len(spans))
-    spread = held.sum(axis=1) > 1  # pages whose cells are on several tiers
+    spread = held.sum(axis=1) > 1  # pages with cells on several tiers
     wanted: Any = np.zeros(CELLS, np.bool_)
     planes = np.zeros(COUNTS, np.bool_)
     visits, machines, newest = np.zeros(CELLS, np.uint64), np.zeros(CELLS, np.uint64), np.zeros(CELLS, np.int64)
@@ -79,7 +78,7 @@ def _add(
     page: Any, tier: int, tiers: Any, votes: Any, cells: Any, wanted: Any,
     counts: Any, planes: Any, visits: Any, machines: Any, newest: Any, all_wanted: Any,
 ) -> None:  # fmt: skip
-    """Add the cells of a page that are on a tier, and their votes; all_wanted: whether those are all of its cells."""
+    """Add a page's cells of one tier, and their votes; all_wanted: these are all of its cells."""
     for j in range(np.uint64(page[4]), np.uint64(page[5])):
         cell = np.uint64(cells[j].cell)
         wanted[cell] = tiers[j] == tier
@@ -102,7 +101,7 @@ def _add(
 
 @numba.njit(cache=True, nogil=True)
 def _indices(table: Any, spans: Any) -> Any:
-    """Index (n, tiers) of the span that a page lies in on each tier, -1 on tiers finer than its own."""
+    """Index (n, tiers) of each page's span by tier, -1 on finer tiers than its own."""
     indices = np.full((len(table), len(spans)), -1, np.int64)
     for p in range(len(table)):
         tier = table[p, 0]
@@ -115,7 +114,7 @@ def _indices(table: Any, spans: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _find_tiers(table: Any, indices: Any, cells: Any, keeps: Any, tiers: Any) -> None:
-    """Tier of each cell of each page: cell by cell, what is older than the newest spans of a tier is handed on."""
+    """Tier of each page's cells: beyond a tier's newest spans, cells move to the next."""
     for p in range(len(table)):
         tiers[table[p, 4] : table[p, 5]] = table[p, 0]
     kept, last = np.empty(CELLS, np.int64), np.empty(CELLS, np.int64)
@@ -137,7 +136,7 @@ def _find_tiers(table: Any, indices: Any, cells: Any, keeps: Any, tiers: Any) ->
 
 @numba.njit(cache=True, nogil=True)
 def _held(table: Any, tiers: Any, count: int) -> Any:
-    """Whether a page has cells on each tier (n, count)."""
+    """Which tiers each page has cells on (n, count)."""
     held = np.zeros((len(table), count), np.bool_)
     for p in range(len(table)):
         for j in range(np.uint64(table[p, 4]), np.uint64(table[p, 5])):
@@ -147,7 +146,7 @@ def _held(table: Any, tiers: Any, count: int) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _keys(indices: Any, held: Any) -> Any:
-    """Tier and index of the pages that there will be, in order."""
+    """Tier and index of the resulting pages, sorted."""
     keys, used = np.empty(held.size, np.int64), 0
     for p in range(len(held)):
         for tier in range(held.shape[1]):
@@ -167,7 +166,7 @@ def _copy(source: Any, first: int, end: int, out: Any, used: int) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _emit_votes(counts: Any, planes: Any, newest: Any, out: Any, used: int) -> Any:
-    """Move counts to votes in the order of their places, saturated; returns where they end."""
+    """Move counts to votes by place, saturated; returns their end."""
     low, high = 0, CELLS
     while not newest[low]:
         low += 1
@@ -188,7 +187,7 @@ def _emit_votes(counts: Any, planes: Any, newest: Any, out: Any, used: int) -> A
 
 @numba.njit(cache=True, nogil=True)
 def _emit_cells(visits: Any, machines: Any, newest: Any, out: Any, used: int) -> int:
-    """Move bitmaps and stamps to cells in the order of their numbers; returns where they end."""
+    """Move bitmaps and stamps to cells by number; returns their end."""
     for i in range(CELLS):
         if newest[i]:
             out[used].cell, out[used].newest_ns = i, newest[i]

@@ -1,4 +1,4 @@
-"""Who folds: the thread that owns a grid, or several that an edge lends it for a long fold."""
+"""Workers of a fold: the owner of a grid, or several threads lent for a long one."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Workers:
-    """map: as the built-in, and may work on `count` elements at the same time, as that of a pool of threads does."""
+    """map: like the built-in, for `count` elements at a time, such as a thread pool's."""
 
     count: int = 1
     map: Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]] = map
 
     def each(self, work: Callable[[int], None]) -> None:
-        """Have `work` done once by each, which is handed its number; returns when all are done."""
+        """Run `work` once per worker, with its number, and wait."""
         for _ in self.map(work, range(self.count)):
             pass
 
