@@ -1,1 +1,1 @@
-"""Followers: processes that read the journal of a site and answer queries of its map."""
+"""Followers: processes that read a site's journal and answer map queries."""

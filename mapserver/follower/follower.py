@@ -1,6 +1,6 @@
-"""A follower's edge to Zenoh, and its map as queries are answered from it (`FollowerSource`).
+"""A follower's edge to Zenoh and its source of answers.
 
-It answers map queries under its own name, and shows a token while its map is of now.
+It answers under its own name, and shows a token while its map is current.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from protocol.site.site_config import SiteConfig
 from protocol.wire import keys
 from protocol.wire.owners import ANSWER_S, EVERY_OTHER, Owner, encode_owner, owner_of, this_process
 
-LOOK_S = 2.0  # between two looks for another follower of the same name
-HANGS_S = 30.0  # without a look at the journal, which takes place every second
+LOOK_S = 2.0  # between looks for another follower of this name
+HANGS_S = 30.0  # without a look at the journal, normally every second
 T = TypeVar("T")
 
 
 class Follower:
-    """Serves queries of one site from a journal, over an open session, until closed. Call `tend` twice a second."""
+    """Answers queries of one site from a journal. Call `tend` twice a second."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class Follower:
         config: ServerConfig,
         now_ns: Callable[[], int],
     ) -> None:
-        """LinkError where another follower has this name."""
+        """LinkError if the name is taken."""
         self._session, self._owner, self._key = session, this_process(), keys.follower_owner(site.name, name)
         self._token_key = keys.follower_alive(site.name, name)
         self._token: zenoh.LivelinessToken | None = None
@@ -62,7 +62,7 @@ class Follower:
         self.following = Following(journal, site, config)
         self.source = FollowerSource(name, self.following, now_ns)
         self.answers = Answers(self.source)
-        # Declared before anybody is asked: of two that start at once, one at least hears the other.
+        # declared before asking: of two starting at once, one hears the other
         self._identity = session.declare_queryable(self._key, self._on_owner)
         others = (owner_of(reply) for reply in session.get(self._key, timeout=ANSWER_S, **EVERY_OTHER))
         self._rivals = {owner for owner in others if owner}
@@ -81,13 +81,13 @@ class Follower:
 
     @property
     def ended(self) -> str:
-        """Why it cannot go on, empty while it can; the process should end."""
+        """Why it must end, or ""."""
         if earlier := [owner for owner in self._rivals if owner < self._owner]:
             return f"another follower has this name, {min(earlier)}"
         return self.following.ended
 
     def tend(self) -> None:
-        """Show the token while the map is of now, and look for others of this name."""
+        """Show the token while the map is current; look for others of this name."""
         _, behind_s = self.following.behind()
         if behind_s <= SHOWN_S and not self._token:
             self._token = self._session.liveliness().declare_token(self._token_key)
@@ -99,7 +99,7 @@ class Follower:
             self._session.get(self._key, self._on_other, timeout=ANSWER_S, **EVERY_OTHER)
 
     def close(self) -> None:
-        """Take no more queries, and end what is in work."""
+        """Take no more queries; finish present ones."""
         self._hide()
         self._queries.stop()
         self.following.stop()
@@ -123,7 +123,7 @@ class Follower:
 
 
 class FollowerSource:
-    """See `MapSource`. Only the server knows what its audit and its solver found: it is asked for that."""
+    """See `MapSource`. Only the server has the audit's and solver's results."""
 
     def __init__(self, name: str, following: Following, now_ns: Callable[[], int]) -> None:
         self.name, self._following, self._now_ns = name, following, now_ns
@@ -142,20 +142,20 @@ class FollowerSource:
         return self._following.run(work)
 
     def changes(self, after: int) -> list[GroundChange]:
-        """Those that the server has found, and the follower has read."""
+        """Changes read from the journal."""
         known = self.run(lambda replica: sorted(replica.changes.items()))
         return [change for number, change in known if number > after]
 
     def machines(self) -> list[dict[str, Any]]:
-        """Not here."""
+        """Not available."""
         _only_at_the_server("what the audit of machines found")
 
     def calibration(self) -> CalibrationAnswer:
-        """Not here."""
+        """Not available."""
         _only_at_the_server("what is known of calibrations")
 
     def info(self) -> dict[str, Any]:
-        """As the server's, of this process; what the journal alone tells is read from it."""
+        """As the server's, of this process."""
         now_ns, past = self._now_ns(), self.past
 
         def described(replica: Replica) -> tuple[dict[str, Any], int, Facts]:
@@ -176,7 +176,7 @@ class FollowerSource:
             counters = dict(self._counts)
         return info | {
             "epoch": epoch,
-            "replica": "unknown",  # the server knows
+            "replica": "unknown",  # known to the server
             "descends": list(identity.descends),
             "accepted": sorted(accepted),
             "decided": decided,
@@ -188,7 +188,7 @@ class FollowerSource:
         }
 
     def alive(self) -> ServerAlive:
-        """Whether the journal is looked at; QueryError where it has not been for long."""
+        """Whether the journal is read; QueryError if not for long."""
         store, merged = self.run(lambda replica: (replica.version.store, replica.merged))
         _, behind_s = self._following.behind()
         if behind_s > HANGS_S:
@@ -197,14 +197,14 @@ class FollowerSource:
         return ServerAlive(store, self._following.journalled, merged, 0.0)
 
     def origin(self) -> Origin:
-        """Who answers is this follower; QueryError while it has no map."""
+        """Names this follower; QueryError without a map."""
         rows, seconds = self._following.behind()
         if seconds == float("inf"):
             raise QueryError(Refusal.NOT_HERE, "this follower has no map yet; ask the map server")
         return Origin(self.name, rows, round(seconds, 3))
 
     def count(self, what: str) -> None:
-        """Count what became of a query."""
+        """Count a query's outcome."""
         with self._lock:
             self._counts[what] += 1
 

@@ -1,1 +1,1 @@
-"""From a batch's bytes to the journal and the grid: admission, the store, and the thread that owns it."""
+"""From a batch's bytes to journal and grid: admission, the store, and its thread."""

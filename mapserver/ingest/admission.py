@@ -1,4 +1,4 @@
-"""What may enter the journal: the rules of identity, as a pure function."""
+"""What may enter the journal: the rules of identity, as pure functions."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from protocol.wire import keys
 from protocol.wire.messages import SampleBatch
 
 Verify = Callable[[str, str, bytes, bytes], None]  # machine, key expression, payload, signature
-FUTURE_NS = DAY_NS  # clocks that nobody set to the right zone or day are less wrong than that
-FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01: a server's clock before this program was written is wrong
+FUTURE_NS = DAY_NS  # clocks set to the wrong zone or day are less wrong
+FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01: an earlier server clock is wrong
 
 
 class GapError(MessageError):
-    """A batch starts beyond the next sample that the server expects, and does not say that those before are lost."""
+    """A batch starts beyond the next expected sample and does not declare those before as lost."""
 
     def __init__(self, first_seq: int, expected: int) -> None:
         problem = f"{first_seq}: sample {expected} is expected next; send from there, or say lost_before"
@@ -28,10 +28,10 @@ class GapError(MessageError):
 
 @dataclass(frozen=True)
 class SeenTime:
-    """What a store has seen of time, beside the server's clock.
+    """Times known to a store besides the server's clock.
 
-    others_ns, newest_ns: newest stamp of the trusted machines but the sender, and of all. received_ns: the server's
-    clock when the last row came in. 0 for none.
+    others_ns, newest_ns: newest stamp of the other trusted machines, and of all. received_ns: the server's clock at the
+    last row. 0 for none.
     """
 
     others_ns: int = 0
@@ -40,7 +40,7 @@ class SeenTime:
 
 
 def nothing_seen(_: str) -> SeenTime:
-    """What a new store has seen."""
+    """A new store's times."""
     return SeenTime()
 
 
@@ -51,9 +51,9 @@ def judge_batch(
     now_ns: Callable[[], int],
     seen: Callable[[str], SeenTime] = nothing_seen,
 ) -> None:
-    """Judge a decoded batch that came in under the key of `machine`; MessageError says what is wrong with it.
+    """Check a decoded batch that came under the key of `machine`; MessageError names the fault.
 
-    seen: of a sender; it is asked for batches from the future alone.
+    seen: of a sender; only asked about batches from the future.
     """
     if batch.machine != machine:
         problem = f"{batch.machine!r} sends under the key of {machine!r}"
@@ -66,13 +66,13 @@ def judge_batch(
 
 
 def _check_newest(batch: SampleBatch, site: SiteConfig, now_ns: int, seen: Callable[[str], SeenTime]) -> None:
-    """Refuse stamps that shift the site's now: one sample of the year 2099 would make all others old."""
+    """Refuse stamps that move the site's now: one sample of 2099 would make all others old."""
     row = int(batch.rows["stamp_ns"].argmax())
     stamp_ns = int(batch.rows["stamp_ns"][row])
     ahead_ns = stamp_ns - now_ns
     if ahead_ns > FUTURE_NS and stamp_ns - (time := seen(batch.machine)).others_ns > FUTURE_NS:
         behind_ns = max(FIRST_NS, time.received_ns, time.newest_ns - FUTURE_NS) - now_ns
-        if behind_ns > 0:  # nothing can be said of a sample by such a clock
+        if behind_ns > 0:  # such a clock says nothing about samples
             problem = (
                 f"the server's clock is {_days(ahead_ns)} behind this sample, and {_days(behind_ns)} behind what its"
             )
@@ -90,9 +90,9 @@ def _days(span_ns: int) -> str:
 
 
 def check_store(batch: SampleBatch, identity: StoreIdentity, accepted: Collection[str]) -> str:
-    """The store that this one replaces for a batch, empty where it need not; MessageError where it may not.
+    """The id of the store that this one replaces for a batch, or ""; MessageError if it may not.
 
-    accepted: ids of the stores whose place a person has let this one take.
+    accepted: ids of stores that a person let this one replace.
     """
     if batch.store in ("", identity.id):
         return ""
@@ -104,7 +104,7 @@ def check_store(batch: SampleBatch, identity: StoreIdentity, accepted: Collectio
 
 
 def signature_problem(verify: Verify, site: str, machine: str, payload: bytes, signature: bytes) -> MessageError | None:
-    """What is wrong with the signature of a batch that came in under the key of `machine`, None where nothing is."""
+    """What is wrong with a batch's signature, or None. machine: of its key."""
     if not machine:
         return MessageError(Refusal.WRONG_MACHINE, "the key names no machine")
     try:
@@ -115,9 +115,9 @@ def signature_problem(verify: Verify, site: str, machine: str, payload: bytes, s
 
 
 def admit(batch: SampleBatch, watermark: int) -> Admission:
-    """Trim what is at or below the watermark; GapError if samples between it and the batch are missing.
+    """Drop samples up to the watermark; GapError if samples before the batch are missing.
 
-    An empty batch asks for the watermark, and may declare samples lost that no later ones follow; it is never a gap.
+    An empty batch asks for the watermark and may declare losses at the end; it is never a gap.
     """
     expected = watermark + 1
     missing = batch.first_seq - expected

@@ -1,8 +1,7 @@
-"""Batches that wait to be committed: bounded in bytes, taken in turn by machine. No threads, no clock.
+"""Batches that wait for a commit: limited in bytes, served in turn by machine. No threads, no clock.
 
-Machines send one batch at a time, but all of them have a backlog after the server was away. Where there is no room, the
-machine with the most bytes waiting gives way, with its newest batch: what is live passes what is late, and one machine
-never keeps another out.
+A machine sends one batch at a time, but after an outage all machines catch up. When full, the machine with most bytes
+loses its newest batch: live data passes late data, and no machine blocks another.
 """
 
 from __future__ import annotations
@@ -13,35 +12,35 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-QUEUE_BYTES = 64 * 2**20  # that wait at most: half a minute of the fullest queue's work is not worth more memory
-BATCH_BYTES = 1024  # of a batch beside its payload: the query that waits for its answer
-GROUP_BATCHES = 256  # committed together at most: one sync to disk for all of them
-GROUP_BYTES = 4 * 2**20  # likewise, but never less than one batch; the others wait 0.1 s for so many samples
-FIRST_BYTES_PER_S = 4 * 2**20  # assumed until some were worked off
-PACE_WEIGHT = 0.1  # of the last group in the mean
+QUEUE_BYTES = 64 * 2**20  # waiting bytes, half a minute of work; more is not worth the memory
+BATCH_BYTES = 1024  # of a batch besides its payload: the query that waits for a reply
+GROUP_BATCHES = 256  # per commit, which costs one sync
+GROUP_BYTES = 4 * 2**20  # per commit, one batch at least; this many samples take 0.1 s
+FIRST_BYTES_PER_S = 4 * 2**20  # until measured
+PACE_WEIGHT = 0.1  # of the newest group in the running mean
 MOST_RETRY_S = 30.0
 
 
 def size_of(payload: bytes) -> int:
-    """What a batch takes while it waits."""
+    """Bytes of a waiting batch."""
     return len(payload) + BATCH_BYTES
 
 
 @dataclass
 class _Lane(Generic[T]):
-    """What one machine has waiting: size and batch of each."""
+    """A machine's waiting batches, with sizes."""
 
     batches: deque[tuple[int, T]] = field(default_factory=deque)
     size: int = 0
 
 
 class Backlog(Generic[T]):
-    """Batches of all machines."""
+    """Waiting batches of all machines."""
 
     def __init__(self, limit: int = QUEUE_BYTES) -> None:
         """limit: bytes that may wait."""
         self._limit = limit
-        self._lanes: OrderedDict[str, _Lane[T]] = OrderedDict()  # whose turn it is comes first
+        self._lanes: OrderedDict[str, _Lane[T]] = OrderedDict()  # the next in turn first
         self._count = 0
         self.size = 0
 
@@ -49,7 +48,7 @@ class Backlog(Generic[T]):
         return self._count
 
     def add(self, machine: str, size: int, batch: T) -> list[T]:
-        """Let a batch wait; returns those that have to give way for it, or itself if there is no room for it."""
+        """Queue a batch; returns the batches dropped for it, or the batch itself if there is no room."""
         gone: list[T] = []
         while self.size + size > self._limit:
             largest = max(self._lanes, key=lambda name: self._lanes[name].size, default=machine)
@@ -64,7 +63,7 @@ class Backlog(Generic[T]):
         return gone
 
     def take(self) -> list[T]:
-        """The next group: one batch of each machine in turn, each machine's own in their order."""
+        """The next group: one batch of each machine in turn, in its order."""
         group: list[T] = []
         taken = 0
         while self._lanes and len(group) < GROUP_BATCHES:
@@ -88,15 +87,15 @@ class Backlog(Generic[T]):
 
 
 class WorkRate:
-    """How fast batches are worked off, which tells when there will be room again."""
+    """Throughput, which says when there will be room."""
 
     def __init__(self) -> None:
         self._bytes_per_s = float(FIRST_BYTES_PER_S)
 
     def worked(self, size: int, seconds: float) -> None:
-        """Learn from a group of so many bytes."""
+        """Update with a finished group."""
         self._bytes_per_s += PACE_WEIGHT * (size / max(seconds, 1e-6) - self._bytes_per_s)
 
     def retry_after_s(self, size: int) -> float:
-        """How long so many bytes take that wait already."""
+        """Time until so many waiting bytes are done."""
         return min(size / self._bytes_per_s, MOST_RETRY_S)

@@ -1,6 +1,6 @@
-"""Batches of one commit decoded together: one pass over the samples of all of them.
+"""Decodes the batches of one commit together, in one pass over all samples.
 
-What is refused, and why, is what `protocol.wire.codec.decode_batch` says of each batch by itself.
+Refusals and reasons equal those of `protocol.wire.codec.decode_batch`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from protocol.machine.samples import COLUMNS, LIMITS, NAN_ALLOWED, SAMPLE_DTYPE,
 from protocol.wire.codec import unpack_batch
 from protocol.wire.messages import PackedBatch, SampleBatch
 
-# The rows as 32-bit words: a stamp and two coordinates of two words each, then single-precision numbers.
+# Rows as 32-bit words: a stamp and two coordinates of two words each, then float32.
 _WORD = np.dtype("<u4")
 _WIDTHS = np.array([SAMPLE_DTYPE[name].itemsize // _WORD.itemsize for name in COLUMNS])
 _WORDS = int(_WIDTHS.sum())
@@ -28,15 +28,15 @@ _FIRST_SINGLE = _WORDS - len(_SINGLE)
 _LOW, _HIGH = (np.array([LIMITS[name][end] for name in _SINGLE], np.float32) for end in (0, 1))
 _FIRST_NS, _LAST_NS = LIMITS["stamp_ns"]
 _XX, _XY, _YY = (_FIRST_SINGLE + _SINGLE.index(name) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
-# Bits of the columns that may be NaN, each group only together.
+# Bit sets of columns that may be NaN, only as a group.
 _NAN_GROUPS = tuple(sum(1 << _SINGLE.index(name) for name in names) for names in NAN_ALLOWED)
 _NAN_ALLOWED = sum(_NAN_GROUPS)
 
 
 def decode_batches(payloads: Sequence[bytes], extent_m: float) -> list[SampleBatch | MessageError]:
-    """Decode and check batches; for each what it holds, or what is wrong with it. Their rows lie in one table.
+    """Decode and check batches; returns each one, or its error. Their rows share one table.
 
-    extent_m: how far from the origin a position may lie.
+    extent_m: largest distance of a position from the origin.
     """
     unpacked = [_unpack(payload) for payload in payloads]
     packed = [batch for batch in unpacked if isinstance(batch, PackedBatch)]
@@ -50,7 +50,7 @@ def decode_batches(payloads: Sequence[bytes], extent_m: float) -> list[SampleBat
 
 
 def warm_up() -> None:
-    """Compile the kernels, or read them from their cache, before a batch waits for them."""
+    """Compile the kernels, or load them, before a batch waits for them."""
     columns = tuple(bytes(SAMPLE_DTYPE[name].itemsize) for name in COLUMNS)
     one = PackedBatch(SampleBatch("", 1, 1, empty(), ""), 1, columns)
     _decode([one], 1.0)
@@ -64,7 +64,7 @@ def _unpack(payload: bytes) -> PackedBatch | MessageError:
 
 
 def _decode(packed: Sequence[PackedBatch], extent_m: float) -> tuple[Table, list[bool]]:
-    """Rows of all batches, and for each batch whether its rows are plausible."""
+    """Rows of all batches, and which batches are plausible."""
     lengths = np.array([batch.n for batch in packed], np.int64)
     columns = b"".join(chain.from_iterable(batch.columns for batch in packed))
     words: AnyArray = np.empty((int(lengths.sum()), _WORDS), _WORD)
@@ -78,7 +78,7 @@ def _decode(packed: Sequence[PackedBatch], extent_m: float) -> tuple[Table, list
 def _batch(batch: PackedBatch, rows: Table, extent_m: float, is_plausible: bool) -> SampleBatch | MessageError:  # noqa: FBT001
     if not is_plausible:
         try:
-            check_samples(rows, extent_m)  # which names field and row
+            check_samples(rows, extent_m)  # names field and row
         except MessageError as error:
             return error
     return replace(batch.batch, rows=rows)
@@ -86,7 +86,7 @@ def _batch(batch: PackedBatch, rows: Table, extent_m: float, is_plausible: bool)
 
 @numba.njit(cache=True, nogil=True)
 def _interleave(columns: Any, lengths: Any, out: Any) -> None:
-    """Make rows (n, words) of the columns of batches, which lie one behind the other."""
+    """Transpose the columns of consecutive batches to rows (n, words)."""
     at, first = 0, 0
     for n in lengths:
         word = 0
@@ -101,7 +101,7 @@ def _interleave(columns: Any, lengths: Any, out: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _judge(rows: Any, singles: Floats32, lengths: Any, extent_m: float, plausible: Any) -> None:
-    """Whether all rows of each batch pass `check_samples`; singles: the same rows, their words as float32."""
+    """Whether each batch passes `check_samples`; singles: the same rows as float32."""
     k = 0
     for batch in range(len(lengths)):
         plausible[batch] = True

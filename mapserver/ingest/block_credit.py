@@ -1,9 +1,9 @@
 """Credit for ground: a machine may open as much of the map as it has driven for. No files, no clock.
 
-A block costs memory for as long as the map lives, and a sample of 80 bytes opens up to four: scattered over a site,
-each would cost 7 kB. So would one on ground that others have opened: its block gets one more page for the time bucket.
-What is refused is never journalled, so the map stays a function of the journal. Credit is not kept: after a start of
-the server each machine has that of a new one (docs/decisions/0011-credit-for-new-ground.md).
+A block costs memory for the map's life, and one sample of 80 bytes opens up to four: scattered ones would cost 7 kB
+each. On opened ground each adds a page for its bucket. Refused samples are never journalled, so the map stays a
+function of the journal. Credit is not stored: after a restart all machines count as new
+(docs/decisions/0011-credit-for-new-ground.md).
 """
 
 from __future__ import annotations
@@ -24,19 +24,18 @@ from protocol.errors import MessageError, Refusal
 from protocol.machine.samples import empty
 from protocol.site.geometry import BLOCK_CELLS
 
-JUMPS = 50  # to new ground, each of as many blocks as a sample can open: 200 blocks with cells of 1 m
-JUMP_M = 200.0  # driven for each further one
-PAGES, FIRST_PAGES = 4000.0, 500.0  # blocks of opened ground, each of up to 11 kB: at most, and of a new machine
-STAY_S = 30.0  # of the server's clock for as many pages as a sample needs: a machine that stays has one bucket in 300 s
-# Of the credit of a new machine, what the next one has less, and what all have more in a minute: names are free where
-# there are no keys.
+JUMPS = 50  # jumps to new ground, each of the blocks a sample can open: 200 blocks with 1 m cells
+JUMP_M = 200.0  # metres driven per further jump
+PAGES, FIRST_PAGES = 4000.0, 500.0  # blocks of opened ground, up to 11 kB each: limit, and of a new machine
+STAY_S = 30.0  # server seconds that earn a sample's pages: standing, a machine has one bucket in 300 s
+# Share of a newcomer's credit that the next one lacks, and that a minute restores: without keys, names are free.
 NEWCOMER = 1 / 64
 MOST_ACCOUNTS = 4096
-MOST_PAIRS = 2048  # of blocks and buckets that are remembered of a machine: 300 s at 25 m/s over new ground enter 1400
+MOST_PAIRS = 2048  # blocks times buckets remembered of a machine; 300 s at 25 m/s on new ground enter 1400
 
 
 class Credit(NamedTuple):
-    """Blocks that a machine may enter: by jumps and as it drives on; pages: of ground that is opened."""
+    """Blocks a machine may enter: by jumps, by driving; pages: on opened ground."""
 
     jumps: float
     driven: float
@@ -45,10 +44,7 @@ class Credit(NamedTuple):
 
 @dataclass(frozen=True)
 class Account:
-    """What a machine has, where it is, whether it has jumped there, and which blocks it entered in which time bucket.
-
-    seen_ns: when the server heard of it last.
-    """
+    """A machine's credit, position, and the blocks entered, by bucket. seen_ns: server time of its last batch."""
 
     credit: Credit
     seen_ns: int
@@ -60,16 +56,16 @@ class Account:
 
 
 class BlockCredit:
-    """The accounts of all machines. opened: keys of the blocks that are open.
+    """The accounts of all machines. opened: keys of open blocks.
 
-    most: credit of either kind [blocks]. per_m, jumps_per_m: that a metre earns.
+    most: limit of jumps and driven [blocks]. per_m, jumps_per_m: earned per metre.
     """
 
     def __init__(self, cell_m: float, config: FoldConfig, opened: Iterable[Block]) -> None:
         self.opened, self._accounts = {block_key(*block) for block in opened}, dict[str, Account]()
         self._limits, self._entered = (cell_m, STD_FLOOR_M**2, config.std_cap_m**2), np.empty((1, 2), np.int64)
-        # What moves over new ground is a square, as wide as a sample's votes and what positions are off to either side.
-        # At 45 degrees it meets sqrt(2) times as many blocks as along an axis.
+        # A square moves over new ground, as wide as a sample's votes plus position errors on both sides. At 45 degrees
+        # it meets sqrt(2) times as many blocks.
         std = math.hypot(config.std_cap_m, STD_FLOOR_M) / cell_m
         edge = 2 * math.ceil(2 * std) + 1
         swept = BLOCK_CELLS + edge - 1 + 2 * SIGMAS * std
@@ -80,11 +76,10 @@ class BlockCredit:
         self._newcomers, self._newcomer_ns = 1.0, 0
 
     def spend(self, machine: str, rows: Table, trimmed: int = 0, now_ns: int = 0) -> None:
-        """Open the blocks of a machine's new samples; trimmed: samples of their batch before them.
+        """Open the blocks of a machine's new samples; trimmed: samples of the batch before them.
 
-        now_ns: the server's clock. MessageError names the first sample without credit; then nothing is opened. The
-        sender gives up a sample that is refused alone, so the machine is there from then on, and what it drove since
-        counts.
+        now_ns: server time. MessageError names the first sample without credit; then nothing is opened. The sender
+        drops a sample refused alone, so the machine's position and metres count from there.
         """
         before, steps = self._account(machine, now_ns), np.empty((len(rows), 2))
         place = (before.x_m, before.y_m, before.has_jumped, before.stamp_ns)
@@ -127,7 +122,7 @@ class BlockCredit:
         self.opened |= new
 
     def _account(self, machine: str, now_ns: int) -> Account:
-        """That of a machine, with what time has brought."""
+        """The machine's account, with what time has earned."""
         known = self._accounts.pop(machine, None)
         if known is None:
             self._newcomers = min(1.0, self._newcomers + NEWCOMER * max(0, now_ns - self._newcomer_ns) / 60e9)
@@ -153,5 +148,5 @@ class BlockCredit:
 
 
 def warm_up(config: FoldConfig) -> None:
-    """Compile the kernel, or read it from its cache, before a batch waits for it."""
+    """Compile the kernel, or load it, before a batch waits for it."""
     BlockCredit(1.0, config, ()).spend("", empty(1))

@@ -1,4 +1,4 @@
-"""All decisions that a store's map follows, of trust and of calibration, and the facts that they come to."""
+"""All decisions of a store, on trust and calibration, and their resulting facts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KINDS = (trust.KIND, CALIBRATION)
 
 
 class Decisions:
-    """Decisions about machines. trust, calibration: those of either kind; facts: what all of them come to."""
+    """Decisions of both kinds. facts: their result."""
 
     def __init__(self) -> None:
         self.trust, self.calibration = TrustDecisions(()), CalibrationDecisions()
@@ -32,13 +32,13 @@ class Decisions:
 
     @classmethod
     def of_journal(cls, journal: JournalQueries) -> Decisions:
-        """Those that a journal has; StoreError where another program wrote one."""
+        """Decisions of a journal; StoreError if another program wrote one."""
         decisions = cls()
         decisions.hear(journal.events(), journal.where)
         return decisions
 
     def hear(self, events: Iterable[Event], where: str) -> None:
-        """Have the decisions among further events of a journal count; StoreError as `of_journal`."""
+        """Apply decisions among a journal's further events; StoreError as `of_journal`."""
         number = self.facts.number
         for event in events:
             if event.kind in KINDS:
@@ -47,20 +47,20 @@ class Decisions:
         self._conclude(number)
 
     def add(self, decisions: Iterable[Decision], number: int) -> None:
-        """Have more decisions count. number: of the last one's event."""
+        """Apply further decisions. number: of the last one's event."""
         for decision in decisions:
             self._take(decision)
         self._conclude(number)
 
     def offer(self, machine: str) -> dict[str, Any] | None:
-        """What a machine may take for its own calibration, as an acknowledgement has it; None for nothing.
+        """A calibration that a machine may adopt, as in an acknowledgement; None for none.
 
-        It is what is taken off its newest samples, dated when the solver said so last: machines take no old one.
+        It is the newest correction, dated by the solver's last confirmation; machines adopt no old one.
         """
         newest = self.facts.corrections.newest(machine)
         if not newest or newest.to_ns < LAST_NS or not newest.covariance:
             return None
-        if newest.most_share == NO_SHARE:  # a calibration is of a sensor that measures something
+        if newest.most_share == NO_SHARE:  # no calibration of a sensor that measures nothing
             return None
         (zz, zs, _), (_, ss, _), _ = newest.covariance
         as_of_ns = self.calibration.as_of_ns(machine)
@@ -74,19 +74,19 @@ class Decisions:
 
     def _conclude(self, number: int) -> None:
         excluded, corrections = self.trust.distrusted, self.calibration.corrections
-        if excluded:  # what is taken off samples that do not count changes no map
+        if excluded:  # corrections of excluded samples change no map
             corrections = corrections.without(excluded)
         self.facts = Facts(excluded, corrections, number)
 
 
 def calibrations(journal: JournalQueries) -> list[CalibrationDecision]:
-    """Decisions about calibration that a journal has, in their order; StoreError as `Decisions.of_journal`."""
+    """Calibration decisions of a journal, in order; StoreError as `Decisions.of_journal`."""
     decisions = (_decision(event, journal.where) for event in journal.events(CALIBRATION))
     return [decision for decision in decisions if isinstance(decision, CalibrationDecision)]
 
 
 def plain(decision: Decision) -> tuple[str, int, Mapping[str, Any]]:
-    """Kind, stamp and body of the event that keeps a decision."""
+    """Kind, stamp and body of a decision's event."""
     if isinstance(decision, CalibrationDecision):
         return CALIBRATION, decision.stamp_ns, decision.body()
     return trust.KIND, decision.stamp_ns, asdict(decision)

@@ -1,6 +1,6 @@
-"""A replica that follows a journal, on a thread of its own or turn by turn; what others read of it.
+"""A replica that follows a journal, on its own thread or turn by turn, and its readers.
 
-A map whose rows are gone from the journal (`mapserver/journal/tail.py`) is given up, and folded again.
+If its rows vanish from the journal (`mapserver/journal/tail.py`), the map is dropped and folded again.
 """
 
 from __future__ import annotations
@@ -25,22 +25,21 @@ from mapserver.past.past import FoldedAnew, StorePast, begun, fold_anew
 from protocol.errors import QueryError, Refusal, StoreError
 from protocol.site.site_config import SiteConfig
 
-ASK_S = 1.0  # a notification may be lost: the journal is asked so often all the same
-OPEN_S = 2.0  # a connection lasts so long: another file may have taken the place of the one that it reads
-PAUSE_S, MOST_PAUSE_S = 0.1, 5.0  # after rows that cannot be read; doubled, since reading up to them takes its time
+ASK_S = 1.0  # polling interval, because notifications may be lost
+OPEN_S = 2.0  # lifetime of a connection, because its file may be replaced
+PAUSE_S, MOST_PAUSE_S = 0.1, 5.0  # after unreadable rows; doubled, because reading up to them takes time
 T = TypeVar("T")
 log = logging.getLogger("mapserver.ingest.following")
 
 
 class UnfitError(StoreError):
-    """A journal of another site or frame."""
+    """The journal belongs to another site or frame."""
 
 
 class Following:
-    """A replica, and how it is kept up. All but the turns themselves is for any thread.
+    """A replica and its upkeep. Thread-safe, except for turns.
 
-    waits: who waits for a row. past: what maps of the past are read from. ended: why it has given up, empty while it
-    goes on; the process should end.
+    waits: for merged rows. past: sources of past maps. ended: why it gave up, or ""; the process should then end.
     """
 
     def __init__(self, location: JournalLocation, site: SiteConfig, config: ServerConfig) -> None:
@@ -48,9 +47,9 @@ class Following:
         self.waits = MergeWaits(0)
         self.past = self._new_past()
         self.ended = ""
-        self._lock = threading.Lock()  # of the replica: held while pages are taken from it, or rows are folded
+        self._lock = threading.Lock()  # guards the replica while pages are taken or rows folded
         self._replica: Replica | None = None
-        self._is_whole = False  # it had all that was journalled, once
+        self._is_whole = False  # was complete once
         self._reader: JournalReader | None = None
         self._reopen_s = 0.0
         self._known = JournalState(0, 0, 0)
@@ -62,36 +61,36 @@ class Following:
         self._thread = threading.Thread(target=self._run, name="following", daemon=True)
 
     def start(self) -> None:
-        """Follow from now on."""
+        """Start following."""
         self._thread.start()
 
     def read_once(self) -> None:
-        """Read what is there now, on the caller's thread, in place of following it; StoreError where that fails."""
+        """Read what is there now, on the caller's thread, in place of following; StoreError if that fails."""
         reader = self._opened()
         complete_s = reader.complete_s()
         self._look(reader, reader.state(), complete_s)
         self._close_reader()
 
     def run(self, work: Callable[[Replica], T]) -> T:
-        """Have `work` done with the replica as it is; QueryError where there is none."""
+        """Run `work` on the replica; QueryError if there is none."""
         with self._lock:
             if self._replica is None or not self._is_whole:
                 raise QueryError(Refusal.NOT_HERE, "this follower has no map yet; ask the map server")
             return work(self._replica)
 
     def behind(self) -> tuple[int, float]:
-        """How many rows the map lacks, and how long ago it had all that was journalled [s]; infinite for never."""
+        """Rows that the map lacks, and seconds since it was complete (inf for never)."""
         replica = self._replica
         rows = max(0, self._known.row - (replica.merged if replica else 0))
         return rows, time.monotonic() - self._complete_s
 
     @property
     def journalled(self) -> int:
-        """The last row of the journal, as of the last look."""
+        """The journal's last row, at the last look."""
         return self._known.row
 
     def stop(self) -> None:
-        """Have the thread end soon."""
+        """Ask the thread to end."""
         self._ending.set()
 
     def close(self) -> None:
@@ -104,17 +103,17 @@ class Following:
         self._close_reader()
 
     def turn(self, timeout_s: float) -> None:
-        """Wait for news for so long at most, and have them in the map; what keeps it from that is named once."""
+        """Wait for news up to a timeout and apply it; a problem is logged once."""
         if (left_s := self._again_s - time.monotonic()) > 0:
             self._ending.wait(min(left_s, timeout_s))
             return
         try:
             reader = self._opened()
             reader.follow(self._known, timeout_s)
-            complete_s = reader.complete_s()  # asked first: the state is of then, or newer
+            complete_s = reader.complete_s()  # asked first, so the state is not older
             self._look(reader, reader.state(), complete_s)
             self._problem, self._pause_s = "", PAUSE_S
-        except (StoreError, OSError) as error:  # the database is away, as while its replica is promoted, or damaged
+        except (StoreError, OSError) as error:  # the database is away, for example during a promotion, or damaged
             if isinstance(error, UnfitError):
                 self.ended = str(error)
             elif str(error) != self._problem:
@@ -127,12 +126,12 @@ class Following:
         while not (self._ending.is_set() or self.ended):
             try:
                 self.turn(ASK_S)
-            except Exception:  # a bug must end the process visibly: a map that stands still is worse than none
+            except Exception:  # a bug must end the process: a frozen map is worse than none
                 log.critical("following failed", exc_info=True)
                 self.ended = "the follower has failed; its log says why"
 
     def _opened(self) -> JournalReader:
-        """The reader, opened again now and then; UnfitError for the journal of another site."""
+        """The reader, reopened now and then; UnfitError for another site's journal."""
         if time.monotonic() >= self._reopen_s:
             self._close_reader()
         if self._reader is None:
@@ -161,7 +160,7 @@ class Following:
             self._forget()
         self._replica = replica = self._replica or self._begun(reader)
         self._hear(reader, replica)
-        if not self._is_whole and replica.wanted != replica.facts:  # nobody has it yet
+        if not self._is_whole and replica.wanted != replica.facts:  # nobody uses it yet
             self._replica = replica = self._begun(reader)
         self._fold(reader, replica, state.row)
         self._correct(reader, replica)
@@ -173,15 +172,15 @@ class Following:
             raise problem
 
     def _forget(self) -> None:
-        """Give up the map: nothing is answered until there is another one."""
+        """Drop the map; queries fail until there is another."""
         with self._lock:
             self._replica, self._is_whole = None, False
         self._complete_s, self._anew = float("-inf"), None
-        self.past = self._new_past()  # its index is of rows
+        self.past = self._new_past()  # its index is by rows
         self.waits.advance(0)
 
     def _begun(self, reader: JournalReader) -> Replica:
-        """A replica of the newest snapshot or checkpoint that is true, or of nothing."""
+        """A replica from the newest valid snapshot or checkpoint, or empty."""
         replica = Replica(self.site, self.config, Tail(reader, self.past.archive))
         self._hear(reader, replica)
         if made := begun(self.past, reader, replica.wanted, self._ending.is_set):
@@ -207,17 +206,17 @@ class Following:
                 return
 
     def _fold_long(self, reader: JournalReader, replica: Replica, until: int) -> None:
-        """Fold as far as rows can be read, while nobody is answered: what is in the grid is in it once."""
+        """Fold all readable rows, before anybody is answered."""
         facts = replica.facts
         rows = (some.without(facts.excluded) for some in replica.tail.rows(reader, until))
         if fold_samples(replica.grid, pieces(rows, Selection.by(facts)), self._ending.is_set):
             replica.adopt(replica.grid, replica.tail.row, facts)
-            # The site's now is that of the rows in the map: watermarks are of these, and of some that are folded next.
+            # The site's now is that of merged rows; watermarks cover these and some that follow.
             replica.reach((machine, mark.newest_ns) for (machine, _), mark in reader.watermarks().items())
             release_memory()
 
     def _correct(self, reader: JournalReader, replica: Replica) -> None:
-        """Have the map follow decisions: another grid is folded beside it, and takes its place once it has its rows."""
+        """Follow decisions: another grid is folded in parallel, and swapped in once it has all rows."""
         if self._anew is None:
             if replica.wanted != replica.facts:
                 facts = replica.wanted
@@ -226,12 +225,12 @@ class Following:
         facts, future = self._anew
         if not future.done():
             return
-        self._anew = None  # one that failed is done again
+        self._anew = None  # retried after a failure
         folded = future.result()
         if folded and folded.row > replica.merged:
-            self._anew = facts, future  # the rows of this one come first
+            self._anew = facts, future  # this grid's rows come first
             return
-        if folded is None or facts.number <= replica.facts.number:  # a decision was taken back meanwhile
+        if folded is None or facts.number <= replica.facts.number:  # the decision was withdrawn
             return
         history, selection = History(reader, self.past.archive), Selection.by(facts)
         if fold_history(folded.grid, history, folded.row, replica.merged, selection, self._ending.is_set, 1):

@@ -1,4 +1,4 @@
-"""What `info` says of a map and its process, and what machines sent and a store has lost: by machine and number."""
+"""`info` of a map and its process; totals of machines, and losses of a store."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ log = logging.getLogger("mapserver.ingest.map_info")
 def map_info(
     site: SiteConfig, grid: Grid, facts: Facts, version: MapVersion, newest_ns: int, now_ns: int
 ) -> dict[str, Any]:
-    """Plain values, from counters. newest_ns: the site's now. now_ns: the clock of this process."""
+    """Plain values, from counters. newest_ns: the site's now. now_ns: the process's clock."""
     counts = grid.counts()
     return {
         "site": {**asdict(site), "frame": site.frame, "crs": site.crs},
@@ -50,9 +50,9 @@ def map_info(
 
 
 def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shortfall]:
-    """Say what was acknowledged and was not in a journal that has just been opened; returns all that ever was.
+    """Log acknowledged samples missing from a newly opened journal; returns all shortfalls ever.
 
-    snapshot_rows: of the snapshots beside it; one that the journal does not reach proves that it was longer.
+    snapshot_rows: of its snapshots; one beyond the journal proves a loss.
     """
     shortfall, newest = journal.shortfall, max(snapshot_rows, default=0)
     if newest > max(journal.last_row, shortfall.expected_row if shortfall else 0):
@@ -64,10 +64,9 @@ def name_shortfalls(journal: Journal, snapshot_rows: Sequence[int]) -> list[Shor
 
 
 def lacking(location: JournalLocation) -> Shortfall | None:
-    """What a journal lacks of what was acknowledged, as long as no start of a server has named it.
+    """The journal's shortfall, until a server start logs it; StoreError if unreadable.
 
-    It may be in use: what proves that it was longer is looked at before it, and is never ahead of it. StoreError where
-    it cannot be read.
+    The journal may be in use: evidence of its length is read first, so it is never ahead.
     """
     newest = max(snapshot_rows(location.folder), default=0)
     traces = location.traces(in_use=is_in_use(location.folder))
@@ -78,7 +77,7 @@ def lacking(location: JournalLocation) -> Shortfall | None:
 
 
 def by_machine(progress: Journal | Progress, shortfalls: Sequence[Shortfall]) -> dict[str, dict[str, int]]:
-    """What each machine sent: spools, samples, samples that it declared lost, newest stamp, and what is missing."""
+    """Spools, samples, declared losses, newest stamp, and missing samples of each machine."""
     gone = missing(shortfalls, progress.watermarks()) if shortfalls else Counter()
     sent = progress.machines()
     names = dict.fromkeys([*sent, *gone])

@@ -1,4 +1,4 @@
-"""Who waits for a journal row to be merged: entries in a list, which hold no thread while they wait."""
+"""Waits for merged journal rows: list entries, which hold no thread."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ class _Wait:
 
 
 class MergeWaits:
-    """Calls back once a row is merged, or its wait is over; may be used from any thread."""
+    """Calls back when a row is merged, or on timeout. Thread-safe."""
 
     def __init__(self, merged: int) -> None:
         self._merged = merged
         self._waiting: list[_Wait] = []
-        self._next_row: float = float("inf")  # the lowest that is waited for
+        self._next_row: float = float("inf")  # lowest awaited
         self._closed = False
         self._news = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="waits", daemon=True)
         self._thread.start()
 
     def add(self, row: int, wait_s: float, then: Then) -> None:
-        """Have `then` called once the row is merged: here, if it is; with an error if that takes longer than wait_s.
+        """Call `then` once the row is merged (at once, if it is), or with an error after wait_s.
 
         QueryError if too many are waiting.
         """
@@ -50,14 +50,14 @@ class MergeWaits:
             then(None)
 
     def advance(self, merged: int) -> None:
-        """Say what is merged now. Only wakes the thread that calls back: whoever owns the store has no time for it."""
+        """Note merged rows. Only wakes the calling thread, because the store's owner has no time."""
         with self._news:
             self._merged = merged
             if merged >= self._next_row:
                 self._news.notify()
 
     def close(self) -> None:
-        """Forget who waits."""
+        """Drop all waits."""
         with self._news:
             self._closed = True
             self._waiting.clear()
@@ -71,7 +71,7 @@ class MergeWaits:
                 wait.then(None if wait.row <= self._merged else QueryError(Refusal.AFTER_TIMEOUT, problem))
 
     def _next_due(self) -> list[_Wait] | None:
-        """Wait until some wait is over, and take those; None at the end."""
+        """Block until some waits are over, and take them; None at the end."""
         with self._news:
             while not self._closed:
                 now_s = time.monotonic()

@@ -1,6 +1,6 @@
-"""The map of one store in a process that reads its journal: grid, facts and events, as far as they were read.
+"""A store's map in a process that reads its journal: grid, facts and events so far.
 
-No clock, thread or file: what was read is handed in. On equal rows and facts its grid is the server's, bit for bit.
+No clock, thread or file: data is passed in. For equal rows and facts the grid equals the server's, bit for bit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from protocol.site.site_config import SiteConfig
 
 
 class Replica:
-    """See `MapState`. tail: how far the journal was read. merged: the last row in the grid. changes: by number."""
+    """See `MapState`. tail: position in the journal. merged: last row in the grid. changes: by number."""
 
     def __init__(self, site: SiteConfig, config: ServerConfig, tail: Tail) -> None:
         self.site, self.config, self.tail = site, config, tail
@@ -33,26 +33,26 @@ class Replica:
 
     @property
     def version(self) -> MapVersion:
-        """The version that the map is."""
+        """The map's version."""
         return MapVersion(self.tail.store, self.merged, self.facts.number)
 
     @property
     def newest_ns(self) -> int:
-        """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
+        """The site's now: newest stamp of machines in the map, 0 for none."""
         shown = (stamp for name, stamp in self._newest_ns.items() if name not in self.facts.excluded)
         return max(shown, default=0)
 
     def machines(self) -> Collection[str]:
-        """Names of all machines that have sent anything."""
+        """Names of all machines that have sent samples."""
         return self._newest_ns.keys()
 
     @property
     def wanted(self) -> Facts:
-        """What all decisions come to: the grid has to be folded again where these are not its facts."""
+        """Facts of all decisions; if they differ from `facts`, the grid must be rebuilt."""
         return self._decisions.facts
 
     def hear(self, events: Sequence[Event], where: str) -> None:
-        """Take further events in their order. StoreError for a decision that another program wrote."""
+        """Apply further events. StoreError for another program's decision."""
         self._decisions.hear(events, where)
         for event in events:
             if event.kind == change_log.KIND:
@@ -60,7 +60,7 @@ class Replica:
                 self.changes[change.id] = change
         self.tail.heard(events)
         if self.wanted == self.facts:
-            self.facts = self.wanted  # of a higher number
+            self.facts = self.wanted  # with a higher number
 
     def fold(self, rows: JournalRows) -> None:
         """Fold the next rows."""
@@ -72,12 +72,12 @@ class Replica:
         self.merged = int(rows.numbers[-1])
 
     def reach(self, newest_ns: Iterable[tuple[str, int]]) -> None:
-        """Know stamps of machines that are in the map, or would be if these were not excluded."""
+        """Note stamps of machines, excluded or not."""
         for name, stamp_ns in newest_ns:
             self._newest_ns[name] = max(self._newest_ns.get(name, 0), stamp_ns)
 
     def adopt(self, grid: Grid, row: int, facts: Facts) -> None:
-        """Go on with a grid that has these facts and all rows up to this one."""
+        """Continue with a grid of these facts and all rows up to this one."""
         self.grid, self.merged, self.facts = grid, row, facts
         if self.wanted == facts:
             self.facts = self.wanted

@@ -1,4 +1,4 @@
-"""A replica that may be promoted: it follows the journal that another server writes, so that a take-over is warm."""
+"""A replica that follows another server's journal and may be promoted: a warm standby."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from protocol.site.site_config import SiteConfig
 
 
 class Standby(Following):
-    """See `Waiting`: its turns are those of who waits for the journal."""
+    """See `Waiting`; it turns while it waits for the journal."""
 
     def __init__(
         self, location: JournalLocation, site: SiteConfig, config: ServerConfig, check: Callable[[bool], object]
     ) -> None:
-        """check: is called before each wait, with whether the grid is warm; what it raises ends the wait."""
+        """check: called before each wait with whether the grid is warm; its exceptions end the wait."""
         super().__init__(location, site, config)
         self._check = check
 
     def follow(self, timeout_s: float) -> None:
-        """Wait for more rows for so long at most, and have them in the grid."""
+        """Wait up to a timeout for rows, and fold them."""
         self._check(self._is_whole)
         self.turn(timeout_s)
 
@@ -35,8 +35,8 @@ class Standby(Following):
         return self._replica is not None and self._replica.merged > 0 and self._replica.tail.is_in(journal)
 
     def grid_for(self, journal: JournalQueries, facts: Facts) -> tuple[int, Grid] | None:
-        """The grid and its last row, if the journal has the rows that it was made of, and these facts."""
-        if self._anew and self._anew[0] == facts:  # it began before any other would
+        """The grid and its last row, if they match the journal and these facts."""
+        if self._anew and self._anew[0] == facts:  # ahead of any other
             wait([self._anew[1]])
             self.turn(0.0)
         replica = self._replica
@@ -45,5 +45,5 @@ class Standby(Following):
         return replica.merged, replica.grid
 
     def _begun(self, reader: JournalReader) -> Replica:
-        reader.check()  # here, where nobody waits for it
+        reader.check()  # here, where nobody waits
         return super()._begun(reader)

@@ -1,4 +1,4 @@
-"""The store of one site: journal, grid and snapshots. One thread owns it (see writer.py)."""
+"""The store of one site: journal, grid and snapshots. Owned by one thread (see writer.py)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ACCEPTED = "accepted_store"  # kind of an event
 
 @dataclass(frozen=True)
 class Incoming:
-    """A batch as it came in: the machine of its key, its bytes, and the signature beside it, if there is one."""
+    """A received batch: machine of its key, bytes, and signature, if any."""
 
     machine: str
     payload: bytes
@@ -52,8 +52,8 @@ class Incoming:
 class Store:
     """Journal, grid, watermarks and counters of one site.
 
-    identity: which store this is; accepted: ids of those whose place it takes. facts: that the grid was folded with;
-    merged: the last journal row that is in it. newest_ns: the site's now.
+    identity: of this store; accepted: ids of stores it replaces. facts: of the grid; merged: its last journal row.
+    newest_ns: the site's now.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Store:
         verify: Verify | None = None,
         standby: Standby | None = None,
     ) -> None:
-        """verify: raises MessageError unless a batch is signed by its machine.
+        """verify: raises MessageError unless the machine signed a batch.
 
         standby: follows a shared journal while another server writes it.
         """
@@ -95,7 +95,7 @@ class Store:
             self._credit = self._new_credit()
             self.merged, counts = last_row, self.grid.counts()
             tail = counts.folded + counts.skipped - in_snapshot.folded - in_snapshot.skipped
-            self._snapshot_samples = 0 if warm else self.journal.samples - tail  # what is warm is on no disk yet
+            self._snapshot_samples = 0 if warm else self.journal.samples - tail  # a warm grid is not on disk yet
             self._newest = {name: entry["newest_ns"] for name, entry in self.machines().items()}
             self._received_ns = self._last_received(last_row)
             self._opened = opened.pop_all()
@@ -107,28 +107,28 @@ class Store:
 
     @property
     def samples_behind(self) -> int:
-        """How many samples the newest snapshot lacks: a start would have to fold them."""
+        """Samples missing from the newest snapshot, which a start would fold."""
         return self.journal.samples - self._snapshot_samples
 
     @property
     def newest_ns(self) -> int:
-        """The site's now: the newest stamp of the machines that are in the map, 0 for none."""
+        """The site's now: newest stamp of machines in the map, 0 for none."""
         return self._newest_but("")
 
     @property
     def version(self) -> MapVersion:
-        """The version of the map as it is."""
+        """The map's version."""
         return MapVersion(self.identity.id, self.merged, self.fact)
 
     @property
     def fact(self) -> int:
-        """Number of the last decision that is in the grid."""
+        """Number of the last decision in the grid."""
         return self.facts.number
 
     def commit(self, group: list[Incoming]) -> list[Ack | Refused]:
-        """Journal a group of batches in one commit, fold it, and return the answer to each.
+        """Journal a group of batches in one commit, fold it, and return the answers.
 
-        Nothing is acknowledged before its commit; where the commit fails, every batch of the group is refused.
+        Nothing is acknowledged before its commit; if the commit fails, all are refused.
         """
         batches = self._decode(group)
         try:
@@ -151,12 +151,12 @@ class Store:
         return [answer for answer, _ in answers]
 
     def save_snapshot(self) -> None:
-        """Write a snapshot of the grid as it is."""
+        """Write a snapshot of the present grid."""
         if write := self.snapshot():
             write()
 
     def snapshot(self) -> Callable[[], None] | None:
-        """Take a snapshot of the grid as it is: what writes it may run on any thread. None where there is none new."""
+        """Take a snapshot; returns its writer, for any thread, or None if nothing is new."""
         if self.merged <= self.snapshot_row:
             return None
         row, grid, samples, state = self.merged, self.grid, self.journal.samples, self.grid.state()
@@ -164,15 +164,15 @@ class Store:
 
         def write() -> None:
             save_snapshot(self.location.folder, row, facts, state)
-            if self.grid is grid:  # else another was adopted meanwhile, which has no snapshot yet
+            if self.grid is grid:  # otherwise another grid was adopted, without a snapshot
                 self.snapshot_row, self._snapshot_samples = row, samples
 
         return write
 
     def adopt(self, grid: Grid, row: int, facts: Facts) -> None:
-        """Go on with a grid that was folded elsewhere, with these facts, up to a journal row.
+        """Continue with a grid folded elsewhere, with these facts, up to a row.
 
-        The rows beyond it are folded here, while batches wait: let them be few.
+        Later rows are folded here while batches wait, so they should be few.
         """
         grid.touch_all()
         selection = Selection.by(facts)
@@ -180,34 +180,34 @@ class Store:
             grid.fold_all(*rows.selected(selection))
         self.grid, self.facts = grid, facts
         self._count_decisions()
-        self.snapshot_row = self._snapshot_samples = 0  # what is on disk was folded with other facts
+        self.snapshot_row = self._snapshot_samples = 0  # the snapshot has other facts
 
     def decide(self, *decisions: Decision) -> Facts:
-        """Keep decisions with the journal, all or none; returns the facts that the map is to follow.
+        """Store decisions, all or none; returns the facts to follow.
 
-        They count at once, unless the map has to be folded again for them.
+        They apply at once, unless the map must be rebuilt.
         """
         self._decisions.add(decisions, self.journal.append_events(map(plain, decisions)))
         self._count_decisions()
         return self._decisions.facts
 
     def confirm(self, confirmed: Mapping[str, int]) -> None:
-        """Date what is offered to machines: the solver says the same of them, as of when [ns]."""
+        """Date what is offered to machines: the solver confirms it, as of when [ns]."""
         self._decisions.calibration.confirm(confirmed)
 
     def accept(self, store: str, reason: str) -> None:
-        """Take the place of another store for good, since a person says so: its runs are taken on here."""
+        """Replace another store for good, by a person's decision: its runs continue here."""
         if store != self.identity.id and store not in self.accepted:
             self.journal.append_event(ACCEPTED, self.newest_ns, {"store": store, "reason": reason})
             self.accepted |= {store}
             log.warning("accepted store=%s reason=%r", store, reason)
 
     def close(self) -> None:
-        """Close the journal and let go of the folder."""
+        """Close the journal and release the folder."""
         self._opened.close()
 
     def info(self) -> dict[str, Any]:
-        """State of the store in plain values, from counters: nothing is counted anew."""
+        """State in plain values, from counters."""
         info = map_info(self.site, self.grid, self.facts, self.version, self.newest_ns, self.now_ns())
         return info | {
             "descends": list(self.identity.descends),
@@ -224,15 +224,15 @@ class Store:
 
     @property
     def decided(self) -> int:
-        """Number of the last decision that is kept, also if the map does not follow it yet."""
+        """Number of the last stored decision, followed or not."""
         return self._decisions.facts.number
 
     def machines(self) -> dict[str, dict[str, int]]:
-        """What each machine sent and lost; see `by_machine`."""
+        """See `by_machine`."""
         return by_machine(self.journal, self.shortfalls)
 
     def _decode(self, group: list[Incoming]) -> list[SampleBatch | MessageError]:
-        """What each batch holds, or why it is refused; one that is not signed is not looked at."""
+        """Each batch, or why it is refused; unsigned batches are not decoded."""
         sent = ((incoming.machine, incoming.payload, incoming.signature) for incoming in group)
         refused = [signature_problem(self._verify, self.site.name, *each) if self._verify else None for each in sent]
         signed = (incoming.payload for incoming, error in zip(group, refused, strict=True) if error is None)
@@ -262,7 +262,7 @@ class Store:
         ), admission
 
     def _newest_but(self, machine: str) -> int:
-        """The newest stamp of the machines in the map but one."""
+        """Newest stamp of machines in the map, except one."""
         hidden = self.facts.excluded | {machine}
         return max((newest_ns for name, newest_ns in self._newest.items() if name not in hidden), default=0)
 
@@ -270,16 +270,16 @@ class Store:
         return SeenTime(self._newest_but(machine), self.newest_ns, self._received_ns)
 
     def _last_received(self, last_row: int) -> int:
-        """The server's clock when the last row came in, 0 where none is in the journal."""
+        """Server time of the last row, 0 for none in the journal."""
         is_there = last_row > self.journal.archived_row
         return max((row.received_ns for row in self.journal.read(after=last_row - 1)), default=0) if is_there else 0
 
     def _new_credit(self) -> BlockCredit:
-        """Accounts for what the map has; what a commit that failed has spent is forgotten."""
+        """Accounts for the present map; forgets what a failed commit spent."""
         return BlockCredit(self.site.cell_m, self.config.fold, self.grid.folded_since(-1)[0])
 
     def _count(self, answer: Ack | Refused, admission: Admission | None) -> None:
-        """Count what became of a batch, once it is certain."""
+        """Count a batch's final outcome."""
         if isinstance(answer, Refused):
             self.counters[f"refused_{answer.reason}"] += 1
         elif admission:
@@ -290,7 +290,7 @@ class Store:
                 log.warning("declared lost machine=%s samples=%d", admission.batch.machine, admission.lost)
 
     def _fold(self, batches: list[SampleBatch]) -> None:
-        """Fold what was committed: all of it that there is, up to the last journal row."""
+        """Fold committed batches, up to the last row."""
         folded = [batch for batch in batches if batch.machine not in self.facts.excluded]
         names = np.array([name_hash(batch.machine) for batch in folded], np.uint64)
         machine = np.repeat(np.arange(len(folded)), [len(batch.rows) for batch in folded])
@@ -302,7 +302,7 @@ class Store:
         self.merged = self.journalled
 
     def _catch_up(self) -> None:
-        """Fold what was committed though its batches were refused, since the database's answer was lost."""
+        """Fold rows that were committed although the database's answer was lost."""
         if self.journal.last_row > self.merged:
             selection = Selection.by(self.facts)
             for rows in read_history(self.history, after=self.merged, selection=selection):
@@ -312,6 +312,6 @@ class Store:
             self.merged = self.journal.last_row
 
     def _count_decisions(self) -> None:
-        """Count further decisions as followed where they come to the facts that the grid has."""
+        """Adopt the number of decisions that lead to the grid's facts."""
         if self._decisions.facts == self.facts:
             self.facts = self._decisions.facts

@@ -1,4 +1,4 @@
-"""Locks of folders: one server on this host has a store open, and one process makes a folder at a place."""
+"""Locks of folders: one server per store on a host, and one process that creates a folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def is_in_use(folder: Path) -> bool:
 
 @contextmanager
 def hold(folder: Path) -> Iterator[None]:
-    """Keep a second server off the folder: each would take the samples that the other has. A crash releases it."""
+    """Keep a second server out: each would lack the other's samples. A crash releases the lock."""
     folder.mkdir(parents=True, exist_ok=True)
     make_private(folder / LOCK_FILE)
     with (folder / LOCK_FILE).open("w") as file:
@@ -40,9 +40,9 @@ def hold(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def hold_place(folder: Path) -> Iterator[None]:
-    """Keep a second process from making a folder at the same place: its lock lies beside that, and goes away after it.
+    """Keep other processes from creating the same folder, by a lock beside it.
 
-    ConfigError where another one does; StoreError where none can be made there.
+    ConfigError if one does; StoreError if it cannot be written.
     """
     path = folder.with_name(f".{folder.name}.lock")
     try:
@@ -52,7 +52,7 @@ def hold_place(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise StoreError(folder, f"cannot be written: {error.strerror or error}") from None
     with file:
-        # One that has just ended has removed its file: a lock of that keeps nobody off.
+        # A process that just ended has unlinked its file, whose lock excludes nobody.
         if not _taken(file) or not _is_still(file, path):
             raise ConfigError(folder, "another process is at work there; wait for it, or choose another --out")
         try:
@@ -62,7 +62,7 @@ def hold_place(folder: Path) -> Iterator[None]:
 
 
 def _taken(file: TextIO) -> bool:
-    """Whether this process has the lock of a file now."""
+    """Try to lock a file."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -71,7 +71,6 @@ def _taken(file: TextIO) -> bool:
 
 
 def _is_still(file: TextIO, path: Path) -> bool:
-    """Whether this is the file of that name."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except FileNotFoundError:

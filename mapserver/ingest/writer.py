@@ -1,4 +1,4 @@
-"""The thread that owns the store: it commits batches, folds them, then replies; other threads hand it work."""
+"""The thread that owns the store: it commits and folds batches, then replies; other threads hand it work."""
 
 from __future__ import annotations
 
@@ -26,40 +26,40 @@ Reply = Callable[[Ack | Refused], None]
 _Batch = tuple[Incoming, Reply]
 log = logging.getLogger("mapserver.ingest.writer")
 
-COMMIT_EVERY_S = 0.01  # at most: a commit costs a sync, some pages and 0.5 ms, however few batches are in it
-HANGS_S = 30.0  # at one piece of work: a group or a look takes less than a second, a disk that hangs for ever
+COMMIT_EVERY_S = 0.01  # least interval of commits, because each costs a sync, some pages and 0.5 ms
+HANGS_S = 30.0  # longest piece of work: normal ones take less than a second, a broken disk for ever
 
 
 @dataclass(frozen=True)
 class _Work:
-    """Work of another thread for the one that owns the store."""
+    """Work from another thread for the store's owner."""
 
     work: Callable[[Store], Any]
     result: Future[Any]
 
 
 class Writer:
-    """Owns a Store on a thread of its own, from here on; site, config, location, now_ns, store_id: of the store.
+    """Owns a Store on its own thread; site, config, location, now_ns, store_id: of the store.
 
-    `submit`, `run` and `look` may be called from any thread. waits: who waits for a row to be merged.
+    `submit`, `run` and `look` are thread-safe. waits: for merged rows.
     """
 
     def __init__(self, store: Store, clock: Callable[[], float] = time.monotonic) -> None:
-        """clock: steady, in seconds."""
+        """clock: monotonic [s]."""
         self.site, self.config, self.location, self.now_ns = store.site, store.config, store.location, store.now_ns
         self.store_id = store.identity.id
         self._store, self._clock = store, clock
-        self._owned = threading.Lock()  # the store: by its thread, but for while that waits for work
-        self._turn = threading.Condition()  # of all that waits
+        self._owned = threading.Lock()  # the store; its thread releases it while it waits
+        self._turn = threading.Condition()  # guards all that waits
         self._backlog: Backlog[_Batch] = Backlog()
-        self._group: list[_Batch] = []  # of this turn, as far as nobody has an answer
+        self._group: list[_Batch] = []  # this turn's unanswered batches
         self._works: deque[_Work] = deque()
         self._pace = WorkRate()
-        self._counts: Counter[str] = Counter()  # of what never comes to the store
+        self._counts: Counter[str] = Counter()  # of what never reaches the store
         self._is_closing = False
-        self._ended = ""  # why nothing is taken any more
+        self._ended = ""  # why nothing is accepted any more
         self._busy_since_s: float | None = None
-        self._committed_s = -math.inf  # when the last commit began
+        self._committed_s = -math.inf  # start of the last commit
         self.waits = MergeWaits(store.merged)
         self.failed, self._fenced = False, ""
         self._thread = threading.Thread(target=self._guard, name="writer", daemon=True)
@@ -67,16 +67,16 @@ class Writer:
 
     @property
     def fenced(self) -> str:
-        """Why this server may not write any more, since another one does; empty while it may."""
+        """Why another server has taken over writing, or ""."""
         return self._fenced or self._store.journal.fenced
 
     @property
     def epoch(self) -> int:
-        """Number of this writer among all of the journal."""
+        """Number of this writer in the journal."""
         return self._store.journal.epoch
 
     def submit(self, incoming: Incoming, reply: Reply) -> None:
-        """Hand in a batch; `reply` is called on the owner's thread, or at once for one that has to come again later."""
+        """Submit a batch; `reply` is called on the owner's thread, or at once if refused."""
         with self._turn:
             ended = self._ended
             gone = [] if ended else self._backlog.add(incoming.machine, size_of(incoming.payload), (incoming, reply))
@@ -90,7 +90,7 @@ class Writer:
             overloaded(Refused(Refusal.OVERLOADED, problem, retry_after_s=retry_after_s))
 
     def run(self, work: Callable[[Store], T], timeout_s: float = 60.0) -> T:
-        """Run `work` on the owner's thread, between two groups of batches, and return its result."""
+        """Run `work` on the owner's thread between groups, and return its result."""
         result: Future[T] = Future()
         with self._turn:
             if self._ended:
@@ -100,9 +100,9 @@ class Writer:
         return result.result(timeout_s)
 
     def look(self, work: Callable[[Store], T]) -> T:
-        """As `run`, for work that reads the map alone: on the calling thread while the owner waits for work.
+        """As `run`, for reads of the map, on the calling thread while the owner is idle.
 
-        A question then costs no change of threads; where batches wait, it takes its turn behind them.
+        This saves a change of threads; otherwise it queues.
         """
         if not (self._backlog or self._works) and self._owned.acquire(blocking=False):
             try:
@@ -113,12 +113,12 @@ class Writer:
         return self.run(work)
 
     def count(self, what: str) -> None:
-        """Count something that never comes to the store: what became of a query."""
+        """Count a query's outcome."""
         with self._turn:
             self._counts[what] += 1
 
     def alive(self) -> ServerAlive:
-        """Whether batches are taken, without waiting for the owner; QueryError where it has ended, or hangs."""
+        """Whether batches are accepted, without waiting; QueryError if the owner has ended or hangs."""
         if self._ended:
             raise QueryError(Refusal.STORE, self._ended)
         since_s = self._busy_since_s
@@ -139,7 +139,7 @@ class Writer:
         return info
 
     def close(self) -> None:
-        """Finish what is waiting, snapshot, close; once more does nothing."""
+        """Finish what waits, snapshot, close; idempotent."""
         self.waits.close()
         with self._turn:
             self._is_closing = True
@@ -151,7 +151,7 @@ class Writer:
             self._own()
 
     def _own(self) -> None:
-        """A bug must end the process visibly: a server that accepts nothing more is worse than none."""
+        """A bug must end the process: a server that accepts nothing is worse than none."""
         try:
             self._serve()
         except FencedError as error:
@@ -160,7 +160,7 @@ class Writer:
             log.error("fenced problem=%r", error.problem)
             self._refuse_all(Refusal.NOT_WRITER)
         except Exception:
-            with self._turn:  # what comes from here on is refused by who hands it in
+            with self._turn:  # later requests are refused on submission
                 self.failed, self._ended = True, "the server's writer has failed; restart the server"
             log.critical("writer failed", exc_info=True)
             self._refuse_all()
@@ -170,7 +170,7 @@ class Writer:
             self._store.close()
 
     def _refuse_all(self, reason: Refusal = Refusal.STORE) -> None:
-        """Leave nobody waiting."""
+        """Answer everybody who waits."""
         while self._group or self._backlog:
             for _, reply in self._group:
                 reply(Refused(reason, self._ended))
@@ -183,12 +183,12 @@ class Writer:
             self._busy_since_s = self._clock()
             if self._group:
                 self._commit()
-            for _ in range(len(self._works)):  # those that come meanwhile wait for the next group
+            for _ in range(len(self._works)):  # later arrivals wait for the next group
                 _answer(self._works.popleft(), self._store)
             self._busy_since_s = None
 
     def _next(self) -> bool:
-        """Wait until there are batches, or work of others; False to end."""
+        """Wait for batches or work; False to end."""
         with self._lent(), self._turn:
             if not (self._backlog or self._works or self._is_closing):
                 self._turn.wait()
@@ -200,7 +200,7 @@ class Writer:
 
     @contextmanager
     def _lent(self) -> Iterator[None]:
-        """Let others look at the store meanwhile."""
+        """Let others read the store meanwhile."""
         self._owned.release()
         try:
             yield
@@ -208,7 +208,7 @@ class Writer:
             self._owned.acquire()
 
     def _gather(self) -> bool:
-        """Let more batches come for the next commit, where the last one is not long ago; True if work comes first."""
+        """Wait for more batches if the last commit is recent; True if work comes first."""
         wait_s = self._committed_s + COMMIT_EVERY_S - self._clock()
         came = wait_s > 0 and self._turn.wait_for(lambda: self._works or self._is_closing, wait_s)
         return bool(came) and not self._is_closing
@@ -227,14 +227,14 @@ class Writer:
     def _save_snapshot(self) -> None:
         try:
             self._store.save_snapshot()
-        except OSError as error:  # the journal is the truth; a missing snapshot only makes the next start longer
+        except OSError as error:  # the journal is the truth; without a snapshot only the next start takes longer
             log.error("snapshot failed error=%r", str(error))
-        except Exception:  # a bug; it must not pass unseen
+        except Exception:  # a bug must be visible
             log.exception("snapshot failed")
 
 
 def _answer(item: _Work, store: Store) -> None:
     try:
         item.result.set_result(item.work(store))
-    except Exception as error:  # handed on to the thread that asked
+    except Exception as error:  # for the asking thread
         item.result.set_exception(error)

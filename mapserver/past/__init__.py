@@ -1,1 +1,1 @@
-"""The past: checkpoints of the evidence, maps as of any time made from them, and the history of a point."""
+"""The past: checkpoints of evidence, maps as of any time, and the history of a point."""

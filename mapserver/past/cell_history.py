@@ -1,6 +1,6 @@
-"""The history of one cell: its evidence span by span, each as if there were no other samples.
+"""The history of one cell: its evidence by span of time, each span on its own.
 
-All spans are folded at once, as if they were time buckets: one page is the evidence of one span.
+All spans are folded at once, as buckets: one page per span.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ Cell = tuple[int, int]  # column, row
 
 @dataclass(frozen=True)
 class CellHistory:
-    """Evidence of one cell by span of time, oldest first; spans without any are not in it.
+    """Evidence of one cell by span, oldest first, without empty spans.
 
-    first_ns, last_ns (n,): stamps of a span, both of them in it. evidence: arrays as in Evidence, (n, 1, ...).
+    first_ns, last_ns (n,): of each span, inclusive. evidence: as Evidence, (n, 1, ...).
     """
 
     first_ns: Ints
@@ -40,9 +40,9 @@ class CellHistory:
 def cell_history(
     past: StorePast, reader: JournalReader, cell: Cell, span_ns: int, selection: Selection = ALL
 ) -> CellHistory:
-    """The history of a cell in spans of a length, which begin at multiples of it.
+    """The history of a cell in spans that begin at multiples of span_ns.
 
-    selection: time and machines; its bounds are not used.
+    selection: time and machines; its bounds are ignored.
     """
     selection = replace(selection, bounds=reach_of(CellWindow(*cell, 1, 1), past.cell_m, past.config))
     scratch = Scratch()
@@ -63,18 +63,18 @@ def cell_history(
     return CellHistory(spans * span_ns, (spans + 1) * span_ns - 1, evidence)
 
 
-_Part = tuple[AnyArray, ...]  # numbers of spans (n,), and what they have of the cell: counts, bitmaps, newest stamps
+_Part = tuple[AnyArray, ...]  # span numbers (n,), and the cell's counts, bitmaps and newest stamps
 _SHAPES = (((), np.int64), ((ev.COUNTS,), np.uint64), ((2,), np.uint64), ((), np.int64))
 
 
 def _pieces(samples: Table, names: NDArray[np.uint64]) -> Iterator[NamedSamples]:
-    """Samples cut so that the weight of each piece stays far below COUNT_MAX."""
+    """Pieces whose total weight stays far below COUNT_MAX."""
     for first in range(0, len(samples), PIECE):
         yield samples[first : first + PIECE], names[first : first + PIECE]
 
 
 def _evidence(past: StorePast, cell: Cell, span_ns: int, some: NamedSamples, scratch: Scratch) -> Iterator[_Part]:
-    """What each span has of the cell from some samples."""
+    """The cell's evidence by span, from some samples."""
     samples, names = some
     near = _near(samples, cell, past.cell_m)
     samples, names = samples[near], names[near]
@@ -88,7 +88,7 @@ def _evidence(past: StorePast, cell: Cell, span_ns: int, some: NamedSamples, scr
 
 
 def _of_cell(pages: Pages, place: int, numbers: Ints) -> _Part:
-    """What pages have of one cell of their block. numbers: of the spans that their indices stand for."""
+    """One cell of a block's pages. numbers: spans of their indices."""
     n, table = len(pages.table), pages.table
     page = np.repeat(np.arange(n), table[:, 3] - table[:, 2])
     here = pages.votes & np.uint64(0xFF) == place
@@ -106,7 +106,7 @@ def _of_cell(pages: Pages, place: int, numbers: Ints) -> _Part:
 
 
 def _near(samples: Table, cell: Cell, cell_m: float) -> Bools:
-    """Which samples may vote for a cell: most know their place too well. With a cell more for rounding."""
+    """Samples that may vote for a cell: most positions are too certain. One cell more for rounding."""
     variance = np.maximum(samples["cov_xx_m2"], samples["cov_yy_m2"]).astype(np.float64) + STD_FLOOR_M**2
     reach_m = 2 * np.sqrt(variance) + 2 * cell_m
     near: Bools = np.abs(samples["x_m"] - (cell[0] + 0.5) * cell_m) <= reach_m

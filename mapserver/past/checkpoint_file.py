@@ -1,9 +1,9 @@
-"""One checkpoint on disk: the evidence of samples stamped before a time, block by block, each to be read alone.
+"""One checkpoint on disk: the evidence of samples stamped before a time, by separately readable blocks.
 
-    MAGIC | records of blocks | index, one INDEX per block in the order of places | header, JSON | TAIL
+    MAGIC | records of blocks | index, one INDEX per block, sorted | header, JSON | TAIL
 
-The tail has the lengths of index and header and the CRC-32 of both; the index has one of each block. So a read of a few
-blocks checks what it uses, and needs nothing of the rest. Files never change.
+The tail has lengths of index and header and their CRC-32, the index one of each block, so reading a few blocks checks
+them and needs no others. Files never change.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from protocol.machine.readings import MAX_STAMP_NS
 from protocol.site.geometry import BLOCK_CELLS, CellWindow
 
 MAGIC = b"SGCHECK2"
-OPEN_END_NS = MAX_STAMP_NS + 1  # closing time of a snapshot: it has every sample of its rows
+OPEN_END_NS = MAX_STAMP_NS + 1  # closing time of a snapshot: all samples of its rows
 INDEX = np.dtype([("x", "<i4"), ("y", "<i4"), ("first", "<i8"), ("bytes", "<i4"), ("crc32", "<u4")])
 TAIL = struct.Struct("<QII8s")  # blocks, bytes of the header, CRC-32 of index and header, MAGIC
-READ_BYTES = 2**22  # of neighbouring blocks at once
+READ_BYTES = 2**22  # of consecutive blocks at once
 
 FileState = tuple[int, int, int]
 
 
 def file_state(stat: os.stat_result) -> FileState:
-    """Inode, time of change and bytes of a file: what tells it from one that has replaced it."""
+    """Inode, change time and size, which identify a file's version."""
     return stat.st_ino, stat.st_mtime_ns, stat.st_size
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a checkpoint is true for.
+    """Validity of a checkpoint.
 
-    closed_ns: it has the samples stamped before this time, from all journal rows up to `row`; OPEN_END_NS: all of them.
-    facts: what its evidence depends on besides. The others: as of a grid's state.
+    closed_ns: it has samples stamped earlier, from journal rows up to `row`; OPEN_END_NS: all. facts: its other
+    dependencies. The rest: as in GridState.
     """
 
     closed_ns: int
@@ -58,23 +58,23 @@ class Header:
     oldest_ns: int = 0
 
     def with_totals(self, state: GridState) -> Header:
-        """The same, of a grid with this state."""
+        """With the totals of a grid's state."""
         return replace(self, **{field.name: getattr(state, field.name) for field in fields(GridState)[1:]})
 
     @property
     def state(self) -> GridState:
-        """The state of the grid but for its blocks."""
+        """The grid's state without blocks."""
         return GridState((), self.folded, self.skipped, self.newest_ns, self.oldest_ns)
 
 
 class DamagedError(StoreError):
-    """A file is no checkpoint, or not what was written."""
+    """A file is no checkpoint, or damaged."""
 
 
 class Checkpoint:
-    """An open checkpoint. Everything raises DamagedError where it cannot be used, OSError where it cannot be read.
+    """An open checkpoint. All methods raise DamagedError if it is unusable, OSError if unreadable.
 
-    index (blocks,): INDEX. state: of the file that was opened.
+    index (blocks,): INDEX. state: of the opened file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -99,7 +99,7 @@ class Checkpoint:
         self._file.close()
 
     def numbers_in(self, window: CellWindow | None) -> Ints:
-        """Numbers of the blocks that a window touches, in the order of places; of all without one."""
+        """Sorted numbers of the blocks in a window; None for all."""
         if window is None:
             return np.arange(len(self.index))
         n, x, y = BLOCK_CELLS, self.index["x"], self.index["y"]
@@ -108,7 +108,7 @@ class Checkpoint:
         return np.flatnonzero(inside)
 
     def records(self, numbers: Ints) -> Iterator[memoryview]:
-        """The bytes of some blocks, in order of places, each checked; neighbours are read at once."""
+        """Checked bytes of blocks, sorted; neighbours are read together."""
         at = 0
         firsts, sizes, crcs = (self.index[name][numbers].tolist() for name in ("first", "bytes", "crc32"))
         while at < len(numbers):
@@ -125,7 +125,7 @@ class Checkpoint:
             at = end
 
     def blocks(self, numbers: Ints) -> Iterator[tuple[int, int, Record]]:
-        """Column, row and record of some blocks."""
+        """Column, row and record of blocks."""
         places = zip(self.index["x"][numbers].tolist(), self.index["y"][numbers].tolist(), strict=True)
         for (x, y), record in zip(places, map(bytes, self.records(numbers)), strict=True):
             if not is_sound(record):
@@ -159,10 +159,7 @@ class Checkpoint:
 
 
 class CheckpointWriter:
-    """Writes a checkpoint into a new file: `add` for each block in the order of places, then `finish`. Raises OSError.
-
-    bytes_written: so far.
-    """
+    """Writes a new checkpoint: `add` blocks in order, then `finish`. Raises OSError."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -174,12 +171,12 @@ class CheckpointWriter:
         self._put(np.array([(x, y, 0, len(record), zlib.crc32(record))], INDEX), record)
 
     def copy(self, source: Checkpoint, numbers: Ints) -> None:
-        """Write blocks as they are in another checkpoint."""
+        """Copy blocks of another checkpoint."""
         for number, record in zip(numbers.tolist(), source.records(numbers), strict=True):
             self._put(source.index[number : number + 1].copy(), record)
 
     def finish(self, header: Header) -> None:
-        """Write what a reader starts with."""
+        """Write index, header and tail."""
         index = np.concatenate([np.empty(0, INDEX), *self._index])
         end = index.tobytes() + json.dumps(asdict(header)).encode()
         tail = TAIL.pack(len(index), len(end) - index.nbytes, zlib.crc32(end), MAGIC)
@@ -192,7 +189,7 @@ class CheckpointWriter:
 
 
 def write_checkpoint(path: Path, header: Header, state: GridState) -> None:
-    """Write the whole state of a grid; the header says what it is true for. Raises OSError."""
+    """Write a grid's whole state. Raises OSError."""
     with whole_file(path, PRIVATE) as file:
         writer = CheckpointWriter(file)
         for x, y, record in state.blocks:

@@ -1,8 +1,7 @@
-"""The checkpoints of one store: which there are, which of them can be used, and which is the nearest before a time.
+"""The checkpoints of one store: which exist, which are usable, and the nearest before a time.
 
-A snapshot is a checkpoint that is closed now: it has all samples up to its journal row, so that a restart folds only
-the rows behind it. All are caches, never the truth: one that is damaged, of another schema or of other facts is passed
-over, and the journal is folded again.
+A snapshot is a checkpoint closed now, with all samples up to its row, so a restart folds only later rows. All are
+caches: damaged ones, or those of another schema or facts, are ignored, and the journal is folded again.
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ from mapserver.past.checkpoint_file import (
     write_checkpoint,
 )
 
-FOLDER = "checkpoints"  # in the folder of a store
-FactsBefore = Callable[[int], Mapping[str, Any]]  # what evidence of samples stamped before a time depends on
+FOLDER = "checkpoints"  # in a store's folder
+FactsBefore = Callable[[int], Mapping[str, Any]]  # dependencies of evidence stamped before a time
 _FORMAT = "%Y-%m-%dT%H.checkpoint"
-_SNAPSHOT = re.compile(r"snapshot-(\d+)\.checkpoint")  # in the folder of the store
+_SNAPSHOT = re.compile(r"snapshot-(\d+)\.checkpoint")  # in the store's folder
 KEPT_SNAPSHOTS = 2
 log = logging.getLogger("mapserver.past.checkpoints")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A checkpoint by its name. header: None where the file is damaged. usable: whether it is true for given facts.
+    """A checkpoint by name. header: None if damaged. usable: valid for given facts.
 
-    closed_ns: OPEN_END_NS of a snapshot.
+    closed_ns: OPEN_END_NS for a snapshot.
     """
 
     path: Path
@@ -50,14 +49,14 @@ class Entry:
 
 
 class Checkpoints:
-    """The files of a store; for any thread. One thread alone makes and removes those of hours, one the snapshots.
+    """A store's checkpoints; thread-safe. One thread writes hourly ones, one snapshots.
 
-    passed_over: how many damaged ones were seen. state: what there was at the last look: how many usable ones, bytes of
-    all, when the newest usable one is closed, 0 for none, and `passed_over`.
+    passed_over: damaged ones seen. state: at the last look: usable ones, total bytes, closing time of the newest (0 for
+    none), `passed_over`.
     """
 
     def __init__(self, store: Path) -> None:
-        """store: the folder of a store."""
+        """store: its folder."""
         self.store, self.folder = store, store / FOLDER
         self.passed_over = 0
         self.state = {"count": 0, "bytes": 0, "newest_ns": 0, "passed_over": 0}
@@ -65,15 +64,15 @@ class Checkpoints:
         self._seen: dict[Path, tuple[FileState, Entry]] = {}
 
     def path(self, closed_ns: int) -> Path:
-        """Where the one that is closed at a full hour lies."""
+        """Path of an hour's checkpoint."""
         return self.folder / datetime.fromtimestamp(closed_ns // 10**9, UTC).strftime(_FORMAT)
 
     def entries(self, facts: FactsBefore, last_row: int) -> list[Entry]:
-        """Those of hours, oldest first; usable are those made with these facts, of rows that there are."""
+        """Hourly checkpoints, oldest first; usable with these facts and rows."""
         return [entry for entry in self.with_snapshots(facts, last_row) if entry.closed_ns != OPEN_END_NS]
 
     def with_snapshots(self, facts: FactsBefore, last_row: int) -> list[Entry]:
-        """As `entries`, and behind them the snapshots."""
+        """As `entries`, then snapshots."""
         with self._lock:
             paths = [*self.folder.glob("*.checkpoint"), *self.store.glob("*.checkpoint")]
             known = [entry for path in paths if (entry := self._look(path))]
@@ -86,12 +85,12 @@ class Checkpoints:
         return entries
 
     def nearest(self, until_ns: int, facts: FactsBefore, last_row: int, from_ns: int = 0) -> Checkpoint | None:
-        """Open the newest usable one that is closed at `until_ns` or before, not before `from_ns`; None for none."""
+        """Open the newest usable one closed in from_ns ... until_ns; None for none."""
         for entry in reversed(self.with_snapshots(facts, last_row)):
             if entry.usable and from_ns <= entry.closed_ns <= until_ns:
                 try:
                     checkpoint = Checkpoint(entry.path)
-                except (OSError, DamagedError):  # removed or replaced a moment ago
+                except (OSError, DamagedError):  # just removed or replaced
                     continue
                 if checkpoint.header == entry.header:
                     return checkpoint
@@ -99,7 +98,7 @@ class Checkpoints:
         return None
 
     def look(self, facts: FactsBefore, last_row: int) -> list[Entry]:
-        """As `entries`; `state` tells of them from then on."""
+        """As `entries`, and update `state`."""
         entries = self.entries(facts, last_row)
         usable = [entry.closed_ns for entry in entries if entry.usable]
         counts = {"count": len(usable), "bytes": sum(entry.bytes for entry in entries), "newest_ns": max([0, *usable])}
@@ -107,7 +106,7 @@ class Checkpoints:
         return entries
 
     def pass_over(self, checkpoint: Checkpoint, error: Exception) -> None:
-        """Use one no more in which damage was found, until it is made again."""
+        """Ignore a damaged one until it is replaced."""
         with self._lock:
             seen = self._seen.get(checkpoint.path)
             if seen and seen[0] == checkpoint.state:
@@ -115,7 +114,7 @@ class Checkpoints:
                 self._count(checkpoint.path, error)
 
     def _look(self, path: Path) -> Entry | None:
-        """What is known of a file, read anew where it changed; None where it is gone or has another name."""
+        """A file's entry, read if changed; None if gone or no checkpoint."""
         try:
             state = file_state(path.stat())
             closed_ns = OPEN_END_NS if _SNAPSHOT.fullmatch(path.name) else _hour_of(path.name)
@@ -142,23 +141,23 @@ class Checkpoints:
 
 
 def snapshot_rows(store: Path) -> list[int]:
-    """Journal rows of the snapshots of a store, newest first."""
+    """Journal rows of a store's snapshots, newest first."""
     rows = map(_row_of, store.glob("snapshot-*.checkpoint"))
     return sorted((row for row in rows if row is not None), reverse=True)
 
 
 def snapshot_path(store: Path, row: int) -> Path:
-    """Where the snapshot of a journal row lies."""
+    """Path of a row's snapshot."""
     return store / f"snapshot-{row}.checkpoint"
 
 
 def save_snapshot(store: Path, row: int, facts: Mapping[str, Any], state: GridState) -> Path:
-    """Write the grid as of a journal row, and remove all snapshots but the newest two. Raises OSError.
+    """Write a snapshot and remove all but the newest two. Raises OSError.
 
-    facts: what its evidence depends on, closed at OPEN_END_NS.
+    facts: dependencies of its evidence, closed at OPEN_END_NS.
     """
     path = snapshot_path(store, row)
-    for part in store.glob(".snapshot-*.part"):  # of a process that was killed: one alone writes to a store
+    for part in store.glob(".snapshot-*.part"):  # of killed processes: only this one writes here
         part.unlink(missing_ok=True)
     write_checkpoint(path, Header(OPEN_END_NS, row, facts), state)
     for old in snapshot_rows(store)[KEPT_SNAPSHOTS:]:
@@ -167,10 +166,9 @@ def save_snapshot(store: Path, row: int, facts: Mapping[str, Any], state: GridSt
 
 
 def remove_beyond(store: Path, last_row: int) -> None:
-    """Remove those made of rows that the journal does not reach: once it grew past them they would pass for true.
+    """Remove checkpoints beyond the journal, which would seem valid once it grows past them.
 
-    They are left where the journal was restored from a backup, or lost its end. A snapshot's name says its row, also
-    where it is damaged.
+    They remain when a journal is restored or loses its end. A snapshot's name has its row even if it is damaged.
     """
     for entry in Checkpoints(store).with_snapshots(lambda _: {}, last_row):
         row = entry.header.row if entry.header else _row_of(entry.path) or 0
@@ -180,11 +178,11 @@ def remove_beyond(store: Path, last_row: int) -> None:
 
 
 def _row_of(path: Path) -> int | None:
-    """The journal row that a snapshot's name says; None of another file."""
+    """Row in a snapshot's name, else None."""
     match = _SNAPSHOT.fullmatch(path.name)
     return int(match.group(1)) if match else None
 
 
 def _hour_of(name: str) -> int:
-    """When one of an hour is closed, as its name says; ValueError for another name."""
+    """Closing time in a name; ValueError for another name."""
     return round(datetime.strptime(name, _FORMAT).replace(tzinfo=UTC).timestamp()) * 10**9

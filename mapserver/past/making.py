@@ -1,7 +1,6 @@
-"""A checkpoint made in small steps: of the nearest one before it, and of the samples that this one lacks.
+"""Makes a checkpoint in small steps, from the nearest earlier one and the samples it lacks.
 
-Only these are folded, and only the blocks that they touch are merged; all others are copied as they are. So it takes
-time in proportion to the samples since, and little memory beside a server's own grid.
+Only touched blocks are merged, others are copied. Time depends on the new samples, memory stays small.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ from protocol.files import PRIVATE, whole_file
 
 FOLDED_AT_ONCE = 32_768  # samples: 30 ms
 MERGED_AT_ONCE = 32  # blocks: 10 ms
-SPILL_SAMPLES = 1_000_000  # what was folded of them takes 50 MB; then it goes to disk, and memory is free again
+SPILL_SAMPLES = 1_000_000  # samples whose folds take 50 MB, which then move to disk
 SPILL_FILE = "spill"
 
 
 def make(past: StorePast, reader: JournalReader, closed_ns: int, facts: Facts) -> Iterator[None]:
-    """Make the checkpoint that is closed at a full hour, with these facts, step by step.
+    """Make the checkpoint of a full hour, with these facts, step by step.
 
-    It is true for all rows that the journal has at the first step. Ended early, it leaves nothing. Raises OSError, and
-    StoreError where the journal, the archive or the checkpoint that it begins with is damaged; that one is passed over.
+    It covers the journal's rows at the first step. Cancelled, it leaves nothing. Raises OSError, and StoreError if
+    journal, archive or base is damaged; the base is then ignored.
     """
     before = past.depends_on(reader, facts)
     header = Header(closed_ns, reader.last_row, before(closed_ns))
@@ -63,7 +62,7 @@ def make(past: StorePast, reader: JournalReader, closed_ns: int, facts: Facts) -
 
 
 def remove_unfinished(checkpoints: Checkpoints) -> None:
-    """Remove what a process that was killed left; raises OSError. Nothing may be in the making."""
+    """Remove a killed process's files; raises OSError. None may be in the making."""
     for left in (checkpoints.folder / SPILL_FILE, *checkpoints.folder.glob(".*.part")):
         left.unlink(missing_ok=True)
 
@@ -75,7 +74,7 @@ def _reopened(base: Checkpoint | None, path: Path) -> Checkpoint:
 
 
 def _write(path: Path, base: Checkpoint | None, part: Grid, header: Header) -> Iterator[None]:
-    """Write the evidence of a checkpoint and a grid together, step by step."""
+    """Write a checkpoint plus a grid, step by step."""
     state = part.state()
     fresh = {(x, y): record for x, y, record in state.blocks}
     numbers = _numbers(base)
@@ -98,7 +97,7 @@ def _write(path: Path, base: Checkpoint | None, part: Grid, header: Header) -> I
 
 
 def _numbers(base: Checkpoint | None) -> dict[Block, int]:
-    """Number of each block in a checkpoint, by its place."""
+    """Number of each block in a checkpoint."""
     if base is None:
         return {}
     places = zip(base.index["x"].tolist(), base.index["y"].tolist(), strict=True)
@@ -108,7 +107,7 @@ def _numbers(base: Checkpoint | None) -> dict[Block, int]:
 def _merged(
     base: Checkpoint | None, numbers: Mapping[Block, int], part: Grid, fresh: Mapping[Block, Record]
 ) -> dict[Block, Record]:
-    """The records of some blocks with those that a checkpoint has of them."""
+    """Merge blocks with those of a checkpoint."""
     both = sorted(numbers[place] for place in fresh if place in numbers)
     if base is None or not both:
         return dict(fresh)

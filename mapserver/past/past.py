@@ -1,12 +1,9 @@
-"""The past of one store: its samples by stamp and place, the checkpoints of its evidence, and maps as of any time.
+"""The past of one store: samples by stamp and place, checkpoints, and maps as of any time.
 
-A map of the past is the nearest checkpoint before it, and the samples that this one lacks: those stamped since it was
-closed, and late ones, stamped before but journalled after it was made. A fold commutes, so the map is the fold of all
-samples up to that time, bit for bit, whichever checkpoint it begins with, and also with none.
-
-So is a map folded again with other facts (`fold_anew`), beside the one that goes on, in a process that writes or
-follows. It begins with the newest checkpoint whose evidence the facts leave as it is, else with nothing. What comes in
-meanwhile is folded in rounds, until a few rows are left.
+A past map is the nearest earlier checkpoint plus the samples it lacks: later ones, and late ones journalled after it
+was made. Folds commute, so the map is the fold of all samples up to its time, bit for bit, from any checkpoint or none.
+`fold_anew` also rebuilds the map with other facts while the old one continues, from the newest unaffected checkpoint;
+rows that arrive meanwhile are folded in rounds, until few are left.
 """
 
 from __future__ import annotations
@@ -33,14 +30,14 @@ from mapserver.past.checkpoints import Checkpoints, FactsBefore
 from protocol.arrays import Table
 from protocol.site.geometry import Bounds, CellWindow, GridGeometry
 
-NamedSamples = tuple[Table, NDArray[np.uint64]]  # and the hashes of their machines' names
-FEW_ROWS = 8  # may be left to whoever goes on with the map: some ms
-MOST_ROUNDS = 20  # where batches come in as fast as they are folded, whoever goes on has to make them wait
+NamedSamples = tuple[Table, NDArray[np.uint64]]  # with hashes of machine names
+FEW_ROWS = 8  # left to whoever continues the map: some ms
+MOST_ROUNDS = 20  # if batches arrive faster than this, they must be held back
 
 
 @dataclass(frozen=True)
 class StorePast:
-    """What the past of one store is read from. For any thread, each with a journal's reader of its own."""
+    """Sources of one store's past. Thread-safe, given a journal reader per thread."""
 
     archive: Archive
     stamps: StampIndex
@@ -57,17 +54,14 @@ class StorePast:
         config: FoldConfig,
         trusted_row: Callable[[JournalQueries], int] = lambda reader: reader.last_row,
     ) -> StorePast:
-        """The past of the store in a folder.
+        """The past of a store's folder.
 
-        trusted_row: checkpoints of rows up to this one are of the journal; a server has removed those that are not.
+        trusted_row: checkpoints up to this row belong to the journal; a server has removed others.
         """
         return cls(Archive(folder / FOLDER), StampIndex(), Checkpoints(folder), cell_m, config, trusted_row)
 
     def depends_on(self, journal: JournalQueries, facts: Facts) -> FactsBefore:
-        """What evidence of samples stamped before a time depends on: its form, the fold, and the facts about machines.
-
-        No checkpoint made with anything else is used.
-        """
+        """Dependencies of evidence stamped before a time: format, fold, facts. Checkpoints with others are not used."""
         bins = [ev.RESISTANCE_BINS, ev.GRADE_BINS, ev.SECTORS]
         form = {"store": journal.identity().id, "schema": ev.SCHEMA, "cell_m": self.cell_m, "bins": bins}
         fold = {**asdict(self.config), "std_floor_m": STD_FLOOR_M}
@@ -76,14 +70,14 @@ class StorePast:
     def samples(
         self, reader: JournalReader, selection: Selection, after: int = 0, until: int = LAST
     ) -> Iterator[NamedSamples]:
-        """The selected samples of rows after < row <= until, corrected, many at a time."""
+        """Selected samples of rows after < row <= until, corrected, in large pieces."""
         for rows in self.rows(reader, selection, after, until):
             yield rows.selected(selection)
 
     def rows(
         self, reader: JournalReader, selection: Selection, after: int = 0, until: int = LAST
     ) -> Iterator[JournalRows]:
-        """Rows after < row <= until that may hold selected samples, as they were sent, many at a time."""
+        """Rows after < row <= until that may hold selected samples, as sent, in large pieces."""
         history = History(reader, self.archive)
         for stretch in self.stamps.stretches(reader, after, until, selection):
             yield from read_history(history, *stretch, selection)
@@ -91,9 +85,9 @@ class StorePast:
     def lacking(
         self, reader: JournalReader, base: Header | None, selection: Selection, until: int = LAST
     ) -> Generator[NamedSamples, None, None]:
-        """The selected samples of rows up to `until` that are not in a checkpoint: all of them without one.
+        """Selected samples of rows up to `until` that a checkpoint lacks; None for all.
 
-        selection: without a beginning, and with an end that is not before that of the checkpoint.
+        selection: no beginning, and no end before the checkpoint's.
         """
         if base is None:
             yield from self.samples(reader, selection, until=until)
@@ -103,18 +97,18 @@ class StorePast:
             yield from self.samples(reader, selection, after=base.row, until=until)
 
     def next_stamp(self, reader: JournalReader, from_ns: int) -> int | None:
-        """The least stamp from `from_ns` on; that itself, where a journal row reaches across it."""
+        """The least stamp since from_ns; from_ns itself inside a journal row's span."""
         stamps = (self.stamps.next_stamp(reader, from_ns), self.archive.next_stamp(from_ns))
         return min((stamp for stamp in stamps if stamp is not None), default=None)
 
     def late_rows(self, reader: JournalReader, header: Header) -> int:
-        """How many journal rows have samples that a checkpoint lacks though they were stamped before it was closed."""
+        """Number of rows with samples stamped before a checkpoint closed, but missing from it."""
         selection = Selection(to_ns=header.closed_ns - 1)
         stretches = self.stamps.stretches(reader, header.row, LAST, selection)
         return sum(reader.rows_before(*stretch, header.closed_ns) for stretch in stretches)
 
     def grid(self, checkpoint: Checkpoint | None, window: CellWindow | None = None) -> Grid:
-        """The evidence of a checkpoint, of the blocks that a window touches or of all; none without a checkpoint."""
+        """Evidence of a checkpoint, in a window or all; empty for None."""
         if checkpoint is None:
             return Grid(self.cell_m, self.config)
         blocks = tuple(checkpoint.blocks(checkpoint.numbers_in(window)))
@@ -127,9 +121,9 @@ class StorePast:
         window: CellWindow | None = None,
         facts: Facts = NO_FACTS,
     ) -> Grid:
-        """The fold of all samples stamped `to_ns` or earlier, with these facts.
+        """The fold of samples stamped up to `to_ns`, with these facts.
 
-        window: only the evidence of these cells is complete, and nothing far from them is read.
+        window: only its cells are complete, and only nearby data is read.
         """
         grid, base = self.nearest(reader, to_ns, window, facts)
         bounds = reach_of(window, self.cell_m, self.config) if window else None
@@ -139,16 +133,16 @@ class StorePast:
         return grid
 
     def newest(self, journal: JournalQueries, facts: Facts) -> tuple[int, Grid]:
-        """The newest snapshot that is true for these facts, and its journal row; 0 and an empty grid without one."""
+        """Row and grid of the newest valid snapshot; 0 and empty without one."""
         grid, header = self.nearest(journal, LAST, None, facts, OPEN_END_NS)
         return header.row if header else 0, grid
 
     def nearest(
         self, journal: JournalQueries, to_ns: int, window: CellWindow | None, facts: Facts, from_ns: int = 0
     ) -> tuple[Grid, Header | None]:
-        """The evidence of the nearest checkpoint without later samples, and its header; empty where there is none.
+        """Evidence and header of the nearest checkpoint without later samples; empty without one.
 
-        from_ns: none that was closed before this time.
+        from_ns: earliest closing time.
         """
         before, last_row = self.depends_on(journal, facts), self.trusted_row(journal)
         while checkpoint := self.checkpoints.nearest(to_ns + 1, before, last_row, from_ns):
@@ -161,7 +155,7 @@ class StorePast:
 
 
 def reach_of(window: CellWindow, cell_m: float, config: FoldConfig) -> Bounds:
-    """Where samples that vote in a window can lie: 3 sigma of the least certain, and a cell for rounding."""
+    """Where samples that vote in a window can lie: 3 sigma of the least certain, and a cell."""
     reach_m = 3 * math.hypot(config.std_cap_m, STD_FLOOR_M) + cell_m
     inner = GridGeometry(cell_m).bounds(window)
     return Bounds(inner.west_m - reach_m, inner.south_m - reach_m, inner.east_m + reach_m, inner.north_m + reach_m)
@@ -169,7 +163,7 @@ def reach_of(window: CellWindow, cell_m: float, config: FoldConfig) -> Bounds:
 
 @dataclass(frozen=True)
 class FoldedAnew:
-    """A grid up to a journal row, and how many rounds it took."""
+    """A rebuilt grid up to a journal row, and its rounds."""
 
     grid: Grid
     row: int
@@ -177,7 +171,7 @@ class FoldedAnew:
 
 
 def fold_anew(past: StorePast, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> FoldedAnew | None:
-    """Fold the map with these facts, up to a row that few are behind; None where `stopped` said so."""
+    """Rebuild the map with these facts, nearly up to the last row; None if `stopped`."""
     made = begun(past, reader, facts, stopped)
     if made is None:
         return None
@@ -190,7 +184,7 @@ def fold_anew(past: StorePast, reader: JournalReader, facts: Facts, stopped: Cal
 
 
 def begun(past: StorePast, reader: JournalReader, facts: Facts, stopped: Callable[[], bool]) -> tuple[Grid, int] | None:
-    """The map up to a journal row that a checkpoint makes quick, or an empty one; None where it is not wanted."""
+    """A map from a checkpoint, with its row, or an empty one; None if `stopped`."""
     last = reader.last_row
     grid, base = past.nearest(reader, LAST, None, facts)
     if base is None or base.closed_ns == OPEN_END_NS:

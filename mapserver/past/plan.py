@@ -1,7 +1,7 @@
-"""Which checkpoints there should be: at the full hours of the site's last day, then one a day, thinned by age.
+"""Which checkpoints should exist: hourly for the last day, then daily, thinned with age.
 
-Pure functions of times: stamps and closing times [ns since 1970]. The site's now is its newest stamp, so that logs that
-are replayed, at any speed, get theirs too.
+Pure functions of stamps and closing times [ns since 1970]. The site's now is its newest stamp, so replayed logs work at
+any speed.
 """
 
 from __future__ import annotations
@@ -10,17 +10,16 @@ from collections.abc import Callable, Mapping, Sequence
 
 from protocol.units import DAY_NS, HOUR_NS
 
-GRACE_NS = 300 * 10**9  # after an hour's end, most of what machines still had of it has come in
+GRACE_NS = 300 * 10**9  # after an hour's end, for samples still on machines
 
 
 def due(
     now_ns: int, usable: Sequence[int], unusable: Sequence[int], next_stamp: Callable[[int], int | None]
 ) -> int | None:
-    """When the checkpoint to be made next is closed; None where all are there.
+    """Closing time of the next checkpoint, or None.
 
-    usable, unusable: closing times of those that there are; one that cannot be used is made again. next_stamp: the
-    least stamp from a time on, so that none is made for hours or days without samples. Whoever is slower than a
-    replayed log skips hours.
+    usable, unusable: closing times of existing ones; unusable are made again. next_stamp: least stamp since a time, to
+    skip times without samples. Slower than a replayed log, hours are skipped.
     """
     if again := [closed_ns for closed_ns in unusable if closed_ns + GRACE_NS <= now_ns]:
         return min(again)
@@ -32,9 +31,9 @@ def due(
 
 
 def surplus(now_ns: int, closed: Sequence[int]) -> list[int]:
-    """Those of the closing times that nobody needs: of hours that went by a day ago all but the last one of each day.
+    """Closing times not needed: those older than a day, but for each day's last one.
 
-    Also those in the future, which were closed when a machine's clock was wrong.
+    Also future ones, closed by a wrong clock.
     """
     last_of_day = {_end(closed_ns - 1, DAY_NS): closed_ns for closed_ns in sorted(closed)}
     old = [each for each in closed if each <= now_ns - DAY_NS]
@@ -43,10 +42,10 @@ def surplus(now_ns: int, closed: Sequence[int]) -> list[int]:
 
 
 def thinned(begin_ns: int, now_ns: int, sizes: Mapping[int, int], most_bytes: int) -> list[int]:
-    """Closing times to do without, so that the others take at most so many bytes.
+    """Closing times to drop, so that the rest fits into most_bytes.
 
-    begin_ns: the first stamp of all. sizes: bytes by closing time. The one goes first without which a map has least to
-    fold in proportion to its age, so that steps grow with age; the newest goes last.
+    begin_ns: first stamp of all. sizes: bytes by closing time. The least additional folding relative to age goes first,
+    so steps grow with age; the newest goes last.
     """
     kept, gone = sorted(sizes), list[int]()
     while kept and sum(sizes[each] for each in kept) > most_bytes:
@@ -55,12 +54,11 @@ def thinned(begin_ns: int, now_ns: int, sizes: Mapping[int, int], most_bytes: in
 
 
 def _least_missed(begin_ns: int, now_ns: int, kept: Sequence[int]) -> int:
-    """Index of the one that is missed least; never the newest of several."""
+    """Index of the least missed; never the newest of several."""
     before = [begin_ns, *kept]
     steps = [(after - before[i]) / max(now_ns - kept[i], HOUR_NS) for i, after in enumerate(kept[1:])]
     return steps.index(min(steps)) if steps else 0
 
 
 def _end(stamp_ns: int, span_ns: int) -> int:
-    """End of the span that a stamp lies in."""
     return (stamp_ns // span_ns + 1) * span_ns

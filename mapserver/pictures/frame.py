@@ -1,4 +1,4 @@
-"""The frame of a figure, around the picture of the ground: title, axes in metres, legend, north arrow, scale bar."""
+"""A figure's frame: title, axes in metres, legend, north arrow, scale bar."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from protocol.site.geometry import Bounds
 Image = NDArray[np.uint8]  # (height, width, 3), BGR
 Colour = tuple[int, int, int]
 
-LEFT, TOP, BOTTOM, PAD = 84, 66, 52, 18  # margins of the ground [px]
+LEFT, TOP, BOTTOM, PAD = 84, 66, 52, 18  # around the ground [px]
 LINE_PX, SWATCH_PX, MIN_PANEL_PX = 24, 16, 180
 COMPASS_PX, BAR_PX = 94, 130
-MAX_LISTED, MAX_NAME = 24, 21  # machines in the legend, letters of a machine's name
+MAX_LISTED, MAX_NAME = 24, 21  # machines in the legend, letters per name
 FONT, FONT_SCALE, TITLE_SCALE, MAX_TITLE_PX = cv2.FONT_HERSHEY_DUPLEX, 0.46, 0.75, 1490
 INK, PAPER, EDGE = (45, 45, 45), (255, 255, 255), (25, 25, 25)
 
 
 @dataclass(frozen=True)
 class LegendEntry:
-    """One line of the legend: a colour and what it means."""
+    """A line of the legend."""
 
     colour: Colour
     text: str
@@ -33,7 +33,7 @@ class LegendEntry:
 
 @dataclass(frozen=True)
 class Axes:
-    """Where the ground lies in `map` [m], and its scale."""
+    """The ground's bounds in `map` [m], and its scale."""
 
     bounds: Bounds
     px_per_m: float
@@ -47,7 +47,7 @@ def compose(
     machines: Sequence[LegendEntry] = (),
     notes: Sequence[str] = (),
 ) -> Image:
-    """Set the painted ground into a figure that is large enough for everything around it. notes: lines below."""
+    """Frame the painted ground. notes: lines below the legend."""
     named = [LegendEntry(machine.colour, machine.text[:MAX_NAME]) for machine in machines[:MAX_LISTED]]
     if len(machines) > MAX_LISTED:
         notes = [f"and {len(machines) - MAX_LISTED} more machines", *notes]
@@ -68,18 +68,18 @@ def compose(
 
 
 def text_size(words: str, scale: float = FONT_SCALE) -> tuple[int, int]:
-    """Width and height [px] of written words."""
+    """Width and height [px] of text."""
     (width, height), _ = cv2.getTextSize(words, FONT, scale, 1)
     return width, height
 
 
 def text(figure: Image, words: str, at: tuple[int, int], colour: Colour, scale: float = FONT_SCALE) -> None:
-    """Write words; `at` is the left end of their base line."""
+    """Write text from the left end of its base line."""
     cv2.putText(figure, words, at, FONT, scale, colour, 1, cv2.LINE_AA)
 
 
 def _draw_axes(figure: Image, axes: Axes, width: int, height: int) -> None:
-    """Border, ticks with metres, and the names of the axes, outside the ground."""
+    """Border, ticks and names of the axes."""
     right, bottom, bounds, px_per_m = LEFT + width, TOP + height, axes.bounds, axes.px_per_m
     cv2.rectangle(figure, (LEFT - 1, TOP - 1), (right, bottom), INK, 1)
     widest = max(text_size(_metres(round(m)))[0] for m in (bounds.west_m, bounds.east_m))
@@ -96,7 +96,7 @@ def _draw_axes(figure: Image, axes: Axes, width: int, height: int) -> None:
 
 
 def _nice(length: float) -> float:
-    """Largest of 1, 2, 5 x 10^k that is not above `length`."""
+    """Largest of 1, 2, 5 x 10^k up to `length`."""
     power = 10.0 ** math.floor(math.log10(length))
     return power * max(step for step in (1, 2, 5) if step <= length / power * (1 + 1e-9))
 
@@ -121,7 +121,7 @@ def _draw_legend(
     notes: Sequence[str],
     at: tuple[int, int],
 ) -> int:
-    """Swatches of the classes, lines of the machines, notes; returns the pixel row below."""
+    """Returns the pixel row below."""
     left, y = at
     for entry in classes:
         box = ((left, y), (left + SWATCH_PX, y + SWATCH_PX))
@@ -143,7 +143,6 @@ def _draw_legend(
 
 
 def _draw_compass(figure: Image, axes: Axes, at: tuple[int, int]) -> None:
-    """Arrow to the north and a bar of known length."""
     left, y = at
     arrow = np.array([(left + 8, y), (left + 15, y + 26), (left + 8, y + 20), (left + 1, y + 26)], np.int32)
     cv2.fillPoly(figure, [arrow], INK, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""The paper's plotter: pictures of the map as BGR images, north up. Pure drawing; only `write_image` touches a disk."""
+"""Pictures of the map, as in the paper: BGR, north up. Only `write_image` uses a disk."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from protocol.site.ground_classes import SLOPE, UNKNOWN, ZONES, resistance_class
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom [px]
 
-MAX_SIDE_PX, MAX_AREA_PX, MAX_CELL_PX = 1240, 800_000, 64  # of the map itself, without margins
+MAX_SIDE_PX, MAX_AREA_PX, MAX_CELL_PX = 1240, 800_000, 64  # of the ground, without margins
 ARROW_SPACING_PX = 34
 UNKNOWN_COLOUR, WRONG_COLOUR = (228, 228, 228), (255, 0, 255)
 FLAT_COLOUR, SLOPE_COLOUR = ZONES[0].bgr, ZONES[1].bgr
-# Bright, and none of them a colour of the ground; a dark edge sets them off from pale ground.
+# bright, unlike any ground; a dark edge separates them from pale ground
 TRACK_COLOURS: tuple[Colour, ...] = (
     (255, 255, 255), (255, 240, 0), (0, 150, 255), (255, 110, 255), (170, 255, 170), (255, 190, 150), (150, 190, 255),
 )  # fmt: skip
@@ -32,7 +32,7 @@ TRACK_COLOURS: tuple[Colour, ...] = (
 
 @dataclass(frozen=True)
 class DrawnTrack:
-    """Where a machine has been, oldest first, in `map` [m]; NaN breaks the line."""
+    """A machine's positions in `map` [m], oldest first; NaN breaks the line."""
 
     name: str
     x_m: Floats
@@ -40,23 +40,23 @@ class DrawnTrack:
 
 
 class NamedLayers(Protocol):
-    """Anything that gives layers by name: a Region, or a dictionary of arrays."""
+    """Layers by name: a Region, or a dictionary of arrays."""
 
     def __getitem__(self, layer: str, /) -> AnyArray:
-        """Values (rows, columns), row 0 the southernmost."""
+        """Values (rows, columns), southernmost row first."""
         ...
 
 
 @dataclass(frozen=True)
 class _Scale:
-    """The scale of a picture: whole pixels per `shrink` cells, so that cells stay crisp."""
+    """Whole pixels per `shrink` cells, to keep cells crisp."""
 
     axes: Axes
     cell_px: int
     shrink: int
 
     def pixels(self, x_m: AnyArray, y_m: AnyArray, height_px: int) -> Floats:
-        """Positions as (n, 2) pixels of the ground's picture, whose last row is the south."""
+        """Positions as pixels (n, 2); the last row is south."""
         x_px = (np.asarray(x_m, np.float64) - self.axes.bounds.west_m) * self.axes.px_per_m
         y_px = height_px - (np.asarray(y_m, np.float64) - self.axes.bounds.south_m) * self.axes.px_per_m
         return np.stack([x_px, y_px], axis=-1) - 0.5  # pixel centres
@@ -65,9 +65,9 @@ class _Scale:
 def draw_resistance(
     region: Region, tracks: Sequence[DrawnTrack] = (), title: str = "Rolling resistance", notes: Sequence[str] = ()
 ) -> Image:
-    """Draw the layer `resistance` in the paper's classes and colours. notes: lines below the legend.
+    """Draw the layer `resistance` in the paper's classes. notes: lines below the legend.
 
-    Where the region has the layer `resistance_filled` too, it is drawn pale in the gaps.
+    A layer `resistance_filled` is drawn pale in the gaps.
     """
     entries = [LegendEntry(zone.bgr, f"{zone.name}  {zone.c_rr:g}") for zone in ZONES]
     scale = _scale(region)
@@ -82,7 +82,7 @@ def draw_resistance(
 
 
 def draw_grade(region: Region, tracks: Sequence[DrawnTrack] = (), title: str = "Grade") -> Image:
-    """Draw the layers `grade_east`, `grade_north` as flat and slope, with arrows that point uphill."""
+    """Draw `grade_east`, `grade_north` as flat and slope, with uphill arrows."""
     entries = [LegendEntry(FLAT_COLOUR, "flat"), LegendEntry(SLOPE_COLOUR, "slope > 7.5 deg")]
     scale, classes = _scale(region), slope_class(region["grade_east"], region["grade_north"])
     ground = _paint(classes, entries, scale)
@@ -91,7 +91,7 @@ def draw_grade(region: Region, tracks: Sequence[DrawnTrack] = (), title: str = "
 
 
 def draw_difference(region: Region, truth: NamedLayers, kind: Literal["resistance", "grade"]) -> Image:
-    """Draw where the map's class differs from the truth; the title says how much of the known ground is wrong."""
+    """Draw where the map's class differs from the truth; the title has the wrong share of known ground."""
     classes, true = _classes(region, kind), _classes(truth, kind)
     if classes.shape != true.shape:
         raise ValueError(f"truth has shape {true.shape}, the map {classes.shape}")
@@ -108,14 +108,14 @@ def draw_difference(region: Region, truth: NamedLayers, kind: Literal["resistanc
 
 
 def side_by_side(images: Sequence[Image]) -> Image:
-    """Compose pictures into one row, aligned at their tops."""
+    """Join pictures in a row, tops aligned."""
     height = max(image.shape[0] for image in images)
     padded = [np.pad(i, ((0, height - i.shape[0]), (0, 0), (0, 0)), constant_values=255) for i in images]
     return np.concatenate(padded, axis=1)
 
 
 def write_image(path: Path, image: Image) -> None:
-    """Write a picture (format by the suffix) so that a viewer sees the old one or the new one, never half of it."""
+    """Write a picture atomically; the suffix sets the format."""
     done, data = cv2.imencode(path.suffix, image)
     if not done:
         raise ValueError(f"{path}: cannot encode the picture")
@@ -146,7 +146,7 @@ def _scale(region: Region) -> _Scale:
 
 
 def _paint(classes: Ints, entries: Sequence[LegendEntry], scale: _Scale) -> Image:
-    """Picture of the classes, north up, without margins."""
+    """The classes as a picture, north up."""
     palette = np.array([*(entry.colour for entry in entries), UNKNOWN_COLOUR], np.uint8)
     shown = _commonest(classes, len(entries), scale.shrink)
     cells = palette[shown[::-1]]  # UNKNOWN, -1, takes the last colour
@@ -154,7 +154,7 @@ def _paint(classes: Ints, entries: Sequence[LegendEntry], scale: _Scale) -> Imag
 
 
 def _commonest(classes: Ints, count: int, shrink: int) -> Ints:
-    """Commonest known class of each `shrink` x `shrink` cells: a thin track must not vanish from a large map."""
+    """Commonest known class per `shrink` x `shrink` cells: thin tracks must stay visible."""
     if shrink == 1:
         return classes
     padding = [(0, -size % shrink) for size in classes.shape]
@@ -186,7 +186,7 @@ def _finish(
     title: str,
     notes: Sequence[str] = (),
 ) -> Image:
-    """Draw the tracks on the painted ground and set it into its frame."""
+    """Draw the tracks, and frame the ground."""
     _draw_tracks(ground, tracks, scale)
     machines = [LegendEntry(colour, track.name) for track, colour in zip(tracks, _colours(tracks), strict=True)]
     return compose(ground, scale.axes, title, [*entries, LegendEntry(UNKNOWN_COLOUR, "unknown")], machines, notes)
@@ -196,7 +196,7 @@ def _finish(
 
 
 def _fixed(pixels: Floats) -> NDArray[np.int32]:
-    """Pixels with four binary places, as OpenCV draws them between the pixels."""
+    """Pixels with four binary places, for OpenCV's shift."""
     return np.rint(np.clip(pixels, -1e6, 1e6) * 16).astype(np.int32)
 
 
@@ -208,7 +208,7 @@ def _draw_tracks(ground: Image, tracks: Sequence[DrawnTrack], scale: _Scale) -> 
         finite = np.isfinite(pixels).all(axis=1)
         pieces = np.split(pixels, np.flatnonzero(~finite))
         lines = [_fixed(piece[np.isfinite(piece).all(axis=1)]) for piece in pieces]
-        for shade, thickness in ((EDGE, 2), (colour, 1)):  # thin: the ground below is what the picture is about
+        for shade, thickness in ((EDGE, 2), (colour, 1)):  # thin, to leave the ground visible
             cv2.polylines(ground, [line for line in lines if len(line)], False, shade, thickness, cv2.LINE_AA, shift=4)
         if finite.any() and ((end := pixels[finite][-1]) >= 0).all() and end[0] < width and end[1] < height:
             ends.append((track, colour, end))
@@ -225,7 +225,7 @@ def _colours(tracks: Sequence[DrawnTrack]) -> list[Colour]:
 
 
 def _label(ground: Image, name: str, colour: Colour, at: tuple[int, int], taken: list[Box]) -> None:
-    """Write a name beside a position where it covers no other; the legend has it in any case."""
+    """Label a position without overlaps; the legend has all names."""
     name = name[:MAX_NAME]
     (width, height), (x, y) = text_size(name), at
     sides = [(x + 11, y + height // 2), (x - 11 - width, y + height // 2)]

@@ -1,4 +1,4 @@
-"""A picture of a drive: its line on the map, and below it resistance, slope, speed and energy along the way."""
+"""A picture of a drive: the line on the map, with resistance, slope, speed and energy below."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LINE: Colour = (180, 90, 20)
 
 @dataclass(frozen=True)
 class _Chart:
-    """Values (n,) at the ends of steps, or of the steps themselves, drawn as such."""
+    """Values (n,) of steps."""
 
     title: str
     values: Floats
@@ -30,9 +30,9 @@ class _Chart:
 
 
 def draw_drive(region: Region, answer: RouteAnswer) -> Image:
-    """The map with the line, and what a drive over it takes.
+    """Draw the map with a route, and charts of its drive.
 
-    region: around the line, with `resistance`, and with `resistance_filled` as a drive counts filled ground as known.
+    region: around the line, with `resistance` and `resistance_filled`.
     """
     totals, machine = answer.totals, answer.machine
     tracks = [DrawnTrack("end", *answer.line_m.T), DrawnTrack("start", *answer.line_m[:1].T)]
@@ -51,7 +51,6 @@ def draw_drive(region: Region, answer: RouteAnswer) -> Image:
 
 
 def _unknown(totals: RouteTotals) -> str:
-    """How much of it is unknown, and what that was taken for."""
     taken = f", taken as {totals.unknown_resistance:.3f}" if totals.unknown else ""
     return f"{totals.unknown:.0%} of it unknown{taken}"
 
@@ -78,7 +77,7 @@ def _profile(answer: RouteAnswer, width: int) -> Image:
 
 
 def _draw(figure: Image, chart: _Chart, x: Floats, unknown: Floats, top: int) -> None:
-    """One chart between these rows of pixels: steps of known ground on white, of unknown ground on grey."""
+    """Draw one chart at a pixel row; unknown ground is grey."""
     low, high = float(chart.values.min()), float(chart.values.max())
     low = min(low, 0.0) if chart.from_zero else low
     span = max(high - low, 1e-9 + 0.02 * abs(high))

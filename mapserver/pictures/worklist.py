@@ -1,4 +1,4 @@
-"""A picture for the foreman: where to send the grader, and why."""
+"""A picture for the foreman: where to grade, and why."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ GROUND: Colour = (238, 240, 240)
 UNKNOWN: Colour = (190, 190, 190)
 WORST: Colour = (40, 30, 215)
 REPAIRED: Colour = (60, 150, 40)
-# Roads by resistance over the target, lightest where there is nothing to do.
+# by resistance over the target, lightest if there is nothing to do
 STEPS: tuple[tuple[float, Colour, str], ...] = (
     (1.25, (170, 200, 170), "near the target or better"),
     (2.0, (140, 200, 235), "up to twice the target"),
     (np.inf, (90, 150, 235), "worse"),
 )
-ARROW_PASSES = 0.75  # share of the passes in one direction, for an arrow to show it
+ARROW_PASSES = 0.75  # share of passes in one direction that gets an arrow
 
 
 def draw_worklist(roads: Segments, worklist: Worklist) -> Image:
-    """Roads, the ten stretches that cost most in red with their ranks, arrows where they are driven one way."""
+    """Roads, the ten most expensive sections in red with ranks, and arrows of one-way traffic."""
     rows = worklist.rows[:TOP]
     lines = [np.array(one.line) for one in roads.segments]
     points = np.concatenate([np.zeros((1, 2)) if not lines else lines[0][:1], *lines])
@@ -80,7 +80,7 @@ def _notes(worklist: Worklist) -> Sequence[str]:
 
 
 def _changes(worklist: Worklist) -> tuple[list[RoadChange], list[RoadChange]]:
-    """Stretches that were repaired, and those that became worse."""
+    """Repaired sections, and deteriorated ones."""
     better = [change for change in worklist.changes if change.after < change.before]
     return better, [change for change in worklist.changes if change.after >= change.before]
 
@@ -106,7 +106,6 @@ def _line(ground: Image, axes: Axes, one: RoadSegment, colour: Colour, thick: in
 
 
 def _arrow(ground: Image, axes: Axes, one: RoadSegment) -> None:
-    """Show the direction of a stretch that is driven one way."""
     there, back = one.passes_ph
     if max(there, back) <= ARROW_PASSES * (there + back) or there + back == 0:
         return
@@ -117,7 +116,6 @@ def _arrow(ground: Image, axes: Axes, one: RoadSegment) -> None:
 
 
 def _number(ground: Image, axes: Axes, one: RoadSegment, words: str) -> None:
-    """Write a rank beside a stretch."""
     line = np.array(one.line)
     ((x, y),) = _pixels(axes, line[len(line) // 2 :][:1], len(ground)).tolist()
     width, height = text_size(words, 0.6)
